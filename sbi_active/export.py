@@ -48,8 +48,8 @@ def to_inference_data(
 
     Args:
         source: A belief, a campaign, a report, or a dict of arrays.
-        parameter_names: One a parameter; None takes the simulator's, which beliefs
-            remember, else theta_1, ...
+        parameter_names: Names of the parameters; None takes the simulator's, which
+            beliefs remember, else theta_1, ...
         num_samples: Draws of all chains together.
         num_chains: Chains; draws that do not fill all are left out.
         model: Model of a report, by a name among ``report.tracing.evidences``.
@@ -90,7 +90,7 @@ def to_datatree(
     Args:
         source: Belief, campaign, report or dict of arrays, as for
             :func:`to_inference_data`.
-        parameter_names: One a parameter.
+        parameter_names: Names of the parameters.
         num_samples: Draws of all chains together.
         num_chains: Chains.
         model: Model of a report, by its name.

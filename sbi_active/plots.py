@@ -31,8 +31,8 @@ def plot_belief(
 
     Args:
         belief: The belief.
-        ax: Where to draw.
-        parameter_names: One a parameter.
+        ax: Axes to draw on.
+        parameter_names: Names of the parameters.
         limits: Lower and upper ends of the axes, shape (2, theta_dim).
         theta_true: Marked by a cross where given.
         pair: Which two parameters.
@@ -69,7 +69,7 @@ def plot_rounds(
     Args:
         beliefs: Before the first round and after each, one more than designs.
         designs: One a round.
-        parameter_names: One a parameter.
+        parameter_names: Names of the parameters.
         theta_true: Marked where given.
         exact_gains: The exact gain of every candidate, one a round, where known.
 

@@ -112,7 +112,7 @@ def row_uniforms(seeds: Tensor, num: int, *, first: int = 0) -> Tensor:
     """Return uniform numbers within (0, 1), row i a function of ``seeds[i]`` alone.
 
     Args:
-        seeds: Shape (n,), int64.
+        seeds: Seeds, shape (n,), int64.
         num: Numbers a row.
         first: Place of the first of them in the row's stream.
 
@@ -131,7 +131,7 @@ def row_normals(seeds: Tensor, num: int) -> Tensor:
     """Return standard normal numbers, the quantiles of :func:`row_uniforms`.
 
     Args:
-        seeds: Shape (n,), int64.
+        seeds: Seeds, shape (n,), int64.
         num: Numbers a row.
 
     Returns:

@@ -124,7 +124,8 @@ class SignalActions(BoxActions):
         """Return the signals to play on the grid ``input_times``, by name.
 
         Args:
-            action: Shape (n, action_dim) for series (n, m), or (action_dim,) for (m,).
+            action: Actions, shape (n, action_dim) for series (n, m), or (action_dim,)
+                for (m,).
 
         Raises:
             ValueError: If the generator gives another shape, or no numbers.

@@ -13,8 +13,8 @@ class ActionSpace(ABC):
     """A set of actions that can be sampled and tested for membership.
 
     Attributes:
-        names: One an entry of the action.
-        units: One an entry of the action; empty where unknown.
+        names: Names of the entries of the action.
+        units: Units of the entries of the action; empty where unknown.
     """
 
     names: list[str]
@@ -30,7 +30,7 @@ class ActionSpace(ABC):
         """Return uniform draws.
 
         Args:
-            sample_shape: Any shape, as in torch's distributions.
+            sample_shape: Shape of the draws, any, as in torch's distributions.
             seed: None uses torch's global generator.
 
         Returns:
@@ -42,7 +42,7 @@ class ActionSpace(ABC):
         """Return which actions belong to the space.
 
         Args:
-            action: Shape (..., action_dim).
+            action: Actions, shape (..., action_dim).
 
         Returns:
             Shape (...), bool.

@@ -50,8 +50,8 @@ class Waveform:
         """Return the signal, {name: (n, m)}.
 
         Args:
-            action: Shape (n, action_dim).
-            input_times: Shape (m,).
+            action: Actions, shape (n, action_dim).
+            input_times: Times of the inputs, shape (m,).
         """
         if action.shape[1] != len(self.names):
             raise ValueError(
@@ -133,8 +133,8 @@ class Together:
         """Return the signals, {name: (n, m)}.
 
         Args:
-            action: Shape (n, action_dim).
-            input_times: Shape (m,).
+            action: Actions, shape (n, action_dim).
+            input_times: Times of the inputs, shape (m,).
         """
         found: dict[str, Tensor] = {}
         sizes = [len(part.names) for part in self.parts]
@@ -172,7 +172,7 @@ class Recorded:
 
     Attributes:
         inputs: By name, shape (t, m).
-        input_times: Shape (m,).
+        input_times: Times of the inputs, shape (m,).
         values: The actions, shape (t, 1).
     """
 

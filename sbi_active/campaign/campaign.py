@@ -69,7 +69,7 @@ class Campaign(CampaignTrials):
         options: Sizes and estimators; or fields of them in a dict.
         directory: New or empty folder to keep the campaign in, as it happens: whatever
             ends the process, :meth:`load` goes on. None keeps it in memory alone.
-        show_progress: Draw a bar of what is being done, and of the rounds of
+        show_progress: Whether to draw a bar of what is being done, and of the rounds of
             :meth:`run`. The logger "sbi_active" says it of all that takes 2 s anyway.
 
     Raises:
@@ -183,10 +183,10 @@ class Campaign(CampaignTrials):
                 own. Others than before hold for this process, with a warning. A dict
                 gives all that are not default, as in the constructor.
             show_progress: Whether to draw a progress bar, as in the constructor.
-            simulator_changed: Take another simulator than the campaign was made with,
-                and compute everything again with it.
-            repair: Give up what is damaged. The files before are kept beside, and a
-                warning names each trial that has to be told again.
+            simulator_changed: Whether to take another simulator than the campaign was
+                made with, and compute everything again with it.
+            repair: Whether to give up what is damaged. The files before are kept
+                beside, and a warning names each trial that has to be told again.
 
         Raises:
             ValueError: If there is no campaign, or one of another simulator or schema.

@@ -66,7 +66,7 @@ class Trial:
             computed again.
         cpu_seconds: CPU time by stage.
         num_simulations: Simulations spent on this trial.
-        num_missing: Those of them lost to faults of the simulator.
+        num_missing: Number of those simulations lost to faults of the simulator.
     """
 
     index: int

@@ -164,8 +164,8 @@ def open_campaign(
             imported without --trust.
         simulator: Place of the simulator; None where the folder says it.
         trust: Whether to import what the folder names.
-        simulator_changed: Take another simulator than before.
-        repair: Give up what is damaged.
+        simulator_changed: Whether to take another simulator than before.
+        repair: Whether to give up what is damaged.
 
     Raises:
         ValueError: If there is no campaign, or nobody knows where its simulator is, or

@@ -129,8 +129,8 @@ class Problem(NamedTuple):
 
     Attributes:
         simulator: With its noise.
-        prior: Over its parameters.
-        actions: Permitted ones; None where none were needed.
+        prior: Prior of its parameters.
+        actions: Permitted actions; None where none were needed.
         effects: What a task's simulator may lack.
     """
 

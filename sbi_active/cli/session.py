@@ -64,7 +64,7 @@ class Session:
             name: Name of the command.
             trust: Whether to import what the folder names.
             simulator: Place of the simulator; None where the folder says it.
-            simulator_changed: Take another simulator than before.
+            simulator_changed: Whether to take another simulator than before.
             **options: Options of the command.
         """
         wants = {"trust": trust, "simulator": simulator, "files": digest(self.folder)}

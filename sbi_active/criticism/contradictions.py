@@ -91,7 +91,7 @@ class SevereTest:
     """An action at which a verdict that names effects would be put to the test.
 
     Attributes:
-        action: Shape (action_dim,).
+        action: Action, shape (action_dim,).
         is_permitted: Whether it is among the permitted actions.
         difference: Between the verdict's prediction and that of a free residual, root
             mean square over the numbers of x, in standard deviations of the verdict's

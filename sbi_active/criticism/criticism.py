@@ -86,8 +86,8 @@ class Criticism:
             bare model's fit shows, where the sensor's error is declared by
             ``measurement_sd``. What the simulator is given stays as it is.
         seed: Seed of all draws.
-        show_progress: Draw a bar of what is being done. The logger "sbi_active" says it
-            of all that takes 2 s anyway.
+        show_progress: Whether to draw a bar of what is being done. The logger
+            "sbi_active" says it of all that takes 2 s anyway.
 
     Raises:
         ValueError: If fewer than two trials can be fitted, shapes differ, an effect

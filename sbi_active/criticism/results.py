@@ -66,7 +66,7 @@ class Residuals:
     r"""Standardized residuals, :math:`(x - \mu) / s` under a posterior predictive.
 
     Attributes:
-        action: Shape (t, action_dim).
+        action: Actions, shape (t, action_dim).
         index: Place of each trial, shape (t,).
         times: Sample times, shape (k,) or (t, k); None without a time axis.
         x: Observations, shape (t, *x_shape), NaN where masked.
@@ -366,8 +366,8 @@ class NextAction:
     """The action whose outcome tells most about which model is right.
 
     Attributes:
-        action: Shape (action_dim,); None where nothing is to be gained.
-        candidates: Shape (a, action_dim).
+        action: Action, shape (action_dim,); None where nothing is to be gained.
+        candidates: Candidates, shape (a, action_dim).
         information_gain: Lower bound on I(model; x | action) a candidate, nats.
         separates: Names that remain in question.
         inseparable: Groups of them that no permitted action separates.

@@ -141,7 +141,7 @@ class Design:
         values.
 
         Args:
-            ax: Where to draw; None makes a figure.
+            ax: Axes to draw on; None makes a figure.
 
         Returns:
             The axes; where there are several panels the ones around them, whose

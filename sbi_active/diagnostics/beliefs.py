@@ -56,8 +56,9 @@ class BeliefCheck:
         verdict: "trust"; "refine" where the belief is not that of a second inference,
             or ranks are not uniform; "stop" where it excludes what others hold or is
             too narrow.
-        reasons: For it, a sentence each.
-        parameter_names: One a parameter; the last of the figures is the joint density.
+        reasons: Reasons for the verdict, a sentence each.
+        parameter_names: Names of the parameters; the last of the figures is the joint
+            density.
         beyond: Nats by which refits, at their own draws, exceed the belief; one a
             refit, the belief is too narrow or elsewhere.
         within: Nats at the belief's draws, likewise: it is too wide, or elsewhere.

@@ -37,7 +37,7 @@ class Stratum:
             network has of it.
         lost: Share of the information that the network loses.
         verdict: Verdict on the stratum, as in :class:`Calibration`.
-        reasons: For it, a clause each.
+        reasons: Reasons for the verdict, a clause each.
     """
 
     name: str
@@ -67,10 +67,10 @@ class Calibration:
             regions are off or it loses much of what outcomes tell, so that beliefs need
             the simulator or the network more training; "stop" where it excludes the
             truth too often, or tells less than the belief did.
-        reasons: For the verdict, a sentence each; empty for "trust".
+        reasons: Reasons for the verdict, a sentence each; empty for "trust".
         overall: All rows.
         strata: By action and round.
-        parameter_names: One a parameter.
+        parameter_names: Names of the parameters.
         gap_method: "likelihood" or "classifier", see :mod:`.log_score`.
         num_invalid: Rows without a measurement that the network cannot take.
         num_simulations: Rows simulated.

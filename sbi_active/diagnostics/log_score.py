@@ -63,8 +63,8 @@ def gap_by_likelihood(
         simulator: Simulator with declared noise.
         belief: Belief over theta before x.
         theta: Truths, shape (n, d).
-        action: Shape (n, action_dim).
-        x: Shape (n, *x_shape).
+        action: Actions, shape (n, action_dim).
+        x: Outcomes, shape (n, *x_shape).
         log_q: Log density of rows of draws, (m, n, d) -> (m, n).
         draws: Draws of q, shape (m, n, d).
         num_contrastive: Draws of q and of the belief, as many of each.

@@ -54,13 +54,13 @@ def judge(
     Args:
         name: Name of the stratum.
         round_: Round of the network.
-        ranks: Shape (n, d + 1), the last by density.
+        ranks: Ranks, shape (n, d + 1), the last by density.
         gap: Terms of the log-score gap, shape (n,), nats.
         gained: log q - log b at the truths, shape (n,), nats.
-        num_posterior_samples: L.
+        num_posterior_samples: Number of posterior draws L.
         level: Level of error of one stratum, shared among its figures.
         tolerance: What may pass.
-        names: One a parameter.
+        names: Names of the parameters.
     """
     n, dim = len(ranks), ranks.shape[1] - 1
     each = level / (NUM_TESTS + dim)

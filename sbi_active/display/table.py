@@ -50,7 +50,7 @@ class Table:
         """Return mean, standard deviation and central 90 % of each parameter.
 
         Args:
-            names: One a parameter.
+            names: Names of the parameters.
             draws: Draws of a belief, shape (n, theta_dim).
         """
         values = draws.double().numpy()

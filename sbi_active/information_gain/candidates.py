@@ -51,7 +51,7 @@ class CandidateSampler:
         declared: Whether the simulator declares its noise around an output that does
             not change from run to run.
         num_drawn: Simulations so far.
-        num_missing: Those of them lost to faults of the simulator.
+        num_missing: Number of those simulations lost to faults of the simulator.
         summaries: What stands for the numbers of an outcome; None keeps all.
     """
 

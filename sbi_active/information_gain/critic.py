@@ -69,7 +69,7 @@ class Critic:
         Args:
             x: Outcomes, shape (n, *x_shape).
             theta: Parameters, shape (n, theta_dim).
-            action: Shape (n, action_dim).
+            action: Actions, shape (n, action_dim).
 
         Raises:
             ValueError: If the model cannot say of a row.

@@ -27,7 +27,7 @@ class Race:
 
     Attributes:
         leader: Index of the largest mean.
-        probability_best: Shape (a,).
+        probability_best: Probability of being the best, shape (a,).
         regret: Expected loss by choosing the leader, nats.
         in_reach: Within some standard errors of the leader, shape (a,), bool.
     """

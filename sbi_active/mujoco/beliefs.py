@@ -39,8 +39,8 @@ def belief_to_parameters(
             ``params.as_vector()``, with ``sample``.
         params: The ``ParameterDict`` that the belief began with, whose shapes, frozen
             parameters and modifiers are kept; None makes one of single numbers.
-        names: One a parameter where there are no ``params``; None takes those of the
-            belief.
+        names: Names of the parameters where there are no ``params``; None takes those
+            of the belief.
         level: Probability of the intervals.
         seed: Seed of the draws.
         path: Path of a YAML file to write.
@@ -91,7 +91,7 @@ class Randomization(NamedTuple):
     """Ranges and joint draws for domain randomization.
 
     Attributes:
-        names: One a parameter.
+        names: Names of the parameters.
         ranges: By level, {name: (low, high)}, central intervals of single parameters.
         samples: Joint draws, shape (n, d), which keep what ranges lose: the
             correlations between parameters.
@@ -115,7 +115,7 @@ def randomization(
     Args:
         belief: Belief with ``sample``; a prior's box will do.
         levels: Probabilities of the ranges, each in (0, 1).
-        names: One a parameter; None takes those of the belief.
+        names: Names of the parameters; None takes those of the belief.
         num_samples: Joint draws to return.
         seed: Seed of the draws.
 

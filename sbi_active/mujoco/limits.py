@@ -137,7 +137,7 @@ class MotionLimits:
         """Return the lowest and highest value of what is limited, over all draws.
 
         Args:
-            action: Shape (n, action_dim).
+            action: Actions, shape (n, action_dim).
 
         Returns:
             By name of a joint, of one with " velocity", or of an actuator with

@@ -46,8 +46,8 @@ def sampled(
     """Return readings at times, a line between those of two steps.
 
     Args:
-        readings: Shape (n, steps, c), from the start on.
-        times: Shape (n, k).
+        readings: Readings, shape (n, steps, c), from the start on.
+        times: Times, shape (n, k).
         start: Time of the first reading.
         step: Between readings.
         late: By how much each channel reads what was there before, (n, c); None is 0.

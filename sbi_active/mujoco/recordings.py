@@ -55,7 +55,7 @@ def trials_of(
     "hinge control". A sensor may have NaN where it was not read; an input is held.
 
     Args:
-        model: Compiled.
+        model: Compiled model.
         recordings: A list of data frames, of dicts of arrays, or of paths of CSV files;
             or one of these for a single trial.
         channels: What the simulator returns.
@@ -106,7 +106,7 @@ def require_in_range(model: Any, name: str, values: Array, what: str) -> None:
     MuJoCo would clip it without a word.
 
     Args:
-        model: Compiled.
+        model: Compiled model.
         name: Name of the actuator.
         values: Values of the control, of any shape.
         what: Source of the values, for the error.

@@ -93,7 +93,7 @@ class _Residuals:
         """Return minus the residuals, shape (n, length), NaN where there is none.
 
         Args:
-            theta: Shape (n, d).
+            theta: Parameters, shape (n, d).
             action: Numbers of sequences, shape (n, 1).
         """
         rows = theta.detach().cpu().double().numpy()

@@ -60,7 +60,7 @@ def added_sensors(source: Source, model: Any, sensors: Sequence[str] | None) -> 
 
     Args:
         source: Source of the model.
-        model: Compiled.
+        model: Compiled model.
         sensors: Names; None for those that the model has.
 
     Raises:
@@ -94,7 +94,7 @@ def channels_of(model: Any, sensors: Sequence[str] | None) -> tuple[Channel, ...
     """Return the numbers that sensors read, in the order of their names.
 
     Args:
-        model: Compiled, with all of them.
+        model: Compiled model, with all of them.
         sensors: Names; None for all.
     """
     own = names_of(model, "sensor")

@@ -139,10 +139,11 @@ class MujocoFunction:
         """Return what the sensors read.
 
         Args:
-            theta: Shape (n, d).
-            action: Shape (n, action_dim).
+            theta: Parameters, shape (n, d).
+            action: Actions, shape (n, action_dim).
             inputs: Controls by actuator, shape (n, m), held between their times.
-            input_times: Shape (m,); the simulation starts at the first.
+            input_times: Times of the inputs, shape (m,); the simulation starts at the
+                first.
             times: Times of the readings, shape (n, k).
             start: By name of a joint, or with " velocity", shape (n,).
             model: Changes of the model, {:class:`.ModelChange`: (n, k)}.

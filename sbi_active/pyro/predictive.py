@@ -19,9 +19,9 @@ class Predictive:
     """A normal mixture.
 
     Attributes:
-        log_weight: Shape (k,).
-        mean: Shape (k, q).
-        cov: Shape (k, q, q).
+        log_weight: Log weights, shape (k,).
+        mean: Means, shape (k, q).
+        cov: Covariances, shape (k, q, q).
     """
 
     log_weight: Tensor

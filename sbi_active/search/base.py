@@ -17,9 +17,9 @@ class Evaluations:
     """Estimates of the utility.
 
     Attributes:
-        action: Shape (n, action_dim).
+        action: Actions, shape (n, action_dim).
         utility: Expected information gain, by its cost where there is one, shape (n,).
-        standard_error: Shape (n,).
+        standard_error: Standard errors, shape (n,).
         probability_valid: Share of simulations with a measurement, shape (n,).
     """
 

@@ -126,7 +126,7 @@ def ascend(
     Args:
         score: Score of points (s, dim), differentiable in the first entries, shape
             (s,).
-        start: Shape (s, dim).
+        start: Starts, shape (s, dim).
         num_continuous: Entries that move, in a unit cube.
         permitted: Function of points (s, dim) that says which are permitted, shape
             (s,), bool.

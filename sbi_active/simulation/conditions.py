@@ -77,7 +77,7 @@ def played(
 
     Args:
         space: Space of the actions.
-        action: Shape (n, action_dim); equal ones are generated once.
+        action: Actions, shape (n, action_dim); equal ones are generated once.
         dtype: Type of the series.
     """
     each, place = torch.unique(action, dim=0, return_inverse=True)

@@ -95,7 +95,7 @@ def find_undetermined(
         simulate: The simulator.
         prior: Prior of its parameters.
         actions: Actions to try, shape (a, action_dim); the first 16 are.
-        names: One a parameter.
+        names: Names of the parameters.
         skip: Parameters that are left alone, since they change nothing anyhow.
         num_rows: Rows a call of the simulator; it is called 2 d + 2 times, and twice
             for what is found.

@@ -68,8 +68,8 @@ class SimulatorModel:
         setup: Called without arguments once a process, before the first run; ``fn``
             receives what it returns as keyword argument ``context``. It is neither
             pickled nor freed before the process ends.
-        parameter_names: One a parameter.
-        channel_names: One an entry of x's last axis; a single one where x is a
+        parameter_names: Names of the parameters.
+        channel_names: Names of the entries of x's last axis; a single one where x is a
             trajectory of one channel, which has no axis of its own.
         sample_times: Time stamps of x's first axis in seconds, shape (T,), for the
             noise.
@@ -155,9 +155,9 @@ class SimulatorModel:
         """Return one draw a row.
 
         Args:
-            theta: Shape (n, theta_dim).
-            action: Shape (n, action_dim).
-            seeds: One a row, shape (n,); None uses torch's global generator.
+            theta: Parameters, shape (n, theta_dim).
+            action: Actions, shape (n, action_dim).
+            seeds: Seeds, one a row, shape (n,); None uses torch's global generator.
             effects: By name, a number or one a row.
 
         Returns:
@@ -179,8 +179,8 @@ class SimulatorModel:
         """Return the noise-free output, shape (n, *x_shape).
 
         Args:
-            theta: Shape (n, theta_dim).
-            action: Shape (n, action_dim).
+            theta: Parameters, shape (n, theta_dim).
+            action: Actions, shape (n, action_dim).
             effects: By name, a number or one a row.
 
         Raises:
@@ -209,8 +209,8 @@ class SimulatorModel:
 
         Args:
             x: Observations, shape (n, *x_shape).
-            theta: Shape (n, theta_dim).
-            action: Shape (n, action_dim).
+            theta: Parameters, shape (n, theta_dim).
+            action: Actions, shape (n, action_dim).
             effects: By name, a number or one a row.
 
         Returns:
@@ -243,8 +243,8 @@ class SimulatorModel:
         The first call runs ``fn`` twice on at most 8 rows; its answer is kept.
 
         Args:
-            theta: Shape (n, theta_dim).
-            action: Shape (n, action_dim).
+            theta: Parameters, shape (n, theta_dim).
+            action: Actions, shape (n, action_dim).
             effects: By name, a number or one a row.
         """
         if self._is_deterministic is None:

@@ -24,8 +24,8 @@ class Simulator(Protocol):
         """Return x of shape (n, *x_shape), torch or NumPy.
 
         Args:
-            theta: Shape (n, theta_dim), float32.
-            action: Shape (n, action_dim), float32.
+            theta: Parameters, shape (n, theta_dim), float32.
+            action: Actions, shape (n, action_dim), float32.
         """
         ...
 

@@ -25,7 +25,7 @@ class Spread:
     are the same functions of the rows in any order.
 
     Attributes:
-        mean: Shape (q,).
+        mean: Means, shape (q,).
         scale: Standard deviations, shape (q,).
         share: :math:`\lambda`.
         z: Standardized rows, zero where not measured, shape (n, q).

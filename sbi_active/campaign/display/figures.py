@@ -47,8 +47,8 @@ def plot_campaign(
         state: State of the campaign.
         simulator: That of a trial, by its index; None where there is none.
         prior: Prior of the current parameters.
-        parameter_names: One a parameter.
-        theta_true: Shape (theta_dim,), where known.
+        parameter_names: Names of the parameters.
+        theta_true: True parameters, shape (theta_dim,), where known.
         num_predicted: Simulations of each trial.
 
     Raises:

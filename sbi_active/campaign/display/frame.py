@@ -42,8 +42,8 @@ def to_dataframe(
     Args:
         state: State of the campaign.
         actions: Action space of the campaign.
-        parameter_names: One a parameter.
-        channel_names: One an entry of x's last axis, where known.
+        parameter_names: Names of the parameters.
+        channel_names: Names of the entries of x's last axis, where known.
     """
     import pandas as pd
 
@@ -108,7 +108,7 @@ def outcome_labels(
 
     Args:
         shape: Shape of the outcome.
-        channel_names: One an entry of the last axis, where known.
+        channel_names: Names of the entries of the last axis, where known.
 
     Example:
         >>> outcome_labels((2,)), outcome_labels((2,), ["angle", "speed"])

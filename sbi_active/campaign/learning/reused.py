@@ -42,7 +42,7 @@ def first_round(
 
     Args:
         simulator: The current one.
-        prior: That theta was drawn from.
+        prior: Prior that theta was drawn from.
         theta: Parameters of the round, shape (n, theta_dim).
         action: Actions of the round, shape (n, action_dim).
         actions: Rows of other actions are not taken.

@@ -43,7 +43,7 @@ class CampaignDirectory:
 
     Args:
         path: Folder with a campaign.
-        repair: Give up what is damaged.
+        repair: Whether to give up what is damaged.
 
     Attributes:
         path: The folder.
@@ -116,7 +116,7 @@ class CampaignDirectory:
 
         Args:
             state: State of the campaign.
-            belief: After ``state.processed``; None where that is the prior.
+            belief: Belief after ``state.processed``; None where that is the prior.
             known: What the reader has too, see :func:`.encode`.
         """
         content = None

@@ -59,9 +59,9 @@ class DrawnPrior(ParticleDraws):
     """Stands for a prior, by its draws; it has no density.
 
     Args:
-        draws: Shape (n, theta_dim).
-        mean: Shape (theta_dim,).
-        variance: Shape (theta_dim,).
+        draws: Draws, shape (n, theta_dim).
+        mean: Mean, shape (theta_dim,).
+        variance: Variance, shape (theta_dim,).
     """
 
     support = constraints.real_vector  # pyright: ignore
@@ -116,9 +116,9 @@ class DrawnActions(ActionSpace):
     """Stands for an action space, by its draws; nobody knows what it contains.
 
     Args:
-        draws: Shape (n, action_dim).
-        names: One an entry of the action.
-        units: One an entry of the action.
+        draws: Draws, shape (n, action_dim).
+        names: Names of the entries of the action.
+        units: Units of the entries of the action.
     """
 
     def __init__(

@@ -130,7 +130,8 @@ def read_manifest(store: Store, *, repair: bool = False) -> dict[str, Any]:
 
     Args:
         store: Store of the campaign.
-        repair: Take the copy where the manifest is damaged, and write it again.
+        repair: Whether to take the copy where the manifest is damaged, and write it
+            again.
 
     Raises:
         ValueError: If there is none, or one of another schema.

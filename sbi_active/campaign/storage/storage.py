@@ -47,7 +47,7 @@ class Storage:
     Args:
         disk: The folder; None keeps the campaign in memory alone.
         bank: Folder of the simulations; None keeps them in the campaign's file.
-        prior: That the campaign began with.
+        prior: Prior that the campaign began with.
     """
 
     def __init__(

@@ -166,7 +166,7 @@ def sample_times_of(times: Any, x: Tensor, names: Sequence[str]) -> Tensor | Non
 
     Args:
         times: Sample times as given; None for none.
-        x: Shape (n, k, ...), NaN where nothing was measured.
+        x: Observations, shape (n, k, ...), NaN where nothing was measured.
         names: Names of the n trials.
     """
     if times is None:

@@ -67,7 +67,7 @@ def suggested_sampling(trials: Trials, residuals: Any, times: Any = None) -> Sam
     from sample to sample, and hides it. At least 8 samples of a trial are left.
 
     Args:
-        trials: With sample times.
+        trials: Trials with sample times.
         residuals: What a fitted model leaves of x, of the shape of x (n, k, ...), NaN
             where nothing was measured.
         times: Sample times, shape (k,) or (n, k), where the trials have none.

@@ -226,7 +226,7 @@ class Trials:
         which then needs no action; rows may have an input and no x.
 
         Args:
-            path: Path of a file, in which lines after # are comments, or of a folder with
+            path: Path of a file, in which lines after # are comments, or a folder with
                 ``trials.csv`` or such files: one with times and no "trial" is a trial.
             columns: Which columns are "trial", "time", "action", "x", "input", "start",
                 "role", "index" and "repeat_of", where they have other names; those left

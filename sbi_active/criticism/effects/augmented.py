@@ -133,8 +133,8 @@ class AugmentedSimulator(SimulatorModel):
             times: Sample times, shape (k,) or (n, k); None takes the model's.
             context: All that is known of how each row's trial was run, in place of
                 index and times.
-            seeds: One a row, for a simulator that takes them; None gives each row 0
-                where the noise is declared.
+            seeds: Seeds, one a row, for a simulator that takes them; None gives each
+                row 0 where the noise is declared.
             merge: Simulate rows once that the simulator would be asked for twice, as
                 where an action was repeated.
 

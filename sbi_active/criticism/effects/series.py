@@ -32,7 +32,7 @@ def lagged_input(u: Tensor, tau: Tensor, step: Tensor) -> Tensor:
     """Return a held series behind a first-order lag, its mean over each step.
 
     Args:
-        u: Shape (n, m), at rest before.
+        u: Series, shape (n, m), at rest before.
         tau: Time constant, 0 for none, shape (n, 1).
         step: Step of the grid.
     """
@@ -46,7 +46,7 @@ def delayed_input(u: Tensor, tau: Tensor, step: Tensor) -> Tensor:
     """Return a held series later by tau, its mean over each step.
 
     Args:
-        u: Shape (n, m); its first value held before.
+        u: Series, shape (n, m); its first value held before.
         tau: Delay, shape (n, 1).
         step: Step of the grid.
     """
@@ -61,7 +61,7 @@ def played(u: Tensor, width: Tensor) -> Tensor:
     r"""Return a series behind a backlash, :math:`|y_k - u_k| \le w / 2`.
 
     Args:
-        u: Shape (n, m); it starts in the middle of the play.
+        u: Series, shape (n, m); it starts in the middle of the play.
         width: w, shape (n, 1).
     """
     half = width.clamp(min=0) / 2
@@ -90,9 +90,10 @@ def lagged_samples(x: Tensor, tau: Tensor, times: Tensor) -> Tensor:
     """Return samples by a sensor with a first-order lag, at rest before the first.
 
     Args:
-        x: Shape (n, k, ...), a line between its samples.
+        x: Observations, shape (n, k, ...), a line between its samples.
         tau: Time constant, 0 for none, shape (n, 1).
-        times: Shape (n, k); what pads a shorter trial has the time of its last sample.
+        times: Times, shape (n, k); what pads a shorter trial has the time of its last
+            sample.
     """
     if x.shape[1] < 2:
         return x
@@ -136,7 +137,7 @@ def rounded(x: Tensor, quantum: Tensor) -> Tensor:
     """Return samples to the nearest multiple of a quantum, 0 for as they are.
 
     Args:
-        x: Shape (n, ...).
+        x: Observations, shape (n, ...).
         quantum: Quantum, of the shape of x or of one that broadcasts to it.
     """
     quantum = quantum.expand_as(x)
@@ -148,9 +149,9 @@ def _affine(factor: Tensor, shift: Tensor, start: Tensor) -> Tensor:
     """Return y with y_0 = start and y_{k+1} = factor_k y_k + shift_k.
 
     Args:
-        factor: Shape (n, k - 1, ...).
+        factor: Factors, shape (n, k - 1, ...).
         shift: Shift of each step, of the same shape.
-        start: Shape (n, 1, ...).
+        start: Start values, shape (n, 1, ...).
     """
     reach = 1
     while reach < factor.shape[1]:

@@ -97,7 +97,7 @@ class OneOutlier(ErrorModel):
         """Return log densities of all trials but each one, shape (n, k).
 
         Args:
-            residual: Shape (n, N).
+            residual: Residuals, shape (n, N).
         """
         parts = []
         for cell, prior in zip(self.noise.cells, self.noise.log_prior, strict=True):

@@ -113,8 +113,8 @@ class FormForce:
         """Return the force, shape (n, nv).
 
         Args:
-            q: Shape (n, nq).
-            v: Shape (n, nv).
+            q: Positions, shape (n, nq).
+            v: Velocities, shape (n, nv).
             t: Since the start of the trial, s.
             phi: Strengths, and the trial's place from -1 to 1 as the last column.
         """

@@ -26,7 +26,7 @@ class Force(Protocol):
             q: Positions, shape (n, nq).
             v: Velocities, shape (n, nv).
             t: Time since the start of the trial, s.
-            phi: Shape (n, k).
+            phi: Parameters of the effect, shape (n, k).
         """
         ...
 

@@ -33,9 +33,9 @@ class Trajectories:
     """Nominal trajectories.
 
     Attributes:
-        time: Shape (k,), s.
-        q: Shape (rows, k, nq).
-        v: Shape (rows, k, nv).
+        time: Times, shape (k,), s.
+        q: Positions, shape (rows, k, nq).
+        v: Velocities, shape (rows, k, nv).
         force: Root mean square of the force that the motion takes, (nv,), N or N m:
             of acceleration, times what a constant force shows of inertia.
     """

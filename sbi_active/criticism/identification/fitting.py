@@ -65,7 +65,7 @@ class Linear:
         Args:
             model: In units, without the others.
             free: Its coordinates, shape (d,).
-            unit: Shape (N,).
+            unit: Units of the residuals, shape (N,).
             tried: Deviations of the prior by which the others are tried anew: by a
                 chord, since many are flat at their null.
         """

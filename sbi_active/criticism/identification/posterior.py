@@ -74,7 +74,7 @@ class Draws:
     """Of the posterior.
 
     Attributes:
-        u: Shape (n, d).
+        u: Coordinates, shape (n, d).
         present: Whether each effect is there, bool, shape (n, e).
         errors: Hypothesis of each channel, shape (n, c).
         size: Deviation of each channel's errors, shape (n, c).

@@ -98,7 +98,7 @@ class Errors:
     Attributes:
         fold: Part that each number belongs to, shape (N,): trials, or with fewer than
             six the parts of trials, which are then left out in their place.
-        num_folds: f.
+        num_folds: Number of folds f.
         is_by_trial: Whether the parts are trials.
         cells: The sensor's error in its units, with what is unknown of its correlation.
         log_cells: Log prior probability of each, shape (c,).

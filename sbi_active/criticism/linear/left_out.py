@@ -118,8 +118,8 @@ def bounded(system: Array, right: Array, low: Array, high: Array) -> Array:
     Args:
         system: A, shape (n, d, d), positive definite.
         right: b, shape (n, d).
-        low: Shape (d,).
-        high: Shape (d,).
+        low: Lower bounds, shape (d,).
+        high: Upper bounds, shape (d,).
     """
     free = np.linalg.solve(system, right[..., None])[..., 0]
     x = np.clip(free, low, high)

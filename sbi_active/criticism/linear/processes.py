@@ -70,7 +70,7 @@ class Processes:
 
         Args:
             variances: Variances of the white part and the process, shape (v, 2).
-            times: Shape (t,).
+            times: Times, shape (t,).
             kernels: Whether each kernel is the smooth one, the rough one first.
         """
         shape = len(kernels), len(times), len(variances)
@@ -163,7 +163,7 @@ def whitened(
     """Return rows (N, k) in the metric of one hypothesis a channel.
 
     Args:
-        rows: Shape (N, k).
+        rows: Rows, shape (N, k).
         processes: Hypotheses of the errors.
         m: In the order trial, channel, time.
         chosen: Hypothesis of each channel, shape (c,).
@@ -234,7 +234,7 @@ class Filter:
 
     Args:
         processes: Hypotheses of the errors.
-        time: Shape (n,).
+        time: Times, shape (n,).
         most: Whitened numbers in memory at once, 16 MB.
 
     Attributes:

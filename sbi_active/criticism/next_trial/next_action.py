@@ -68,7 +68,7 @@ class PredictedRival:
 
         Args:
             action: One of the candidates, shape (action_dim,).
-            num_samples: n.
+            num_samples: Number of draws n.
             seed: Seed of the draws.
         """
         return self._at(action, num_samples, seed)[0]

@@ -49,8 +49,8 @@ class Contents:
         digest: Hash of noise, library and priors as they were before the data.
         exploratory: Library or priors were changed after the data were seen.
         num_trials: Trials that could be fitted.
-        action_labels: One an entry of the action, with its unit.
-        channel_names: One an entry of x's last axis, where known.
+        action_labels: Labels of the entries of the action, with their units.
+        channel_names: Names of the entries of x's last axis, where known.
         leave_one_out: Leave-one-out scores of the bare model and of the one that was
             chosen, where trials are independent given their parameters.
         severe_tests: Where a verdict that names effects would be put to the test most:

@@ -42,9 +42,9 @@ def plot_residuals(
         before: Residuals of the bare model, the upper row.
         after: Residuals of the augmented one, the lower row; None where nothing was
             added.
-        action_labels: One an entry of the action, with its unit; none where the action
-            is only the trial's number.
-        channel_names: One an entry of x without a time axis.
+        action_labels: Labels of the entries of the action, with their units; none where
+            the action is only the trial's number.
+        channel_names: Names of the entries of x without a time axis.
         added: What the augmented model has more, in words.
 
     Returns:

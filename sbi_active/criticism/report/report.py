@@ -103,7 +103,7 @@ def build_report(
 
     Args:
         trials: The measured trials.
-        actions: Permitted ones, for names and units.
+        actions: Permitted actions, for names and units.
         designed: Actions were chosen for their information.
         exploratory: What was frozen was changed afterwards.
         warnings: Further ones.

@@ -164,7 +164,7 @@ class SettledNoise(NoiseGrid):
 
     Args:
         noise: That it stands for.
-        residual: Shape (N,).
+        residual: Residuals, shape (N,).
     """
 
     def __init__(self, noise: ChannelNoise, residual: Array) -> None:

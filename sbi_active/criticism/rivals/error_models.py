@@ -57,7 +57,7 @@ class ErrorModel(ABC):
         """Return a cell and a size of the noise for each residual, at random.
 
         Args:
-            residual: Shape (n, N).
+            residual: Residuals, shape (n, N).
             rng: Source of the draws.
 
         Returns:

@@ -28,7 +28,7 @@ def with_known_inputs(
 
     Args:
         model: The simulator.
-        trials: Measured ones.
+        trials: Measured trials.
         actions: The permitted ones.
     """
     if trials.inputs is None or model.inputs is not None:
@@ -58,8 +58,8 @@ def conditions_at(
 
     Args:
         model: The simulator.
-        trials: Measured ones.
-        action: Shape (a, action_dim).
+        trials: Measured trials.
+        action: Actions, shape (a, action_dim).
 
     Raises:
         ValueError: If inputs were recorded, and none at some of these actions.
@@ -89,7 +89,7 @@ def together(trials: Trials, further: dict[str, Any]) -> dict[str, Any]:
     """Return how trials were run, with further ones behind them.
 
     Args:
-        trials: Measured ones.
+        trials: Measured trials.
         further: From :func:`conditions_at`.
     """
     own = {"inputs": trials.inputs, "start": trials.start}

@@ -108,7 +108,7 @@ class Rival:
         """Return residuals in units of the declared noise.
 
         Args:
-            u: Shape (n, dim).
+            u: Coordinates, shape (n, dim).
             penalized: Where the simulator gives no number, a search needs a residual
                 that drives it away: the spread of the prior predictive, in units of the
                 noise. False gives what the likelihood has there, the prior predictive
@@ -194,7 +194,7 @@ class Rival:
         """Return whitened residuals and their derivatives by finite differences.
 
         Args:
-            u: Shape (n, dim).
+            u: Coordinates, shape (n, dim).
             whiten: Maps (..., N) to (..., N).
             step: In u, one or one a coordinate, shape (dim,).
 

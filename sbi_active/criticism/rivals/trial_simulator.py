@@ -89,7 +89,7 @@ class TrialSimulator:
         """Return what the simulator predicts for the measured numbers.
 
         Args:
-            theta: Shape (n, theta_dim).
+            theta: Parameters, shape (n, theta_dim).
             phi: By effect, shape (n, phi_dim), or (n, t, phi_dim) of scope "trial".
 
         Returns:

@@ -95,7 +95,7 @@ def evaluate_left_out(
     Args:
         trials: Those that may be fitted.
         fold: Fits and traces some trials; called once a trial.
-        show_progress: Draw a bar of the trials.
+        show_progress: Whether to draw a bar of the trials.
     """
     valid = np.flatnonzero(trials.valid.numpy())
     before, after, selected = [], [], []

@@ -41,7 +41,8 @@ class Belief(Distribution, ABC):
     Attributes:
         prior: The original prior.
         label: How the belief was made, for reports.
-        parameter_names: One a parameter, where the simulator names them; else None.
+        parameter_names: Names of the parameters, where the simulator names them; else
+            None.
         diagnostics: What is known of its quality.
     """
 

@@ -46,7 +46,7 @@ class Diagnostics:
         network_warnings: Warnings of the amortized network beside a refined belief.
         assumptions: By name, each with the figure that it was judged by.
         num_simulations: Rows that the belief cost.
-        num_missing: Those of them lost to faults of the simulator.
+        num_missing: Number of those simulations lost to faults of the simulator.
         effective_sample_size: Effective number of the weighted draws behind it.
         error_nats: Expected divergence from the belief of endless simulations.
         error_nats_if_explained: Expected divergence if the observations were as

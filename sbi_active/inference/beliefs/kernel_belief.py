@@ -34,7 +34,7 @@ class KernelBelief(Belief):
 
     Args:
         prior: The original prior, which gives the support.
-        draws: Shape (n, theta_dim).
+        draws: Draws, shape (n, theta_dim).
         weight: Normalized, shape (n,); None weighs all alike.
 
     References:

@@ -21,7 +21,7 @@ class WeightedDraws:
 
     Attributes:
         u: Draws in the potential's coordinates, shape (n, d).
-        weight: Their weights, which sum to 1, shape (n,).
+        weight: Weights of the draws, which sum to 1, shape (n,).
         log_evidence: Log of the integral of prior times likelihood, nats.
         standard_error: Standard error of log_evidence, nats.
         effective_sample_size: Number of draws that count.

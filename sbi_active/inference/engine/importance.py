@@ -215,7 +215,7 @@ def fitted(
 
     Args:
         u: Draws, shape (n, d).
-        weight: Their weights, which sum to 1, shape (n,).
+        weight: Weights of the draws, which sum to 1, shape (n,).
         num_components: Number of components at most; fewer where few draws count.
         settings: How much wider it is.
         rng: Source of its starts.

@@ -77,7 +77,7 @@ def reweighted(mixture: StudentMixture, u: Array, weight: Array) -> StudentMixtu
     Args:
         mixture: Components.
         u: Draws, shape (n, dim).
-        weight: Their weights, which sum to 1, shape (n,).
+        weight: Weights of the draws, which sum to 1, shape (n,).
     """
     parts = mixture.log_parts(u)
     share = np.exp(parts - log_sum_exp(parts, axis=0))

@@ -74,7 +74,7 @@ class LFIRE:
         """Return summaries, and whether there was a measurement, shape (n, q + 1).
 
         Args:
-            x: Shape (n, *x_shape); NaN where there was no measurement.
+            x: Outcomes, shape (n, *x_shape); NaN where there was no measurement.
             center: Subtracted from the numbers before powers are taken, (x_dim,).
             scale: They are divided by, shape (x_dim,).
         """

@@ -22,7 +22,7 @@ class LFIREModel:
     Attributes:
         settings: Settings of the regressions.
         particles: Parameter sets, shape (p, theta_dim).
-        action: Shape (a, action_dim).
+        action: Actions, shape (a, action_dim).
         center: Center of the outcomes of each action, shape (a, x_dim).
         scale: Scale of the outcomes of each action, shape (a, x_dim).
         log_ratios: A row an action, an entry a particle.
@@ -45,7 +45,7 @@ class LFIREModel:
 
         Args:
             theta: Particles, shape (n, theta_dim).
-            x: Shape (n, *x_shape); NaN where there was no measurement.
+            x: Outcomes, shape (n, *x_shape); NaN where there was no measurement.
             action: Simulated ones, shape (n, action_dim).
         """
         particle = _places(theta, self.particles, "theta", "particles")

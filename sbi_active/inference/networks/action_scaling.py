@@ -32,7 +32,7 @@ class Polynomials(nn.Module):
     Rows further out are moved to the edge, since nothing was seen there.
 
     Args:
-        rows: Shape (n, d).
+        rows: Rows of numbers, shape (n, d).
         exponents: :math:`j`, shape (p, d).
     """
 
@@ -242,7 +242,7 @@ class ActionScaling(nn.Module):
 
     Args:
         y: Shape (n, m), finite.
-        action: Shape (n, action_dim).
+        action: Actions, shape (n, action_dim).
     """
 
     mean: Tensor

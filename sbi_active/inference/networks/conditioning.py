@@ -44,7 +44,7 @@ class Conditioning(nn.Module):
     noise of scale one.
 
     Args:
-        theta: Shape (n, theta_dim).
+        theta: Parameters, shape (n, theta_dim).
         condition: Packed (x, action), shape (n, x_dim + action_dim); NaN in x where
             there was no measurement.
         action_dim: Numbers in an action.

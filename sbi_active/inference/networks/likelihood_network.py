@@ -124,9 +124,10 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         """Return log q(input | condition), shape (sample_dim, batch_dim), float32.
 
         Args:
-            input: Shape (sample_dim, batch_dim, x_dim) or (batch_dim, x_dim).
-            condition: Shape (batch_dim, condition_dim), or with the sample_dim too.
-            kwargs: Not used.
+            input: Outcomes, shape (sample_dim, batch_dim, x_dim) or (batch_dim, x_dim).
+            condition: Conditions, shape (batch_dim, condition_dim), or with the
+                sample_dim too.
+            kwargs: Arguments that are not used.
         """
         return log_prob_of_batch(self, self._log_density, input, condition)
 

@@ -110,7 +110,7 @@ class MixtureDensity:
         """Build the network on rows standardized number by number, as in sbi.
 
         Args:
-            theta: Shape (n, theta_dim).
+            theta: Parameters, shape (n, theta_dim).
             x: Packed conditions, shape (n, condition_dim); NaN where a simulation gave
                 no measurement.
         """

@@ -188,9 +188,11 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         """Return log q(input | condition), shape (sample_dim, batch_dim).
 
         Args:
-            input: Shape (sample_dim, batch_dim, theta_dim) or (batch_dim, theta_dim).
-            condition: Shape (batch_dim, condition_dim), or with the sample_dim too.
-            kwargs: Not used.
+            input: Parameters, shape (sample_dim, batch_dim, theta_dim) or (batch_dim,
+                theta_dim).
+            condition: Conditions, shape (batch_dim, condition_dim), or with the
+                sample_dim too.
+            kwargs: Arguments that are not used.
         """
         return log_prob_of_batch(self, self._log_density, input, condition)
 

@@ -39,7 +39,7 @@ class Response(nn.Module):
     Args:
         u: Whitened parameters, shape (n, d).
         y: Finite outcomes, of scale one over all actions, shape (n, m).
-        action: Shape (n, action_dim).
+        action: Actions, shape (n, action_dim).
         kind: Whether f is linear in u.
     """
 

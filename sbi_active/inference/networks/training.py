@@ -67,8 +67,8 @@ def train_mixture_density(
     Args:
         network: Changed in place.
         optimizer: Over the network's parameters.
-        theta: Shape (n, theta_dim).
-        condition: Shape (n, condition_dim).
+        theta: Parameters, shape (n, theta_dim).
+        condition: Conditions, shape (n, condition_dim).
         train_rows: Indices of rows to train on.
         held_out_rows: Indices of rows to validate on; may be empty.
         budget: How long to train.

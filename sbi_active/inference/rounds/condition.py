@@ -32,7 +32,7 @@ def action_rows(
     """Return actions as float32 rows of their own, one repeated where one is given.
 
     Args:
-        action: Shape (action_dim,), (1, action_dim) or (n, action_dim).
+        action: Action, shape (action_dim,), (1, action_dim) or (n, action_dim).
         action_dim: The dimension to expect; None takes that of ``action``.
         num_rows: Rows n to return; None keeps as many as there are.
 

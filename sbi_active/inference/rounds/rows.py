@@ -53,9 +53,9 @@ def round_rows(
     """Return the rows of a round, or say what is wrong with them.
 
     Args:
-        theta: Shape (n, theta_dim), within the prior's support.
-        x: Shape (n, *x_shape), or (n,) where x is one number.
-        action: Shape (n, action_dim), or (action_dim,) for all rows.
+        theta: Parameters, shape (n, theta_dim), within the prior's support.
+        x: Outcomes, shape (n, *x_shape), or (n,) where x is one number.
+        action: Actions, shape (n, action_dim), or (action_dim,) for all rows.
         prior: Gives theta_dim and the support.
         x_shape: Shape of earlier outcomes; None takes that of these.
         action_dim: Dimension of earlier actions; None takes that of these.

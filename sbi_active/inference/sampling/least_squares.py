@@ -144,9 +144,9 @@ def within(system: Array, gradient: Array, u: Array, low: Array, high: Array) ->
     it.
 
     Args:
-        system: Shape (n, dim, dim).
-        gradient: Shape (n, dim).
-        u: Shape (n, dim); a step is subtracted.
+        system: Matrices of the normal equations, shape (n, dim, dim).
+        gradient: Gradients, shape (n, dim).
+        u: Coordinates, shape (n, dim); a step is subtracted.
         low: Lower bounds, shape (dim,).
         high: Upper bounds.
 

@@ -83,7 +83,7 @@ def bridge(
         log_likelihood: Log L, (n, d) -> (n,); -inf allowed.
         guess: q.
         rng: Source of randomness.
-        num_particles: n.
+        num_particles: Number of particles n.
         most: Evaluations of the likelihood at most.
         moves: Proposals; None takes :class:`NormalMoves`.
         max_moves: A step.
@@ -171,7 +171,7 @@ class Moves(Protocol):
 
         Args:
             u: Particles, shape (n, d).
-            weight: Their weights at this step, which sum to 1, shape (n,).
+            weight: Weights of the particles at this step, which sum to 1, shape (n,).
             power: Power of the target at this step.
         """
         ...

@@ -28,8 +28,8 @@ def normalized(log_weight: Array) -> Array:
     """Return weights that sum to one, shape (n,), whatever their size.
 
     Args:
-        log_weight: Shape (n,). Beyond 1e16 a sum of several is lost in the rounding of
-            its logarithm; where none is finite, all count the same.
+        log_weight: Log weights, shape (n,). Beyond 1e16 a sum of several is lost in the
+            rounding of its logarithm; where none is finite, all count the same.
     """
     if not np.isfinite(log_weight).any():
         return np.full(len(log_weight), 1 / len(log_weight))

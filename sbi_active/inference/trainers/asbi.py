@@ -130,8 +130,8 @@ class ASBI(MixtureRounds, NPE_C):
                 cannot take them, with a warning. True drops them: information gain is
                 then biased towards actions that fail, since what failures tell about
                 theta is lost and what is left is all success.
-            data_device: Where to keep the rows.
-            action: Shape (n, action_dim), or (action_dim,) for all rows.
+            data_device: Device that keeps the rows.
+            action: Actions, shape (n, action_dim), or (action_dim,) for all rows.
             belief: The distribution of theta in this round; None is the current one.
 
         Returns:

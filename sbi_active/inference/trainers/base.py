@@ -162,7 +162,7 @@ class ActiveInference(ABC):
         """Go on from a belief that was inferred before.
 
         Args:
-            belief: After the trials.
+            belief: Belief after the trials.
             trials: They replace the history.
         """
         self._belief, self.trials = belief, [*trials]

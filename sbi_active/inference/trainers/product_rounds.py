@@ -111,8 +111,8 @@ class ProductRounds(ActionRounds):
             from_round: Round number, as in sbi; without meaning where there are
                 actions.
             algorithm: Algorithm name, as in sbi; None is sbi's.
-            data_device: Where to keep the rows.
-            action: Shape (n, action_dim), or (action_dim,) for all rows.
+            data_device: Device that keeps the rows.
+            action: Actions, shape (n, action_dim), or (action_dim,) for all rows.
             belief: The distribution of theta in this round; None is the current one.
 
         Raises:

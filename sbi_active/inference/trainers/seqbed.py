@@ -145,7 +145,7 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         Args:
             theta: Particles, each of them several times, shape (n, theta_dim).
             x: Outcomes, shape (n, *x_shape); NaN where there was no measurement.
-            action: Shape (n, action_dim).
+            action: Actions, shape (n, action_dim).
             belief: The distribution of the particles; None is the current belief.
         """
         if action is None:

@@ -38,7 +38,7 @@ class Contrast(InformationGainEstimator):
     errors from contributions include it.
 
     Args:
-        num_contrastive: L.
+        num_contrastive: Number of contrastive draws L.
         seed: Seed of the draws.
         batch_size: Rows in one pass of the network.
 

@@ -29,7 +29,7 @@ class LikelihoodGain(Contrast):
     noise is declared.
 
     Args:
-        num_contrastive: L.
+        num_contrastive: Number of contrastive draws L.
         seed: Seed of the draws.
         batch_size: Rows in one pass of the network.
 

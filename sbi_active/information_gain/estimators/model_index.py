@@ -40,7 +40,7 @@ class RivalPredictive(Protocol):
 
         Args:
             action: One action, shape (action_dim,).
-            num_samples: n.
+            num_samples: Number of draws n.
             seed: Seed of the draws; the same for all actions and models.
 
         Returns:

@@ -31,8 +31,8 @@ class ParameterFeatures:
     """Low-order features of whitened parameters.
 
     Attributes:
-        center: Shape (d,).
-        transform: Shape (d, d).
+        center: Center of the parameters, shape (d,).
+        transform: Whitening transform, shape (d, d).
         knots: Whitened parameters at the center of a radial feature, shape (k, d).
     """
 

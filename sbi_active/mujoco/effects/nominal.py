@@ -74,7 +74,7 @@ def nominal(
     Args:
         simulator: Simulator of a :class:`.MujocoFunction`.
         trials: Trials that say how the robot moves; None takes signals or actions.
-        actions: Permitted ones, where there are no trials.
+        actions: Permitted actions, where there are no trials.
 
     Returns:
         The sizes; and theta, action and keyword arguments of a call.

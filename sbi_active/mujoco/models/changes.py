@@ -64,7 +64,7 @@ class Insertion(ModelChange):
         Args:
             model: Written.
             data: At the start, its forces computed.
-            phi: Shape (k,).
+            phi: Parameters of the effect, shape (k,).
         """
 
 
@@ -88,7 +88,7 @@ class StateChange(ModelChange):
             q: Their positions, shape (n, joints).
             v: Their velocities.
             load: Forces of the actuators on them in the step before.
-            phi: Shape (n, k).
+            phi: Parameters of the effect, shape (n, k).
         """
 
     @override

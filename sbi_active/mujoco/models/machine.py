@@ -34,7 +34,7 @@ class Rows:
         changes: By change, shape (n, k).
         forces: By force, shape (n, k).
         start: Positions and velocities at the start, by name, (n,).
-        controls: Shape (n, steps, nu), held over each step.
+        controls: Controls, shape (n, steps, nu), held over each step.
     """
 
     theta: Array
@@ -97,7 +97,7 @@ class Model:
 
         Args:
             number: Number of the copy to write into.
-            theta: Shape (d,).
+            theta: Parameters, shape (d,).
             changes: By change, shape (k,).
         """
         model = self.writer.model(theta)

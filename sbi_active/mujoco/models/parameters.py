@@ -100,7 +100,7 @@ def bounded(model: Any, parameters: Mapping[str, Any]) -> tuple[Bounded, ...]:
     """Return parameters as users declare them.
 
     Args:
-        model: Compiled, to find quantities and units.
+        model: Compiled model, to find quantities and units.
         parameters: By name: (low, high) of the quantity of that name; (low, high,
             "element.attribute") under a name of one's own; or (low, high, edit) with a
             function ``edit(spec, value)``.

@@ -126,7 +126,7 @@ def find_quantity(model: Any, text: str) -> Quantity:
     """Return the quantity that is called "element.attribute".
 
     Args:
-        model: Compiled.
+        model: Compiled model.
         text: Its name; "joint:element.attribute" where elements of two kinds share a
             name and an attribute.
 

@@ -45,7 +45,7 @@ class Bank:
         simulator: Simulator of these rows. Its name, settings and source are compared
             with those in the bank.
         version: Version of the simulator, yours; given, it stands for the source code.
-        parameter_names: One a parameter; None takes those of the simulator.
+        parameter_names: Names of the parameters; None takes those of the simulator.
         created: Date to note in a new bank.
         name: Name of the bank in its file, which may hold several, as a campaign's
             does.

@@ -17,7 +17,7 @@ def log_density(distribution: Any, theta: Tensor) -> Tensor:
 
     Args:
         distribution: Anything with ``log_prob``.
-        theta: Shape (n, theta_dim).
+        theta: Parameters, shape (n, theta_dim).
 
     Returns:
         Shape (n,), float64.

@@ -40,7 +40,7 @@ class AutocorrelatedNoise(ScaleNoise):
             channel.
         correlation_time: :math:`\tau` in seconds, of all channels. Without time stamps
             it counts samples.
-        posterior: Over (sd, correlation_time), event shape (p,).
+        posterior: Posterior of (sd, correlation_time), event shape (p,).
         measurement_sd: Known standard deviation of the measurement alone, where the
             rest of an unknown sd is what a simulator gets wrong, a number or one a
             channel; None where nothing is known of it.
@@ -224,9 +224,9 @@ def innovations(
     with s the last time observed before t, and :math:`u_t = e_t` where there is none.
 
     Args:
-        residual: Shape (n, T, ...), NaN where not observed.
+        residual: Residuals, shape (n, T, ...), NaN where not observed.
         tau: Correlation times, shape (n,).
-        times: Shape (T,) or (n, T); None for 0, 1, 2, ...
+        times: Times, shape (T,) or (n, T); None for 0, 1, 2, ...
 
     Returns:
         :math:`u_t^2` and :math:`\log(1 - \rho^2)`, zero where not observed, shapes (n,

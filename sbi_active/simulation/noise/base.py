@@ -37,10 +37,10 @@ class NoiseModel(ABC):
     unknown :math:`\eta`, draw it from ``posterior`` and give it as ``parameters``.
 
     Attributes:
-        parameter_names: One a parameter.
+        parameter_names: Names of the parameters.
         parameters: Their values in natural units, shape (p,), float64.
-        posterior: Over the parameters, event shape (p,); None where they are declared
-            exactly.
+        posterior: Posterior of the parameters, event shape (p,); None where they are
+            declared exactly.
         times: Time stamps of the first axis of x in seconds, shape (T,); None where
             nobody gave them.
     """
@@ -71,12 +71,12 @@ class NoiseModel(ABC):
 
         Args:
             mean: Noise-free outputs, shape (n, *x_shape).
-            seeds: One a row, shape (n,), and row i depends on ``seeds[i]`` alone; None
-                draws from torch's global generator.
+            seeds: Seeds, one a row, shape (n,), and row i depends on ``seeds[i]``
+                alone; None draws from torch's global generator.
             times: Times of x's first axis in seconds, shape (T,) or one set a row (n,
                 T); None takes those of the model.
-            parameters: Shape (p,), or one set a row (n, p); None takes the model's own,
-                or for each row a draw from the posterior.
+            parameters: Parameters of the noise, shape (p,), or one set a row (n, p);
+                None takes the model's own, or for each row a draw from the posterior.
 
         Returns:
             Shape (n, *x_shape).
@@ -115,9 +115,9 @@ class ScaleNoise(NoiseModel):
         sd: Standard deviation, in the units of x; a number, or one a channel (the last
             axis of x). Its parameters are named "sd", or "sd_1", "sd_2", ...
         shared: Further parameters by name, which follow those.
-        posterior: Over the parameters, event shape (p,). One that
-            :func:`.estimate_noise` did not make is represented
-            by 256 fixed draws of equal weight.
+        posterior: Posterior of the parameters, event shape (p,). One that
+            :func:`.estimate_noise` did not make is represented by 256 fixed draws of
+            equal weight.
     """
 
     def __init__(

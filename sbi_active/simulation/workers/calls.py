@@ -42,7 +42,7 @@ class Call:
         rows: Their indices in the whole set, shape (k,), int64.
         theta: Parameters, shape (k, theta_dim).
         action: Actions, shape (k, action_dim).
-        seeds: One a row, shape (k,), int64.
+        seeds: Seeds, one a row, shape (k,), int64.
         seed: Seed of the whole set.
         draws: Where the random numbers come from: "seeds" passes those to the
             simulator; "blocks" forks the global generators for each block of 256 rows,
@@ -85,7 +85,7 @@ class Reply:
     """What came of a call.
 
     Attributes:
-        x: Shape (k, *x_shape), float32; None where there is a fault.
+        x: Outcomes, shape (k, *x_shape), float32; None where there is a fault.
         seconds: Wall time that the simulator took.
         fault: What went wrong; None if nothing did.
         traceback: Text that tells it.

@@ -35,8 +35,8 @@ class Schedule:
     and without company.
 
     Args:
-        theta: Shape (n, theta_dim).
-        action: Shape (n, action_dim).
+        theta: Parameters, shape (n, theta_dim).
+        action: Actions, shape (n, action_dim).
         seed: Seed of the whole set.
         has_seeds: Whether the simulator takes them.
         batch_size: Rows a call; None measures how many take ``BATCH_SECONDS``.
@@ -47,8 +47,9 @@ class Schedule:
         on_rows: Told about finished rows: index (k,), x (k, *x_shape), status (k,).
 
     Attributes:
-        x: Shape (n, *x_shape), NaN where there is none; None until a call succeeds.
-        status: Shape (n,), int8, -1 for rows that are not finished.
+        x: Outcomes, shape (n, *x_shape), NaN where there is none; None until a call
+            succeeds.
+        status: Status of each row, shape (n,), int8, -1 for rows that are not finished.
         tracebacks: Tracebacks of the missing rows.
         faults: How many rows are missing for which fault.
     """
