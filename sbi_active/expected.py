@@ -11,8 +11,8 @@ def require(holds: bool, expected: str, got: Any, advice: str) -> None:
     Args:
         holds: Whether it is.
         expected: Name and range of the setting.
-        got: What was given.
-        advice: What to do.
+        got: Value that was given.
+        advice: Advice on what to do.
 
     Raises:
         ValueError: With all three.

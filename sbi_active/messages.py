@@ -158,7 +158,7 @@ class Explained:
     """An error whose text names its place on the page.
 
     Attributes:
-        code: Its code.
+        code: Code of the message.
     """
 
     code: str

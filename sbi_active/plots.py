@@ -34,8 +34,8 @@ def plot_belief(
         ax: Axes to draw on.
         parameter_names: Names of the parameters.
         limits: Lower and upper ends of the axes, shape (2, theta_dim).
-        theta_true: Marked by a cross where given.
-        pair: Which two parameters.
+        theta_true: True parameters, marked by a cross where given.
+        pair: Pair of parameters to draw.
         num_samples: Points.
     """
     i, j = pair
@@ -68,9 +68,9 @@ def plot_rounds(
 
     Args:
         beliefs: Before the first round and after each, one more than designs.
-        designs: One a round.
+        designs: Designs, one a round.
         parameter_names: Names of the parameters.
-        theta_true: Marked where given.
+        theta_true: True parameters, marked where given.
         exact_gains: The exact gain of every candidate, one a round, where known.
 
     Returns:

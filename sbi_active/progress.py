@@ -37,7 +37,7 @@ def stage(
     """Tell of the block while it runs; of a block within it nothing is told.
 
     Args:
-        what: What it does.
+        what: Name of the work.
         show_progress: Whether to draw a bar.
         count: Steps done, from which the time that is left is estimated.
     """
@@ -56,9 +56,9 @@ class News:
     """A bar and a log of one stage, kept up to date by a thread of its own.
 
     Args:
-        what: What is being done.
+        what: Name of the work.
         expected: Seconds that it took before; None where it is the first.
-        before: Where that was, such as "trial 3".
+        before: Place where that was, such as "trial 3".
         has_bar: Whether to draw a bar.
         count: Steps done, from which the seconds are estimated in place of that.
     """

@@ -74,7 +74,7 @@ def grouped(values: Mapping[str, Any], groups: Mapping[str, Any]) -> dict[str, A
     """Return values by name, with loose ones in the settings that they belong to.
 
     Args:
-        values: Some of which are fields of the settings.
+        values: Values, some of which are fields of the settings.
         groups: The class of each settings, a dataclass, by the name of its value.
 
     Example:
@@ -99,7 +99,7 @@ def takes_loose(**groups: Any) -> Callable[[Taking], Taking]:
     For one version, with a warning. A dataclass has them as attributes as well.
 
     Args:
-        **groups: As in :func:`grouped`.
+        **groups: Groups of options, as in :func:`grouped`.
     """
     home = {entry.name: g for g, kind in groups.items() for entry in fields(kind)}
 

@@ -34,7 +34,7 @@ def derive_seed(seed: int, *key: int | str) -> int:
 
     Args:
         seed: The user's seed, a non-negative integer.
-        key: What the seed is for, for example ``("train", 3)``.
+        key: Purpose of the seed, for example ``("train", 3)``.
 
     Returns:
         An integer in [0, 2**63).

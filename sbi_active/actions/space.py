@@ -31,7 +31,7 @@ class ActionSpace(ABC):
 
         Args:
             sample_shape: Shape of the draws, any, as in torch's distributions.
-            seed: None uses torch's global generator.
+            seed: Seed of the draws; None uses torch's global generator.
 
         Returns:
             Shape (*sample_shape, action_dim).
@@ -52,7 +52,7 @@ class ActionSpace(ABC):
         """Return which actions keep limits beyond those of their entries.
 
         Args:
-            action: Within the limits of each entry, shape (n, action_dim).
+            action: Actions within the limits of each entry, shape (n, action_dim).
 
         Returns:
             Shape (n,), bool.

@@ -24,10 +24,10 @@ class SummaryAction(DiscreteActions):
     them otherwise.
 
     Args:
-        summaries: By name, a function of raw outcomes (n, k), a torch tensor, that
-            returns (n, d); or an object with ``fit`` and ``transform`` of NumPy arrays,
-            such as ``sklearn.decomposition.PCA``, of which copies are fitted to the
-            simulations of a round.
+        summaries: Summaries by name. Each is a function of raw outcomes (n, k), a torch
+            tensor, that returns (n, d); or an object with ``fit`` and ``transform`` of
+            NumPy arrays, such as ``sklearn.decomposition.PCA``, of which copies are
+            fitted to the simulations of a round.
         use: Which summary a belief rests on: at each trial the "best", that of which
             the outcome is expected to tell most at the executed action, since all of
             them are at hand; or the "chosen" one, as in Kim & Matsubara (2025).
@@ -35,7 +35,7 @@ class SummaryAction(DiscreteActions):
 
     Attributes:
         summaries: Summaries by name, as given.
-        labels: Their names, in the order of :math:`\delta`.
+        labels: Names of the summaries, in the order of :math:`\delta`.
         use: Which summary a belief rests on, "best" or "chosen".
 
     Raises:

@@ -114,7 +114,7 @@ class Together:
     """Signals of several inputs at once, the entries of one behind those of another.
 
     Attributes:
-        parts: One an input.
+        parts: Waveforms, one an input.
     """
 
     parts: tuple[Waveform, ...]
@@ -147,7 +147,7 @@ def together(*waveforms: Waveform) -> Together:
     """Return the signals of several inputs, such as the joints of an arm, as one.
 
     Args:
-        *waveforms: One an input.
+        *waveforms: Waveforms, one an input.
 
     Raises:
         ValueError: If there is none, or two are of the same input.
@@ -171,7 +171,7 @@ class Recorded:
     """Inputs that were recorded; the action is their number.
 
     Attributes:
-        inputs: By name, shape (t, m).
+        inputs: Inputs by name, shape (t, m).
         input_times: Times of the inputs, shape (m,).
         values: The actions, shape (t, 1).
     """
@@ -190,7 +190,7 @@ class Recorded:
         """Return the inputs of some trials, {name: (n, m)}.
 
         Args:
-            action: Their numbers, shape (n, 1).
+            action: Numbers of the recordings, shape (n, 1).
             input_times: The grid of the recordings, shape (m,).
         """
         number = action[:, 0].round().long()

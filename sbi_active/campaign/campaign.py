@@ -56,15 +56,15 @@ class Campaign(CampaignTrials):
         simulator: ``simulator(theta, action)``, shapes (n, theta_dim) and
             (n, action_dim), giving x of shape (n, *x_shape).
         prior: Prior of the parameters, with a support.
-        actions: What the robot may do: a space, or a list of actions.
+        actions: Actions that the robot may take: a space, or a list of actions.
         method: "asbi", "alhi" (a surrogate likelihood) and "seqbed" (ratios) design
             actions; "nsbi" and "nlhi" are the first two with actions drawn at random.
-        effects: What the simulator may lack, see :class:`.Effect`.
-            With them, actions are also chosen to tell whether it does.
+        effects: Effects that the simulator may lack, see :class:`.Effect`. With them,
+            actions are also chosen to tell whether it does.
         cost: Cost of actions (n, action_dim), shape (n,), positive; or one number an
             action of a list. Actions are then chosen for their information by cost.
-        constraint: Which of actions (n, action_dim) the robot may execute now, shape
-            (n,), bool. The network learns about the others as well.
+        constraint: Function of actions (n, action_dim) that says which may be executed
+            now, shape (n,), bool. The network learns about the others as well.
         seed: Seed of all draws; the same seed and outcomes give the same campaign.
         options: Sizes and estimators; or fields of them in a dict.
         directory: New or empty folder to keep the campaign in, as it happens: whatever
@@ -171,7 +171,7 @@ class Campaign(CampaignTrials):
             simulator: Simulator that the campaign was made with. Without it the
                 campaign can be read, told and corrected, and neither :meth:`ask` nor
                 :meth:`update` compute.
-            prior: Needed where it is a class of your own; else None takes the
+            prior: Prior, needed where it is a class of your own; else None takes the
                 directory's.
             actions: Action space or list of actions; None takes the directory's, as
                 above.
@@ -179,9 +179,10 @@ class Campaign(CampaignTrials):
                 since: functions are not stored.
             cost: Cost of actions, as given to the constructor.
             constraint: Constraint of actions, as given to the constructor.
-            options: None takes the directory's; needed where an estimator is of your
-                own. Others than before hold for this process, with a warning. A dict
-                gives all that are not default, as in the constructor.
+            options: Options of the campaign; None takes the directory's; needed where
+                an estimator is of your own. Others than before hold for this process,
+                with a warning. A dict gives all that are not default, as in the
+                constructor.
             show_progress: Whether to draw a progress bar, as in the constructor.
             simulator_changed: Whether to take another simulator than the campaign was
                 made with, and compute everything again with it.
@@ -251,9 +252,9 @@ class Campaign(CampaignTrials):
         """Return the pending trial, or design the next one.
 
         Args:
-            target: What it should tell most about: "theta", names of parameters, or
-                "model", whether the simulator lacks one of the campaign's effects and
-                which. "auto" is "theta" without effects; with them it is the one of
+            target: Target that it should tell most about: "theta", names of parameters,
+                or "model", whether the simulator lacks one of the campaign's effects
+                and which. "auto" is "theta" without effects; with them it is the one of
                 which the best action tells more, in nats, and under an alarm "model".
 
         Returns:
@@ -322,9 +323,11 @@ class Campaign(CampaignTrials):
         An exception of the real system passes through; the trial stays pending.
 
         Args:
-            real_system: Takes an action, shape (action_dim,), and gives x.
+            real_system: Function that takes an action, shape (action_dim,), and gives
+                x.
             num_rounds: Trials to run.
-            on_round: Called with each trial once the belief contains it.
+            on_round: Function that is called with each trial once the belief contains
+                it.
 
         Returns:
             The belief after the last trial.
@@ -349,9 +352,10 @@ class Campaign(CampaignTrials):
         """Compare the current simulator with all trials so far.
 
         Args:
-            effects: What the simulator may lack, None takes the campaign's; those
-                already adopted are left out. The first library of a model counts as
-                frozen: with another one, or other priors, the report is "exploratory".
+            effects: Effects that the simulator may lack; None takes the campaign's;
+                those already adopted are left out. The first library of a model counts
+                as frozen: with another one, or other priors, the report is
+                "exploratory".
             evaluate: Whether to report the error before and after, see
                 :func:`.close_loop`.
 

@@ -69,9 +69,9 @@ class CampaignOptions:
         num_simulations: Rows a round to train on.
         num_samples: Simulations a candidate action for the expected information gain,
             half to choose and half to report.
-        density_estimator: What is learned: as in :class:`.ASBI` and
-            :class:`.ALHI`; for "seqbed" a classifier as in
-            :class:`.SeqBED`, or :class:`.LFIRE`.
+        density_estimator: Density estimator that is trained, as in :class:`.ASBI` and
+            :class:`.ALHI`; for "seqbed" a classifier as in :class:`.SeqBED`, or
+            :class:`.LFIRE`.
         estimator: Estimator of the expected information gain, as in
             :class:`.InformationGainDesigner`; "posterior" is the paper's.
         refine: Whether a belief is refined with the simulator after each trial; without
@@ -102,7 +102,7 @@ class CampaignOptions:
             after another: what one has simulated the next reads, and its first round
             begins with the rows of others, weighted by :func:`.reuse`. None keeps them
             in the campaign's directory, if it has one.
-        details: What few campaigns set otherwise.
+        details: Further options that few campaigns change.
     """
 
     num_simulations: int = 5_000

@@ -109,8 +109,8 @@ class ModelVersion:
     """A simulator that a campaign used, and how it came to it.
 
     Attributes:
-        number: From 0, the simulator that the campaign started with.
-        effects: All that were adopted so far, in the order of their parameters.
+        number: Number of the version; 0 is the simulator that the campaign began with.
+        effects: Effects that were adopted so far, in the order of their parameters.
         digest: Hash of noise, library and priors behind the adoption; "" at first.
         num_trials: Number of trials told before it was adopted.
         misfit: Misfit of the trials that the version was given, as in :class:`Trial`.
@@ -155,18 +155,19 @@ class CampaignState:
         method: Name of the method.
         seed: Seed of all draws.
         options: Sizes and estimators.
-        trials: In the order in which they were asked for or told.
+        trials: Trials in the order in which they were asked for or told.
         processed: Indices of trials that the belief contains, in order of use.
         versions: Lineage of the simulator, the current one last.
         is_stale: Whether a trial that the belief contains was corrected since.
         num_earlier: Rows that were in ``options.bank`` before the campaign.
-        draws: Some of the belief after each trial, for pictures, by the trial's index,
+        draws: Draws of the belief after each trial, for pictures, by the trial's index,
             shape (n, theta_dim); of the parameters that the model had then.
-        batches: What was simulated for the current model where belief, designs and
-            scores share their simulations.
+        batches: Simulations made for the current model where belief, designs and scores
+            share their simulations.
         meter: Counts the campaign's simulations.
-        watch: Entered around whatever may take long, with the state, the index of the
-            trial that it is for (of the next one where it is for none) and its name.
+        watch: Context that is entered around whatever may take long, with the state,
+            the index of the trial that it is for (of the next one where it is for none)
+            and its name.
     """
 
     method: str

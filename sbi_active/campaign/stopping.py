@@ -25,8 +25,8 @@ class StopRules:
 
     Attributes:
         min_information_gain: The next trial is expected to tell less than this, nats.
-        max_sd: All parameters' standard deviations under the belief are below this:
-            one number, or one a parameter, in the parameters' units.
+        max_sd: Largest standard deviation of any parameter under the belief: one
+            number, or one a parameter, in the parameters' units.
         calibration_lost: The verdict of :mod:`sbi_active.diagnostics` is "stop":
             inferred twice again, the refined belief excludes what these hold; or, where
             beliefs are the network's word, the network excludes the truth too often at

@@ -19,8 +19,10 @@ class CampaignTrials(CampaignView):
     """The half of a :class:`.Campaign` that takes what happened, and computes nothing.
 
     Attributes:
-        on_trial: Called with each trial that was told, once it is recorded; set it.
-        on_update: Called with each trial, once the belief contains it; set it.
+        on_trial: Function that is called with each trial that was told, once it is
+            recorded; set it.
+        on_update: Function that is called with each trial, once the belief contains it;
+            set it.
     """
 
     on_trial: Callable[[Trial], None] | None = None
@@ -114,7 +116,7 @@ class CampaignTrials(CampaignView):
             x: Outcome, as in :meth:`tell`; None keeps the outcome where there is one.
             action: Executed action, as in :meth:`tell`.
             status: Status of the trial, as in :meth:`tell`.
-            reason: Kept with the trial.
+            reason: Reason that is kept with the trial.
 
         Raises:
             ValueError: If :meth:`tell` would refuse the trial, or it was not told yet.
@@ -159,7 +161,7 @@ class CampaignTrials(CampaignView):
 
         Args:
             trial: The trial or its index, a pending one too.
-            reason: Kept with the trial.
+            reason: Reason that is kept with the trial.
 
         Returns:
             The recorded trial.

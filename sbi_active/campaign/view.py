@@ -35,8 +35,8 @@ class CampaignView:
     """The readable half of a :class:`.Campaign`.
 
     Attributes:
-        actions: What the robot may do.
-        state: All that happened.
+        actions: Actions that the robot may take.
+        state: State of the campaign.
     """
 
     actions: ActionSpace

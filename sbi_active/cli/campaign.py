@@ -215,8 +215,8 @@ def library_of(campaign: Campaign, own: Sequence[Effect] = ()) -> list[Effect]:
     """Return the effects to compare, once each.
 
     Args:
-        campaign: Whose own follow, and then those that are usual.
-        own: They come first.
+        campaign: Campaign whose own effects follow, and then the usual ones.
+        own: Effects that come first.
     """
     taken = {effect.name for effect in own}
     known = [effect for effect in campaign.effects if effect.name not in taken]

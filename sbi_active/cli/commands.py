@@ -211,7 +211,7 @@ def _add(
 
     Args:
         name: Name of the command.
-        help: What it does.
+        help: Text that says what it does.
         *params: Arguments and options of the command.
         place: Place of its function, as ``module.name``.
         to: The commands that it belongs to.

@@ -112,9 +112,9 @@ class Declared:
         trusts: Whether the command line says to import it, whoever wrote it.
 
     Attributes:
-        task: Its name, for a campaign on a task.
+        task: Name of the task, for a campaign on a task.
         noise: Noise as --noise had it.
-        place: Where names of files begin.
+        place: Folder where names of files begin.
     """
 
     def __init__(self, folder: Path, *, trusts: bool) -> None:

@@ -40,8 +40,8 @@ def load_object(name: str, folder: str | None = None) -> Any:
 
     Args:
         name: ``module:attribute``, or ``path/file.py:attribute``.
-        folder: Where paths begin and modules are looked for first; None is the current
-            one, in which no modules are looked for where it is a campaign's.
+        folder: Folder where paths begin and modules are looked for first; None is the
+            current one, in which no modules are looked for where it is a campaign's.
 
     Raises:
         ValueError: If there is no such module or attribute, or it cannot be imported.
@@ -87,7 +87,7 @@ def make_task(name: str, options: Sequence[str]) -> Task:
 
     Args:
         name: One of ``TASKS``.
-        options: Each ``NAME=VALUE``.
+        options: Options, each ``NAME=VALUE``.
 
     Raises:
         ValueError: If an option has no value, the task has none of that name, or what
@@ -128,10 +128,10 @@ class Problem(NamedTuple):
     """What options declare.
 
     Attributes:
-        simulator: With its noise.
+        simulator: Simulator with its noise.
         prior: Prior of its parameters.
         actions: Permitted actions; None where none were needed.
-        effects: What a task's simulator may lack.
+        effects: Effects that a task's simulator may lack.
     """
 
     simulator: Any

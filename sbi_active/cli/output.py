@@ -27,8 +27,8 @@ class Answer(NamedTuple):
     """What a command found.
 
     Attributes:
-        data: For programs; numbers that are not finite become null.
-        text: For people.
+        data: Data for programs; numbers that are not finite become null.
+        text: Text for people.
     """
 
     data: dict[str, Any]

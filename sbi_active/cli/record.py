@@ -40,7 +40,7 @@ def sum_up(folder: Path, known: Mapping[str, Any]) -> None:
 
     Args:
         folder: Folder of the campaign.
-        known: What :class:`Record` needs.
+        known: Facts that :class:`Record` needs.
     """
     with _stored(folder) as store:
         content = {**known, "of": _mark(store, store.length(EVENTS, LOG))}

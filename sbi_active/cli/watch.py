@@ -99,8 +99,8 @@ def served(watched: Watched, port: int) -> ThreadingHTTPServer:
     """Return a server of a page, for this machine alone.
 
     Args:
-        watched: Has the page.
-        port: Where it listens; 0 is any that is free.
+        watched: Object that has the page.
+        port: Port where it listens; 0 is any that is free.
 
     Raises:
         ValueError: If another program listens there, or only others may.

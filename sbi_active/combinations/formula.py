@@ -23,7 +23,7 @@ class Term:
         index: Index of the parameter.
         weight: Weight of the term, or exponent of the factor.
         log: Whether it is a factor of a product.
-        shift: Added to the parameter before the logarithm.
+        shift: Shift that is added to the parameter before the logarithm.
     """
 
     index: int
@@ -47,7 +47,7 @@ class Combination:
     """A sum of terms; with a logarithm among them, the product that it stands for.
 
     Attributes:
-        terms: One a parameter.
+        terms: Terms, one a parameter.
     """
 
     terms: tuple[Term, ...]

@@ -16,7 +16,7 @@ class MissedTrial:
 
     Attributes:
         position: Place among the held-out trials.
-        name: What the trial is called.
+        name: Name of the trial in reports.
         size: Root mean square error; inf where the model is sure of no measurement.
         unit: Unit of ``size``: sensor deviations, or the simulator's where it is the
             draw.
@@ -38,7 +38,7 @@ class OutlyingTrial:
 
     Attributes:
         position: Place among the fitted trials.
-        name: What the trial is called.
+        name: Name of the trial in reports.
         times: Error on the fit to the others, in medians of theirs.
         size: Root mean square of that error, in sensor deviations.
     """
@@ -54,10 +54,10 @@ class BoundParameter:
     """A parameter that the trials press against a bound of its prior.
 
     Attributes:
-        name: What the parameter is called.
-        model: In which model: "none", or effects joined by " + ".
+        name: Name of the parameter.
+        model: Model in which it is: "none", or effects joined by " + ".
         side: "lower" or "upper".
-        bound: Where the prior ends.
+        bound: Value at which the prior ends.
         beyond: Best fit with the bound moved; NaN where the simulator gives nothing
             beyond it.
     """
@@ -74,7 +74,7 @@ class Bounds:
     """Parameters at bounds of the prior, and whether they make up for effects.
 
     Attributes:
-        parameters: Those of the bare model, then of the model of the verdict.
+        parameters: Parameters of the bare model, then of the model of the verdict.
         p_value: Tail probability of the chi-square of the bare model with its bounds
             moved; NaN where none of its parameters is at one.
         replaces: Effects that the verdict named, and that the bare model does without
@@ -93,9 +93,9 @@ class SevereTest:
     Attributes:
         action: Action, shape (action_dim,).
         is_permitted: Whether it is among the permitted actions.
-        difference: Between the verdict's prediction and that of a free residual, root
-            mean square over the numbers of x, in standard deviations of the verdict's
-            prediction, noise included.
+        difference: Difference between the verdict's prediction and that of a free
+            residual, root mean square over the numbers of x, in standard deviations of
+            the verdict's prediction, noise included.
     """
 
     action: Array

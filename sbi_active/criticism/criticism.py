@@ -72,8 +72,8 @@ class Criticism:
             deterministic one without is estimated from repeated trials.
         prior: Prior of its parameters.
         trials: Measured trials.
-        effects: What the simulator may lack; those of the order of the trials are left
-            out where that is unknown.
+        effects: Effects that the simulator may lack; those of the order of the trials
+            are left out where that is unknown.
         actions: The permitted actions, for what no action separates and for the next
             one; None leaves both to the trials at hand.
         summaries: Compare at most this many summaries of x in place of all its numbers,
@@ -299,7 +299,7 @@ class Criticism:
         """Return the action whose outcome tells most about which rival is right.
 
         Args:
-            actions: None takes those of the constructor.
+            actions: Permitted actions; None takes those of the constructor.
             beyond: Whether to name one that is not permitted where rivals are
                 separated by no other.
         """

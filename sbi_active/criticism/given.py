@@ -23,11 +23,11 @@ def made_given(
     """Yield what was not looked at, and why, a sentence each.
 
     Args:
-        trials: That were compared.
-        num_summaries: That stand for x; 0 for none.
-        sampling: What was found of it; None where nobody looked.
+        trials: Trials that were compared.
+        num_summaries: Number of summaries that stand for x; 0 for none.
+        sampling: Sampling that was found; None where nobody looked.
         left_out: Names of effects of an order that is unknown.
-        screening: What linear evidence set aside; None where all were fitted.
+        screening: Screening by linear evidence; None where all were fitted.
         nuisances: Names of those that each trial has anew.
         warm_up: In which trials that were not fitted tell of theirs.
     """

@@ -27,7 +27,7 @@ class ModelKey:
     ``str(key)`` is what reports and results call it.
 
     Attributes:
-        effects: Their names, in the order of the library.
+        effects: Names of the effects, in the order of the library.
         error: A catch-all; None for the noise alone.
 
     Example:
@@ -71,7 +71,7 @@ class Residuals:
         times: Sample times, shape (k,) or (t, k); None without a time axis.
         x: Observations, shape (t, *x_shape), NaN where masked.
         mean: Posterior predictive mean of the model refitted to all trials, shape of x.
-        sd: Its standard deviation, noise included, shape of x.
+        sd: Predictive standard deviation, noise included, shape of x.
         refitted: (x - mean) / sd, shape of x.
         prequential: Residuals of trial t predicted from the trials before it, the first
             from the prior, shape of x.
@@ -79,12 +79,12 @@ class Residuals:
             posterior mean; 0 without a time axis.
         noise: "declared", "estimated" (from repeats or the trajectories themselves), or
             "stochastic" (the simulator is the draw).
-        probability_valid: That each trial has a measurement, shape (t,); None where it
-            was not computed.
+        probability_valid: Probability that each trial has a measurement, shape (t,);
+            None where it was not computed.
         roughness: Deviation of the simulator, which jumps, from any smooth function of
             its parameters, shape of x; it counts as noise here. None where it is
             smooth.
-        names: What each trial is called; empty for positions from 0.
+        names: Names of the trials; empty for positions from 0.
     """
 
     action: Array
@@ -111,9 +111,9 @@ class Evidence:
         log_evidence: log Z, nats.
         standard_error: Standard error of log Z, Monte Carlo, nats.
         effective_sample_size: Number of draws that count.
-        engine: What gave the evidence: "importance" sampling around least squares,
-            "smc" (sequential Monte Carlo), or of a model far behind "laplace" or
-            "linear".
+        engine: Method that gave the evidence: "importance" sampling around least
+            squares, "smc" (sequential Monte Carlo), or of a model far behind "laplace"
+            or "linear".
         num_simulations: Trials simulated.
         names: Names of the coordinates (theta, phi).
         draws: Posterior draws of (theta, phi), shape (m, dim).
@@ -153,8 +153,9 @@ class Detection:
         chi_square: Smallest whitened residual sum of squares of the bare model.
         degrees_of_freedom: Measurements less the parameters that they determine.
         p_value: p-value of that chi-square; anti-conservative where noise is estimated.
-        level: Below which it is an alarm; 0 where something is unknown of the noise.
-        null_log_evidence: By least squares, nats.
+        level: Level below which it is an alarm; 0 where something is unknown of the
+            noise.
+        null_log_evidence: Log evidence by least squares, nats.
         null_cross_check: Log evidence from other starts; None where no alarm was near
             or these ended in the same place.
         least_chi_square: The smallest of any parameters that were tried; NaN where the
@@ -212,7 +213,7 @@ class Estimate:
         name: Name of the effect.
         family: Family of the effect.
         units: Units of phi.
-        describe: Its sentence, or "".
+        describe: Sentence of the effect, or "".
         probability: Probability that the effect is missing, alone or with others.
         log_bayes_factor: Log Bayes factor of the effect alone against the bare model.
         mean: Mean of phi given the effect alone, shape (phi_dim,).
@@ -253,7 +254,7 @@ class Tracing:
         aliases: After an alarm, pairs of effects that explain the data about as well
             (log evidence within log 20 of the best) with predictions closer than the
             noise over the permitted actions; repeated trials may separate them.
-        estimates: One an effect, most probable first.
+        estimates: Estimates, one an effect, most probable first.
         evidences: Evidence of every model tried, by name; effects have priors of
             unknown scale.
         robust: Whether effect priors a third and three times as wide agree.
@@ -270,12 +271,12 @@ class Tracing:
             trials speak against them; "" for none.
         refuted: The RMSE of these further trials, or of left-out ones, before and
             after, which is why; None where it is not.
-        refuted_on: Which trials these are; "" for all that had no part in the verdict.
+        refuted_on: Name of these trials; "" for all that had no part in the verdict.
         misfit: Why, where every model misses by more than the sensor's error. Effects
             that help are then ``chosen``, those that are probably the cause are the
             verdict, and the rest stand in ``beside``.
-        trial_names: What each trial is called, by its index; others by their index.
-        stand_in: Why forces of the dictionary that are chosen only stand in for
+        trial_names: Names of the trials by index; others are called by their index.
+        stand_in: Reasons why forces of the dictionary that are chosen only stand in for
             something that nobody declared, a clause each; empty where they may be it.
         p_value: Tail probability of the chi-square of the verdict's model, its
             parameters all taken as determined; NaN where nobody asked.
@@ -336,15 +337,16 @@ class Evaluation:
     Attributes:
         scheme: "held out" or "leave one out".
         trials: Positions of the scored trials, shape (s,).
-        before: By metric, one value a scored trial, shape (s,): "rmse", "energy score",
-            "log predictive density", "coverage" (share of entries in the central 90 %).
+        before: Values by metric, one value a scored trial, shape (s,): "rmse", "energy
+            score", "log predictive density", "coverage" (share of entries in the
+            central 90 %).
         after: Values with the effects added, likewise.
         table: Columns metric, before, after, ratio, low, high: RMSE over all scored
             trials, means of the others, ratio after / before (difference for the log
             density and the coverage), and its 90 % bootstrap interval, paired over
             trials; NaN below 8 trials.
         selected: Verdict of each fold, shape (s,).
-        names: What each scored trial is called; empty for its position.
+        names: Names of the scored trials; empty for their positions.
         p_value: Tail probability of the chi-square of all scored trials under what the
             model with the effects predicts; NaN where the noise is not declared.
         missed: Held-out trials far outside what that model predicts, farthest first.
@@ -376,8 +378,8 @@ class NextAction:
         outside_separates: The group that it separates; empty without.
         outside_gain: Lower bound on the information about which of the group is right,
             all taken as equally likely, nats; 0 without.
-        within: Where several forms of a force are left, the action within the range of
-            the trials that tells most about which, shape (action_dim,).
+        within: Action, where several forms of a force are left, within the range of the
+            trials that tells most about which, shape (action_dim,).
         within_gain: Lower bound on that information, nats.
         beyond: Action that tells most beyond that range, permitted or not.
         beyond_gain: Lower bound on that information, nats.

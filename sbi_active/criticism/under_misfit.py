@@ -109,7 +109,8 @@ class ModelError:
 
     Attributes:
         name: Effects joined by " + ", or "none".
-        probability: Among the admitted models; 0 for one that was not admitted.
+        probability: Probability among the admitted models; 0 for one that was not
+            admitted.
         left_out: Root mean square on left-out trials by channel, units of x, (c,).
         held_out: Root mean square on held-out trials, likewise; None without any.
         remains: Share of the bare model's excess error on left-out trials.
@@ -136,19 +137,19 @@ class Misfit:
         cause: Probability that each of them is the cause: of being there, times that of
             its odds.
         better: Probability that each lowers the error on a new trial.
-        odds: That each of them is no imitation.
-        sensor: Its standard deviation by channel, units of x, (c,).
+        odds: Odds that each of them is no imitation.
+        sensor: Standard deviation of the sensor by channel, units of x, (c,).
         passes: Whether the chi-square of the verdict passes against the sensor.
         size: Size of the residual process beside the verdict's model, in sensor
             deviations.
         time_scale: Time scale of that process, in the unit of the sample times; NaN
             where x has no time axis, and each number an error of its own.
-        left_out: What was left out: "trials" or "parts of trials".
+        left_out: Units that were left out: "trials" or "parts of trials".
         weights: Weights of models by their errors on left-out parts, where
             probabilities are too sure; by name, largest first, without those that
             hardly count. A next action is to tell these apart.
-        instead: What may stand in the place of an effect that helps: left-out trials
-            are not surely predicted worse with it there.
+        instead: Effects that may stand in the place of an effect that helps: left-out
+            trials are not surely predicted worse with it there.
     """
 
     models: tuple[ModelError, ...]

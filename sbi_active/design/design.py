@@ -44,7 +44,7 @@ class Design:
             measurement, partly observed ones included, shape (a,). Rows lost to a fault
             do not count; NaN where nothing else is left.
         bound: Side of the information that the estimates lie on.
-        index: Which candidate was chosen.
+        index: Index of the chosen candidate.
         num_simulations: Simulations spent.
         name: Name of the action, with its unit.
         labels: Names of its entries, with their units.
@@ -52,11 +52,11 @@ class Design:
         estimator: Class that estimated.
         num_samples: Simulations of each candidate, shape (a,). Candidates that were
             eliminated early have fewer.
-        stopped: Why no further simulations were run: "leader separated", "difference
-            negligible", "budget spent" or "simulations given".
+        stopped: Reason why no further simulations were run: "leader separated",
+            "difference negligible", "budget spent" or "simulations given".
         num_missing: Simulations of them all that were lost to faults of the simulator.
-        notes: What to know: estimators that failed a check or disagree, where an
-            estimate is a bound, candidates that were excluded.
+        notes: Notes on the estimates: estimators that failed a check or disagree, where
+            an estimate is a bound, candidates that were excluded.
         cost: Cost of each candidate, shape (a,); None where there is none.
         steps: Designs of the actions of a batch in turn, each given the former and the
             pending ones; empty for a single action.

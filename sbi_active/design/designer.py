@@ -135,9 +135,9 @@ class InformationGainDesigner:
         """Return the action that tells most about the target, or a batch of them.
 
         Args:
-            model: What the estimator needs, for :class:`PosteriorGain` anything with
-                ``log_posterior(theta, x, action)``; None where it needs nothing. For
-                the target "model" the rivals, a sequence of
+            model: Model that the estimator needs, for :class:`PosteriorGain` anything
+                with ``log_posterior(theta, x, action)``; None where it needs nothing.
+                For the target "model" the rivals, a sequence of
                 :class:`.RivalPredictive`.
             simulator: ``simulator(theta, action)``; not used for the target "model".
             belief: Distribution of the parameters; None is ``model.belief``.
@@ -151,8 +151,8 @@ class InformationGainDesigner:
                 where the model has seen them, both are too high.
             cost: Cost of actions (n, action_dim), shape (n,), positive; or one number
                 an action of a list, shape (a,). The utility is information by cost.
-            constraint: Which of actions (n, action_dim) are permitted, shape (n,),
-                bool.
+            constraint: Function of actions (n, action_dim) that says which are
+                permitted, shape (n,), bool.
             exclude: Actions not to repeat, shape (t, action_dim); in a box nor others
                 within a hundredth of its width.
             pending: Actions under way, shape (p, action_dim), whose outcomes will be

@@ -27,10 +27,10 @@ class Estimates:
             candidate.
         num_samples: Simulations of each candidate, shape (a,).
         probability_valid: Share of them with a measurement, shape (a,).
-        eligible: Which may be chosen, shape (a,), bool.
+        eligible: Mask of those that may be chosen, shape (a,), bool.
         leader: The candidate of the largest utility.
-        stopped: Why no further simulations were run.
-        notes: What to know of the estimates.
+        stopped: Reason why no further simulations were run.
+        notes: Notes on the estimates.
     """
 
     action: Tensor
@@ -57,7 +57,7 @@ def eliminate(
     """Simulate candidates until one leads, in ever smaller groups.
 
     Args:
-        evaluator: Simulates and estimates.
+        evaluator: Evaluator that simulates and estimates.
         action: Candidates, shape (a, action_dim).
         num_samples: Simulations a candidate on average.
         early: Whether to begin with half of them.

@@ -29,12 +29,13 @@ class GainEvaluator:
 
     Args:
         sampler: Draws outcomes.
-        estimator: None chooses one by what the first simulations show.
-        model: What the estimator needs.
+        estimator: Estimator of the information; None chooses one by what the first
+            simulations show.
+        model: Model that the estimator needs.
         belief: Belief over the parameters.
 
     Attributes:
-        notes: What speaks against the estimator, or why others were not taken.
+        notes: Notes on what speaks against the estimator, or why others were not taken.
         num_others: Actions whose outcomes will be known as well.
         replicates: Whether every row is simulated twice; None before the first.
     """

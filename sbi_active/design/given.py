@@ -45,7 +45,7 @@ class GivenGains:
     Attributes:
         simulations: The rows.
         estimator: Estimator of the information.
-        model: What the estimator needs.
+        model: Model that the estimator needs.
         belief: Belief over the parameters in the rows.
         limits: Limits of the choice.
         seed: Seed of the split.

@@ -55,13 +55,13 @@ class RandomDesigner:
         """Return a random action.
 
         Args:
-            model: Only its belief is used, see below.
+            model: Model of which only the belief is used, see below.
             simulator: ``simulator(theta, action)``; only used, and then needed, with
                 ``min_probability_valid``.
             belief: Belief over the parameters, at which candidates are simulated; None
                 is ``model.belief``.
-            constraint: Which of actions (n, action_dim) are permitted, shape (n,),
-                bool.
+            constraint: Function of actions (n, action_dim) that says which are
+                permitted, shape (n,), bool.
             exclude: Actions not to repeat, shape (t, action_dim); in a box nor others
                 within a hundredth of its width.
             min_probability_valid: Candidates that give a measurement less often are

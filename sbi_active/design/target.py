@@ -29,7 +29,7 @@ class Target:
     Attributes:
         name: "theta", names of parameters, or "model".
         estimator: Estimator of the information, as the designer was given it.
-        model: What the estimator needs.
+        model: Model that the estimator needs.
         simulator: ``simulator(theta, action)``.
         belief: Distribution of the parameters; None for the target "model".
     """

@@ -128,12 +128,13 @@ def check_belief(
 
     Args:
         inference: A trainer or a campaign after at least one trial.
-        simulator: None takes the campaign's.
+        simulator: Simulator of new outcomes; None takes the campaign's.
         num_repeats: Inferences of simulated trials; 0, or at least 10.
         num_copies: New outcomes of each executed action in a repeat.
         num_refits: Inferences of the same trials with other seeds.
         num_posterior_samples: Draws that a repeat's parameters are ranked among.
-        refinement: None takes the campaign's settings, or the defaults.
+        refinement: Options of the refits; None takes the campaign's settings, or the
+            defaults.
         belief: Belief to be judged; None takes the current one.
         infer: ``infer(action, x, seed)`` gives a belief; None refines.
         level: Probability that ranks alone flag a right belief, at most.

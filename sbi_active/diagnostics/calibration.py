@@ -30,11 +30,12 @@ class Stratum:
         rank_distance: Largest distance of the ranks' distribution from uniform, one a
             parameter (Kolmogorov & Smirnov).
         rank_interval: Interval of that distance, one a parameter.
-        p_value: That ranks of uniform ones are as far, one a parameter, as sbi gives.
+        p_value: Probability that ranks of uniform ones are as far, one a parameter, as
+            sbi gives.
         gap: Log-score gap, a lower bound in nats.
         gap_interval: Interval of that bound.
-        information: What outcomes tell beyond the belief, nats: gap and what the
-            network has of it.
+        information: Information that outcomes tell beyond the belief, nats: gap and
+            what the network has of it.
         lost: Share of the information that the network loses.
         verdict: Verdict on the stratum, as in :class:`Calibration`.
         reasons: Reasons for the verdict, a clause each.
@@ -68,8 +69,8 @@ class Calibration:
             the simulator or the network more training; "stop" where it excludes the
             truth too often, or tells less than the belief did.
         reasons: Reasons for the verdict, a sentence each; empty for "trust".
-        overall: All rows.
-        strata: By action and round.
+        overall: Figures of all rows.
+        strata: Figures by action and round.
         parameter_names: Names of the parameters.
         gap_method: "likelihood" or "classifier", see :mod:`.log_score`.
         num_invalid: Rows without a measurement that the network cannot take.
@@ -80,7 +81,7 @@ class Calibration:
         label: Index of each row's stratum, shape (n,).
         tarp: Expected coverage and credibility by distances to random points (Lemos et
             al. 2023), of all rows.
-        tarp_area: Between these from .5 up; negative for too narrow a posterior.
+        tarp_area: Area between these from .5 up; negative for too narrow a posterior.
         local: p-values that the posterior is right at given outcomes, where asked for.
     """
 

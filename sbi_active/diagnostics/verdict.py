@@ -59,7 +59,7 @@ def judge(
         gained: log q - log b at the truths, shape (n,), nats.
         num_posterior_samples: Number of posterior draws L.
         level: Level of error of one stratum, shared among its figures.
-        tolerance: What may pass.
+        tolerance: Tolerance of the figures.
         names: Names of the parameters.
     """
     n, dim = len(ranks), ranks.shape[1] - 1

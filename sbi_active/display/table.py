@@ -18,7 +18,7 @@ class Table:
     r"""A table; the first column holds words, all others numbers.
 
     Attributes:
-        header: One a column.
+        header: Headings of the columns.
         rows: Cells, shown by :func:`str`.
 
     Example:

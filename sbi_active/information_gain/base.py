@@ -137,7 +137,7 @@ class InformationGainEstimator(ABC):
         """Return the contribution of every simulation; their mean is the estimate.
 
         Args:
-            model: What was learned, see the estimator.
+            model: Model that was learned, see the estimator.
             simulations: Fresh simulations, not those the model was trained on.
             belief: Density of theta in the simulations; None where an estimator has no
                 use for it.

@@ -52,7 +52,7 @@ class CandidateSampler:
             not change from run to run.
         num_drawn: Simulations so far.
         num_missing: Number of those simulations lost to faults of the simulator.
-        summaries: What stands for the numbers of an outcome; None keeps all.
+        summaries: Summaries that stand for the numbers of an outcome; None keeps all.
     """
 
     def __init__(

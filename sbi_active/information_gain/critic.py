@@ -44,9 +44,9 @@ class Critic:
     r"""A function :math:`f(x, \theta | \xi)` of the model, evaluated in batches.
 
     Attributes:
-        model: What was learned.
-        method: Its method.
-        user: Who asks, for errors.
+        model: Model that was learned.
+        method: Method of the model that is the function f.
+        user: Name of the caller, for errors.
         batch_size: Rows in one pass.
     """
 

@@ -29,7 +29,8 @@ class Race:
         leader: Index of the largest mean.
         probability_best: Probability of being the best, shape (a,).
         regret: Expected loss by choosing the leader, nats.
-        in_reach: Within some standard errors of the leader, shape (a,), bool.
+        in_reach: Mask of those within some standard errors of the leader, shape (a,),
+            bool.
     """
 
     leader: int

@@ -92,7 +92,8 @@ class Randomization(NamedTuple):
 
     Attributes:
         names: Names of the parameters.
-        ranges: By level, {name: (low, high)}, central intervals of single parameters.
+        ranges: Ranges by level, {name: (low, high)}, central intervals of single
+            parameters.
         samples: Joint draws, shape (n, d), which keep what ranges lose: the
             correlations between parameters.
     """

@@ -49,8 +49,8 @@ def sampled(
         readings: Readings, shape (n, steps, c), from the start on.
         times: Times, shape (n, k).
         start: Time of the first reading.
-        step: Between readings.
-        late: By how much each channel reads what was there before, (n, c); None is 0.
+        step: Time between readings.
+        late: Delay of each channel, (n, c); None is 0.
 
     Returns:
         Shape (n, k, c).

@@ -58,7 +58,7 @@ def trials_of(
         model: Compiled model.
         recordings: A list of data frames, of dicts of arrays, or of paths of CSV files;
             or one of these for a single trial.
-        channels: What the simulator returns.
+        channels: Channels that the simulator returns.
         inputs: Actuators that are driven.
 
     Raises:
@@ -224,7 +224,7 @@ def _note_angles(model: Any, channel: Channel, x: Array, what: str) -> None:
 
     Args:
         model: Compiled model.
-        channel: What was read; angles are those in rad.
+        channel: Channel that was read; angles are those in rad.
         x: Readings, shape (k,).
         what: Name of the log in messages.
     """

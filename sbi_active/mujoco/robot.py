@@ -42,7 +42,7 @@ def named_box(parameters: Sequence[Bounded]) -> BoxUniform:
     It is sbi's own class, which a campaign's folder keeps and makes again.
 
     Args:
-        parameters: With bounds, names and units.
+        parameters: Parameters with bounds, names and units.
     """
     box = BoxUniform(
         torch.tensor([p.low for p in parameters]),
@@ -65,7 +65,7 @@ class Robot(NamedTuple):
         simulator: Runs MuJoCo; ``simulator.fn`` is a :class:`.MujocoFunction`.
         prior: Uniform within the bounds of the parameters, with ``names`` and
             ``units``.
-        actions: What the robot may do; None where only recordings say that.
+        actions: Actions that the robot may take; None where only recordings say that.
         trials: The recordings; None where there are none.
     """
 
@@ -94,7 +94,7 @@ def from_mjcf(
         spec_or_path: An ``MjSpec``, the path of an MJCF, or its text; or a list of such
             that share all parameters, as with and without a payload, of which the entry
             "model" of an action is the number.
-        parameters: What is unknown, by name: ``{"hinge.damping": (low, high)}`` for a
+        parameters: Unknown parameters by name: ``{"hinge.damping": (low, high)}`` for a
             quantity of :mod:`.quantities`; ``{"friction": (low, high,
             "hinge.frictionloss")}`` under a name of one's own; ``{"length": (low, high,
             edit)}`` with ``edit(spec, value)`` for what only the spec can say. The
@@ -103,8 +103,8 @@ def from_mjcf(
             named by actuators, which are then the actions.
         sensors: Sensors of the MJCF that are read, None for all; also joints, as in
             "hinge" or "hinge velocity", for which it has no sensor.
-        actions: What is chosen in each trial, beside a signal too: its names are
-            joints (start positions), joints with ``" velocity"`` behind, actuators
+        actions: Actions that are chosen in each trial, beside a signal too: its names
+            are joints (start positions), joints with ``" velocity"`` behind, actuators
             (a control that is held), or "model". A name that a joint and an actuator
             share is the actuator's; the joint's start is then "hinge position".
         times: Times of the readings, s from the start of a trial, shape (k,); None

@@ -48,9 +48,9 @@ class Channel:
     """A number that a sensor reads.
 
     Attributes:
-        name: What reports call it.
-        place: In the model's ``sensordata``.
-        unit: In SI, as far as the model tells it.
+        name: Name in reports.
+        place: Place in the model's ``sensordata``.
+        unit: Unit in SI, as far as the model tells it.
     """
 
     name: str
@@ -76,7 +76,7 @@ class MujocoFunction:
             velocities, controls that are held ("motor control"), poses of mocap bodies
             ("target mocap[0]" to "target mocap[6]").
         threads: Number of threads of MuJoCo's rollout.
-        readout: What lies between the model's sensors and what is returned, with
+        readout: Readout between the model's sensors and what is returned, with
             ``readout.late(theta)``, by how much each channel reads what was there
             before, s, and ``readout.read(x, theta)``, shapes (n, c) and (n, k, c).
         recorded: Model and start states of each recording, where the entry "recording"
@@ -145,10 +145,10 @@ class MujocoFunction:
             input_times: Times of the inputs, shape (m,); the simulation starts at the
                 first.
             times: Times of the readings, shape (n, k).
-            start: By name of a joint, or with " velocity", shape (n,).
+            start: Start state by name of a joint, or with " velocity", shape (n,).
             model: Changes of the model, {:class:`.ModelChange`: (n, k)}.
             force: Generalized forces, {:class:`.Force`: (n, k)}.
-            watch: Called with the rows that run, before they do.
+            watch: Function that is called with the rows that run, before they do.
 
         Returns:
             Shape (n, k, channels), or (n, k) of a single one; NaN in a row that

@@ -68,9 +68,9 @@ def from_sysid(
         params: A ``ParameterDict``. A uniform prior within ``get_bounds()``.
         transform: A ``SignalTransform``; of its weights and its normalization nothing
             is needed where noise is declared.
-        actions: What the robot may do; None takes the recorded sequences, of which the
-            action is the number. Entries are those of :class:`.MujocoFunction`; "model"
-            is the number of a ``ModelSequences``.
+        actions: Actions that the robot may take; None takes the recorded sequences, of
+            which the action is the number. Entries are those of
+            :class:`.MujocoFunction`; "model" is the number of a ``ModelSequences``.
         noise: Noise of the signals, one or one a signal; None takes autocorrelated
             errors of unknown size, one a signal, and unknown correlation time. A
             ``residual_fn`` needs it.

@@ -40,7 +40,7 @@ class Coordinates:
 
     Args:
         fit: Predictive of the channels that were seen.
-        target: Their outcome, shape (q,).
+        target: Outcome of these channels, shape (q,).
         error_model: Error model of the deviations.
         rng: Random generator of the Gibbs sweeps.
     """

@@ -114,7 +114,7 @@ class ChannelBias:
     Attributes:
         probability: :math:`\rho`.
         bias: B.
-        spike: What is left without a bias.
+        spike: Deviation that is left without a bias.
     """
 
     probability: float = 0.1

@@ -90,7 +90,7 @@ def from_pyro(
 
     Args:
         model: ``model(action)``.
-        action: One to try it at, shape (action_dim,).
+        action: Action to try it at, shape (action_dim,).
         outcome: Name of the outcome's site.
 
     Raises:

@@ -36,7 +36,7 @@ class RobustBelief(Belief):
         estimator: q over packed conditions.
         condition: (x_i, action), shape (n, condition_dim).
         prior: The original prior.
-        denoised: What the outcomes were drawn with.
+        denoised: Denoised outcomes that it was drawn with.
     """
 
     label = "robust, chained approximation"

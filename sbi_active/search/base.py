@@ -49,7 +49,8 @@ class Objective:
 
     Attributes:
         actions: The space.
-        permitted: Which of actions (n, action_dim) may be chosen, shape (n,), bool.
+        permitted: Function of actions (n, action_dim) that says which may be chosen,
+            shape (n,), bool.
         evaluate: Simulate actions (k, action_dim), all at the same parameters, also
             from call to call.
         num_evaluations: Actions that may be evaluated.

@@ -25,7 +25,7 @@ class Progress(NamedTuple):
     """What a search knows so far.
 
     Attributes:
-        objective: What it maximizes.
+        objective: Objective that it maximizes.
         coordinates: Coordinates of the actions.
         found: Evaluations that are numbers.
     """

@@ -58,12 +58,14 @@ def check_simulator(
         simulator: ``simulator(theta, action)``, see
             :class:`.Simulator`.
         prior: Prior of the parameters.
-        actions: What the robot may do; the values of a discrete space are all run.
+        actions: Actions that the robot may take; the values of a discrete space are all
+            run.
         num_rows: Rows a check, at least 16.
         max_seconds: Seconds of simulation time; a slow simulator gets fewer rows, 16 at
             least.
-        num_simulations: That the campaign needs, for :attr:`SimulatorReport.minutes`.
-        workers: Where they will run, or the number of calls at a time.
+        num_simulations: Simulations that the campaign needs, for
+            :attr:`SimulatorReport.minutes`.
+        workers: Workers of the campaign, or the number of calls at a time.
         seed: Seed of the draws.
 
     Example:

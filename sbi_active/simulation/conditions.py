@@ -133,7 +133,7 @@ def one_row(arrays: Mapping[str, Any], i: int) -> dict[str, Any]:
     """Return the keyword arguments of a row, from those of all, as copies of its own.
 
     Args:
-        arrays: From :func:`as_arrays`.
+        arrays: Arrays from :func:`as_arrays`.
         i: Index of the row.
     """
     return {

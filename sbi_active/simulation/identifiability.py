@@ -46,12 +46,12 @@ class Undetermined:
     """Parameters that no permitted action determines, as far as was tried.
 
     Attributes:
-        parameters: Their names.
+        parameters: Names of the parameters.
         known: The combinations through which the outcome depends on them; empty where
             it does not, or where there is no short formula.
         is_exact: Whether the outcome is the same, rather than within a tenth of the
             noise.
-        text: In words, with what to do.
+        text: Text in words, with what to do.
     """
 
     parameters: tuple[str, ...]

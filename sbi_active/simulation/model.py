@@ -62,8 +62,8 @@ class SimulatorModel:
             ``fn(theta, action, rng)`` of one row: float64 NumPy arrays of shapes
             (theta_dim,) and (action_dim,), and a NumPy generator from the row's seed,
             which a ``fn`` without random numbers may leave out.
-        noise: Added to the output of ``fn``; None where ``fn`` is itself the draw. A
-            number is the standard deviation of Gaussian noise.
+        noise: Noise added to the output of ``fn``; None where ``fn`` is itself the
+            draw. A number is the standard deviation of Gaussian noise.
         batched: Whether ``fn`` takes all rows at once.
         setup: Called without arguments once a process, before the first run; ``fn``
             receives what it returns as keyword argument ``context``. It is neither
@@ -78,7 +78,7 @@ class SimulatorModel:
             that were recorded.
 
     Attributes:
-        noise: With the time stamps, where there are any.
+        noise: Noise with the time stamps, where there are any.
         effect_names: Names of the effects that ``fn`` declares.
         conditions: Which of ``times``, ``inputs``, ``input_times`` and ``start`` ``fn``
             takes as keyword arguments.
@@ -158,7 +158,7 @@ class SimulatorModel:
             theta: Parameters, shape (n, theta_dim).
             action: Actions, shape (n, action_dim).
             seeds: Seeds, one a row, shape (n,); None uses torch's global generator.
-            effects: By name, a number or one a row.
+            effects: Effects by name, a number or one a row.
 
         Returns:
             Shape (n, *x_shape).
@@ -181,7 +181,7 @@ class SimulatorModel:
         Args:
             theta: Parameters, shape (n, theta_dim).
             action: Actions, shape (n, action_dim).
-            effects: By name, a number or one a row.
+            effects: Effects by name, a number or one a row.
 
         Raises:
             ValueError: If the model was built without a noise model, or ``fn`` is
@@ -211,7 +211,7 @@ class SimulatorModel:
             x: Observations, shape (n, *x_shape).
             theta: Parameters, shape (n, theta_dim).
             action: Actions, shape (n, action_dim).
-            effects: By name, a number or one a row.
+            effects: Effects by name, a number or one a row.
 
         Returns:
             Shape (n,), float64, nats.
@@ -245,7 +245,7 @@ class SimulatorModel:
         Args:
             theta: Parameters, shape (n, theta_dim).
             action: Actions, shape (n, action_dim).
-            effects: By name, a number or one a row.
+            effects: Effects by name, a number or one a row.
         """
         if self._is_deterministic is None:
             few = at_rows(effects, slice(FEW))

@@ -84,7 +84,7 @@ class SimulationInterrupted(Explained, KeyboardInterrupt):
     """The user interrupted a simulation.
 
     Attributes:
-        simulations: What is finished; the other rows are missing.
+        simulations: Simulations that are finished; the other rows are missing.
     """
 
     code = "SA308"

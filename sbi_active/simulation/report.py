@@ -38,8 +38,8 @@ class SimulatorReport:
         num_workers: Workers that share them.
         noiseless: Numbers of x, flattened, that two seeds leave as they are while
             others change.
-        defects: What keeps a campaign from working.
-        warnings: What deserves a look.
+        defects: Defects that keep a campaign from working.
+        warnings: Warnings of what deserves a look.
     """
 
     num_rows: int = 0

@@ -38,7 +38,7 @@ def outcome_tensor(
     It has memory of its own: a simulator may return the buffer that it works in.
 
     Args:
-        x: What the simulator returned.
+        x: Outcomes that the simulator returned.
         num_rows: Rows that it was given.
         dtype: Floating type to return; None keeps that of x.
 
@@ -112,7 +112,7 @@ def square_of(x: Tensor, before: int | None) -> int | None:
 
     Args:
         x: Outcomes, shape (n, *x_shape).
-        before: What this returned for earlier ones; None for none.
+        before: Value that this returned for earlier ones; None for none.
 
     Raises:
         ValueError: If that was so for two numbers of rows: each outcome has a number

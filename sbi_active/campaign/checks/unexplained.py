@@ -40,7 +40,7 @@ def simulate_prior(
     """Return simulations of a trial's action from the prior.
 
     Args:
-        trial: Gives the action.
+        trial: Trial whose action is simulated.
         simulator: ``simulator(theta, action)``.
         prior: Prior of theta.
         num_samples: Number of rows.
@@ -67,7 +67,7 @@ def outlyingness(x: Tensor, drawn: Tensor) -> float:
 
     Args:
         x: The outcome, shape x_shape; NaN where nothing was measured.
-        drawn: Simulated ones, shape (n, *x_shape).
+        drawn: Simulated outcomes, shape (n, *x_shape).
 
     Example:
         >>> outlyingness(torch.tensor([3.0]), torch.tensor([[0.0], [0.5], [1.0]]))
@@ -106,7 +106,7 @@ def in_doubt(
     Args:
         belief: Belief from the trials that are explained; the prior before any.
         prior: The original prior.
-        texts: From :func:`doubts`.
+        texts: Reasons from :func:`doubts`.
     """
     if not texts:
         return belief

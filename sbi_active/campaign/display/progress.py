@@ -29,7 +29,7 @@ class StageWatch:
             state: State of the campaign.
             index: Index of the trial that the work is for; of the next one where it is
                 for none.
-            name: What it does.
+            name: Name of the work.
         """
         if not is_asked_for(self.show_progress):
             yield

@@ -58,8 +58,8 @@ class Learner:
 
     Attributes:
         x_shape: Shape of an outcome.
-        simulations: Those that the last training was on, where the design is to rest on
-            them; else None.
+        simulations: Simulations that the last training was on, where the design is to
+            rest on them; else None.
 
     Raises:
         ValueError: If the prior has no support or no width, the simulator is

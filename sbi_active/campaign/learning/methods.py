@@ -27,8 +27,8 @@ class Method:
 
     Attributes:
         designs: Whether actions are chosen for information, or drawn at random.
-        build: Makes the trainer of a prior and a campaign's options.
-        estimator: What is trained by default.
+        build: Function that makes the trainer of a prior and a campaign's options.
+        estimator: Estimator that is trained by default.
         faithful: Options of the setting of the method's authors that differ from those
             of :meth:`.CampaignOptions.faithful`.
         refines: Whether its beliefs are refined, where the options ask for it.

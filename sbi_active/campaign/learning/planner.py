@@ -33,7 +33,7 @@ class Planner:
     Args:
         limits: The action space, what of it is permitted, and its cost.
         state: State of the campaign.
-        effects: What its simulator may lack.
+        effects: Effects that its simulator may lack.
 
     Attributes:
         effects: Effects that the simulator may lack.
@@ -93,8 +93,8 @@ class Planner:
 
         Args:
             learner: Learner of the current simulator.
-            trials: That gave a measurement, or none.
-            effects: What it may lack; None takes the campaign's.
+            trials: Trials that gave a measurement, or none.
+            effects: Effects that it may lack; None takes the campaign's.
         """
         return compare(
             self._state,
@@ -202,7 +202,7 @@ def _model_design(
 
     Args:
         criticism: Comparison of the model with all trials so far.
-        limits: What is permitted, and its cost.
+        limits: Limits of the actions, and their cost.
         exclude: Actions not to repeat, shape (t, action_dim).
 
     Returns:

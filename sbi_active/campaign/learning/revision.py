@@ -39,7 +39,7 @@ def compare(
         prior: Prior of its parameters.
         actions: The permitted ones.
         trials: Trials to compare it with.
-        effects: What it may lack; those already adopted are left out.
+        effects: Effects that it may lack; those already adopted are left out.
     """
     # Criticism reads results of everything below, so it is imported where it is used.
     from sbi_active.criticism import Criticism, Trials
@@ -74,7 +74,7 @@ def criticize(
 
     Args:
         state: State of the campaign.
-        criticism: From :func:`compare`.
+        criticism: Comparison from :func:`compare`.
         evaluate: Whether to report the error before and after.
         designed: Whether the actions were chosen for information.
     """
@@ -97,7 +97,7 @@ def revise(state: CampaignState, actions: ActionSpace, report: Report) -> Learne
     Args:
         state: State of the campaign.
         actions: Action space of the campaign.
-        report: Whose verdict names effects.
+        report: Report whose verdict names effects.
     """
     if not hasattr(report, "tracing"):
         raise TypeError(
@@ -155,7 +155,7 @@ def rebuilt(
         simulator: Simulator that it began with.
         prior: Prior that it began with.
         actions: The permitted ones.
-        effects: Among them those that were adopted.
+        effects: Effects, among them those that were adopted.
 
     Raises:
         ValueError: If an adopted effect is not among them.

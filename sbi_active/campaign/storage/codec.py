@@ -68,9 +68,9 @@ def encode(value: Any, *, known: Mapping[str, Any]) -> bytes:
     Args:
         value: Numbers, texts, arrays, tensors, containers, and objects of this library,
             sbi's utilities and networks, torch's distributions and modules.
-        known: What the reader has too, by name, such as the simulator and the prior.
-            It is stored by its name, and what hangs from it, where it is of a class
-            that is not stored, by its place.
+        known: Objects that the reader has too, by name, such as the simulator and the
+            prior. It is stored by its name, and what hangs from it, where it is of a
+            class that is not stored, by its place.
 
     Raises:
         NotStorableError: If there is anything else in it.

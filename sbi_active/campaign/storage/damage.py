@@ -15,7 +15,7 @@ class DamagedCampaignError(Explained, OSError):
 
     Attributes:
         path: The file.
-        reason: What is wrong with it, and what is whole.
+        reason: Text that says what is damaged, and what is whole.
     """
 
     code = "SA606"

@@ -47,9 +47,9 @@ class CampaignDirectory:
 
     Attributes:
         path: The folder.
-        store: Its file.
-        manifest: What the campaign is.
-        notes: What was given up, a sentence each.
+        store: Store of the campaign's records.
+        manifest: Description of the campaign.
+        notes: Notes on what was given up, a sentence each.
 
     Raises:
         ValueError: If the folder holds no campaign, or one of another schema.
@@ -85,7 +85,7 @@ class CampaignDirectory:
         """Add to the log; it is on the disk when this returns.
 
         Args:
-            event: What happened.
+            event: Event that is written.
             trial: The trial as it is afterwards.
             **entries: JSON data.
         """
@@ -117,7 +117,7 @@ class CampaignDirectory:
         Args:
             state: State of the campaign.
             belief: Belief after ``state.processed``; None where that is the prior.
-            known: What the reader has too, see :func:`.encode`.
+            known: Objects that the reader has too, see :func:`.encode`.
         """
         content = None
         name = self._belief_written[1] if belief is not None else None
@@ -154,7 +154,8 @@ class CampaignDirectory:
         """Bring a new state to where the log ends.
 
         Args:
-            state: Changed in place; ``is_stale`` where beliefs must be computed again.
+            state: State that is changed in place; ``is_stale`` where beliefs must be
+                computed again.
 
         Returns:
             The name of the belief; None where it is the prior, or to be computed.

@@ -21,7 +21,7 @@ def num_rows(folder: str | None) -> int:
     """Return how many rows of the simulator itself a bank of campaigns has.
 
     Args:
-        folder: None for none.
+        folder: Folder of the bank; None for none.
     """
     if folder is None or not Path(folder, NAME).exists():
         return 0
@@ -53,7 +53,7 @@ class CampaignBanks:
 
         Args:
             simulator: The current one.
-            model: Its number in the campaign.
+            model: Number of the model in the campaign.
         """
         self._own, self._model = simulator, model
 

@@ -78,7 +78,7 @@ class Storage:
 
         Args:
             simulator: The current one.
-            version: Its number.
+            version: Number of the version.
         """
         if self.disk is not None:
             self.disk.acquire()

@@ -126,7 +126,7 @@ def require_names(names: Sequence[object] | None, num: int) -> tuple[str, ...] |
     """Return names of trials as text, or raise where they are not one each.
 
     Args:
-        names: None for none.
+        names: Names of the trials; None for none.
         num: Number of trials.
     """
     if names is None:
@@ -147,8 +147,8 @@ def require_labels(
 
     Args:
         name: Name of the argument.
-        labels: None for none.
-        sizes: How many there may be.
+        labels: Labels to check; None for none.
+        sizes: Numbers of labels that are allowed.
     """
     if labels is None:
         return None

@@ -41,8 +41,8 @@ def inputs_of(
         inputs: Inputs, as :func:`named_series` takes them; None for none.
         times: Times of the values, shape (m,), (t, m), or a list of t, or a dict of
             such by name; None takes those of x where there are as many.
-        x: What was measured, shape (t, k, ...).
-        x_times: Its times, shape (k,) or (t, k).
+        x: Observations that were measured, shape (t, k, ...).
+        x_times: Times of x, shape (k,) or (t, k).
         hold: Value between two times, as in :func:`on_one_grid`.
 
     Raises:
@@ -110,7 +110,7 @@ def on_one_grid(
     Beyond a trial's end its last value is held, before its begin its first.
 
     Args:
-        series: By name, shape (t, m), NaN after the last value of a trial.
+        series: Series by name, shape (t, m), NaN after the last value of a trial.
         stamps: Times of the values, by name, shape (t, m), NaN where there are none.
         hold: "previous" holds each value until the next one, as a command is held;
             "linear" draws lines between them.
@@ -152,8 +152,8 @@ def held_at(
     """Return series, each held until its next value, at the times of another grid.
 
     Args:
-        series: By name, shape (t, m).
-        own: Their grid, shape (m,).
+        series: Series by name, shape (t, m).
+        own: Grid of the series, shape (m,).
         times: The other, shape (n,).
     """
     slack = ON_TIME * (own[1] - own[0])

@@ -22,9 +22,9 @@ class Measurements:
         position: Position of each number in the flattened x of shape (t, *x_shape),
             shape (N,).
         trial: Row of its trial, shape (N,).
-        channel: Its channel, shape (N,).
-        time: Its sample time; its place along x's first axis where no times are
-            given, shape (N,).
+        channel: Channel of each number, shape (N,).
+        time: Sample time of each number; its place along x's first axis where no times
+            are given, shape (N,).
         gap: Time since the measured number before it in the same trial and channel;
             inf for the first, shape (N,).
         has_time: Whether x has a time axis.
@@ -53,7 +53,8 @@ class Measurements:
         """Return the measurements of some trials.
 
         Args:
-            trials: Their x has a time axis where they, or the model, have sample times.
+            trials: Trials. Their x has a time axis where they, or the model, have
+                sample times.
             model_times: The simulator's sample times.
             is_sequence: The first axis of x is a time axis whose samples are counted.
         """
@@ -107,7 +108,7 @@ class Measurements:
 
         Args:
             center: Center of what can be expected, shape (N,).
-            reach: How far numbers may be from it, shape (N,).
+            reach: Distance from it that numbers may have, shape (N,).
         """
         x = np.clip(self.x, center - reach, center + reach)
         beyond = np.unique(self.trial[x != self.x])

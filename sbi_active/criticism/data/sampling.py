@@ -68,8 +68,8 @@ def suggested_sampling(trials: Trials, residuals: Any, times: Any = None) -> Sam
 
     Args:
         trials: Trials with sample times.
-        residuals: What a fitted model leaves of x, of the shape of x (n, k, ...), NaN
-            where nothing was measured.
+        residuals: Residuals that a fitted model leaves, of the shape of x (n, k, ...),
+            NaN where nothing was measured.
         times: Sample times, shape (k,) or (n, k), where the trials have none.
 
     Raises:
@@ -132,8 +132,8 @@ def thinned(trials: Trials, sampling: Sampling, times: Any = None) -> Trials:
     simulator is given, go; of a trial that is shorter the last one stays.
 
     Args:
-        trials: With x of shape (n, k, ...).
-        sampling: What was found of them.
+        trials: Trials with x of shape (n, k, ...).
+        sampling: Sampling that was found.
         times: Sample times, as in :func:`suggested_sampling`.
     """
     found = trials.select(slice(None))
@@ -178,8 +178,8 @@ def _innovations(series: Array, stamps: Array, every: int) -> tuple[float, int]:
 
     Args:
         series: Residuals, one a trial and channel, shape (s, k), NaN where missing.
-        stamps: Their times, alike.
-        every: Which of them are kept.
+        stamps: Times of the samples, of the same shape.
+        every: Interval of the samples that are kept: every 1st, 2nd, ...
     """
     r, t = series[:, every - 1 :: every], stamps[:, every - 1 :: every]
     gaps = np.diff(t, axis=1)

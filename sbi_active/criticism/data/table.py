@@ -37,7 +37,7 @@ class TrialTable:
 
     Attributes:
         arguments: Arguments of :class:`.Trials`, by name.
-        columns: What its columns are.
+        columns: Columns of the table, by their role.
     """
 
     arguments: dict[str, Any]
@@ -64,7 +64,7 @@ def read_table(
         inputs: A table of their inputs at times of their own, with columns "time",
             "input_*", and "trial" unless all trials share them. What is said of
             columns and units holds for it too.
-        source: What messages call the table; "" takes its path.
+        source: Name of the table in messages; "" takes its path.
 
     Raises:
         ValueError: If a column is missing or unknown, a cell is no number, an action,

@@ -29,7 +29,7 @@ class Columns:
             empty where a row is a trial.
         time: Column of the time stamps; None where a row is a trial.
         optional: Columns of "role", "index" and "repeat_of", where there are such.
-        units: By column, "" where none is known.
+        units: Units by column, "" where none is known.
     """
 
     action: tuple[str, ...]
@@ -77,7 +77,7 @@ def find_columns(
             "start", "role", "index" or "repeat_of"; others are then ignored. None goes
             by the names.
         units: Units by column, with or without what stands in its brackets.
-        source: What messages call the table.
+        source: Name of the table in messages.
         of_inputs: The table holds times and inputs alone, and those of all trials
             where no column names the trial.
         has_inputs: Inputs stand in another table, so that no action is needed.

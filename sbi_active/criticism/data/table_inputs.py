@@ -25,9 +25,9 @@ class InputRows:
         values: Values of the inputs, shape (n, c), NaN where a cell is empty.
         time: Times in s, shape (n,).
         members: Rows of each trial.
-        trials: Their names; one empty name where all share the series.
+        trials: Names of the trials; one empty name where all share the series.
         place: Returns what a message calls a row.
-        source: What it calls the table.
+        source: Name of the table in messages.
     """
 
     names: dict[str, str]
@@ -101,7 +101,7 @@ class InputRows:
             row: Number of the trial in each row of x, shape (k,).
             time: Times of x in s, shape (k,).
             place: Returns what a message calls a row of x.
-            source: What it calls the table of x.
+            source: Name of the table of x in messages.
         """
         for t, at in enumerate(self.members):
             own = self.time[at]

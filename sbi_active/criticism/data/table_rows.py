@@ -32,8 +32,8 @@ class Rows:
 
     Args:
         frame: The table.
-        columns: What its columns are.
-        source: What messages call it.
+        columns: Columns of the table, by their role.
+        source: Name of the table in messages.
 
     Attributes:
         code: Number of each row's trial, shape (n,).

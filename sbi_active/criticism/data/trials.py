@@ -52,12 +52,12 @@ class Trials:
         order: "known", or "unknown" where the index does not say when a trial was
             executed: nothing is then traced to wear or drift from trial to trial.
         sample_times: Times of x's first axis, shape (k,), (n, k), or a list of n.
-        names: What reports, warnings and figures call each trial; None takes its index.
-            A selection keeps them.
+        names: Names of the trials in reports, warnings and figures; None takes their
+            indices. A selection keeps them.
         repeat_of: Position of the trial that each one repeats, shape (n,), -1 for
             none; None takes trials of equal actions as repeats of the first. A repeat
             of a repeat is one of the first.
-        action_labels: What reports call each entry of the action, with its unit.
+        action_labels: Labels of the action's entries in reports, with units.
         channel_labels: Labels of the entries of x's last axis, likewise.
         inputs: What varies in time, {name: series}, each of shape (n, m), (m,) where
             all trials share it, or a list of n arrays. An array (n, m) or a list
@@ -67,13 +67,13 @@ class Trials:
             are as many.
         input_hold: Between two of its times an input has the "previous" value, as a
             command is held, or is "linear".
-        input_labels: What reports call each input, with its unit.
+        input_labels: Labels of the inputs in reports, with units.
         start: Measured start state, shape (n, d), or {name: (n,)}.
 
     Attributes:
-        inputs: By name, shape (n, m), on one uniform grid for all trials: its step is
-            the smallest median step of a trial, and before and after a trial's own
-            times its first and last value are held. None where there are none.
+        inputs: Inputs by name, shape (n, m), on one uniform grid for all trials: its
+            step is the smallest median step of a trial, and before and after a trial's
+            own times its first and last value are held. None where there are none.
         input_times: The grid, shape (m,).
         action_is_label: Whether the action is only the trial's number.
 
@@ -231,8 +231,8 @@ class Trials:
             columns: Which columns are "trial", "time", "action", "x", "input", "start",
                 "role", "index" and "repeat_of", where they have other names; those left
                 out are then ignored. Several columns may name a trial together.
-            units: By column, where the header has none. Numbers are taken as they are,
-                but for the time, which is converted to seconds.
+            units: Units by column, where the header has none. Numbers are taken as they
+                are, but for the time, which is converted to seconds.
             order: Order of execution; "unknown" where rows are in any order.
             inputs: Another file, or a data frame, with the inputs at times of their
                 own: "time", "input_\*", and "trial" unless all trials share them.

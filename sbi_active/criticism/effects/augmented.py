@@ -131,8 +131,8 @@ class AugmentedSimulator(SimulatorModel):
             action: Actions as commanded, shape (n, action_dim).
             index: Place of each row's trial, shape (n,); None is ``next_index``.
             times: Sample times, shape (k,) or (n, k); None takes the model's.
-            context: All that is known of how each row's trial was run, in place of
-                index and times.
+            context: Conditions under which each row's trial was run, in place of index
+                and times.
             seeds: Seeds, one a row, for a simulator that takes them; None gives each
                 row 0 where the noise is declared.
             merge: Simulate rows once that the simulator would be asked for twice, as

@@ -31,8 +31,8 @@ def require_distinct(effects: Sequence[Effect], parameters: Sequence[str] = ()) 
     """Raise where two numbers would have one name in tables and records.
 
     Args:
-        effects: By their own names, whose parts between " + " must not come again
-            either, since that joins names, and those of the entries of their phi.
+        effects: Effects by their own names, whose parts between " + " must not come
+            again either, since that joins names, and those of the entries of their phi.
         parameters: Names of the simulator's own.
     """
     parts = [part for effect in effects for part in effect.name.split(" + ")]

@@ -31,7 +31,7 @@ class Context:
         index: Place of each row's trial in the order of the trials, shape (n,).
         times: Sample times, shape (k,) or (n, k); None for x without a time axis.
         inputs: Inputs as commanded, {name: (n, m)}; None for trials without.
-        input_times: Their uniform grid, shape (m,).
+        input_times: Uniform grid of the inputs, shape (m,).
         start: Measured start states, shape (n, d) or {name: (n,)}; None for none.
     """
 
@@ -58,10 +58,11 @@ class Effect:
     r"""A nested extension of a simulator that vanishes at :math:`\phi = \phi_0`.
 
     Args:
-        name: What reports call it; unique among the effects of a loop.
-        hook: What it changes: the "action" that is executed, the "input" series, the
-            "parameter" vector theta, the keyword arguments of the simulator's function
-            ("dynamics"), the "observation" x, or the standard deviation of the "noise".
+        name: Name in reports; unique among the effects of a loop.
+        hook: Part that it changes: the "action" that is executed, the "input" series,
+            the "parameter" vector theta, the keyword arguments of the simulator's
+            function ("dynamics"), the "observation" x, or the standard deviation of the
+            "noise".
         prior: Distribution of phi, with event or batch shape (phi_dim,) or ().
         null: Value of phi, a number or shape (phi_dim,), at which the effect vanishes;
             may be infinite.
@@ -284,7 +285,7 @@ class UnderKey:
 
     Attributes:
         keyword: Keyword of the simulator's function.
-        key: What phi belongs to, such as a force.
+        key: Key that phi belongs to, such as a force.
         order: Center and half span of the trials' order; with it the place of the
             trial, from -1 to 1, is the last column of phi.
     """

@@ -59,9 +59,9 @@ def start_from_first_samples(
     Args:
         trials: Trials with sample times. Held-out trials start from their own
             first samples.
-        start: By name, an entry of x's last axis, or this and the order of the
-            derivative: {"angle": 0, "speed": (0, 1)}. The polynomial has the largest
-            of these orders, and at least one.
+        start: Start state by name: an entry of x's last axis, or this and the order of
+            the derivative: {"angle": 0, "speed": (0, 1)}. The polynomial has the
+            largest of these orders, and at least one.
         within: Time from its first sample in which a trial's motion is such a
             polynomial, in the unit of the sample times.
         sd: Standard deviation of the sensor, one for all entries of x or one each.

@@ -202,7 +202,7 @@ def on_channel(effect: Effect, channel: int, name: str) -> Effect:
     Args:
         effect: Effect on an observation of one channel.
         channel: Entry of x's last axis.
-        name: What reports call it.
+        name: Name in reports.
     """
     return replace(
         effect,

@@ -43,7 +43,7 @@ class Summarized:
     """A comparison of models given summaries.
 
     Attributes:
-        model: Simulates the summaries, with noise of unit size.
+        model: Simulator of the summaries, with noise of unit size.
         trials: Trials, with their summaries as x.
         effects: Effects as declared, acting on x before it is summarized.
         weight: W / s, shape (k, numbers of x).

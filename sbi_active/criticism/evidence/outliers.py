@@ -57,11 +57,11 @@ class OneOutlier(ErrorModel):
 
     Args:
         noise: The error of all other trials.
-        measurements: What the residuals are of.
+        measurements: Measurements that the residuals belong to.
         largest: Size that an error may need to have, in standard deviations.
 
     Attributes:
-        trials: Those with a measurement, shape (k,).
+        trials: Trials with a measurement, shape (k,).
         sizes: Sizes of the gross error, in standard deviations of the noise, shape
             (s,).
     """

@@ -72,10 +72,10 @@ class RivalSet:
 
     Attributes:
         effects: Effects of scope "campaign", by name.
-        library: Those that were declared, of which priors tell.
+        library: Effects that were declared, of which priors tell.
         noise: Distribution of the errors of the bare model.
         center: Mean of the prior predictive, shape (N,).
-        spread: Its deviation, shape (N,).
+        spread: Deviation of the prior predictive, shape (N,).
         can_fail: Whether a trial, or one of the prior predictive, has no outcome.
         step: Step of finite differences.
         is_smooth: Whether derivatives mean anything.
@@ -83,8 +83,8 @@ class RivalSet:
             ``noise`` has on top of the declared one, shape (N,); 0 where it is smooth.
         fits: The rivals that were asked for.
         found: Modes of some that are not fitted yet.
-        best_fits: Where least squares ended, of rivals that were fitted so, by their
-            coordinates; their searches begin there.
+        best_fits: Points where least squares ended, of rivals that were fitted so, by
+            their coordinates; their searches begin there.
         warm_up: Time from its first sample in which a trial that was not fitted tells
             of its nuisances, and is not scored.
     """

@@ -71,7 +71,7 @@ class Joint:
     """One degree of freedom, and how large things are on it.
 
     Attributes:
-        name: What reports call it.
+        name: Name in reports.
         place: Place among the positions.
         dof: Place among the velocities.
         unit: Unit of a force on it, "N" or "N m".
@@ -96,7 +96,7 @@ class FormForce:
     """A force of a known form on one joint, phi times its size.
 
     Attributes:
-        joint: On which it acts.
+        joint: Joint on which it acts.
         form: Name in the dictionary, or "free f(...)" of what stands in brackets.
         size: Factor that gives the form a root mean square of one.
         horizon: Unit of t, s.
@@ -115,7 +115,7 @@ class FormForce:
         Args:
             q: Positions, shape (n, nq).
             v: Velocities, shape (n, nv).
-            t: Since the start of the trial, s.
+            t: Time since the start of the trial, s.
             phi: Strengths, and the trial's place from -1 to 1 as the last column.
         """
         force = np.zeros_like(v)

@@ -75,8 +75,8 @@ def force_effects(
             in metres means nothing.
         include: Patterns of names of effects, as in "*of hinge" or "sin*".
         exclude: Patterns of names of effects that are taken out.
-        free: Also free shapes f(q), f(v), f(t) and f(q) v, smooth forms that are in no
-            dictionary.
+        free: Whether to add free shapes f(q), f(v), f(t) and f(q) v, smooth forms that
+            are in no dictionary.
         seed: Seed of the draws.
 
     Raises:

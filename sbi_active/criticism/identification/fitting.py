@@ -42,7 +42,7 @@ class Linear:
     Attributes:
         rival: Rival of theta and the effects beside it.
         effect: Number of the effect that a coordinate belongs to, -1 for none, (d,).
-        null: Where effects vanish, shape (d,); NaN for other coordinates.
+        null: Values at which effects vanish, shape (d,); NaN for other coordinates.
         unit: Root mean square residual of each number's channel, shape (N,).
         model: Linear model, in units.
     """
@@ -63,8 +63,8 @@ class Linear:
         """Return it around a fit of some of the effects.
 
         Args:
-            model: In units, without the others.
-            free: Its coordinates, shape (d,).
+            model: Linear model in units, without the others.
+            free: Coordinates of that model, shape (d,).
             unit: Units of the residuals, shape (N,).
             tried: Deviations of the prior by which the others are tried anew: by a
                 chord, since many are flat at their null.
@@ -127,7 +127,7 @@ class Fitted(Linear):
         """Return rows (N, k) whitened by the likeliest error of each channel.
 
         Args:
-            rows: In units.
+            rows: Rows in units.
             fold: Part of each number, shape (N,), with errors of its own.
         """
         m, draws = self.measurements, self.draws
@@ -159,7 +159,7 @@ def fitted(
         beside: Effects that may be there; those of scope "trial" are.
         known_sd: Deviation of each channel's white errors, shape (c,); None estimates.
         seed: Seed of all draws.
-        settings: How much is spent.
+        settings: Settings of what is spent.
     """
     own, rng = settings, np.random.default_rng(seed)
     rival = _rivals(model, prior, trials, beside, own, seed)

@@ -55,7 +55,7 @@ class IdentifiedBelief(KernelBelief):
         That of a parameter at a bound of its prior is one-sided, from the bound on.
 
         Args:
-            level: Its probability.
+            level: Probability of the interval.
         """
         if not 0 < level < 1:
             raise ValueError(
@@ -96,10 +96,10 @@ def identify(
             leaves sizes to the trials, one a channel.
         prior: Prior of its parameters.
         trials: Trajectories, with gaps where nothing was measured.
-        beside: What the model may lack. Those of scope "trial" are there, with a
-            nuisance in each trial.
+        beside: Effects that the model may lack. Those of scope "trial" are there, with
+            a nuisance in each trial.
         seed: Seed of all draws.
-        settings: How much is spent, and what decides.
+        settings: Settings of what is spent, and of what decides.
 
     Returns:
         A belief with ``interval(level)`` by parameter. Its ``diagnostics`` have
@@ -316,7 +316,7 @@ def _opened(inside: Array, sd: float, half: float) -> Array:
     says nothing of the parameter.
 
     Args:
-        inside: How far they are, shape (n,).
+        inside: Distances from the bound, shape (n,).
         sd: Deviation that the parameter has without bounds.
         half: Share of it that is wide enough.
     """

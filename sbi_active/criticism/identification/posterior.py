@@ -101,7 +101,7 @@ def sample(
     Args:
         grams: Gram matrices of (r_0, J), by channel.
         processes: Hypotheses of the errors, white noise first, of size one.
-        unknowns: Priors.
+        unknowns: Priors of the unknowns.
         known_size: Deviation of the white part by channel; None where it is unknown.
         rng: Source of the draws.
         sweeps: Sweeps of each chain, after those that are left out.
@@ -224,9 +224,9 @@ def _present(
     """Return which effects are there, one after the other given all others.
 
     Args:
-        swept: Given those that are there; follows.
-        p: Priors.
-        present: Which are there so far, shape (n, e).
+        swept: Gaussians given the effects that are there; changed in place.
+        p: Priors of the unknowns.
+        present: Mask of the effects that are there so far, shape (n, e).
         absent: Prior probability that none is there.
         rng: Source of the draws.
     """

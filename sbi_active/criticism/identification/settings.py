@@ -120,7 +120,7 @@ class IdentifySettings:
         """Return hypotheses of errors of size one, white noise first.
 
         Args:
-            m: Which say what time scales can be told.
+            m: Measurements, which say what time scales can be told.
             declared: Share of the variance of residuals that a declared white error
                 has at least in all channels; shares go on by tens to a tenth of it.
         """

@@ -16,8 +16,8 @@ class Candidate:
     Attributes:
         model: Linearized at its best fit.
         grams: Gram matrices of its rows.
-        posterior: Under the shared errors.
-        left: Its errors on left-out parts of the trials.
+        posterior: Posterior under the shared errors.
+        left: Errors of the model on left-out parts of the trials.
         log_prior: Probability of its set of effects, nats.
     """
 

@@ -85,7 +85,7 @@ class Errors:
     """The grid of errors over some measurements.
 
     Args:
-        measurements: With a time axis.
+        measurements: Measurements with a time axis.
         unit: Standard deviation of the sensor, shape (N,).
         cells: The sensor's error, with what is unknown of its correlation.
         largest: Root mean square of the residual of a model that misses, in sensor
@@ -198,10 +198,10 @@ class Errors:
         """Return the evidence and the posterior of a model.
 
         Args:
-            model: Linear, with its prior.
+            model: Linear model with its prior.
             grams: Gram matrices of its rows.
             folds: Parts that count, bool, shape (f,); None takes all.
-            factor: On the scales of the effects' priors.
+            factor: Factor on the scales of the effects' priors.
             process: Whether u is given the process; else the sensor's error alone.
         """
         use = np.ones(self.num_folds, bool) if folds is None else folds

@@ -72,8 +72,8 @@ def leave_out(
     """Return a model's errors on each part of the trials that it was not fitted to.
 
     Args:
-        model: Linear.
-        errors: Which says what the parts are.
+        model: Linear model.
+        errors: Errors, which say what the parts are.
         folds: Parts that count, shape (f,); None takes all.
         weight: Weight of each squared error, in refits and in what is returned, (N,).
     """
@@ -167,9 +167,9 @@ def _expected(
         e^T (I + S P_{-f} S^T)^{-1} e = e^T e - e^T S P S^T e.
 
     Args:
-        rows: In units of the model's own error, shape (N, 1 + d).
-        error: On left-out parts, shape (N,).
-        errors: Which says what the parts are.
+        rows: Rows in units of the model's own error, shape (N, 1 + d).
+        error: Errors on left-out parts, shape (N,).
+        errors: Errors, which say what the parts are.
         precision: Precision of the fit to all, the inverse of P, shape (d, d).
         is_free: Coordinates within their bounds without each part, shape (f, d); at a
             bound a coordinate is as good as known.

@@ -58,7 +58,7 @@ class Library:
     Coordinates of these effects count from where their columns were taken.
 
     Args:
-        search: Has fitted the model.
+        search: Search that has fitted the model.
         base: Key of the model; the bare one unless given.
         names: Names of the effects; all unless given.
     """

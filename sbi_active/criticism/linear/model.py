@@ -28,9 +28,9 @@ class LinearModel:
 
     Attributes:
         key: Key of the rival.
-        u: Where it is linearized, shape (d,).
-        residual: There, in standard deviations of the sensor, shape (N,).
-        jacobian: Its derivatives, shape (N, d).
+        u: Point at which it is linearized, shape (d,).
+        residual: Residual there, in standard deviations of the sensor, shape (N,).
+        jacobian: Derivatives of the residual, shape (N, d).
         center: Center of the prior, shape (d,).
         sd: Standard deviation of the prior, shape (d,).
         scaled: Coordinates of effects whose prior has an unknown scale, bool, (d,).
@@ -104,7 +104,7 @@ def linearize(rival: Rival, u: Array, unit: Array, step: float | Array) -> Linea
 
     Args:
         rival: Rival with effects that change the prediction.
-        u: Where, shape (d,).
+        u: Point of linearization, shape (d,).
         unit: Standard deviation of the sensor, shape (N,).
         step: Step of finite differences, one or one a coordinate, shape (d,).
     """
@@ -151,7 +151,7 @@ def enlarged(
     Args:
         model: Linear model without them.
         rival: Rival with them.
-        new: Which of the rival's coordinates they are, bool, shape (d,).
+        new: Mask of these among the rival's coordinates, bool, shape (d,).
         values: Values of the new ones, shape (k,).
         columns: Derivatives of the residual by them, shape (N, k).
     """
@@ -176,10 +176,10 @@ def chords(
 
     Args:
         rival: The model.
-        u: From where, shape (d,).
-        new: Which coordinates, bool, shape (d,).
+        u: Point to start from, shape (d,).
+        new: Mask of the new coordinates, bool, shape (d,).
         tried: Length of the step, one or one each, shape (k,).
-        residual: At u, in units, shape (N,).
+        residual: Residual at u, in units, shape (N,).
         unit: Standard deviation of each number's error, shape (N,).
     """
     where = np.flatnonzero(new)

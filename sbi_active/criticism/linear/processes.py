@@ -121,10 +121,11 @@ class Filters:
 
     Args:
         processes: Hypotheses of the errors.
-        measurements: In the order trial, channel, time.
+        measurements: Measurements in the order trial, channel, time.
         fold: Part of each number, shape (N,); it starts a new series, as a trial and a
             channel do.
-        group: What each number is counted in, the same along a series, shape (N,).
+        group: Group that each number is counted in, the same along a series, shape
+            (N,).
     """
 
     def __init__(
@@ -165,7 +166,7 @@ def whitened(
     Args:
         rows: Rows, shape (N, k).
         processes: Hypotheses of the errors.
-        m: In the order trial, channel, time.
+        m: Measurements in the order trial, channel, time.
         chosen: Hypothesis of each channel, shape (c,).
         fold: Part of each number, shape (N,); it starts a new series.
     """

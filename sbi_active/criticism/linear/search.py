@@ -46,11 +46,11 @@ class Search:
         unit: Standard deviation of the sensor, shape (N,).
         prior: Log prior probabilities of "none" and each effect.
         cells: The sensor's error alone.
-        settings: How much is spent on fits.
+        settings: Settings of what is spent on fits.
 
     Attributes:
         found: Fitted models, the bare one first.
-        errors: That all models share; known after the bare fit.
+        errors: Errors that all models share; known after the bare fit.
         names: Effects that change the prediction, of which sets are fitted.
     """
 

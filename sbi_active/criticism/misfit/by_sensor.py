@@ -58,8 +58,8 @@ class BySensor:
     """Linear models of which one fits to the sensor's error.
 
     Attributes:
-        search: Its models.
-        rivals: They are made of.
+        search: Search with its models.
+        rivals: Rivals that the models are made of.
         equivalent: Groups of effects that no permitted action separates.
     """
 

@@ -24,7 +24,7 @@ def log_scaled(bare: Candidate, errors: Errors, scales: Array) -> Array:
 
     Args:
         bare: The model.
-        errors: With the sensor's error.
+        errors: Errors with the sensor's error.
         scales: Factors on it, one a number, shape (s, N), or one for all, (s, 1).
     """
     scales = np.broadcast_to(scales, (len(scales), len(bare.model.residual)))
@@ -44,7 +44,7 @@ def log_one_part(bare: Candidate, errors: Errors) -> Array:
 
     Args:
         bare: The model.
-        errors: That its Gram matrices are of.
+        errors: Errors that its Gram matrices are of.
     """
     n, grams = len(errors.cells), bare.grams
     some = slice(n, n + errors.num_processes)

@@ -51,7 +51,7 @@ def evaluate_linear(misfit: Fitted, trials: Trials) -> Evaluation | None:
 
     Args:
         misfit: The models.
-        trials: That were fitted.
+        trials: Trials that were fitted.
     """
     errors = misfit.search.errors
     if not errors.is_by_trial:

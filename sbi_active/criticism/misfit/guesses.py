@@ -128,7 +128,7 @@ def gained_by_guesses(search: Search, key: ModelKey, name: str) -> float:
     coefficient for all numbers of a trial.
 
     Args:
-        search: Has fitted the models; x has no time axis.
+        search: Search that has fitted the models; x has no time axis.
         key: The set with the effect.
         name: Name of the effect.
     """

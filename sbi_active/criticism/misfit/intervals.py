@@ -56,7 +56,7 @@ def covariance(
 
     Args:
         model: Linear model.
-        posterior: Given a process that is independent in each trial.
+        posterior: Posterior given a process that is independent in each trial.
         left: Refits without each part of the trials.
         errors: Errors that all models share.
         action: Action of each trial, shape (t, action_dim).

@@ -43,7 +43,7 @@ def beside_misfit(
 
     Args:
         tracing: The verdict by the sensor's error, or one of unknown size.
-        detection: Which it follows.
+        detection: Detection that it follows.
         rivals: The models.
         equivalent: Groups of effects that nothing separates.
         held_out: Trials on which models are scored; None for none.

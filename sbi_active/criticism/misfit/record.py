@@ -165,12 +165,13 @@ def keep_draws(
     """Return a linear model's record, and keep its draws as its posterior sample.
 
     Args:
-        rivals: That keep them.
-        model: Fitted.
+        rivals: Rivals that keep them.
+        model: Fitted model.
         center: Center of its posterior, shape (d,).
         cov: Covariance of its posterior, shape (d, d).
         log_z: Log evidence of the model, nats.
-        best: Where other trials are predicted from, shape (d,); None takes the draws.
+        best: Point from which other trials are predicted, shape (d,); None takes the
+            draws.
     """
     key = model.key
     if key in rivals.fits:
@@ -302,8 +303,8 @@ def alike(search: Search, log_z: dict[str, float]) -> tuple[frozenset[str], ...]
     """Return pairs of effects that fit the trials nearly alike and about as well.
 
     Args:
-        search: Has fitted them alone.
-        log_z: Their evidence alone.
+        search: Search that has fitted them alone.
+        log_z: Log evidence of each effect alone, by name.
     """
     best = max(log_z.values(), default=-np.inf)
     likely = [n for n, value in log_z.items() if value > best - THRESHOLD]

@@ -99,8 +99,8 @@ class Choice:
         cause: Probability of each effect that helps of being the cause.
         better: Probability that a left-out trial is predicted better with it.
         odds: Odds of being a cause and no imitation, by effect that helps.
-        instead: What may stand in the place of an effect that helps, where anything
-            may (:func:`stand_ins`).
+        instead: Effects that may stand in the place of an effect that helps, where
+            anything may (:func:`stand_ins`).
     """
 
     key: ModelKey
@@ -123,7 +123,7 @@ def choose(
     """Return what helps, and the probability that it is the cause.
 
     Args:
-        models: Fitted ones; with a set of effects, the sets with one effect less.
+        models: Fitted models; with a set of effects, the sets with one effect less.
         names: Names of all effects.
         equivalent: Groups of them that nothing separates, which share their mass.
         timed: Whether x has a time axis.
@@ -177,7 +177,7 @@ def starts(
     """Return the sets that the rule prunes; :func:`choose` needs all their parts.
 
     Args:
-        models: Fitted ones.
+        models: Fitted models.
         names: Names of all effects.
         timed: Whether x has a time axis.
 
@@ -224,7 +224,7 @@ def stand_ins(
     predicted worse with a probability of .9.
 
     Args:
-        models: Fitted ones; sets that were not fitted do not count.
+        models: Fitted models; sets that were not fitted do not count.
         key: The set.
         names: Names of all effects, in the order of the sets.
     """
@@ -309,7 +309,7 @@ def predicts_better(one: Array, other: Array) -> float:
 
     Args:
         one: Mean squared errors of the model on left-out trials, shape (f,).
-        other: Those of the other.
+        other: Mean squared errors of the other model.
     """
     some = np.isfinite(one) & np.isfinite(other)
     ratio = np.log(one[some]) - np.log(other[some])

@@ -30,7 +30,7 @@ def judged(
 
     Args:
         rivals: The models.
-        tracing: Which effects the data point to.
+        tracing: Tracing with the effects that the data point to.
         evaluation: Error before and after on trials that had no part in it.
     """
     tracing = beyond_bounds(rivals, unless_refuted(tracing, evaluation))

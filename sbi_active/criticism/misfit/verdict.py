@@ -56,10 +56,10 @@ class Misfit:
     """The models of trials that none of them explains to the sensor's error.
 
     Attributes:
-        search: Its models.
-        rivals: They are made of.
+        search: Search with its models.
+        rivals: Rivals that the models are made of.
         equivalent: Groups of effects that nothing separates.
-        choice: What helps.
+        choice: Choice of what helps.
         standard: Returns a model's squared errors on left-out parts, as the rule takes
             them.
         log_bayes_factor: Log Bayes factor of anything with a residual process against
@@ -225,10 +225,10 @@ def scored(search: Search, c: Candidate, log_p: float, square: Array) -> Scored:
     """Return what the rule is to know of a model.
 
     Args:
-        search: Has fitted it.
+        search: Search that has fitted it.
         c: The model.
-        log_p: Its unnormalized log posterior probability.
-        square: Its mean squared errors on left-out parts, (f,).
+        log_p: Unnormalized log posterior probability.
+        square: Mean squared errors on left-out parts, (f,).
     """
     model = c.model
     of_all = search.columns(model.key, ModelKey()) & (model.trial_of < 0)
@@ -299,7 +299,7 @@ def settled(
 
     Args:
         search: The models so far.
-        score: What the rule is to know of one.
+        score: Function that returns what the rule needs of a model.
         equivalent: Groups of effects that nothing separates.
         guessed: Returns what guesses in the place of an effect gain over it, nats; None
             asks none.
@@ -339,7 +339,7 @@ def _misses(
     """Return whether even the best model gains by a residual process.
 
     Args:
-        search: Has fitted the models.
+        search: Search that has fitted the models.
         use: Parts of the trials that count; None for all.
         most: Effects of the models that count; None for all.
     """

@@ -44,7 +44,7 @@ def beyond_bounds(rivals: RivalSet, tracing: Tracing) -> Tracing:
 
     Args:
         rivals: The models.
-        tracing: Which effects the data point to.
+        tracing: Tracing with the effects that the data point to.
     """
     keys = [k for k in dict.fromkeys([ModelKey(), tracing.key]) if k in rivals.fits]
     sides = {key: _sides(rivals, key) for key in keys}

@@ -51,8 +51,8 @@ class PredictedRival:
         rivals: The models.
         key: Key of this rival.
         probability: Probability of this rival, those of all rivals adding up to one.
-        candidates: All actions that will be asked for, shape (a, action_dim). They are
-            predicted together, each as the next trial.
+        candidates: Candidates, all actions that will be asked for, shape (a,
+            action_dim). They are predicted together, each as the next trial.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ def choose_action(
 
     Args:
         rivals: The models.
-        tracing: Their probabilities.
+        tracing: Tracing with their probabilities.
         actions: The permitted ones.
         beyond: Whether to try others where these separate nothing.
     """

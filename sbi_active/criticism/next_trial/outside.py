@@ -22,7 +22,7 @@ def outside_candidates(
 
     Args:
         actions: The permitted ones.
-        candidates: Some or all of them, shape (a, action_dim).
+        candidates: Candidates, some or all actions, shape (a, action_dim).
         limit: Actions at most.
 
     Returns:
@@ -50,7 +50,7 @@ def extrapolated(actions: ActionSpace, candidates: Tensor, *, limit: int) -> Ten
 
     Args:
         actions: The permitted ones.
-        candidates: Some or all of them, shape (a, action_dim).
+        candidates: Candidates, some or all actions, shape (a, action_dim).
         limit: Actions at most.
 
     Returns:

@@ -70,12 +70,12 @@ def find_warnings(
     Args:
         trials: The measured trials.
         residuals: Residuals of the bare model.
-        tracing: Which effect the data point to.
+        tracing: Tracing with the effect that the data point to.
         detection: Whether the bare model misses the data.
         residuals_after: Residuals with the effects of the verdict.
         evaluation: Error before and after.
         effects: Effects that were added.
-        exploratory: What was frozen was changed after the data were seen.
+        exploratory: Whether what was frozen was changed after the data were seen.
         designed: Actions were chosen for their information.
     """
     found = (

@@ -39,13 +39,13 @@ class Contents:
         residuals: Residuals of the bare model.
         residuals_after: Residuals of the augmented one; None where nothing was added.
         detection: Whether the bare model misses the data.
-        tracing: Which effect the data point to.
+        tracing: Tracing with the effect that the data point to.
         evaluation: Error before and after; None where no trial was scored.
-        next_action: What to do next; its ``action`` is None where nothing is to be
+        next_action: Action to take next; its ``action`` is None where nothing is to be
             gained. None without permitted actions.
         simulator: The augmented simulator, or the bare one where nothing was added.
         prior: Prior of its parameters (never a posterior).
-        warnings: One sentence each.
+        warnings: Warnings, one sentence each.
         digest: Hash of noise, library and priors as they were before the data.
         exploratory: Library or priors were changed after the data were seen.
         num_trials: Trials that could be fitted.
@@ -53,8 +53,8 @@ class Contents:
         channel_names: Names of the entries of x's last axis, where known.
         leave_one_out: Leave-one-out scores of the bare model and of the one that was
             chosen, where trials are independent given their parameters.
-        severe_tests: Where a verdict that names effects would be put to the test most:
-            a permitted action, and one beyond.
+        severe_tests: Actions that would put a verdict that names effects to the test
+            most: a permitted action, and one beyond.
         action_is_label: Whether the action is only the trial's number.
     """
 

@@ -45,7 +45,7 @@ def plot_residuals(
         action_labels: Labels of the entries of the action, with their units; none where
             the action is only the trial's number.
         channel_names: Names of the entries of x without a time axis.
-        added: What the augmented model has more, in words.
+        added: Name of what the augmented model adds.
 
     Returns:
         The figure.
@@ -81,7 +81,7 @@ def plot_probabilities(tracing: Tracing, *, at_most: int = 14) -> Figure:
     Sets of several effects with less than .01 are left out.
 
     Args:
-        tracing: What the tracing found.
+        tracing: Tracing to draw.
         at_most: Bars, the most probable ones.
 
     Returns:

@@ -70,7 +70,7 @@ class Report(Contents):
         """Write report.txt, report.md, report.html and the figures as PNG.
 
         Args:
-            directory: Made where it does not exist.
+            directory: Folder, made where it does not exist.
 
         Returns:
             The page's path.
@@ -105,9 +105,9 @@ def build_report(
         trials: The measured trials.
         actions: Permitted actions, for names and units.
         designed: Actions were chosen for their information.
-        exploratory: What was frozen was changed afterwards.
-        warnings: Further ones.
-        **parts: As in :class:`.Contents`.
+        exploratory: Whether what was frozen was changed afterwards.
+        warnings: Further warnings.
+        **parts: Parts of :class:`.Contents`.
     """
     labels = [f"action {i + 1}" for i in range(trials.action.shape[1])]
     if trials.action_labels is not None:

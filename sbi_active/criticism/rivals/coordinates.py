@@ -53,7 +53,7 @@ class SearchCoordinates:
         high: Upper bounds in u, shape (dim,).
         center: Center of the Gaussian that stands for the prior in a search, shape
             (dim,).
-        precision: Its inverse variance, 0 between two bounds, shape (dim,).
+        precision: Inverse variance, 0 between two bounds, shape (dim,).
     """
 
     def __init__(

@@ -69,7 +69,7 @@ class ErrorModel(ABC):
         """Return whitening transforms under which the posterior has other widths.
 
         Args:
-            residual: At a mode, shape (N,).
+            residual: Residual at a mode, shape (N,).
         """
         return []
 
@@ -131,7 +131,7 @@ class NoiseGrid(ErrorModel):
     Args:
         cells: Cells of the correlation time and the noise model's own parameters.
         scales: Factors on the standard deviation, shape (j,).
-        log_weights: Their log prior probabilities, shape (j,).
+        log_weights: Log prior probabilities, shape (j,).
     """
 
     def __init__(

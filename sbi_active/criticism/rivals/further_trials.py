@@ -90,7 +90,7 @@ def together(trials: Trials, further: dict[str, Any]) -> dict[str, Any]:
 
     Args:
         trials: Measured trials.
-        further: From :func:`conditions_at`.
+        further: Conditions from :func:`conditions_at`.
     """
     own = {"inputs": trials.inputs, "start": trials.start}
     joined = {key: _joined(own[key], further[key]) for key in own if key in further}

@@ -39,7 +39,7 @@ def declared_noise(
     Args:
         noise: Noise of the simulator; None where the simulator is the draw, and its own
             deviation is the unit.
-        measurements: What is measured.
+        measurements: Measured numbers.
         seed: Seed of the draws of the posterior.
 
     Raises:
@@ -123,7 +123,7 @@ def measurement_sds(noise: NoiseModel | None, measurements: Measurements) -> Any
 
     Args:
         noise: The simulator's.
-        measurements: What is measured.
+        measurements: Measured numbers.
 
     Returns:
         A number, or where channels have their own one a measured number, shape (N,).

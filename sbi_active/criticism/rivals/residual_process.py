@@ -70,7 +70,7 @@ class ResidualProcess(ErrorModel):
 
     Args:
         noise: The error without the process.
-        measurements: What the residuals are of.
+        measurements: Measurements that the residuals belong to.
         action: Action of each trial, in ranges of the action space, shape (t,
             action_dim).
         order: Order of each trial, in the span of those at hand, shape (t,); None for
@@ -290,7 +290,7 @@ def smooth_features(m: Measurements, at: Array) -> Array:
 
     Args:
         m: The measurements of all trials.
-        at: Which of them are the trial's n, bool, shape (N,).
+        at: Mask of the trial's n among them, bool, shape (N,).
     """
     points, channel = _coordinates(m, np.zeros((m.shape[0], 0)), m.span)
     return _features(points[at], channel[at])

@@ -27,7 +27,7 @@ class Rival:
     r"""A model of the trials, :math:`p(x | z)\, p(z)` with z = (theta, phi).
 
     Args:
-        key: What the rival is.
+        key: Key of the rival.
         simulator: Simulator of the trials, shared by all rivals.
         prior: Prior of theta.
         effects: Effects that this rival has.
@@ -35,7 +35,7 @@ class Rival:
         error: Distribution of the residual.
         spread: Deviation of the prior predictive, shape (N,), which is the density of a
             number where the simulator gives none.
-        center: Its mean, shape (N,).
+        center: Mean of the prior predictive, shape (N,).
         step: Step of finite differences, in u.
         disagreement: Probabilities, equally likely, that a trial has no outcome where
             the simulator has one, or vice versa.
@@ -196,7 +196,7 @@ class Rival:
         Args:
             u: Coordinates, shape (n, dim).
             whiten: Maps (..., N) to (..., N).
-            step: In u, one or one a coordinate, shape (dim,).
+            step: Step in u, one or one a coordinate, shape (dim,).
 
         Returns:
             Shapes (n, N) and (n, N, dim).

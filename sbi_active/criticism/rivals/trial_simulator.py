@@ -45,7 +45,7 @@ class TrialSimulator:
         seed: Seed of the replicates.
 
     Attributes:
-        measurements: What is predicted.
+        measurements: Measurements that are predicted.
         num_simulations: Trials predicted so far; a deterministic simulator runs once
             for those with the same inputs.
         failed: Whether any of them had no outcome.
@@ -90,7 +90,8 @@ class TrialSimulator:
 
         Args:
             theta: Parameters, shape (n, theta_dim).
-            phi: By effect, shape (n, phi_dim), or (n, t, phi_dim) of scope "trial".
+            phi: Parameters by effect, shape (n, phi_dim), or (n, t, phi_dim) of scope
+                "trial".
 
         Returns:
             The mean, shape (n, N), NaN where the simulator gives no number; the

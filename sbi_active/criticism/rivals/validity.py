@@ -36,7 +36,7 @@ def log_outcomes(
 
     Args:
         probability: Probability of an outcome by the simulator, shape (n, t).
-        valid: Which trials have one, shape (t,).
+        valid: Mask of the trials that have one, shape (t,).
         rates: :math:`\epsilon`, the R probabilities of disagreement, equally likely.
 
     Returns:
@@ -52,7 +52,7 @@ def surprising_outcomes(residuals: Residuals) -> tuple[list[int], list[int]]:
     """Return places of trials whose validity the model holds for improbable.
 
     Args:
-        residuals: With the probability of a measurement in each trial.
+        residuals: Residuals with the probability of a measurement in each trial.
 
     Returns:
         Those without a measurement and those with one, of a probability below 1/20.

@@ -109,8 +109,8 @@ def promise(rivals: RivalSet, key: ModelKey) -> float:
     It costs a part of a fit, which then goes on from there.
 
     Args:
-        rivals: All models.
-        key: Which of them.
+        rivals: Set of all models.
+        key: Key of the model.
     """
     if key in rivals.fits:
         return np.inf
@@ -191,7 +191,7 @@ def alternatives(
     nothing separates as one. What nothing separates from the bare model is none.
 
     Args:
-        effects: Their names.
+        effects: Names of the effects.
         equivalent: Groups that nothing separates, with "none" for the bare model.
 
     Example:

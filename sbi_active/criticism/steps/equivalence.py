@@ -253,7 +253,7 @@ def _imitates(
         simulator: Simulator of the permitted actions.
         rivals: The models.
         theta: Parameters beside the other, shape (1, theta_dim).
-        unit: What counts as large in each number.
+        unit: Size that counts as large in each number.
     """
     own = SearchCoordinates(rivals.prior, (one,), (), len(simulator))
     for far in FAR:

@@ -43,9 +43,9 @@ def evaluate_held_out(
 
     Args:
         rivals: The models, fitted to other trials.
-        tracing: What was traced in those.
+        tracing: Tracing of the fitted trials.
         held_out: Trials to score.
-        num_draws: From each posterior.
+        num_draws: Draws from each posterior.
         level: Probability that a right verdict has any trial called far outside.
     """
     before, after = _predictions(rivals, tracing, held_out, num_draws)
@@ -78,7 +78,7 @@ def tail(prediction: Prediction, trials: Trials) -> float:
 
     Args:
         prediction: Prediction of some trials.
-        trials: What was measured in them.
+        trials: Trials with what was measured.
     """
     x = trials.x.double().numpy().reshape(-1)[prediction.position]
     off = prediction.mean - prediction.mean.mean(0)
@@ -93,7 +93,7 @@ def evaluate_left_out(
     """Return the error on each trial of models chosen and fitted without it.
 
     Args:
-        trials: Those that may be fitted.
+        trials: Trials that may be fitted.
         fold: Fits and traces some trials; called once a trial.
         show_progress: Whether to draw a bar of the trials.
     """

@@ -93,7 +93,7 @@ def unless_refuted(tracing: Tracing, evaluation: Evaluation | None) -> Tracing:
     ones.
 
     Args:
-        tracing: Which effect the data point to.
+        tracing: Tracing with the effect that the data point to.
         evaluation: Error before and after on trials that had no part in it.
     """
     if not tracing.chosen:

@@ -40,7 +40,7 @@ class LeaveOneOut:
         density: Log predictive density of each trial, shape (t,), nats.
         pareto_k: Shape of the largest weights, (t,).
         num_draws: Number of posterior draws.
-        names: What each trial is called; empty for its position.
+        names: Names of the trials; empty for their positions.
 
     References:
         Vehtari, Gelman & Gabry, Statistics and Computing 27 (2017).
@@ -73,7 +73,8 @@ def leave_one_out(rivals: RivalSet, tracing: Tracing) -> tuple[LeaveOneOut, ...]
 
     Args:
         rivals: The models.
-        tracing: Their verdict. "unexplained" and "outlier" have the bare model alone.
+        tracing: Tracing with their verdict. "unexplained" and "outlier" have the bare
+            model alone.
     """
     found = [_density(rivals, ModelKey())]
     if tracing.verdict not in (NONE, UNEXPLAINED, OUTLIER):

@@ -64,7 +64,7 @@ def missed_trials(
 
     Args:
         rivals: The models.
-        tracing: Their verdict.
+        tracing: Tracing with their verdict.
         trials: Trials that had no part in it.
         before: Prediction of the bare model, for these trials.
         after: Prediction of the model of the verdict.
@@ -145,7 +145,7 @@ def _tails(prediction: Prediction, errors: Array, x: Array) -> Array:
     Args:
         prediction: Prediction of the trials.
         errors: Draws of the errors beside it, shape (n, N).
-        x: What was measured, shape (N,).
+        x: Measured numbers, shape (N,).
     """
     off = prediction.mean - prediction.middle
     sd = np.sqrt((off**2).mean(0) + (errors**2).mean(0))

@@ -38,7 +38,7 @@ class Prediction:
         trial: Trial of each number, shape (N,).
         position: Position of each number in the flattened x, shape (N,).
         valid: Whether each trial has an outcome, one draw each, shape (n, t), bool.
-        probability_valid: That it has one, given the draw, shape (n, t).
+        probability_valid: Probability that it has one, given the draw, shape (n, t).
         at_best: Noise-free prediction by the best fit, shape (N,), where every model
             misses; None otherwise.
     """
@@ -86,7 +86,7 @@ def predict(
         trials: Trials to predict, taken as unseen but for the first part that their
             nuisances are known from, which is left out; None takes those that were
             fitted, with the residual process of "unexplained" conditioned on them.
-        key: Which of the models.
+        key: Key of the model.
         num_draws: Number n of posterior draws.
         seed: Seed of the draws; None is that of the models.
         scored: Whether to compute ``log_likelihood``, which is empty without.

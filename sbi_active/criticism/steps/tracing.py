@@ -52,7 +52,7 @@ def log_priors(
 
     Args:
         effects: The declared ones.
-        catch_alls: Those that are compared.
+        catch_alls: Catch-alls that are compared.
     """
     members: dict[str, list[str]] = {}
     for effect in effects:
@@ -328,9 +328,9 @@ def estimate_of(
     """Return an effect's estimate by the draws of the model that has it alone.
 
     Args:
-        effect: Whose phi is the end of the draws.
+        effect: Effect whose phi is the end of the draws.
         evidence: Evidence of that model.
-        probability: That the effect is there.
+        probability: Probability that the effect is there.
         log_bayes_factor: Log Bayes factor of that model against the bare one.
     """
     phi = evidence.draws[:, -effect.phi_dim :]

@@ -40,10 +40,10 @@ class Belief(Distribution, ABC):
 
     Attributes:
         prior: The original prior.
-        label: How the belief was made, for reports.
+        label: Label that says how the belief was made, for reports.
         parameter_names: Names of the parameters, where the simulator names them; else
             None.
-        diagnostics: What is known of its quality.
+        diagnostics: Diagnostics of its quality.
     """
 
     arg_constraints = {}  # pyright: ignore
@@ -270,8 +270,9 @@ def named(belief: Distribution, simulator: Any) -> Distribution:
     """Return a belief that knows the names of a simulator's parameters.
 
     Args:
-        belief: Changed in place, unless it is a distribution of the user's.
-        simulator: One with or without ``parameter_names``.
+        belief: Belief that is changed in place, unless it is a distribution of the
+            user's.
+        simulator: Simulator with or without ``parameter_names``.
     """
     names = getattr(simulator, "parameter_names", None)
     if not isinstance(belief, Belief) or names is None:

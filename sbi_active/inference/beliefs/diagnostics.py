@@ -26,7 +26,7 @@ class Assumption:
 
     Attributes:
         holds: Whether it may be relied on.
-        figure: What that was judged by.
+        figure: Figure that it was judged by.
     """
 
     holds: bool
@@ -42,21 +42,21 @@ class Diagnostics:
     Attributes:
         trustworthy: Whether nothing that was checked speaks against the belief; None
             where nothing was.
-        warnings: What speaks against it and what to do, a sentence each.
+        warnings: Warnings of what speaks against it and what to do, a sentence each.
         network_warnings: Warnings of the amortized network beside a refined belief.
-        assumptions: By name, each with the figure that it was judged by.
+        assumptions: Assumptions by name, each with the figure that it was judged by.
         num_simulations: Rows that the belief cost.
         num_missing: Number of those simulations lost to faults of the simulator.
         effective_sample_size: Effective number of the weighted draws behind it.
         error_nats: Expected divergence from the belief of endless simulations.
         error_nats_if_explained: Expected divergence if the observations were as
             simulations are.
-        tail_probability: How often a simulation from the belief lies as far out as all
-            trials together do.
+        tail_probability: Probability that a simulation from the belief lies as far out
+            as all trials together do.
         tail_probability_of_trial: Tail probability of each trial alone.
-        combinations: What is known of parameters that are not known one by one, and
-            what is not; says nothing where each is.
-        figures: Further ones, by the method; each is an attribute as well.
+        combinations: Combinations that are known of parameters not known one by one,
+            and what is not; says nothing where each is.
+        figures: Further figures, by the method; each is an attribute as well.
     """
 
     trustworthy: bool | None = None

@@ -45,9 +45,9 @@ class KnownCombination:
 
     Attributes:
         text: The formula.
-        value: Its median.
+        value: Median of the combination.
         low: End of its central 90 % interval.
-        high: The other end.
+        high: Other end of that interval.
         width: Standard deviation of the sum, or of a product's logarithm, in those of
             the prior.
     """
@@ -100,7 +100,7 @@ class Combinations:
 
     Attributes:
         known: Combinations with their intervals.
-        unknown: What is left open.
+        unknown: Combinations that are left open.
     """
 
     known: tuple[KnownCombination, ...] = ()

@@ -95,7 +95,8 @@ def find_contradiction(
         likelihood: Likelihood of all trials under the declared noise.
         theta: Best fit, then parameters around it, shape (n, d).
         residual: Whitened residuals at the best fit, shape (N,), 0 where not observed.
-        jacobian: Their derivatives in coordinates of a standard normal prior, (N, d).
+        jacobian: Derivatives of the residuals in coordinates of a standard normal
+            prior, (N, d).
         level: Tail probability below which trials contradict.
         rng: Source of the draws of the noise.
     """

@@ -72,8 +72,8 @@ def refine_declared(
         simulator: Deterministic beside a declared noise.
         prior: The original prior.
         action: Executed actions, shape (t, action_dim).
-        x: Their outcomes, shape (t, *x_shape).
-        hints: Where else to look first.
+        x: Outcomes of the actions, shape (t, *x_shape).
+        hints: Distributions that say where else to look first.
         past: State of an earlier call: draws to go on from, and what needs no
             simulation.
         settings: Budget.

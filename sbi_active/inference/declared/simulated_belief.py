@@ -70,7 +70,7 @@ class SimulatedBelief(Belief):
         defensive: The share :math:`\epsilon`.
 
     Attributes:
-        histories: What a refinement goes on from after a further trial.
+        histories: Histories that a refinement goes on from after a further trial.
         free: Parameters that keep their prior, shape (d,).
     """
 

@@ -37,7 +37,7 @@ class Particles(Proposal):
 
     Attributes:
         drawn: Places, shape (n, d).
-        log_density: Its normalized log density, (n, d) -> (n,).
+        log_density: Normalized log density, (n, d) -> (n,).
     """
 
     drawn: Array
@@ -78,7 +78,7 @@ class LinearResponse:
 
     Args:
         potential: Potential of all trials.
-        found: Its modes.
+        found: Modes of the density.
         axes: Axes that places are of; others change nothing.
     """
 

@@ -217,7 +217,7 @@ def fitted(
         u: Draws, shape (n, d).
         weight: Weights of the draws, which sum to 1, shape (n,).
         num_components: Number of components at most; fewer where few draws count.
-        settings: How much wider it is.
+        settings: Settings that say how much wider it is.
         rng: Source of its starts.
     """
     dim = u.shape[1]

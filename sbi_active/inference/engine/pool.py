@@ -46,7 +46,7 @@ class Pool:
         log_likelihood: Log likelihood of the trials so far, shape (n,).
         log_mixture: Log of the sum over proposals, each times its number of draws.
         log_own: Log density of the proposal that each was drawn from.
-        is_final: Which of them the posterior rests on, shape (n,).
+        is_final: Mask of those that the posterior rests on, shape (n,).
         num_final: Draws of their proposal, also those that do not count.
         proposals: Pairs of the number of draws and the proposal.
         num_trials: Number of trials in the likelihood.
@@ -121,7 +121,7 @@ class Pool:
         """Simulate draws of a proposal, shape (n, d), and weigh all.
 
         Args:
-            proposal: What they were drawn from.
+            proposal: Proposal that they were drawn from.
             drawn: The draws.
             potential: Potential of all trials.
             floor: Log likelihood below which a draw is given up.
@@ -155,7 +155,7 @@ class Pool:
 
         Args:
             potential: Potential of these trials and further ones.
-            settings: How far below the best a draw is left out.
+            settings: Settings that say how far below the best a draw is left out.
         """
         log_weight = self.log_mixture_weight
         rows = np.flatnonzero(

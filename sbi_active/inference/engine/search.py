@@ -178,7 +178,7 @@ def laplace_precision(
     Args:
         problem: The sum of squares.
         u: Places, shape (n, d).
-        whiten: What whitens residuals.
+        whiten: Whitener of the residuals.
     """
     _, jac = problem.jacobian(u, whiten, problem.step)
     # Never wider than the prior: a flat direction has its variance.

@@ -38,8 +38,8 @@ class Settings:
         fewest: Effective draws below which the likelihood is tempered.
         few_tempered: Rounds of this beyond which the likelihood is called rough.
         broad: Effective draws that shape the wide share of a proposal.
-        share_of_wide: That share.
-        share_if_rough: That share where the likelihood is rough.
+        share_of_wide: Share of a proposal that is wide.
+        share_if_rough: Share of a proposal that is wide where the likelihood is rough.
         num_components: Components of a proposal at least; one a mode.
         efficient: Share of a proposal's draws that are effective, with which it is good
             enough: more is drawn from it in place of fitting another.

@@ -46,7 +46,7 @@ class LFIREModel:
         Args:
             theta: Particles, shape (n, theta_dim).
             x: Outcomes, shape (n, *x_shape); NaN where there was no measurement.
-            action: Simulated ones, shape (n, action_dim).
+            action: Simulated actions, shape (n, action_dim).
         """
         particle = _places(theta, self.particles, "theta", "particles")
         place = _places(action, self.action, "action", "simulated actions")

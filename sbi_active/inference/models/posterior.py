@@ -230,7 +230,7 @@ def at_conditions(
     row has none.
 
     Args:
-        direct: Over packed conditions.
+        direct: Estimator over packed conditions.
         condition: Packed conditions, shape (n, c).
 
     Returns:

@@ -51,8 +51,8 @@ class Conditioning(nn.Module):
         scaling: Whether x, without a baseline, is standardized given the action or over
             all rows.
         whiten: Whether theta is whitened by its full covariance or only scaled.
-        baseline: Whose frames to use; "best" compares Gaussian log scores on held-out
-            rows.
+        baseline: Baseline whose frames are used; "best" compares Gaussian log scores on
+            held-out rows.
         most_numbers: Number of an outcome's numbers beyond which
             :class:`.Directions` stand for them. Half of it summarizes what a network
             learns as well in ten times the time.

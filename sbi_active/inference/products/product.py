@@ -41,7 +41,7 @@ class TrainedRegion:
     """Where a network was trained: what it says elsewhere is made up.
 
     Attributes:
-        mixture: Fitted to the rows.
+        mixture: Mixture fitted to the rows.
         floor: Log density of the mixture at the edge.
     """
 
@@ -97,7 +97,7 @@ class Product:
         model: q, up to factors without theta.
         trials: The history.
         region: R; None is the whole support.
-        previous: Takes the prior's place, where beliefs are chained.
+        previous: Belief that takes the prior's place, where beliefs are chained.
     """
 
     def __init__(

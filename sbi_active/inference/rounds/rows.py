@@ -56,7 +56,7 @@ def round_rows(
         theta: Parameters, shape (n, theta_dim), within the prior's support.
         x: Outcomes, shape (n, *x_shape), or (n,) where x is one number.
         action: Actions, shape (n, action_dim), or (action_dim,) for all rows.
-        prior: Gives theta_dim and the support.
+        prior: Prior that gives theta_dim and the support.
         x_shape: Shape of earlier outcomes; None takes that of these.
         action_dim: Dimension of earlier actions; None takes that of these.
         exclude_invalid: Drop rows in which a number is missing.

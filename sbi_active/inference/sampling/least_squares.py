@@ -82,7 +82,8 @@ def descend(
         u: Starts, shape (n, dim).
         whiten: Whitener of the residuals.
         step: Step of finite differences.
-        iterations: At most; a start that is expected to gain nothing stops.
+        iterations: Number of iterations at most; a start that is expected to gain
+            nothing stops.
         center: Center of the penalty, shape (n, dim); None has that of the prior.
         secant: Derivatives are updated from the steps made, by Broyden's rule, and not
             computed again.

@@ -40,8 +40,8 @@ class NormalCoordinates:
         low: Lower bounds of a search, shape (d,).
         high: Upper bounds of a search, shape (d,).
         center: Mean of the normal that stands for the prior, shape (d,).
-        precision: Its inverse variance, shape (d,): 0 of a uniform number, which has
-            its bounds, and up to 1 of one that is narrow between them.
+        precision: Inverse variance, shape (d,): 0 of a uniform number, which has its
+            bounds, and up to 1 of one that is narrow between them.
     """
 
     def __init__(

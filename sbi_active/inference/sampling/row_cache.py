@@ -33,7 +33,7 @@ class RowCache(Generic[T]):
         """Return the values of all rows, simulating those that are new.
 
         Args:
-            label: What the rows belong to, such as an action.
+            label: Label that the rows belong to, such as an action.
             rows: Parameters, shape (n, dim); always of one dtype for a label.
             simulate: Maps places among the rows, shape (m,), to m values: arrays,
                 tuples of them, or None.

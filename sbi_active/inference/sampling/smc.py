@@ -188,7 +188,7 @@ class Moves(Protocol):
 
         Args:
             before: Particles, shape (n, d).
-            after: Where they are after it, shape (n, d).
+            after: Particles after it, shape (n, d).
             acceptance: Share of them that moved.
         """
         ...

@@ -19,7 +19,7 @@ class Unbounding:
     Draws of a density that is cut at many edges would else nearly all miss it.
 
     Attributes:
-        axes: Which axes are mapped, shape (d,); the others stay.
+        axes: Mask of the axes that are mapped, shape (d,); the others stay.
     """
 
     axes: NDArray[np.bool_]

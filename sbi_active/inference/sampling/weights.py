@@ -42,7 +42,7 @@ def effective_sample_size(log_weight: Array) -> float:
     r"""Return :math:`(\sum w_i)^2 / \sum w_i^2`; 0 where no weight is positive.
 
     Args:
-        log_weight: Not normalized, shape (n,).
+        log_weight: Log weights, not normalized, shape (n,).
 
     References:
         Kong, Liu & Wong, Journal of the American Statistical Association 89 (1994).

@@ -22,10 +22,10 @@ class Told:
     """What a belief is to be inferred from.
 
     Attributes:
-        trials: All of them, the new one last.
+        trials: Trials, all of them, the new one last.
         simulator: To refine the belief with; None takes the word of the network.
         refinement: Budget of that; None is ``RefinementOptions()``.
-        given_seed: By the caller; None for none.
+        given_seed: Seed given by the caller; None for none.
         afresh: Whether to begin at the prior, without the belief before the last trial
             and without this round's network.
     """
@@ -146,7 +146,7 @@ class ActiveInference(ABC):
         """Return the refined belief of these trials alone, computed from scratch.
 
         Args:
-            trials: They replace the history.
+            trials: Trials that replace the history.
             simulator: Simulator to refine the belief with, as in :meth:`update`.
             refinement: Budget of the refinement.
             seed: Seed of all draws; None draws one from torch's global generator.
@@ -163,7 +163,7 @@ class ActiveInference(ABC):
 
         Args:
             belief: Belief after the trials.
-            trials: They replace the history.
+            trials: Trials that replace the history.
         """
         self._belief, self.trials = belief, [*trials]
         self._forget_round()

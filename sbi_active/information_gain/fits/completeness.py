@@ -21,7 +21,7 @@ class Completeness:
     Attributes:
         share: Share of a row's outcomes that are complete, shape (n,).
         counted: Rows that are not missing, shape (n,).
-        smooth: Its log probability as a function of the parameters, where it is random.
+        smooth: Log probability as a function of the parameters, where it is random.
     """
 
     share: Tensor

@@ -88,7 +88,7 @@ def of_friction(
     Args:
         group: Group of joints.
         sizes: Sizes of the model.
-        force: One prior deviation.
+        force: Force of one prior deviation.
         unit: Unit of a force.
     """
     model = sizes.model

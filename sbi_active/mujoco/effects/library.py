@@ -74,11 +74,12 @@ def mjcf_effects(
     Args:
         model: The simulator of :func:`.from_mjcf` or :func:`.from_sysid`, or what they
             return, or an ``MjSpec``, a path or the text of an MJCF.
-        trials: Whose actions and inputs say how the robot moves; None takes those of
-            a robot, else its signals or actions, else it is released around its start.
-        actions: In place of the robot's.
+        trials: Trials whose actions and inputs say how the robot moves; None takes
+            those of a robot, else its signals or actions, else it is released around
+            its start.
+        actions: Actions in place of the robot's.
         include: Pattern of names that are kept, as in "\* friction loss", or several.
-        exclude: Those that are not.
+        exclude: Patterns of those that are not.
 
     Raises:
         ValueError: If a pattern fits no effect.
@@ -98,8 +99,8 @@ def likely_effects(robot: Robot, trials: Trials) -> list[Effect]:
     """Return what joints and drives most often have and an MJCF does not say.
 
     Args:
-        robot: From its MJCF.
-        trials: Whose actions and inputs say how it moves.
+        robot: Robot from its MJCF.
+        trials: Trials whose actions and inputs say how it moves.
     """
     simulator, actions, trials = _simulator(robot, None, trials)
     sizes, call = nominal(simulator, trials, actions)

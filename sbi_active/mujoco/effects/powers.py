@@ -33,7 +33,7 @@ class PowerForce:
         Args:
             q: Positions, shape (n, nq).
             v: Velocities, shape (n, nv).
-            t: Not used.
+            t: Time, which is not used.
             phi: Parameters of the effect, shape (n, 1).
         """
         force = np.zeros_like(v)

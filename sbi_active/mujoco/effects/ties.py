@@ -25,7 +25,7 @@ class Group:
 
     Attributes:
         names: Names of the elements.
-        label: What effects are called by.
+        label: Label that effects are named by.
     """
 
     names: tuple[str, ...]

@@ -62,8 +62,8 @@ class Insertion(ModelChange):
         """Move what was inserted to where it rests under the load at the start.
 
         Args:
-            model: Written.
-            data: At the start, its forces computed.
+            model: Model that was written into.
+            data: Data at the start, its forces computed.
             phi: Parameters of the effect, shape (k,).
         """
 
@@ -85,8 +85,8 @@ class StateChange(ModelChange):
         """Return what is added for each joint, shape (n, joints).
 
         Args:
-            q: Their positions, shape (n, joints).
-            v: Their velocities.
+            q: Positions of the joints, shape (n, joints).
+            v: Velocities of the joints.
             load: Forces of the actuators on them in the step before.
             phi: Parameters of the effect, shape (n, k).
         """

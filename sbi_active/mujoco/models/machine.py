@@ -31,8 +31,8 @@ class Rows:
 
     Attributes:
         theta: Parameters, shape (n, d).
-        changes: By change, shape (n, k).
-        forces: By force, shape (n, k).
+        changes: Parameters by change, shape (n, k).
+        forces: Parameters by force, shape (n, k).
         start: Positions and velocities at the start, by name, (n,).
         controls: Controls, shape (n, steps, nu), held over each step.
     """
@@ -74,7 +74,7 @@ class Model:
         data: Data to work in.
         positions: Places of the machine's ``qpos`` in that of this model.
         velocities: Places of the machine's ``qvel`` in that of this model.
-        inserted: What it has beyond the machine's model.
+        inserted: Insertions that the machine's model does not have.
         pool: Copies of the base that are written into.
         datas: Data to step rows together.
         originals: Fields as compiled, of those that are ever written.
@@ -98,7 +98,7 @@ class Model:
         Args:
             number: Number of the copy to write into.
             theta: Parameters, shape (d,).
-            changes: By change, shape (k,).
+            changes: Parameters by change, shape (k,).
         """
         model = self.writer.model(theta)
         if model is None:
@@ -173,7 +173,7 @@ class Machine:
         """Run rows, whatever models they need.
 
         Args:
-            rows: All of them.
+            rows: Rows, all of them.
             run: ``run(model, models, rows)`` simulates some rows, each by its model,
                 and returns one result a row.
             size: Most rows at a time.

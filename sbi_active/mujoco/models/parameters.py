@@ -62,7 +62,7 @@ class Bounded:
     """A parameter of a model.
 
     Attributes:
-        name: What reports call it.
+        name: Name in reports.
         low: Lowest value.
         high: Highest value.
         unit: Unit of the values.
@@ -101,9 +101,9 @@ def bounded(model: Any, parameters: Mapping[str, Any]) -> tuple[Bounded, ...]:
 
     Args:
         model: Compiled model, to find quantities and units.
-        parameters: By name: (low, high) of the quantity of that name; (low, high,
-            "element.attribute") under a name of one's own; or (low, high, edit) with a
-            function ``edit(spec, value)``.
+        parameters: Parameters by name: (low, high) of the quantity of that name; (low,
+            high, "element.attribute") under a name of one's own; or (low, high, edit)
+            with a function ``edit(spec, value)``.
 
     Raises:
         ValueError: If there is none, bounds are not in order, or a name is unknown.

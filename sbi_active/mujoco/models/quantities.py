@@ -127,8 +127,8 @@ def find_quantity(model: Any, text: str) -> Quantity:
 
     Args:
         model: Compiled model.
-        text: Its name; "joint:element.attribute" where elements of two kinds share a
-            name and an attribute.
+        text: Name of the quantity; "joint:element.attribute" where elements of two
+            kinds share a name and an attribute.
 
     Raises:
         ValueError: If there is no such element or attribute, with the nearest ones.

@@ -30,7 +30,7 @@ def readings(model: Model, models: list[Any], rows: Rows, *, threads: int = 1) -
 
     Args:
         model: Model of all rows.
-        models: One a row.
+        models: Models, one a row.
         rows: Rows whose controls have shape (n, steps, nu + 7 nmocap).
         threads: Threads of MuJoCo's rollout.
 

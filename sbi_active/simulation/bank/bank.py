@@ -276,10 +276,10 @@ class Bank:
         """Return whole columns without the others.
 
         Args:
-            names: Among ``theta``, ``action``, ``x``, ``status``, ``index`` (of the row
-                in its run), ``seed`` (of the run; a row's own one is
-                ``row_seeds(seed, 1, first=index)``), ``log_proposal``, ``log_action``
-                and ``label`` (an index into :attr:`labels`).
+            names: Names of columns among ``theta``, ``action``, ``x``, ``status``,
+                ``index`` (of the row in its run), ``seed`` (of the run; a row's own one
+                is ``row_seeds(seed, 1, first=index)``), ``log_proposal``,
+                ``log_action`` and ``label`` (an index into :attr:`labels`).
         """
         readable = {*COLUMNS} | {"seed", "label"}
         if unknown := {*names} - readable:

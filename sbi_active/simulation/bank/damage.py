@@ -23,7 +23,7 @@ class CorruptSegmentError(Explained, OSError):
 
     Attributes:
         path: The file, or the folder where one is not there.
-        reason: What is wrong with it.
+        reason: Text that says what is wrong with it.
     """
 
     code = "SA605"
@@ -101,7 +101,7 @@ def parsed(path: Path, content: bytes) -> dict[str, Any]:
 
     Args:
         path: Named in the error.
-        content: Its bytes, or those of the text within.
+        content: Bytes of the record, or those of the text within.
 
     Raises:
         CorruptSegmentError: If it is no object, or one that no bank writes.

@@ -144,7 +144,7 @@ def _globals(functions: list[types.FunctionType]) -> dict[str, Any]:
     """Return the global variables that functions use, from function to function.
 
     Args:
-        functions: Where to begin.
+        functions: Functions to begin with.
     """
     found: dict[str, Any] = {}
     waiting, seen = [f for f in functions if not _is_library(f)], {*functions}

@@ -28,8 +28,8 @@ class ReusedRows:
     r"""Rows of a bank, weighted for a target.
 
     Attributes:
-        bank: Where the rows are.
-        rows: Their positions, shape (k,), int64.
+        bank: Bank that has the rows.
+        rows: Positions of the rows, shape (k,), int64.
         weights: Sum to one, shape (k,), float64.
         denominator: "mixture" of all proposals, or each row's "own" proposal.
         share: Share of the weight, by label of the proposal.
@@ -111,8 +111,8 @@ def reuse(
     Args:
         bank: The rows.
         target: A prior or belief, anything with ``log_prob``.
-        action: Only rows with this action, shape (action_dim,); None takes all.
-        proposals: By label, all of those in the bank that have one.
+        action: Action of the rows that are taken, shape (action_dim,); None takes all.
+        proposals: Proposals by label, all of those in the bank that have one.
         same_actions: Whether all proposals drew actions from one law, whatever theta.
 
     Returns:

@@ -140,7 +140,7 @@ def positions(rows: Any, total: int) -> np.ndarray | None:
 
     Args:
         rows: Positions, a slice, a mask over all rows, or None.
-        total: How many rows there are.
+        total: Number of all rows.
 
     Raises:
         ValueError: If they are anything else.

@@ -40,7 +40,7 @@ class Segment:
     """What is known of a segment without its columns.
 
     Attributes:
-        number: Its place among those of the bank, from 1.
+        number: Place of the segment among those of the bank, from 1.
         num_rows: Rows in it.
         counts: Counts of rows by outcome.
         run: Name of the run that its rows belong to.
@@ -64,7 +64,7 @@ def write_segment(
     Args:
         store: The file.
         name: Name of the bank.
-        run: Its ``run``, ``seed`` and ``label``.
+        run: Run, with ``run``, ``seed`` and ``label``.
         columns: Arrays of the same length, by name.
     """
     counts = [int((columns["status"] == outcome).sum()) for outcome in Outcome]
@@ -107,7 +107,7 @@ def read_columns(
     Args:
         store: The file.
         name: Name of the bank.
-        segment: Which one.
+        segment: Segment to read.
         names: Names of the columns.
         shapes: Shapes of theta, action and x, of a row.
 

@@ -158,7 +158,7 @@ def made(folder: Path, what: str) -> None:
     """Make a store in a folder of its own.
 
     Args:
-        folder: Made too where there is none.
+        folder: Folder, made where there is none.
         what: The store is said to be.
 
     Raises:

@@ -38,7 +38,7 @@ class NoiseModel(ABC):
 
     Attributes:
         parameter_names: Names of the parameters.
-        parameters: Their values in natural units, shape (p,), float64.
+        parameters: Values of the parameters in natural units, shape (p,), float64.
         posterior: Posterior of the parameters, event shape (p,); None where they are
             declared exactly.
         times: Time stamps of the first axis of x in seconds, shape (T,); None where

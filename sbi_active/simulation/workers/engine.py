@@ -83,8 +83,8 @@ def simulate(
         theta: Parameters, shape (n, theta_dim).
         action: Actions, shape (n, action_dim).
         seed: Seed of the whole set.
-        workers: Where the rows run and what one may cost, or the number of calls at a
-            time; None is this process.
+        workers: Workers that run the rows and what one may cost, or the number of calls
+            at a time; None is this process.
         batch_size: Rows a call; None gives workers as many as take a quarter of a
             second. A simulator in this process is given all at once, or, after its
             first rows have shown that this would take long, as many as take about a

@@ -46,7 +46,7 @@ class IdleWorkers:
         Args:
             key: Digest of the simulator and its surroundings, as for :meth:`take`.
             workers: Loaded with that simulator.
-            at_most: How many of them may wait; the others end.
+            at_most: Number of them that may wait; the others end.
         """
         with self._lock:
             room = 0

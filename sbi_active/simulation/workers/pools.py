@@ -86,7 +86,7 @@ class WorkerPool(Pool):
     of the same simulator, folder, path and environment.
 
     Args:
-        simulator: Sent once to each worker.
+        simulator: Simulator, sent once to each worker.
         num_workers: Number of processes.
     """
 

@@ -54,10 +54,10 @@ class Worker:
         simulator: Pickled.
 
     Attributes:
-        connection: Gives None at the start of a call and then its reply, both pickled;
-            and an end of file where the process died.
-        call: What it was given last.
-        deadline: When that is given up, which is known once it has been started.
+        connection: Connection that gives None at the start of a call and then its
+            reply, both pickled; and an end of file where the process died.
+        call: Call that it was given last.
+        deadline: Time when that is given up, which is known once it has been started.
     """
 
     call: Call

@@ -51,7 +51,7 @@ class Schedule:
             succeeds.
         status: Status of each row, shape (n,), int8, -1 for rows that are not finished.
         tracebacks: Tracebacks of the missing rows.
-        faults: How many rows are missing for which fault.
+        faults: Numbers of missing rows by fault.
     """
 
     #: A call is sized to take this long, which hides what sending it costs.

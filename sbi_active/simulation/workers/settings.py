@@ -17,7 +17,8 @@ class Workers:
         time_limit: Seconds a row, loading the simulator not counted; a batch may take
             as much as its rows. None waits for ever. With it, or with more than one
             worker, a simulator that ends its process costs a row.
-        num_retries: How often a missing row is tried again, with the same seed.
+        num_retries: Number of times that a missing row is tried again, with the same
+            seed.
 
     Raises:
         ValueError: If a number is out of its range.
