@@ -1,4 +1,4 @@
-"""Who called the package: warnings point at the user's line, from however deep."""
+"""The user's line that called the package, at which warnings point."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an argument has to be: one form of words for all settings."""
+"""Errors of arguments, in one form of words for all settings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What takes its time says so: a bar, and lines of a log."""
+"""Progress of slow steps: a bar, and lines of a log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the draws of a distribution lie."""
+"""Support of a distribution's draws."""
 
 from __future__ import annotations
 

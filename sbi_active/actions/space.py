@@ -1,4 +1,4 @@
-"""What every action space offers."""
+"""The interface of every action space."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which summary of an outcome is looked at, as a part of the action."""
+"""The choice of an outcome's summary as a part of the action."""
 
 from __future__ import annotations
 

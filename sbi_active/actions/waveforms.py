@@ -43,7 +43,7 @@ class Waveform:
 
     @property
     def units(self) -> list[str]:
-        """Their units."""
+        """Units of the parameters."""
         return [unit for name, unit in self.every if name not in self.fixed]
 
     def __call__(self, action: Tensor, input_times: Tensor) -> dict[str, Tensor]:
@@ -126,7 +126,7 @@ class Together:
 
     @property
     def units(self) -> list[str]:
-        """Their units."""
+        """Units of the parameters."""
         return [unit for part in self.parts for unit in part.units]
 
     def __call__(self, action: Tensor, input_times: Tensor) -> dict[str, Tensor]:

@@ -19,7 +19,7 @@ from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignDetails:
-    """What few campaigns set otherwise; the papers' experiments do.
+    """Options that few campaigns change; the papers' experiments do.
 
     Attributes:
         posterior: How a belief of "alhi", "nlhi" or "seqbed" is sampled, see

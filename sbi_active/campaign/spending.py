@@ -1,4 +1,4 @@
-"""What a campaign does with the last of its simulations, and without any."""
+"""The end of a campaign's simulations: its last ones, and trials without any."""
 
 from __future__ import annotations
 

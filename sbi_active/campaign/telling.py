@@ -1,4 +1,4 @@
-"""What is told of a trial, checked before it is recorded."""
+"""Checks of a told trial before it is recorded."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def new_trial(state: CampaignState) -> Trial:
 def recorded(state: CampaignState, facts: Mapping[str, Any]) -> Trial:
     """Return the record of a trial as the log has it.
 
-    What was found about it stays where it is the same trial as before.
+    Earlier findings stay if the trial is the same as before.
 
     Args:
         state: State of the campaign.

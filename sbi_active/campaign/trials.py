@@ -1,4 +1,4 @@
-"""What is told of trials, corrected and taken back."""
+"""Telling, correcting and withdrawing trials."""
 
 from __future__ import annotations
 

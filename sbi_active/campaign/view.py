@@ -1,4 +1,4 @@
-"""What can be read of a campaign at any time, without changing anything."""
+"""The readable side of a campaign, which changes nothing."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class CampaignView:
 
     @property
     def effects(self) -> Sequence[Effect]:
-        """What the simulator may lack, as the campaign was told."""
+        """Effects that the simulator may lack, as the campaign was told."""
         return self._planner.effects
 
     @property
@@ -105,7 +105,7 @@ class CampaignView:
 
     @property
     def directory(self) -> Path | None:
-        """Where the campaign is kept; None for in memory alone."""
+        """Folder of the campaign; None if it is kept in memory alone."""
         return self._storage.path
 
     @property

@@ -1,4 +1,4 @@
-"""Where a campaign's programs are, as its folder says, and who may believe it.
+"""The programs that a campaign's folder names, and whether to trust it.
 
 A folder may have come from anybody. What its ``command.json`` names is imported where
 this account wrote that file, or was told once by ``--trust`` to follow it; both are
@@ -105,7 +105,7 @@ def write_declared(folder: Path, declared: Mapping[str, Any]) -> None:
 
 
 class Declared:
-    """What the folder of a campaign names, where that may be imported.
+    """Programs that the folder of a campaign names, where they may be imported.
 
     Args:
         folder: Folder of the campaign.

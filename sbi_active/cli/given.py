@@ -1,4 +1,4 @@
-"""What options name: objects, simulators, priors, spaces of actions, tasks, effects."""
+"""Objects that options name: simulators, priors, action spaces, tasks, effects."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def _parse(option: str) -> tuple[str, Any]:
 
 
 class Problem(NamedTuple):
-    """What options declare.
+    """The problem that options declare.
 
     Attributes:
         simulator: Simulator with its noise.

@@ -1,4 +1,4 @@
-"""How words become values: numbers, options of several words, files of options."""
+"""Values from words: numbers, options of several words, files of options."""
 
 from __future__ import annotations
 

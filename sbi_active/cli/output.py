@@ -1,4 +1,4 @@
-"""What a command prints, and where: answers, notes, errors."""
+"""Output of a command: answers, notes, errors."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TRACEBACK = re.compile(
 
 
 class Answer(NamedTuple):
-    """What a command found.
+    """The answer of a command.
 
     Attributes:
         data: Data for programs; numbers that are not finite become null.

@@ -78,7 +78,7 @@ def _stored(folder: Path) -> Iterator[Store]:
 
 
 class Record:
-    """What is known of a campaign without computing: a part of its interface.
+    """A campaign's record, known without computing: a part of its interface.
 
     Args:
         folder: Folder of the campaign.
@@ -119,7 +119,7 @@ class Record:
 
     @property
     def status(self) -> dict[str, Any]:
-        """What the command of this name answers.
+        """Answer of the command of this name.
 
         Raises:
             Unsure: If a trial that the belief has used is another one now.

@@ -54,12 +54,12 @@ class Combination:
 
     @property
     def index(self) -> tuple[int, ...]:
-        """Its parameters."""
+        """Indices of its parameters."""
         return tuple(term.index for term in self.terms)
 
     @property
     def weight(self) -> Array:
-        """Of the terms."""
+        """Weights of the terms."""
         return np.array([term.weight for term in self.terms])
 
     @property

@@ -1,4 +1,4 @@
-"""What must hold before models are compared with trials."""
+"""Checks before models are compared with trials."""
 
 from __future__ import annotations
 

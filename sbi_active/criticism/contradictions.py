@@ -1,4 +1,4 @@
-"""What speaks against a verdict, or would: trials, bounds of the prior, actions."""
+"""Evidence against a verdict, or its tests: trials, bounds of the prior, actions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a comparison was made given, in sentences."""
+"""The conditions of a comparison, in sentences."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What each step of the closed loop finds, as plain data."""
+"""Results of each step of the closed loop, as plain data."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CATCH_ALLS = (UNEXPLAINED, SCATTER, OUTLIER)
 
 @dataclass(frozen=True)
 class ModelKey:
-    """Which model of the trials, as ``rivals.fit(key)`` takes it.
+    """Key of a model of the trials, as ``rivals.fit(key)`` takes it.
 
     ``str(key)`` is what reports and results call it.
 
@@ -136,7 +136,7 @@ class Evidence:
 
     @property
     def name(self) -> str:
-        """What reports call the model."""
+        """Name of the model in reports."""
         return str(self.key)
 
 
@@ -236,7 +236,7 @@ class Estimate:
 
 @dataclass(frozen=True, kw_only=True)
 class Tracing:
-    """Which effect the data point to.
+    """Attribution: the effect that the data point to.
 
     Attributes:
         verdict: "none", "unexplained", "scatter", "outlier", or effects joined by
@@ -322,7 +322,7 @@ class Tracing:
 
     @property
     def model(self) -> str:
-        """What reports call the model of the verdict."""
+        """Name of the verdict's model in reports."""
         return self.verdict if self.misfit is None else str(self.key)
 
     def has_several(self, name: str) -> bool:

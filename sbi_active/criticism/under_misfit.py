@@ -1,4 +1,4 @@
-"""What is found where every model misses by more than the sensor's error."""
+"""Results if every model misses by more than the sensor's error."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TEMPERED = 0.6
 
 @dataclass(frozen=True, kw_only=True)
 class Odds:
-    r"""That an effect is a cause, and does not imitate what nobody declared.
+    r"""Odds that an effect is a cause, and does not imitate an undeclared one.
 
     .. math::
         o = \left(6 \min(n, 9) \; .7^{k - 1} \; .6^b \; g
@@ -99,7 +99,7 @@ class Odds:
 
     @property
     def probability(self) -> float:
-        """Of a cause, o / (1 + o)."""
+        """Probability of a cause, o / (1 + o)."""
         return self.value / (1 + self.value)
 
 

@@ -1,4 +1,4 @@
-"""From estimates of the candidates to a design."""
+"""The choice of a design from estimates of the candidates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a designer returns."""
+"""The design that a designer returns."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class Design:
 
     @property
     def joint_information_gain(self) -> float:
-        """What the action or the batch tells together, nats, beyond pending trials."""
+        """Joint information gain of the action or batch beyond pending trials, nats."""
         steps = self.steps or (self,)
         return sum(float(s.expected_information_gain[s.index]) for s in steps)
 

@@ -1,4 +1,4 @@
-"""Which candidates a designer may choose."""
+"""Candidates that a designer may choose."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SAME = 0.01  # of the width of a box, within which two actions are the same
 
 @dataclass(frozen=True)
 class DesignLimits:
-    """Which actions may be chosen, and what they cost.
+    """Limits and costs of the actions that may be chosen.
 
     Attributes:
         actions: The space.

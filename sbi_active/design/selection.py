@@ -29,7 +29,7 @@ FEW = 256  # given rows by which to choose the estimator
 
 @dataclass(frozen=True)
 class Selection:
-    """What one action is chosen by; see :class:`.InformationGainDesigner`.
+    """The choice of one action; see :class:`.InformationGainDesigner`.
 
     Attributes:
         target: Target that is learned about.

@@ -1,4 +1,4 @@
-"""What a design is to tell about, and what it takes to estimate that."""
+"""The target of a design, and what it takes to estimate its information."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from sbi_active.simulation.workers.settings import Workers
 
 @dataclass(frozen=True)
 class Target:
-    """What the information is about.
+    """The target of the information.
 
     Attributes:
         name: "theta", names of parameters, or "model".

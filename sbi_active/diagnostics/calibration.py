@@ -1,4 +1,4 @@
-"""What a calibration check finds, stratum by stratum, and the verdict."""
+"""Results of a calibration check, stratum by stratum, and the verdict."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From ranks and gaps of a stratum to figures, intervals and a verdict."""
+"""Figures, intervals and a verdict from ranks and gaps of a stratum."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NUM_TESTS = 4  # kinds of figures beside the ranks of each parameter
 
 @dataclass(frozen=True, kw_only=True)
 class Tolerance:
-    """What a verdict lets pass.
+    """Tolerances of a verdict.
 
     Attributes:
         coverage: Error of the coverage of the 90 % regions.

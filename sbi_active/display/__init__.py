@@ -1,4 +1,4 @@
-"""How things are shown: tables, pages that travel, cards of a notebook, figures.
+"""Display: tables, pages in one file, cards of a notebook, figures.
 
 Here lives how text, Markdown and HTML are set. What is said in them lives with what it
 is about: in ``campaign.display``, ``criticism.report``, and with beliefs and designs.

@@ -1,4 +1,4 @@
-"""What an estimator of the expected information gain gets and gives."""
+"""Interface of an estimator of the expected information gain."""
 
 from __future__ import annotations
 

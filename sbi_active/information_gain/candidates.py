@@ -103,7 +103,7 @@ class CandidateSampler:
 
     @property
     def notes(self) -> list[str]:
-        """What stands for an outcome, where not all of its numbers do."""
+        """Notes on the summaries that stand for an outcome."""
         if self.summaries is None:
             return []
         return [self.summaries.note(self._num_numbers)]

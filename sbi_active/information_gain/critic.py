@@ -1,4 +1,4 @@
-"""What a model says of outcomes and parameters, where it can say it."""
+"""Values of a model at outcomes and parameters, where it has any."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which candidate leads, how surely, and which are still in reach."""
+"""The leading candidate, its probability, and those still in reach."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ REACH = 3.0  # standard errors within which candidates stay
 
 @dataclass(frozen=True)
 class Race:
-    r"""Which candidate leads, and how surely, under the central limit.
+    r"""The leading candidate and its probability, under the central limit.
 
     The means of the candidates are jointly Gaussian with the covariance of the paired
     contributions over n. It is applied through the contributions themselves,

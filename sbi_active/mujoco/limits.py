@@ -1,4 +1,4 @@
-"""Which actions keep a robot within its limits: they are played in simulation first."""
+"""Actions that keep a robot within its limits, by simulating them first."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ MOST_STEPS = 1e7
 
 
 class Robot(NamedTuple):
-    """What a campaign or the closed loop needs of a robot.
+    """The parts of a robot that a campaign or the closed loop needs.
 
     Attributes:
         simulator: Runs MuJoCo; ``simulator.fn`` is a :class:`.MujocoFunction`.

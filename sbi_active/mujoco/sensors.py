@@ -1,4 +1,4 @@
-"""What is read: sensors of the MJCF, and those of joints that it does not have."""
+"""Sensors of the MJCF, and those of joints that it does not have."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a ``SignalTransform`` of ``mujoco.sysid`` does to predicted signals."""
+"""The action of a ``SignalTransform`` of ``mujoco.sysid`` on predicted signals."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Signal:
 
 @dataclass
 class SignalReadout:
-    """What a transform does to predicted signals, by channel.
+    """The action of a transform on predicted signals, by channel.
 
     Attributes:
         names: Names of the channels' signals.

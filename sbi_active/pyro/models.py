@@ -65,7 +65,7 @@ class SitesPrior(Distribution):
 
 @dataclass(frozen=True)
 class PyroProblem:
-    """What a Pyro model gives a campaign.
+    """Simulator and prior that a Pyro model gives a campaign.
 
     Attributes:
         simulator: Simulator, with a noise where the outcome has a known likelihood.

@@ -1,4 +1,4 @@
-"""What simulations can give, as a normal mixture."""
+"""The predictive of simulations as a normal mixture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a search gets and gives."""
+"""Interface of a search."""
 
 from __future__ import annotations
 

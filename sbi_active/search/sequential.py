@@ -22,7 +22,7 @@ MANY = 32  # draws for a permitted point
 
 
 class Progress(NamedTuple):
-    """What a search knows so far.
+    """State of a search.
 
     Attributes:
         objective: Objective that it maximizes.

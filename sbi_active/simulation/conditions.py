@@ -1,4 +1,4 @@
-"""How a trial was run, beyond its action: keyword arguments of a simulator's function.
+"""Conditions of a trial beyond its action: keyword arguments of a simulator.
 
 A function ``fn(theta, action)`` may take any of ``times``, shape (n, k), at which x is
 measured; ``inputs``, {name: (n, m)}, over time; ``input_times``, (m,), their uniform

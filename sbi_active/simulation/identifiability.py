@@ -1,4 +1,4 @@
-"""Which parameters of a simulator no permitted action tells apart."""
+"""Parameters of a simulator that no permitted action tells apart."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What became of each simulated row: a measurement, none, or a fault."""
+"""Outcomes of simulated rows: a measurement, none, or a fault."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sbi_active.messages import Explained, SimulationWarning
 
 
 class Outcome(IntEnum):
-    """What became of a row.
+    """Outcome of a row.
 
     Attributes:
         OK: A measurement; some of its numbers may be NaN, which masks them.

@@ -1,4 +1,4 @@
-"""What was seen of a simulator before a campaign."""
+"""Report on a simulator before a campaign."""
 
 from __future__ import annotations
 

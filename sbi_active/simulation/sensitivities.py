@@ -1,4 +1,4 @@
-"""How x answers to parameters at a few places: derivatives, noise, rounding."""
+"""Sensitivity of x to parameters at a few places: derivatives, noise, rounding."""
 
 from __future__ import annotations
 

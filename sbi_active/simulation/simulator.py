@@ -1,4 +1,4 @@
-"""What users bring as a simulator, and what its output must look like."""
+"""Interface of a user's simulator, and checks of its output."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FEW_VALUES = 4  # outcomes for each whole number among them, at least: they are 
 
 
 class Simulator(Protocol):
-    """What users bring: a draw from p(x | theta, action), one row a parameter set.
+    """A user's simulator: draws from p(x | theta, action), one row a parameter set.
 
     A plain function will do. It may also accept ``seeds`` (shape (n,), int64), and then
     row i depends on ``seeds[i]`` alone.

@@ -1,4 +1,4 @@
-"""What a belief says of the trials that it was fitted to."""
+"""The misfit of a belief to the trials that it was fitted to."""
 
 from __future__ import annotations
 

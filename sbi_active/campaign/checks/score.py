@@ -1,4 +1,4 @@
-"""How well a trial was predicted, before it is used."""
+"""Scores of a trial's prediction, made before the trial is used."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TIE = 1e-9  # of a distance, by which rounding may part equal ones
 
 @dataclass(frozen=True)
 class Score:
-    """How well an outcome was predicted.
+    """Scores of the prediction of an outcome.
 
     Attributes:
         surprise: Tail probability, in (0, 1].

@@ -1,4 +1,4 @@
-"""What each outcome was compared with: simulations from the belief before it."""
+"""Simulations from the belief before a trial, with which its outcome is compared."""
 
 from __future__ import annotations
 

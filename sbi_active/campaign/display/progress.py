@@ -1,4 +1,4 @@
-"""What a campaign is doing and how long it will take: a bar and a log."""
+"""Progress of a campaign: a bar and a log say what it does and how long it takes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the robot may do in a campaign, and what it costs."""
+"""Limits and costs of the robot's actions in a campaign."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which trial comes next: for the parameters, or for which model is right."""
+"""The choice of the next trial, for the parameters or for the right model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a round's network learned, trained once something asks."""
+"""The network of a round, trained once something asks for it."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ class CampaignDirectory:
 
     @property
     def num_changes(self) -> int:
-        """How often another simulator took the place of the one before."""
+        """Number of times that another simulator took the place of the one before."""
         return len(self._changes)
 
     def save(self, state: CampaignState, belief: Any, known: Mapping[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""What stands for a prior and actions that are programs, for readers without these.
+"""Draws that stand for a prior and actions that readers cannot load.
 
 A class of a user's own is not stored with a campaign. Draws of it are, by which a
 campaign can be shown, told and corrected where nobody runs the user's programs.

@@ -48,7 +48,7 @@ class Loaded:
 
 
 class StoredLearner:
-    """What is known of a campaign without its simulator.
+    """A campaign's learner as far as it is known without the simulator.
 
     Args:
         prior: Prior that the campaign began with.

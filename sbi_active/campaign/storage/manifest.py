@@ -1,4 +1,4 @@
-"""What a campaign is: written once, with a copy, and in words for people."""
+"""The description of a campaign: written once, with a copy, and in words for people."""
 
 from __future__ import annotations
 

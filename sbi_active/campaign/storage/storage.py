@@ -1,4 +1,4 @@
-"""What a campaign keeps: nothing, simulations, or all of it in a folder."""
+"""Storage of a campaign: nothing, simulations, or all of it in a folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-r"""Which samples of a trajectory tell something of their own.
+r"""Thinning of trajectories to samples that carry information of their own.
 
 What a simulator gets wrong is smooth, and at a rate that is high beside it each sample
 says again what the one before said. An autocorrelated error takes up some of that, and
@@ -36,7 +36,7 @@ NUM_TIMES, SHORTEST, LONGEST = 40, 0.2, 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class Sampling:
-    """How densely trials are sampled, and how densely they need to be.
+    """The sampling of trials, and the sampling that they need.
 
     Attributes:
         step: Median time between samples, s.

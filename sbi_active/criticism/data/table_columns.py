@@ -1,4 +1,4 @@
-"""What the columns of a table of trials are, and their units."""
+"""Roles and units of the columns of a table of trials."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 
 @dataclass(frozen=True, kw_only=True)
 class Columns:
-    """Which column of a table is what.
+    """Roles of the columns of a table.
 
     Attributes:
         action: Columns of the action.

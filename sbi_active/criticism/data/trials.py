@@ -286,7 +286,7 @@ class Trials:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What each trial is called, as given, or its index."""
+        """Names of the trials, as given, or their indices."""
         return self._names or tuple(f"{value:.15g}" for value in self.index.tolist())
 
     def called(self, positions: Sequence[int]) -> str:

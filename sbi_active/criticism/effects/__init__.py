@@ -1,4 +1,4 @@
-"""What a simulator may lack: declared effects, and the simulator that has them.
+"""Declared effects that a simulator may lack, and the simulator that has them.
 
 Here live effects, their checks and priors. How well one explains trials does not.
 """

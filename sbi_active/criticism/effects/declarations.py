@@ -1,4 +1,4 @@
-"""What a declared effect must be before anything is computed with it."""
+"""Checks of declared effects before anything is computed with them."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ NUM_DRAWS = 64
 
 @dataclass(frozen=True)
 class Context:
-    """What an effect may know of the rows that it changes.
+    """Conditions of the rows that an effect changes.
 
     Attributes:
         index: Place of each row's trial in the order of the trials, shape (n,).

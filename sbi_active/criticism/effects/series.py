@@ -1,4 +1,4 @@
-r"""What an actuator or a sensor does to a series, exactly between its samples.
+r"""Actuators and sensors acting on a series, exactly between its samples.
 
 An input is held between the points of its grid, and a simulator may read it once a
 step. What a delay :math:`\tau` or a lag makes of it is therefore its mean over the step

@@ -1,4 +1,4 @@
-"""How trials were run, as effects and simulators are told."""
+"""Conditions of trials, as effects and simulators get them."""
 
 from __future__ import annotations
 

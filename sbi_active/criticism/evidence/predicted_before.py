@@ -1,4 +1,4 @@
-"""What the simulator predicts before the data."""
+"""The prior predictive of the simulator."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much is spent on the evidence of a rival."""
+"""Settings of what is spent on the evidence of a rival."""
 
 from __future__ import annotations
 

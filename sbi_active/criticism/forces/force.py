@@ -1,4 +1,4 @@
-"""What a generalized force is to a simulator: a key of its argument ``force``."""
+"""Generalized forces, keys of a simulator's argument ``force``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a simulator's joints move, and what moves them, along nominal trajectories."""
+"""Motion and forces of a simulator's joints along nominal trajectories."""
 
 from __future__ import annotations
 

@@ -80,7 +80,7 @@ class Linear:
 
     @property
     def origin(self) -> Array:
-        """Where the model is linear, with effects at their null, shape (d,)."""
+        """Point of linearization, with effects at their null, shape (d,)."""
         return np.where(self.effect < 0, self.model.u, self.null)
 
     @property
@@ -92,7 +92,7 @@ class Linear:
 
     @property
     def unknowns(self) -> Unknowns:
-        """What is known of u - ``origin`` before the trials."""
+        """Prior knowledge of u - ``origin``."""
         c, at = self.rival.coordinates, self.origin
         is_flat = (self.effect >= 0) & (c.precision == 0)
         precision = np.where(is_flat, 1.0, c.precision)
@@ -105,7 +105,7 @@ class Linear:
 
     @property
     def measurements(self) -> Measurements:
-        """What is fitted."""
+        """Measurements that are fitted."""
         return self.rival.simulator.measurements
 
 

@@ -37,7 +37,7 @@ TINY = 1e-300  # keeps logarithms finite
 
 @dataclass(frozen=True)
 class Unknowns:
-    """What is known of u before the logs, d coordinates from where effects vanish.
+    """Prior knowledge of u, d coordinates from where effects vanish.
 
     Attributes:
         low: Lower bounds, shape (d,).
@@ -60,7 +60,7 @@ class Unknowns:
 
     @property
     def log_density(self) -> Array:
-        """What the prior's constant adds by each effect that is there, shape (e,)."""
+        """Log constant of the prior for each effect that is there, shape (e,)."""
         own = np.flatnonzero(self.effect >= 0)
         center, precision = self.center[own], self.precision[own]
         log_p = 0.5 * (np.log(np.maximum(precision, TINY)) - precision * center**2)
@@ -71,7 +71,7 @@ class Unknowns:
 
 @dataclass(frozen=True)
 class Draws:
-    """Of the posterior.
+    """Draws of the posterior.
 
     Attributes:
         u: Coordinates, shape (n, d).

@@ -1,4 +1,4 @@
-"""How much an identification spends, and what decides in it."""
+"""Settings of an identification."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sbi_active.criticism.linear.settings import FitSettings
 
 @dataclass(frozen=True, kw_only=True)
 class SamplerSettings:
-    """How much is drawn, and what is known of doubtful effects and of errors before.
+    """Numbers of draws, and priors of doubtful effects and of errors.
 
     Attributes:
         chains: Independent ones, side by side.
@@ -37,7 +37,7 @@ class SamplerSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class IdentifySettings:
-    """How much is spent, and what is told apart.
+    """Settings of what is spent, and of what is told apart.
 
     Attributes:
         num_screened: Draws of the prior that are looked at, at least.

@@ -1,4 +1,4 @@
-r"""What single parts of the trials say beside all of them.
+r"""The disagreement between single parts of the trials.
 
 Where the model is right, parameters fitted to single trials differ by no more than
 their errors allow. Where it is wrong they follow what it lacks: beside dry friction
@@ -26,7 +26,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Spread:
-    """How parts of the trials disagree.
+    """The disagreement between parts of the trials.
 
     Attributes:
         p_value: p-value of each parameter being the same in all parts, shape (d,).

@@ -34,7 +34,7 @@ class Fits(Protocol):
 
     @property
     def errors(self) -> Errors:
-        """That all models share."""
+        """Errors that all models share."""
         ...
 
     def model(self, key: ModelKey) -> LinearModel:

@@ -60,7 +60,7 @@ class LinearModel:
 
     @property
     def rms(self) -> float:
-        """Of the residual, in standard deviations of the sensor."""
+        """Root mean square of the residual, in standard deviations of the sensor."""
         return float(np.sqrt(np.mean(self.residual**2)))
 
     @property
@@ -72,7 +72,7 @@ class LinearModel:
 
     @property
     def promised(self) -> float:
-        """By how much its linear optimum lowers the sum of squares.
+        """Fall of the sum of squares at its linear optimum.
 
         In sensor variances, with the residual's own size as that of the errors.
         """

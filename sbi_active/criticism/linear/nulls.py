@@ -1,4 +1,4 @@
-"""Where an effect vanishes, among the coordinates of a model."""
+"""The null of an effect among the coordinates of a model."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True, kw_only=True)
 class TimeScales:
-    """Which time scales of a process are told apart.
+    """Time scales of a process that are told apart.
 
     Attributes:
         sample: The shortest, in steps from sample to sample; one half as long is hardly

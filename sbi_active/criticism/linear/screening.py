@@ -1,4 +1,4 @@
-"""Which effects of a large library are worth a fit: linear evidence of one Jacobian.
+"""Screening of a large library of effects by the linear evidence of one Jacobian.
 
 A fit of an effect takes a dozen simulations of the trials, its column one. With the
 bare model's best fit and a column of every effect the evidence of all singles and pairs
@@ -28,7 +28,7 @@ TRIED, PAIRED = 20, 30
 
 @dataclass(frozen=True)
 class Screening:
-    """What linear evidence says of a library.
+    """The result of screening a library by linear evidence.
 
     Attributes:
         kept: Names of the effects that are worth a fit, in the library's order.

@@ -1,4 +1,4 @@
-"""What is declared of the sensor's error, where anything is."""
+"""The declared error of the sensor."""
 
 from __future__ import annotations
 

@@ -115,7 +115,7 @@ class BySensor:
 
     @property
     def catch_alls(self) -> tuple[str, ...]:
-        """Those that are compared after an alarm."""
+        """Catch-alls that are compared after an alarm."""
         if len(self._one_part):
             return CATCH_ALLS
         return tuple(name for name in CATCH_ALLS if name != OUTLIER)

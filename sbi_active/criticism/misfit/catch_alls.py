@@ -1,4 +1,4 @@
-r"""What else may be the matter with the bare model, in closed form.
+r"""Catch-all alternatives to the bare model, in closed form.
 
 Larger noise scales all Gram matrices, a gross error of one trial is a residual process
 in that trial alone, "unexplained" one in all of them.

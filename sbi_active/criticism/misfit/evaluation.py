@@ -26,12 +26,12 @@ class Fitted(Protocol):
 
     @property
     def search(self) -> Search:
-        """Its models."""
+        """Search with its models."""
         ...
 
     @property
     def rivals(self) -> RivalSet:
-        """What they are models of."""
+        """Rivals that the models are made of."""
         ...
 
     def posterior(self, key: ModelKey, use: NDArray[np.bool_]) -> Posterior:

@@ -1,4 +1,4 @@
-r"""What the residual follows where every model misses.
+r"""Guesses of what the residual follows where every model misses.
 
 Each guess adds :math:`c\, g(v)` to a model's output, with g one elementary function of
 an entry of the action, an input, the output, its slope, or the time in the trial. Where

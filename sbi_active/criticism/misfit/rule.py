@@ -1,4 +1,4 @@
-r"""What helps, and what is the cause, when every model is wrong.
+r"""Model selection and effect attribution under misspecification.
 
 1. Models are *admitted* whose error on left-out trials is within a tenth of the
    smallest, or is not larger on a new trial with a probability of .9: one trial far
@@ -61,7 +61,7 @@ AHEAD = 10.0  # nats from which a model is admitted whatever its error
 
 @dataclass(frozen=True)
 class Scored:
-    """What the rule knows of a model.
+    """Scores of a model, as the rule uses them.
 
     Attributes:
         log_p: Unnormalized log posterior probability.
@@ -84,13 +84,13 @@ class Scored:
 
     @property
     def excess(self) -> float:
-        """Of the fit's residual, beyond the sensor's error."""
+        """Excess of the fit's residual beyond the sensor's error."""
         return max(self.fitted - 1, SMALLEST_EXCESS)
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What the rule says.
+    """The choice that the rule makes.
 
     Attributes:
         key: The model whose effects all help; the bare one where none does.

@@ -118,7 +118,7 @@ class Misfit:
 
     @cached_property
     def weights(self) -> dict[ModelKey, float]:
-        """How much each model counts by its errors on left-out parts."""
+        """Weight of each model by its errors on left-out parts."""
         found = self.search.found
         return weights_by_error(
             {key: candidate.left.square for key, candidate in found.items()},

@@ -1,4 +1,4 @@
-r"""How much each model counts where all of them are wrong.
+r"""Weights of models where all of them are wrong.
 
 Probabilities among them are too sure: evidence grows with the samples of a trajectory,
 and what every model misses is no noise. Here each left-out part of the trials counts

@@ -1,4 +1,4 @@
-"""What to measure next: the action that tells rivals apart, and the severest test.
+"""The next trial: the action that tells rivals apart, and the severest test.
 
 Here lives what proposes a trial. What concludes from trials lives in ``steps``.
 """

@@ -1,4 +1,4 @@
-"""What limits the conclusions of a report, a sentence each."""
+"""Cautions that limit the conclusions of a report, a sentence each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a named verdict is conditional on, and the actions that would test it."""
+"""Conditions of a named verdict, and the actions that would test it."""
 
 from __future__ import annotations
 

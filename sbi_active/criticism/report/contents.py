@@ -1,4 +1,4 @@
-"""What a report holds, apart from how it is set."""
+"""Contents of a report, apart from its layout."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ NUM_PRIOR = 2_000  # draws that a width is compared with
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Contents:
-    """What the closed loop found.
+    """Findings of the closed loop.
 
     Attributes:
         residuals: Residuals of the bare model.
@@ -144,7 +144,7 @@ class Contents:
 
     @property
     def combinations(self) -> Combinations:
-        """What the model of the verdict knows of parameters together, and what not."""
+        """Combinations of parameters that the verdict's model knows, and does not."""
         evidences = self.tracing.evidences
         evidence = evidences.get(self.tracing.model, evidences[NONE])
         with forked_generators(0, "report"):

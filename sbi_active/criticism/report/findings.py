@@ -1,4 +1,4 @@
-"""What a report says of the models: their probabilities, and what they leave."""
+"""Section of a report on the models: their probabilities and residuals."""
 
 from __future__ import annotations
 

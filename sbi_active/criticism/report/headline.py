@@ -1,4 +1,4 @@
-"""What a report says first: the verdict with what limits it, and what was found."""
+"""Headline of a report: the verdict with its limits, and the findings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a report says of the error, the parameters, and what to do next."""
+"""Section of a report on the error, the parameters, and the next step."""
 
 from __future__ import annotations
 

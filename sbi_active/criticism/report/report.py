@@ -24,7 +24,7 @@ from sbi_active.messages import Message
 
 
 class Report(Contents):
-    """What the closed loop found, see :class:`.Contents`.
+    """Report of the closed loop, see :class:`.Contents`.
 
     ``print(report)`` has the verdict in its first line.
     """

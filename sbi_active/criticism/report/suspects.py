@@ -1,4 +1,4 @@
-"""What a report says of trials that may have a gross error, or that decide alone."""
+"""Section of a report on trials that may have a gross error, or decide alone."""
 
 from __future__ import annotations
 

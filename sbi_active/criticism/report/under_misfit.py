@@ -1,4 +1,4 @@
-"""What a report says where every model misses by more than the sensor's error."""
+"""Section of a report if every model misses by more than the sensor's error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-r"""What a verdict rests on: its Bayes factor with each trial left out.
+r"""Influence of trials on a verdict: its Bayes factor with each one left out.
 
 .. math::
     Z(x_{-k}) = Z(x)\, E_{p(z | x)}\left[\frac{p(x_{-k} | z)}{p(x | z)}\right],

@@ -33,7 +33,7 @@ LARGEST_SHAPE = 0.7
 
 @dataclass(frozen=True, kw_only=True)
 class LeaveOneOut:
-    """How well one model predicts each trial from the others.
+    """Scores of one model's prediction of each trial from the others.
 
     Attributes:
         name: Name of the model.

@@ -27,7 +27,7 @@ NUM_DRAWS = 200
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a rival predicts for measured numbers.
+    """Predictions of a rival for measured numbers.
 
     Attributes:
         mean: Noise-free predictions, one a posterior draw, shape (n, N).
@@ -55,12 +55,12 @@ class Prediction:
 
     @property
     def middle(self) -> Array:
-        """By which the error is measured: of the best fit, or the mean, (N,)."""
+        """Prediction that errors refer to: that of the best fit, or the mean, (N,)."""
         return self.mean.mean(0) if self.at_best is None else self.at_best
 
     @property
     def log_density(self) -> Array:
-        """Of the measurements of each trial, shape (t,), nats."""
+        """Log density of the measurements of each trial, shape (t,), nats."""
         each = self.log_likelihood
         return log_sum_exp(each, axis=0) - np.log(len(each))
 

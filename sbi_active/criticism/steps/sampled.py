@@ -70,7 +70,7 @@ class Sampled:
 
     @property
     def catch_alls(self) -> tuple[str, ...]:
-        """Those that are compared after an alarm."""
+        """Catch-alls that are compared after an alarm."""
         return CATCH_ALLS
 
     def detected(self) -> Detection:

@@ -1,4 +1,4 @@
-"""Which effect the data point to: probabilities over the rivals."""
+"""Attribution to an effect: probabilities over the rivals."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def log_priors(
 
 
 class Evidences(Protocol):
-    """What the trials say of each model, by samples or by linear algebra."""
+    """Evidence of each model, by samples or by linear algebra."""
 
     @property
     def rivals(self) -> RivalSet:
@@ -81,7 +81,7 @@ class Evidences(Protocol):
 
     @property
     def catch_alls(self) -> tuple[str, ...]:
-        """Those that are compared after an alarm."""
+        """Catch-alls that are compared after an alarm."""
         ...
 
     def detected(self) -> Detection:

@@ -1,4 +1,4 @@
-"""How far a belief is to be trusted, and the figures behind that."""
+"""Trustworthiness of a belief, and the figures behind it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 @dataclass(frozen=True)
 class Assumption:
-    """What a method takes for granted, and what was found of it.
+    """An assumption of a method, and how it was checked.
 
     Attributes:
         holds: Whether it may be relied on.
@@ -35,7 +35,7 @@ class Assumption:
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnostics:
-    """What is known of a belief's quality.
+    """Diagnostics of a belief's quality.
 
     ``print(belief.diagnostics)`` says it in words.
 

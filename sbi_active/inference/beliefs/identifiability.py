@@ -1,4 +1,4 @@
-"""Which combinations of parameters a belief knows, and which it does not."""
+"""Combinations of parameters that a belief knows, and those that it does not."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class UnknownCombination:
 
 @dataclass(frozen=True)
 class Combinations:
-    """What a belief knows of parameters that it does not know one by one.
+    """Knowledge of parameters that a belief does not know one by one.
 
     False where there is nothing to say: every parameter is known by itself, or nothing
     is known much better than anything else.

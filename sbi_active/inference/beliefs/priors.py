@@ -1,4 +1,4 @@
-"""What a prior must be, so that a belief can begin from it."""
+"""Checks of a prior before a belief begins from it."""
 
 from __future__ import annotations
 

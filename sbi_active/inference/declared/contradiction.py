@@ -50,7 +50,7 @@ INFORMED = 1e-3  # derivative below which no trial informs a parameter
 
 @dataclass(frozen=True)
 class Contradiction:
-    """What trials show that contradict one another.
+    """The contradiction between trials.
 
     Attributes:
         inflation: Factor s of the noise's standard deviation.

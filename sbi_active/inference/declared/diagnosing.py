@@ -1,4 +1,4 @@
-"""How far a belief by a simulated likelihood can be trusted."""
+"""Diagnostics of a belief by a simulated likelihood."""
 
 from __future__ import annotations
 

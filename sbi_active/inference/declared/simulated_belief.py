@@ -25,7 +25,7 @@ NUM_FITTED = 1_000  # draws behind the smooth density
 
 @dataclass(frozen=True)
 class DeclaredRecord:
-    """What a belief goes on from when a further trial is known.
+    """The record that a belief goes on from when a further trial is known.
 
     Attributes:
         trials: Actions and outcomes in the likelihood of the draws.

@@ -1,4 +1,4 @@
-"""What is found of a posterior."""
+"""The fit of a posterior: weighted draws and figures."""
 
 from __future__ import annotations
 

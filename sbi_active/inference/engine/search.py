@@ -71,7 +71,7 @@ class SearchSettings:
 
 @dataclass(frozen=True)
 class Found:
-    """What a search found.
+    """The result of a search.
 
     Attributes:
         guess: A normal component a mode, weighted by its mass; behind these, one an

@@ -1,4 +1,4 @@
-"""What a trainer learned, as a function of parameters, outcome and action.
+"""Learned models as functions of parameters, outcome and action.
 
 Here live posteriors, likelihoods and ratios. Beliefs, which have seen a trial, live in
 ``beliefs``.

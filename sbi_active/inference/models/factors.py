@@ -1,4 +1,4 @@
-"""What a trial of an action contributes to the belief, as a network learned it."""
+"""Learned factors that a trial of an action contributes to the belief."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a network sees instead of raw parameters and conditions, and the way back."""
+"""Transforms of a network's parameters and conditions, and their inverses."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from sbi_active.inference.networks.mixture_network import (
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingBudget:
-    """How long and how to train.
+    """Length and settings of the training.
 
     Attributes:
         num_iterations: Steps of gradient descent.

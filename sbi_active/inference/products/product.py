@@ -29,7 +29,7 @@ BATCH_SIZE = 20_000  # rows at once, which bounds the memory
 
 
 class TrialModel(Protocol):
-    """What is learned of one trial's likelihood."""
+    """Learned model of one trial's likelihood."""
 
     def log_factor(self, theta: Tensor, x: Tensor, action: Tensor) -> Tensor:
         """Return log p(x_i | theta_i, action_i), (n,), but for a term without theta."""
@@ -38,7 +38,7 @@ class TrialModel(Protocol):
 
 @dataclass(frozen=True)
 class TrainedRegion:
-    """Where a network was trained: what it says elsewhere is made up.
+    """Region where a network was trained; its values elsewhere mean nothing.
 
     Attributes:
         mixture: Mixture fitted to the rows.

@@ -1,4 +1,4 @@
-"""What goes into a round with actions: checked rows, and the trials that ended it."""
+"""Contents of a round with actions: checked rows, and the trials that ended it."""
 
 from __future__ import annotations
 

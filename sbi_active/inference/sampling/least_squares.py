@@ -40,7 +40,7 @@ class LeastSquares(Protocol):
 
     @property
     def coordinates(self) -> Bounds:
-        """Of the search."""
+        """Coordinates of the search."""
         ...
 
     @property

@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 
 class RowCache(Generic[T]):
-    """What was simulated once, so that no parameters are simulated twice.
+    """Cache of simulated rows, so that no parameters are simulated twice.
 
     A search returns to its best point, draws of a weighted sample repeat, and rivals
     that differ in their errors alone ask for the same parameters. Beyond ``most``

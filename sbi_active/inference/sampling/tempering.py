@@ -1,4 +1,4 @@
-"""How far to go from one density towards another in a step."""
+"""Step lengths from one density towards another."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every active inference method offers, whatever it learns."""
+"""The interface of every active inference method."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sbi_active.inference.rounds.rows import Observation
 
 @dataclass(frozen=True)
 class Told:
-    """What a belief is to be inferred from.
+    """Trials and options from which a belief is inferred.
 
     Attributes:
         trials: Trials, all of them, the new one last.
@@ -38,7 +38,7 @@ class Told:
 
     @property
     def settings(self) -> RefinementOptions:
-        """Of the refinement."""
+        """Settings of the refinement."""
         return RefinementOptions() if self.refinement is None else self.refinement
 
     def seed(self) -> int:

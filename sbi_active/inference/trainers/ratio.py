@@ -26,7 +26,7 @@ LFIRE_KEYWORDS = {"settings", "num_particles"}
 
 
 class AmortizedRounds(ProductRounds, RatioEstimatorTrainer):
-    r"""What the two losses share.
+    r"""The base of both losses.
 
     Without ``action=`` these are sbi's trainers, to the last bit at the same torch seed
     (but for a silent tracker). With it a round trains a classifier of (theta, x,

@@ -1,4 +1,4 @@
-"""Which estimator to use, by what can be checked."""
+"""The choice of an estimator by what can be checked."""
 
 from __future__ import annotations
 

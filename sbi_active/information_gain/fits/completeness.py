@@ -1,4 +1,4 @@
-"""How probable a complete outcome is, as a function of the parameters."""
+"""Probability of a complete outcome, as a function of the parameters."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sbi_active.information_gain.fits.presence import random_presence
 
 @dataclass(frozen=True)
 class Completeness:
-    """How probable a complete outcome of one candidate is.
+    """Probability of a complete outcome of one candidate.
 
     Attributes:
         share: Share of a row's outcomes that are complete, shape (n,).

@@ -1,4 +1,4 @@
-"""What the error of a learned model adds to that of its information."""
+"""Error of the information that comes from the error of a learned model."""
 
 from __future__ import annotations
 

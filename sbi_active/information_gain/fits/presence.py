@@ -1,4 +1,4 @@
-"""What the mere presence of a measurement tells about the parameters."""
+"""Information about the parameters in the mere presence of a measurement."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a plain MuJoCo model lacks, enumerated from the model itself.
+"""Effects that a plain MuJoCo model lacks, enumerated from the model itself.
 
 Here lives what makes effects of a compiled model: their names, units, null values and
 priors, and what they write into it. How effects are compared with trials stands in

@@ -1,4 +1,4 @@
-"""How effects act: on the model, and as generalized forces."""
+"""Effects on the model, and effects that are generalized forces."""
 
 from __future__ import annotations
 

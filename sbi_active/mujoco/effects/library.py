@@ -1,4 +1,4 @@
-"""What a plain model lacks: its effects, enumerated from the model itself."""
+"""The library of effects that a plain model lacks, enumerated from the model."""
 
 from __future__ import annotations
 

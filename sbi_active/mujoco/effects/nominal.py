@@ -1,4 +1,4 @@
-"""How large things are in a model as it usually moves: what priors are scaled by."""
+"""Nominal sizes of a model as it usually moves, by which priors are scaled."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an effect changes in a model: keys of the simulator's ``model`` and ``force``.
+"""Changes of a model by an effect: keys of the simulator's ``model`` and ``force``.
 
 Both are keyword arguments of a simulator's function, {change: phi}, with phi of shape
 (n, k). A change of the model is a :class:`ModelChange`; a generalized force is a

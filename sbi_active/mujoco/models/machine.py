@@ -27,7 +27,7 @@ POOL = 32
 
 @dataclass
 class Rows:
-    """What one model simulates at once.
+    """Rows that one model simulates at once.
 
     Attributes:
         theta: Parameters, shape (n, d).

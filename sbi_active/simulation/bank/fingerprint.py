@@ -1,4 +1,4 @@
-"""What tells one simulator from another: its name, its settings and its source."""
+"""Fingerprint of a simulator: its name, its settings and its source."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Rows(Protocol):
-    """Where rows are kept: a bank."""
+    """The bank that keeps rows."""
 
     def load(self, run: str) -> tuple[Tensor, Tensor, Tensor] | None:
         """Return what is stored of a run."""

@@ -37,7 +37,7 @@ TABLES = ("theta", "action", "x")  # of more than one number a row
 
 @dataclass(frozen=True)
 class Segment:
-    """What is known of a segment without its columns.
+    """Header of a segment, without its columns.
 
     Attributes:
         number: Place of the segment among those of the bank, from 1.

@@ -1,4 +1,4 @@
-"""What a noise model is, and what those with a standard deviation share."""
+"""Interface of a noise model, and the base of those with a standard deviation."""
 
 from __future__ import annotations
 

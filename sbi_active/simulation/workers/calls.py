@@ -82,7 +82,7 @@ class Call:
 
 @dataclass(frozen=True, eq=False)
 class Reply:
-    """What came of a call.
+    """The result of a call.
 
     Attributes:
         x: Outcomes, shape (k, *x_shape), float32; None where there is a fault.

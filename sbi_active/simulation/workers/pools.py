@@ -1,4 +1,4 @@
-"""Where calls of a simulator run: in this process, or in worker processes."""
+"""Pools that run calls of a simulator, in this process or in worker processes."""
 
 from __future__ import annotations
 

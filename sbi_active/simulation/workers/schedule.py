@@ -1,4 +1,4 @@
-"""Which rows are simulated together, and what is done about calls that fail."""
+"""The schedule of a simulation: rows simulated together, and calls that fail."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where simulations run, and what a row may cost."""
+"""Workers that run simulations, and the cost of a row."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from sbi_active.expected import require
 
 @dataclass(frozen=True)
 class Workers:
-    """Where simulations run, and what a row may cost; nothing of x depends on it.
+    """Workers that run simulations, and the cost of a row; x does not depend on them.
 
     Attributes:
         num_workers: Calls at a time; -1 means one a core. One worker without a time

@@ -1,4 +1,4 @@
-"""What a store of rows offers to the engine, and when rows are handed to it."""
+"""Interface of a store of rows, and the times when rows are handed to it."""
 
 from __future__ import annotations
 
