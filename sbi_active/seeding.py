@@ -6,13 +6,13 @@ a row come from a counter (SplitMix64), which NumPy and torch cannot do for many
 at once. Code that only knows the global generators of torch and NumPy runs under
 :func:`forked_generators`, which restores them.
 
-What takes a seed, or needs none, leaves both global generators as it found them and
-does not depend on them: campaigns, designs, refinements, updates with a seed,
-simulators and their noise, reports, exports. Three kinds of calls draw from torch's, as
-anywhere in torch and sbi: sampling that takes no seed (``belief.sample``, as of any
-distribution, and ``model(theta, action)`` without ``seeds``), a call whose ``seed=`` is
-left at None, and what is sbi's own to the last bit: making a trainer (sbi draws from
-the prior to look at it), ``train``, and sampling an sbi posterior.
+Calls that take a seed, or need none, leave both global generators as they were and do
+not depend on them: campaigns, designs, refinements, updates with a seed, simulators and
+their noise, reports, exports. Three kinds of calls draw from torch's, as anywhere in
+torch and sbi: sampling that takes no seed (``belief.sample``, as of any distribution,
+and ``model(theta, action)`` without ``seeds``), a call whose ``seed=`` is left at None,
+and what is sbi's own to the last bit: making a trainer (sbi draws from the prior to
+look at it), ``train``, and sampling an sbi posterior.
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ def support_of(distribution: Distribution) -> Any:
 def within_support(distribution: Any, theta: Tensor) -> Tensor:
     """Return whether rows (n, theta_dim) lie in a distribution's support, shape (n,).
 
-    Where it has none, as a trained network, whether their log density is finite.
+    If it has none, as a trained network, return whether their log density is finite.
     """
     try:
         inside = support_of(distribution).check(theta)

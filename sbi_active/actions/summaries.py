@@ -16,7 +16,7 @@ from sbi_active.actions.space import ActionSpace
 class SummaryAction(DiscreteActions):
     r"""A choice :math:`\delta \in \{1, \ldots, K\}` among summaries of one outcome.
 
-    To be joined with what the robot does, ``MixedActions(BoxActions(...),
+    It is joined with what the robot does, ``MixedActions(BoxActions(...),
     SummaryAction(...))``. The simulator returns the raw outcome, shape (n, k), whatever
     :math:`\delta` is; a campaign calls it with :math:`\delta` = 0, once for all
     summaries, so that the choice costs nothing and gains are compared on the same

@@ -53,7 +53,7 @@ class Watched:
 
     @property
     def version(self) -> str:
-        """Text that changes with the store, and when somebody begins or ends to write."""
+        """Text that changes with the store and with whoever begins or ends to write."""
         with contextlib.suppress(ValueError, OSError):  # of a lock that is none
             return f"{digest(self._folder)}-{is_locked(self._folder):d}"
         return "unknown"

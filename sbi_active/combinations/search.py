@@ -43,11 +43,12 @@ def search(
 ) -> list[tuple[Combination, float]]:
     r"""Return combinations that are known though their parameters are not.
 
-    Of all sums :math:`g = \sum_i w_i t_i(\theta_i)`, t the identity or a logarithm, the
-    one with the smallest :math:`\sqrt{w^T C w / w^T S w}`, C the covariance and S that
-    of the prior, is the last eigenvector of a generalized eigenproblem. Pairs come
-    first, then triples, then all parameters at once, each independent of those before.
-    Of the formulas that are about as narrow as the best the simplest is taken.
+    Combinations are sums :math:`g = \sum_i w_i t_i(\theta_i)`, t the identity or a
+    logarithm. The one with the smallest :math:`\sqrt{w^T C w / w^T S w}`, C the
+    covariance and S that of the prior, is the last eigenvector of a generalized
+    eigenproblem. Pairs come first, then triples, then all parameters at once, each
+    independent of those before. Of the formulas that are about as narrow as the best
+    the simplest is taken.
 
     Args:
         moments: Function that returns the covariance C and the prior's S of any terms.

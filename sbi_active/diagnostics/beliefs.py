@@ -10,8 +10,8 @@ Two questions, which find different errors:
   inference makes show here, the more the more the new outcomes tell, which is why each
   action is simulated ``num_copies`` times.
 
-What no check around a belief can find is a mode that each inference loses in the same
-way; :func:`.check_calibration` draws from all of the prior.
+No check around a belief can find a mode that each inference loses in the same way;
+:func:`.check_calibration` draws from all of the prior.
 
 References:
     Saeilynoja, Schmitt, Buerkner & Vehtari 2025, arXiv:2502.03279 (posterior SBC);

@@ -36,7 +36,7 @@ NUMBERS = 20_000_000
 class MotionLimits:
     """A constraint on actions: joints and actuators stay within limits when played.
 
-    As ``constraint=`` of a :class:`.Campaign` or a designer it lets through actions
+    Passed as ``constraint=`` to a :class:`.Campaign` or a designer, it permits actions
     whose motion, simulated at draws from the belief, stays within every limit at each
     step, and in which no state diverges. The draws are few and the model is not the
     robot: leave a margin, and keep the robot's own guards.

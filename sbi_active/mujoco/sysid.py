@@ -1,8 +1,8 @@
 r"""Data and parameters of ``mujoco.sysid`` as simulator, prior, actions and trials.
 
-What is simulated is what it simulates: controls are lines between their samples, taken
-at the model's steps and held over each; a sensor's reading is stamped with the end of
-the step at whose begin it was taken, and a state with its own time. Signals are
+The simulation is that of ``mujoco.sysid``: controls are lines between their samples,
+taken at the model's steps and held over each; a sensor's reading is stamped with the
+end of the step at whose begin it was taken, and a state with its own time. Signals are
 compared at the measured times that its window keeps. A transform's delays, gains and
 biases act on the prediction, those of the measured signals the other way round, so that
 outcomes are in the units in which they were measured.

@@ -108,7 +108,7 @@ class StudentError:
 class ChannelBias:
     r"""Each channel is right or has a bias: :math:`x_o = x + m b`, b summed out.
 
-    As :class:`SpikeAndSlab` with a normal slab, for sensors whose zero has moved:
+    It is :class:`SpikeAndSlab` with a normal slab, for sensors whose zero has moved:
     :math:`m \sim \mathrm{Bernoulli}(\rho)`, :math:`b \sim N(0, B^2)`.
 
     Attributes:

@@ -133,8 +133,8 @@ def square_of(x: Tensor, before: int | None) -> int | None:
 def require_noise(x: Tensor, again: Tensor) -> None:
     """Raise where two seeds gave identical outcomes.
 
-    Of counts, and of what is or is not, many are equal by chance: a few whole numbers
-    among many outcomes prove nothing.
+    Many counts and yes-or-no outcomes are equal by chance: a few whole numbers among
+    many outcomes prove nothing.
 
     Args:
         x: Outcomes under one seed, shape (n, *x_shape).

@@ -114,10 +114,9 @@ def find_method(name: str) -> Method:
 def faithful_options(name: str) -> CampaignOptions:
     """Return the setting of a method's authors, for the numerical experiment.
 
-    That is :meth:`.CampaignOptions.faithful` for ASBI and NSBI; ALHI and
-    NLHI have the same network on x given (theta, action), beliefs by kernel density
-    estimation and nested Monte Carlo for the gain; SeqBED has LFIRE, at the same total
-    of simulations.
+    This is :meth:`.CampaignOptions.faithful` for ASBI and NSBI; ALHI and NLHI have the
+    same network on x given (theta, action), beliefs by kernel density estimation and
+    nested Monte Carlo for the gain; SeqBED has LFIRE, at the same total of simulations.
 
     Args:
         name: Name of the method.

@@ -102,9 +102,9 @@ class Measurements:
     def bounded(self, center: Array, reach: Array) -> Measurements:
         """Return the same with numbers that are beyond all reason within a reach.
 
-        What is so far off is wrong whatever its digits are, and in double precision its
-        residual would hold nothing of the simulator any more. Where most trials are, it
-        is the model that is elsewhere, and nothing is changed.
+        Such a number is wrong whatever its digits are, and in double precision its
+        residual would no longer depend on the simulator. If most trials are so far off,
+        the model is wrong instead, and nothing is changed.
 
         Args:
             center: Center of what can be expected, shape (N,).

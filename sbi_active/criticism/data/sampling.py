@@ -1,8 +1,8 @@
 r"""Thinning of trajectories to samples that carry information of their own.
 
-What a simulator gets wrong is smooth, and at a rate that is high beside it each sample
-says again what the one before said. An autocorrelated error takes up some of that, and
-its innovations
+Errors of a simulator are smooth, and at a high sampling rate each sample repeats the
+error of the one before. An autocorrelated error takes up some of that, and its
+innovations
 
 .. math::
     e_k = \frac{r_k - \rho_k r_{k-1}}{\sqrt{1 - \rho_k^2}}, \qquad

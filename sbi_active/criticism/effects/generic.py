@@ -57,12 +57,12 @@ def generic_effects(
 ) -> list[Effect]:
     r"""Return effects that wrap the inputs and outputs of a simulator.
 
-    Of the action: gain, offset, saturation and, where actions have both signs, a dead
-    zone. Of the observation: bias, gain, drift with the trial's index, an offset of
-    the clock where x has sample times, and saturation where the prior is given. Scales
-    come from the range of the actions, the noise, and the prior predictive. Noise
-    inflation needs no effect: it is always among the rivals. The drift is left out of a
-    comparison with trials whose order is unknown.
+    Effects on the action are gain, offset, saturation and, where actions have both
+    signs, a dead zone. Effects on the observation are bias, gain, drift with the
+    trial's index, an offset of the clock where x has sample times, and saturation where
+    the prior is given. Scales come from the range of the actions, the noise, and the
+    prior predictive. Noise inflation needs no effect: it is always among the rivals.
+    The drift is left out of a comparison with trials whose order is unknown.
 
     Trials in place of the actions say more, and so do the signals of a model that has
     some. An action that is a label, or stands for a signal, is left as it is. Of each

@@ -103,7 +103,7 @@ def probe_step(rival: Rival, u: Array) -> tuple[float | None, bool]:
 def local_roughness(rival: Rival, *, step: float, seed: int) -> tuple[Array, Array]:
     r"""Return the standard deviation of what no smooth function follows, shape (N,).
 
-    And the draws around the best fit that tell, shape (n, dim).
+    It also returns the draws around the best fit that show it, shape (n, dim).
 
     A simulator of contact or chaos answers a change of its parameters that is far
     within their posterior by a jump. Beside the error of measurement s, jumps of size r

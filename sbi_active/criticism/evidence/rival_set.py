@@ -205,8 +205,8 @@ class RivalSet:
     def scaled_actions(self, trials: Trials | None = None) -> Array:
         """Return actions in ranges of the action space, those of the fit first.
 
-        Those that are labels are so far from each other that a smooth function of them
-        has another value at each.
+        Actions that are labels are so far from each other that a smooth function of
+        them has another value at each.
 
         Args:
             trials: Further trials.
@@ -267,8 +267,8 @@ class RivalSet:
     def search_again(self) -> Found:
         """Return the bare model's modes from where other models have its parameters.
 
-        What an effect that is there drew the first search away from, the model that has
-        it shows.
+        A missing effect may have drawn the first search away from a mode that the model
+        with this effect shows.
         """
         rival, seed = self.rival(ModelKey()), derive_seed(self.seed, "again")
         others = [other for key, other in self.fits.items() if key != ModelKey()]

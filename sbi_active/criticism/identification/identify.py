@@ -52,7 +52,8 @@ class IdentifiedBelief(KernelBelief):
     def interval(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Return the central interval of each parameter by its name.
 
-        That of a parameter at a bound of its prior is one-sided, from the bound on.
+        The interval of a parameter at a bound of its prior is one-sided, from the bound
+        on.
 
         Args:
             level: Probability of the interval.

@@ -252,8 +252,8 @@ class Errors:
     def weight(self, posterior: Posterior) -> Array:
         """Return how much the squared errors of a trial count, mean one, shape (N,).
 
-        By the inverse of their mean variance: where a parameter differs from trial to
-        trial, a trial that depends on it more tells less of everything else.
+        Weights are the inverse of their mean variance: where a parameter differs from
+        trial to trial, a trial that depends on it more tells less of everything else.
 
         Args:
             posterior: Posterior of a model.

@@ -1,6 +1,6 @@
 """Errors on trials that a model was not fitted to, and its intervals.
 
-By linear algebra: a model is refitted without each part of the trials by least squares,
+A model is refitted by linear algebra without each part of the trials by least squares,
 from its linearization at the best fit to all.
 """
 

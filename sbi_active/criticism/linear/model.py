@@ -171,8 +171,8 @@ def chords(
 ) -> Array:
     """Return derivatives of the residual by some coordinates, shape (N, k).
 
-    Of a step as long as one tries, within the bounds, and no tangent: many effects are
-    flat at their null.
+    They are difference quotients over a step within the bounds and no tangents: many
+    effects are flat at their null.
 
     Args:
         rival: The model.

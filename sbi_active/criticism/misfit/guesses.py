@@ -124,7 +124,7 @@ def smooth_evidence(search: Search) -> float:
 def gained_by_guesses(search: Search, key: ModelKey, name: str) -> float:
     """Return the nats that guesses in the place of an effect gain over it.
 
-    As likely beforehand one as the other: their mean evidence counts. Each has one
+    Guesses are equally likely beforehand: their mean evidence counts. Each has one
     coefficient for all numbers of a trial.
 
     Args:

@@ -284,7 +284,7 @@ def admitted(
 ) -> list[ModelKey]:
     """Return the models that predict left-out trials about as well as the best.
 
-    And those that are far more probable than all of them.
+    It also returns those that are far more probable than all of them.
     """
     best = min(models.values(), key=lambda m: m.error)
     smallest = max(best.error, 1.0)  # below the sensor's, by chance
@@ -305,7 +305,7 @@ def admitted(
 def predicts_better(one: Array, other: Array) -> float:
     """Return the probability that a model has the smaller error on a new trial.
 
-    By Student's t over the trials' log ratios of mean squared errors.
+    The test is Student's t over the trials' log ratios of mean squared errors.
 
     Args:
         one: Mean squared errors of the model on left-out trials, shape (f,).

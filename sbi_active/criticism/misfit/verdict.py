@@ -159,9 +159,9 @@ class Misfit:
     def outlying(self) -> tuple[OutlyingTrial, ...]:
         """Return the trials that err far more than the others let expect.
 
-        By what the verdict's model leaves of each as it is fitted to the others, in
-        units of what they let expect: a trial that alone shows what an effect does is
-        not one of them.
+        They are found by the residuals of the verdict's model for each trial as fitted
+        to the others, in units of what these let expect: a trial that alone shows what
+        an effect does is not one of them.
         """
         errors, found = self.search.errors, self.search.found[self.choice.key]
         if not errors.is_by_trial:

@@ -52,7 +52,7 @@ def estimated(mean: float, sd: float, draws: float) -> str:
 def with_error(mean: float, sd: float) -> str:
     """Return a mean to the second digit of its deviation; nothing for NaN.
 
-    Of a mean that is known better than that, six digits are enough.
+    A mean that is known better than that has six digits.
 
     Example:
         >>> with_error(0.35992, 0.00071), with_error(1234.5, 56.7)

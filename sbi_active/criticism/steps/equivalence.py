@@ -196,8 +196,9 @@ class _Neighborhood:
     def rest(self, aim: Array, both: NDArray[np.bool_]) -> tuple[Array, bool, bool]:
         """Return what parameters leave of some predictions, by Gauss-Newton steps.
 
-        And whether they were free: at an edge of the prior, the edge may be what stands
-        against them. And whether the search has ended, so that no step promises more.
+        It also returns whether they were free, since at an edge of the prior the edge
+        may be what stands against them; and whether the search has ended, so that no
+        step promises more.
         """
         low, high = self.coordinates.low, self.coordinates.high
         v = self.u

@@ -118,7 +118,7 @@ def outlying_trials(
 ) -> list[tuple[int, float]]:
     """Return fitted trials whose error is far beyond what all others show.
 
-    By Student's t of the logarithms, each trial against the others.
+    The test is Student's t of the logarithms, each trial against the others.
 
     Args:
         squares: Mean squared error of each trial on the fit to the others, in sensor

@@ -125,7 +125,7 @@ class Sampled:
     def outliers(self) -> dict[float, float]:
         """Return the probability that each trial is the one, if one has a gross error.
 
-        By the trial's index, most probable first.
+        Keys are the trials' indices, most probable first.
         """
         _, weights, residual = self.rivals.fit(ModelKey(error=OUTLIER)).weighted()
         error = self.rivals.one_outlier()

@@ -123,7 +123,7 @@ class Evidences(Protocol):
     def outliers(self) -> dict[float, float]:
         """Return the probability that each trial is the one, if one has a gross error.
 
-        By the trial's index, most probable first.
+        Keys are the trials' indices, most probable first.
         """
         ...
 

@@ -110,8 +110,8 @@ def _assumptions(fit: Fit) -> tuple[dict[str, Assumption], list[str]]:
 def misplaced(tail: list[float], joint: float, edge_mass: float) -> list[str]:
     """Return warnings of a belief that may be far from the truth.
 
-    By the tail probability of each trial and of all, and the belief's mass near the
-    edge of one parameter.
+    They rest on the tail probability of each trial and of all, and the belief's mass
+    near the edge of one parameter.
     """
     warnings = []
     if joint < RARE or min(tail) < RARE / len(tail):

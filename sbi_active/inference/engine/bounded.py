@@ -1,8 +1,8 @@
 r"""Particles between bounds that cut a posterior along many axes.
 
-Of a normal approximation hardly a draw lies within all of them, and its center may be
-far beyond one. What a linear response says has no such trouble: with the residuals r
-and their derivatives J at the modes m,
+Hardly any draw of a normal approximation lies within all of them, and its center may be
+far beyond one. A linear response has no such trouble: with the residuals r and their
+derivatives J at the modes m,
 
 .. math::
     q(u) \propto p(u) \sum_m \exp\Bigl(-\frac{\| r_m + J_m (u - m) \|^2}{2 w^2}\Bigr)

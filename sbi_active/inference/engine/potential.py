@@ -176,7 +176,7 @@ class SimulatedPotential:
     def residual(self, u: Array) -> tuple[Array]:
         """Return residuals of all trials in deviations of the noise, shape (n, N).
 
-        Those of a simulation without a number are large.
+        Residuals of a simulation without a number are large.
         """
         theta, parts = self.coordinates.to_theta(u), []
         own = self.likelihood

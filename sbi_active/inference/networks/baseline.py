@@ -171,7 +171,7 @@ class Baseline(Response):
 def precision_factor(precision: Tensor) -> Tensor:
     """Return the lower factor of I + J J^T, which rounding may have made indefinite.
 
-    That happens where noise is extrapolated to nearly nothing; a share of the largest
+    This happens where noise is extrapolated to nearly nothing; a share of the largest
     entry, raised until it suffices, then stands for the lost I.
     """
     factor, info = torch.linalg.cholesky_ex(precision)

@@ -102,7 +102,7 @@ class NormalCoordinates:
     def splits_off(self, axes: NDArray[np.bool_], rng: np.random.Generator) -> bool:
         r"""Return whether the prior is a product over some axes and all others.
 
-        Of two draws a and b, the density must not see which the axes come from:
+        The density must not depend on which of two draws a and b the axes come from:
 
         .. math::
             p(a)\, p(b) = p(a_S, b_R)\, p(b_S, a_R).

@@ -179,7 +179,7 @@ class Moves(Protocol):
     def propose(self, u: Array, rng: np.random.Generator) -> tuple[Array, Array]:
         """Return where particles may go (n, d), and the log ratio of own densities.
 
-        That of where they are over that of where they go, shape (n,).
+        The ratio is the density where they are over that where they go, shape (n,).
         """
         ...
 

@@ -15,8 +15,8 @@ def largest_power(
 ) -> float:
     """Return the largest power that suffices, between a start and an end.
 
-    By bisection; from 0 by powers of ten first, since where a likelihood is narrow the
-    first power may be of the order of 1e-8.
+    The search is by bisection; from 0 by powers of ten first, since where a likelihood
+    is narrow the first power may be of the order of 1e-8.
 
     Args:
         suffices: Whether a power of a likelihood, or of a ratio of densities, leaves

@@ -27,7 +27,7 @@ from sbi_active.threads import single_thread
 class ActionRounds(ActiveInference):
     r"""Rows by round of the belief they were drawn from, and the trials in between.
 
-    To be mixed in before a trainer of sbi's, whose private hooks it overrides
+    It is mixed in before a trainer of sbi's, whose private hooks it overrides
     (``tests/inference/trainers/test_sbi_hooks.py`` lists them). Without actions that
     trainer does what it always does. A round with them is that of Algorithm 1: this
     round's rows, a network built anew, plain maximum likelihood.
@@ -108,8 +108,9 @@ class ActionRounds(ActiveInference):
     def train(self, *args: Any, **kwargs: Any) -> Any:
         """Train the estimator, with the arguments of sbi's own ``train``.
 
-        What is not given is sbi's default, with actions what the settings say. With
-        actions the network is built anew at each call, unless ``resume_training``.
+        Arguments that are not given are sbi's defaults, or with actions those of the
+        settings. With actions the network is built anew at each call, unless
+        ``resume_training``.
 
         Returns:
             The trained estimator; with actions its condition is packed.

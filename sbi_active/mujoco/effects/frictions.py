@@ -36,7 +36,8 @@ TURNING = 0.1
 class FrictionChange(StateChange):
     r"""Adds dry friction to joints.
 
-    By position, more towards either end of the range in which a joint moves,
+    Friction by position is larger towards either end of the range in which a joint
+    moves,
 
     .. math::
         F = \phi_1 (1 - w)^2 + \phi_2 w^2, \qquad

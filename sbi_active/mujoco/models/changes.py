@@ -71,9 +71,9 @@ class Insertion(ModelChange):
 class StateChange(ModelChange):
     """A change that follows the state of joints: added to theirs before every step.
 
-    What a force cannot do, such as hold a joint still by dry friction that depends on
-    where it is, MuJoCo's own solver then does. Rows with such a change are stepped
-    together, as those with a :class:`Force`.
+    MuJoCo's own solver then does what a force cannot, such as hold a joint still by dry
+    friction that depends on where it is. Rows with such a change are stepped together,
+    as those with a :class:`Force`.
     """
 
     @abstractmethod

@@ -33,7 +33,7 @@ KINDS = {
 def names_of(model: Any, kind: str) -> list[str]:
     """Return the names of a kind of element in their order.
 
-    What has none is called by its kind and number, as in "joint 0".
+    An element without a name is called by its kind and number, as in "joint 0".
     """
     mujoco = mujoco_of()
     mark, count = KINDS[kind]

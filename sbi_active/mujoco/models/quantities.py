@@ -160,7 +160,7 @@ def find_quantity(model: Any, text: str) -> Quantity:
 def is_movable(model: Any, body: str) -> bool:
     """Return whether a body's center of mass can be written.
 
-    Of a body that is compiled as simple its inertia matrix has no room for that.
+    The inertia matrix of a body that is compiled as simple has no room for it.
     """
     return not int(model.body_simple[element_id(model, "body", body)])
 

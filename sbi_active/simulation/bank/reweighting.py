@@ -100,7 +100,7 @@ def reuse(
     which is consistent only where *each* proposal covers the target, and of larger
     variance. Neither can tell whether the proposals cover the target.
 
-    What is weighted is the law of theta *given an action*, as a posterior estimator of
+    Weights are for the law of theta *given an action*, as a posterior estimator of
     q(theta | x, action) needs it. Proposals may have met with different actions, so by
     default the mixture is taken anew among the rows of each action. Where every action
     is another one, that amounts to the second formula: set ``same_actions``.

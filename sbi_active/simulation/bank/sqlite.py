@@ -78,8 +78,8 @@ def connected(path: Path, mode: str, *, timeout: float) -> sqlite3.Connection:
 def opened(path: Path, what: str) -> tuple[sqlite3.Connection, bool]:
     """Return a connection to a store, and whether it is for one look alone.
 
-    That is so where not even the notes of a reader can be written beside the file: it
-    is then read as it is, and others have to wait.
+    This is the case if not even the notes of a reader can be written beside the file:
+    it is then read as it is, and others have to wait.
 
     Args:
         path: The file.

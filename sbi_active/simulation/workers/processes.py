@@ -121,7 +121,7 @@ class Worker:
     def end(self) -> int:
         """Kill the process and what it started; return its exit code.
 
-        That is the negative signal of one that was killed.
+        The code of a killed process is its negative signal.
         """
         if self.connection.closed:
             return self._process.exitcode or 0
