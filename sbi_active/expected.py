@@ -6,7 +6,7 @@ from typing import Any
 
 
 def require(holds: bool, expected: str, got: Any, advice: str) -> None:
-    """Raise where a setting is not what it has to be.
+    """Raise if a setting is not what it has to be.
 
     Args:
         holds: Whether it is.
@@ -15,7 +15,7 @@ def require(holds: bool, expected: str, got: Any, advice: str) -> None:
         advice: Advice on what to do.
 
     Raises:
-        ValueError: With all three.
+        ValueError: If it does not hold, with all three in its text.
 
     Example:
         >>> require(False, "num_rows >= 1", 0, "use some thousand")

@@ -82,7 +82,7 @@ def to_datatree(
     model: str | None = None,
     seed: int = 0,
 ) -> Any:
-    """Return the same as an xarray ``DataTree``, which ArviZ 1.x takes.
+    """Return draws and data as an xarray ``DataTree``, which ArviZ 1.x takes.
 
     It needs xarray alone, so that one Python may write what another one reads: by
     ``to_netcdf``, or ``to_zarr``.

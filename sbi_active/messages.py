@@ -133,7 +133,7 @@ def _slug(title: str) -> str:
 
 
 def place(code: str) -> str:
-    """Return where a code is explained, as the end of a message."""
+    """Return the place where a code is explained, as the end of a message."""
     return f" (see {PAGE}#{code.lower()}-{_slug(explanations()[code][0])})"
 
 

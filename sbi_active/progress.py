@@ -34,7 +34,7 @@ def is_asked_for(show_progress: bool) -> bool:
 def stage(
     what: str, *, show_progress: bool = False, count: Count | None = None
 ) -> Iterator[None]:
-    """Tell of the block while it runs; of a block within it nothing is told.
+    """Report the block while it runs, but no block within it.
 
     Args:
         what: Name of the work.
@@ -83,7 +83,7 @@ class News:
 
     @contextmanager
     def told(self) -> Iterator[None]:
-        """Tell of the block."""
+        """Report the block."""
         self._begin()
         try:
             yield

@@ -25,7 +25,7 @@ Array = NDArray[Any]
 
 
 def support_of(distribution: Distribution) -> Any:
-    """Return where a distribution's draws lie, as a torch constraint.
+    """Return the support of a distribution's draws, as a torch constraint.
 
     It is what the distribution says, but where torch says too much: a transformed
     distribution has the image of its base, not all that its last transform can reach;

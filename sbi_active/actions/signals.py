@@ -220,7 +220,7 @@ class SignalActions(BoxActions):
         return ((last - first).clamp(min=0) * self._step).double()
 
     def _require_names(self) -> None:
-        """Raise where limits name inputs that the generator does not have."""
+        """Raise if limits name inputs that the generator does not have."""
         some = self.low if self._values is None else self._values[0]
         known = {*self.inputs(some[None])}
         for limits in (self._amplitude, self._rate):

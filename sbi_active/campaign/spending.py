@@ -23,7 +23,7 @@ def used_up(state: CampaignState) -> str | None:
 
 
 def require_left(state: CampaignState) -> None:
-    """Raise where no further trial can be designed.
+    """Raise if no further trial can be designed.
 
     Raises:
         SimulationBudgetError: If the simulations are used up.

@@ -56,7 +56,7 @@ class CampaignView:
         return campaign_html(self)
 
     def _known_together(self) -> str:
-        """Return what the belief knows of parameters that it does not know alone.
+        """Return the combinations that the belief knows of parameters not known alone.
 
         A belief that was not read from the directory yet is not read for this.
         """

@@ -46,7 +46,7 @@ def declare(
     effects: str | None,
     **_: Any,
 ) -> dict[str, Any]:
-    """Return where everything is that a program wrote, as other commands need it."""
+    """Return the places of all that a program wrote, as other commands need them."""
     if simulator is None:
         raise ValueError(
             "expected --simulator; got none; name it, as in --simulator my_robot.py:fn"
@@ -62,7 +62,7 @@ def declare(
 
 
 def declared_of_task(name: str, options: Sequence[str]) -> dict[str, Any]:
-    """Return the same for a campaign on a task.
+    """Return the declaration of a campaign on a task.
 
     Args:
         name: Name of the task.
@@ -72,7 +72,7 @@ def declared_of_task(name: str, options: Sequence[str]) -> dict[str, Any]:
 
 
 def read_declared(folder: Path) -> dict[str, Any]:
-    """Return what a campaign's folder says; nothing for a campaign of a program.
+    """Return the declaration in a campaign's folder; empty for a campaign of a program.
 
     Raises:
         ValueError: If the file does not hold what the command line writes.
@@ -124,7 +124,7 @@ class Declared:
         self.task, self.noise, self.place = texts
 
     def names(self, what: str) -> list[str]:
-        """Return what the folder names under a key, each MODULE:NAME.
+        """Return the names under a key of the folder, each MODULE:NAME.
 
         Raises:
             ValueError: If it names something that may be anybody's program.
@@ -150,7 +150,7 @@ class Declared:
         return options
 
     def _require_trust(self, what: str, place: Path | None) -> None:
-        """Raise where nobody here said that what comes from a place may be executed.
+        """Raise if nobody here said that what comes from a place may be executed.
 
         None is this library. A relative place, or one within the folder, holds whatever
         somebody put there.

@@ -63,7 +63,7 @@ def digest(folder: Path) -> str:
 
 
 def _mark(store: Store, num: int) -> list[Any]:
-    """Return how long the log is, and a checksum of its end and of the state."""
+    """Return the length of the log, and a checksum of its end and of the state."""
     last = store.get(EVENTS, LOG, num) if num else None
     content = (last or b"") + (store.get(OBJECTS, STATE) or b"")
     return [num, hashlib.sha256(content).hexdigest()]

@@ -72,7 +72,7 @@ class Combination:
         return sum(t.weight * t.coordinate(theta) for t in self.terms)  # pyright: ignore
 
     def value(self, theta: Array) -> Array:
-        """Return what the formula says, (n, d) -> (n,)."""
+        """Return the value of the formula, (n, d) -> (n,)."""
         sums = self.coordinate(theta)
         return np.exp(sums) if self.is_product else sums
 

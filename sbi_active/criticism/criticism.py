@@ -245,7 +245,7 @@ class Criticism:
         return self._detection
 
     def trace(self) -> Tracing:
-        """Return which effect the data point to."""
+        """Return the tracing: the effect that the data point to."""
         misfit = self.misfit()
         if self._tracing is not None:
             return self._tracing
@@ -334,7 +334,7 @@ class Criticism:
         )
 
     def judged(self, evaluation: Evaluation | None) -> Tracing:
-        """Return what was traced, unless trials that had no part in it speak against.
+        """Return the tracing, unless trials that had no part in it speak against it.
 
         Effects with which these are predicted worse are withdrawn, and forces of the
         dictionary that leave more than the sensor's error are called stand-ins.
@@ -347,7 +347,7 @@ class Criticism:
     def _fitting(
         self, what: str, total: int | None = None
     ) -> AbstractContextManager[None]:
-        """Tell of a block that fits models, and of how many."""
+        """Show progress of a block that fits models."""
         fits, before = self.rivals.fits, len(self.rivals.fits)
         return stage(
             what,

@@ -60,7 +60,7 @@ def thinned_to_need(
 
 
 def in_words(found: Sampling) -> str:
-    """Return what was left out and why."""
+    """Return a text on the samples that were left out, and why."""
     return (
         f"SA525 of {1 / found.step:.3g} samples a second every "
         f"{_ordinal(found.every)} is used ({1 / found.suggested_step:.3g} a second; "

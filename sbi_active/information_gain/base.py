@@ -66,7 +66,7 @@ class CandidateSimulations:
         return torch.stack(partly).any(0) & self.counted
 
     def num_valid(self) -> tuple[Tensor, Tensor]:
-        """Return how many outcomes have a measurement, and of how many, both (a,).
+        """Return the numbers of outcomes with a measurement, and of all, both (a,).
 
         A partly observed outcome has one; missing rows are not counted.
         """
@@ -168,7 +168,7 @@ class InformationGainEstimator(ABC):
         return gain.masked_fill(~simulations.counted, torch.nan)
 
     def bound_on(self, model: Any) -> Bound:
-        """Return which side of the information the estimate's expectation lies on.
+        """Return the side of the information that the estimate's expectation lies on.
 
         A model with ``exact_likelihood = True`` has an exact likelihood, others a
         learned one.
@@ -176,7 +176,7 @@ class InformationGainEstimator(ABC):
         return self.bound
 
     def cautions(self, gain: Tensor) -> list[str]:
-        """Say what contributions (a, n) give to know, as a limit that is near."""
+        """Return cautions about contributions (a, n), as a limit that is near."""
         return []
 
     def problems(self, simulations: CandidateSimulations) -> list[str]:
@@ -184,7 +184,7 @@ class InformationGainEstimator(ABC):
         return []
 
     def remarks(self, simulations: CandidateSimulations) -> list[str]:
-        """Return what to know of an estimate from simulations."""
+        """Return remarks on an estimate from simulations."""
         return []
 
     @abstractmethod

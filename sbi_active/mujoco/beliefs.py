@@ -111,7 +111,7 @@ def randomization(
     num_samples: int = 1_000,
     seed: int = 0,
 ) -> Randomization:
-    """Return what to randomize a simulation by, as wide as a belief is.
+    """Return a randomization of a simulation, as wide as a belief is.
 
     Args:
         belief: Belief with ``sample``; a prior's box will do.

@@ -21,7 +21,7 @@ def identify_robot(
     beside: Sequence[Effect] | None = None,
     seed: int = 0,
 ) -> IdentifiedBelief:
-    """Return what recordings tell of a robot's parameters, with intervals that hold.
+    """Return the belief of recordings over a robot's parameters, with intervals.
 
     It is :func:`sbi_active.criticism.identification.identify` with what the MJCF may
     lack beside the parameters.

@@ -101,7 +101,7 @@ def trials_of(
 
 
 def require_in_range(model: Any, name: str, values: Array, what: str) -> None:
-    """Raise where a control is outside the range that its actuator has.
+    """Raise if a control is outside the range that its actuator has.
 
     MuJoCo would clip it without a word.
 

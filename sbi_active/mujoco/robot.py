@@ -186,7 +186,7 @@ def _read(given: Any, sensors: Sequence[str] | None) -> Source:
 
 
 def require_alike(machines: Sequence[Machine]) -> None:
-    """Raise where models differ in what trials say of them by name."""
+    """Raise if models differ in what trials say of them by name."""
     for kind in ("joint", "actuator", "sensor"):
         names = [names_of(machine.model, kind) for machine in machines]
         for k, own in enumerate(names):
@@ -279,7 +279,7 @@ def _start(
 
 
 def _require_times(times: NDArray[Any], step: float) -> None:
-    """Raise where times are not seconds from the start of a trial."""
+    """Raise if times are not seconds from the start of a trial."""
     increase = times.ndim == 1 and len(times) > 0 and (np.diff(times) > 0).all()
     if not (increase and np.isfinite(times).all() and times[0] >= 0):
         raise ValueError(

@@ -136,7 +136,7 @@ class MujocoFunction:
         force: Any = None,
         watch: Watch | None = None,
     ) -> Tensor:
-        """Return what the sensors read.
+        """Return the sensors' readings.
 
         Args:
             theta: Parameters, shape (n, d).

@@ -38,7 +38,7 @@ class Predictive:
         return Predictive(log_weight, mean, factor @ factor.mT)
 
     def marginal(self, seen: Tensor) -> Predictive:
-        """Return that of some channels, a boolean of shape (q,)."""
+        """Return the predictive of some channels, a boolean of shape (q,)."""
         cov = self.cov[:, seen][:, :, seen]
         return Predictive(self.log_weight, self.mean[:, seen], cov)
 

@@ -35,7 +35,7 @@ class Evaluations:
         )
 
     def known(self) -> Evaluations:
-        """Return those that are numbers."""
+        """Return the evaluations that are numbers."""
         keep = self.utility.isfinite() & self.standard_error.isfinite()
         return Evaluations(*(part[keep] for part in self._all()))
 
@@ -81,7 +81,7 @@ class Search(ABC):
 
     @abstractmethod
     def num_evaluations(self, budget: int, num_samples: int) -> int:
-        """Return how many actions to evaluate on the way.
+        """Return the number of actions to evaluate on the way.
 
         Args:
             budget: Simulations of the design.

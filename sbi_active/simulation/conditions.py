@@ -32,7 +32,7 @@ SOURCES = {
 def conditions_of(
     fn: Callable[..., Any], keywords: Sequence[str]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return which of them a function takes, and which it cannot do without.
+    """Return the conditions that a function takes, and those that it requires.
 
     A ``functools.partial`` that binds one has decided it.
 
@@ -50,7 +50,7 @@ def conditions_of(
 
 
 def require_conditions(needed: tuple[str, ...], given: Mapping[str, Any]) -> None:
-    """Raise where a function lacks what it cannot do without."""
+    """Raise if a function lacks a condition that it requires."""
     for name in needed:
         if name not in given:
             raise ValueError(
@@ -62,7 +62,7 @@ def require_conditions(needed: tuple[str, ...], given: Mapping[str, Any]) -> Non
 def require_taken(
     inputs: SignalActions | MixedActions | None, conditions: tuple[str, ...]
 ) -> None:
-    """Raise where signals are given that a function does not take."""
+    """Raise if signals are given that a function does not take."""
     if inputs is not None and "inputs" not in conditions:
         raise ValueError(
             "expected a function that takes the signals of its actions; got one "
@@ -90,7 +90,7 @@ def played(
 
 
 def require_rows_each(name: str, value: Any, num: int) -> None:
-    """Raise where a keyword argument is neither a number nor one a row."""
+    """Raise if a keyword argument is neither a number nor one a row."""
     if isinstance(value, Mapping):
         for key, part in value.items():
             require_rows_each(f"{name}[{key!r}]", part, num)

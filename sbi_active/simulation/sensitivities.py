@@ -106,7 +106,7 @@ class Sensitivities:
         return np.where(size > limit[:, None], size, 0.0), vectors.swapaxes(1, 2)
 
     def covariances(self, practical: bool) -> Array:
-        """Return what many trials leave, in prior deviations, shape (k, d, d)."""
+        """Return covariances that many trials leave, in prior deviations, (k, d, d)."""
         size, vectors = self.singular()
         largest = np.maximum(size.max(1, keepdims=True), 1e-300)
         known = (size / (NUMERIC * largest)) ** 2

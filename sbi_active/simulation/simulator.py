@@ -78,7 +78,7 @@ def outcome_array(x: Any) -> np.ndarray:
 
 
 def _require_outcome(x: Any) -> None:
-    """Raise where there is none; it counts as an exception of the simulator."""
+    """Raise if there is none; it counts as an exception of the simulator."""
     if x is None:
         raise RuntimeError(
             "expected an outcome from the simulator; got None; return x, with NaN "
@@ -87,10 +87,10 @@ def _require_outcome(x: Any) -> None:
 
 
 def require_rows(theta: Tensor, action: Tensor) -> None:
-    """Raise where parameters and actions are no finite rows (n, ...) of each other.
+    """Raise if parameters and actions are no finite rows (n, ...) of each other.
 
     Raises:
-        ValueError: With the first row that is not finite.
+        ValueError: If a row is not finite; it names the first.
     """
     if theta.ndim != 2 or action.ndim != 2 or len(theta) != len(action):
         raise ValueError(
@@ -131,7 +131,7 @@ def square_of(x: Tensor, before: int | None) -> int | None:
 
 
 def require_noise(x: Tensor, again: Tensor) -> None:
-    """Raise where two seeds gave identical outcomes.
+    """Raise if two seeds gave identical outcomes.
 
     Many counts and yes-or-no outcomes are equal by chance: a few whole numbers among
     many outcomes prove nothing.

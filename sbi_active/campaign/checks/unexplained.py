@@ -92,7 +92,7 @@ def outlyingness(x: Tensor, drawn: Tensor) -> float:
 
 
 def doubts(trials: Sequence[Trial]) -> list[str]:
-    """Return what is wrong with trials beyond all simulations, and what to do."""
+    """Return the doubts about trials beyond all simulations, with advice."""
     return [
         _doubt(t) for t in trials if t.is_measured and (t.outlyingness or 0.0) > NOTABLE
     ]

@@ -131,7 +131,7 @@ def outcome_labels(
 
 
 def expected_gain(design: Design | None) -> tuple[float, float]:
-    """Return what an action was expected to tell and the standard error, nats.
+    """Return the expected information gain of an action and its standard error, nats.
 
     NaN where it was not designed.
     """

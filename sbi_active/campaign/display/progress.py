@@ -23,7 +23,7 @@ class StageWatch:
 
     @contextmanager
     def __call__(self, state: CampaignState, index: int, name: str) -> Iterator[None]:
-        """Tell of the block.
+        """Show progress while the block runs.
 
         Args:
             state: State of the campaign.

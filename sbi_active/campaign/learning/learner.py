@@ -302,7 +302,7 @@ class Learner:
             self._state.change(index, network_used_by=asked)
 
     def model(self, index: int) -> RoundModel:
-        """Return what a design asks, trained now or on demand.
+        """Return the model that a design asks, trained now or on demand.
 
         Args:
             index: Index of the trial that is designed.

@@ -199,7 +199,7 @@ class _Reader:
         self._seen: list[Any] = []
 
     def value(self, node: Any) -> Any:
-        """Return what a node stands for."""
+        """Return the value that a node stands for."""
         if not isinstance(node, dict):
             return node
         kind = node[TAG]

@@ -268,7 +268,7 @@ class CampaignDirectory:
             return None
 
     def _require_whole(self, *, repair: bool) -> None:
-        """Raise where the log lacks lines that the saved state has counted.
+        """Raise if the log lacks lines that the saved state has counted.
 
         A repair takes their trials from the state, and has all else computed again.
         """
@@ -324,7 +324,7 @@ def _has(state: CampaignState, trial: Trial) -> bool:
 
 
 def _facts(trial: Trial) -> dict[str, Any]:
-    """Return of a trial what cannot be computed again, NaN as null."""
+    """Return the facts of a trial that cannot be computed again, NaN as null."""
     x = None if trial.x is None else _listed(trial.x.tolist())
     return {
         "index": trial.index,

@@ -165,10 +165,10 @@ def read_manifest(store: Store, *, repair: bool = False) -> dict[str, Any]:
 def require_same_simulator(
     manifest: Mapping[str, Any], simulator: Callable[..., Any]
 ) -> None:
-    """Raise where a simulator is not the one that the campaign was made with.
+    """Raise if a simulator is not the one that the campaign was made with.
 
     Raises:
-        ValueError: It says where they differ.
+        ValueError: If they differ; it says where.
     """
     lines = differences(manifest["simulator"], fingerprint(simulator))
     if lines:

@@ -93,7 +93,7 @@ def root(repeat_of: Tensor) -> Tensor:
             own for none.
 
     Returns:
-        The same with positions that repeat nothing themselves, -1 for none.
+        Positions that repeat nothing themselves, -1 for none.
 
     Raises:
         ValueError: If a position is no trial, or trials repeat each other in a circle.

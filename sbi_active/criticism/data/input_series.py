@@ -163,7 +163,7 @@ def held_at(
 
 
 def require_covered(x_times: Tensor, stamps: Mapping[str, Tensor]) -> None:
-    """Raise where x was measured long before or after an input of its trial.
+    """Raise if x was measured long before or after an input of its trial.
 
     Args:
         x_times: Times of what was measured, shape (t, k), NaN for none.

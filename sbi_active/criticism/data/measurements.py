@@ -100,7 +100,7 @@ class Measurements:
         )
 
     def bounded(self, center: Array, reach: Array) -> Measurements:
-        """Return the same with numbers that are beyond all reason within a reach.
+        """Return the measurements with implausible numbers moved within a reach.
 
         Such a number is wrong whatever its digits are, and in double precision its
         residual would no longer depend on the simulator. If most trials are so far off,

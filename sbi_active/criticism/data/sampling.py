@@ -59,7 +59,7 @@ class Sampling:
 
 
 def suggested_sampling(trials: Trials, residuals: Any, times: Any = None) -> Sampling:
-    """Return how densely trials are sampled, and how densely they need to be.
+    """Return the sampling of trials, and the sampling that they need.
 
     It is the highest rate at which neighboring innovations are correlated by no more
     than .2, or three standard errors, and below which they are not for want of motion:

@@ -211,7 +211,7 @@ class _TrialRows(Rows):
         return found
 
     def _require_distinct(self, action: Array, samples: list[Array]) -> None:
-        """Raise where two trials are the same number for number."""
+        """Raise if two trials are the same number for number."""
         is_long, seen = self.columns.time is not None, {}
         what = "trials" if is_long else "rows"
         for t, own in enumerate(samples):

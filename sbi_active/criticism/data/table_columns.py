@@ -42,7 +42,7 @@ class Columns:
     units: dict[str, str]
 
     def label(self, column: str) -> str:
-        """Return what a column is called, with its unit, as in "speed [m/s]"."""
+        """Return the label of a column, with its unit, as in "speed [m/s]"."""
         unit = self.units.get(column, "")
         name = self.short(column)
         return f"{name} [{unit}]" if unit else name
@@ -69,7 +69,7 @@ def find_columns(
     of_inputs: bool = False,
     has_inputs: bool = False,
 ) -> Columns:
-    """Return what the columns are, by their names or as the user says.
+    """Return the roles of the columns, by their names or as the user says.
 
     Args:
         names: Names of all columns.
@@ -147,7 +147,7 @@ def find_columns(
 def _require_inputs(
     found: Mapping[str, tuple[str, ...]], names: Sequence[str], source: str
 ) -> None:
-    """Raise where a table of inputs lacks them or their times, or holds more."""
+    """Raise if a table of inputs lacks them or their times, or holds more."""
     for key, column in ((TIME, TIME), ("input", "input_*")):
         if not found[key]:
             raise ValueError(

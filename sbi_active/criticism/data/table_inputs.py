@@ -39,7 +39,7 @@ class InputRows:
     source: str
 
     def arguments(self) -> dict[str, Any]:
-        """Return them as arguments of ``Trials``.
+        """Return the inputs as arguments of ``Trials``.
 
         Raises:
             ValueError: If a trial has fewer than two values of an input, which has a
@@ -95,7 +95,7 @@ class InputRows:
         return replace(self, members=members, trials=[*trials])
 
     def require_covered(self, row: Array, time: Array, place: Any, source: str) -> None:
-        """Raise where x was measured long before or after the inputs of its trial.
+        """Raise if x was measured long before or after the inputs of its trial.
 
         Args:
             row: Number of the trial in each row of x, shape (k,).
@@ -117,7 +117,7 @@ class InputRows:
                 )
 
     def _require_one_origin(self, rows: Sequence[Array]) -> None:
-        """Raise where a trial begins after another of its length has ended."""
+        """Raise if a trial begins after another of its length has ended."""
         earliest = min(self.time[at[0]] for at in rows)
         for at in rows:
             begin, end = self.time[at[0]], self.time[at[-1]]

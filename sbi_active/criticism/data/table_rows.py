@@ -93,7 +93,7 @@ class Rows:
         )
 
     def place(self, i: Any) -> str:
-        """Return what a message calls a row."""
+        """Return the name of a row in messages."""
         trial = f" (trial {self.names[self.code[i]]})" if self.columns.trial else ""
         return f"row {i + 1}{trial}"
 
@@ -133,7 +133,7 @@ class Rows:
         return values
 
     def constant(self, column: str, values: Array | None = None) -> Array:
-        """Return what each trial has in a column, which must not vary within it."""
+        """Return the value of each trial in a column, which must not vary within it."""
         values = self.numbers(column) if values is None else values
         own = values[self.first]
         for i in np.flatnonzero(values != own[self.code]):
@@ -146,7 +146,7 @@ class Rows:
         return own
 
     def _require_order(self, time: Array, column: str) -> None:
-        """Raise where a sample is there twice, or time runs backward in a trial."""
+        """Raise if a sample is there twice, or time runs backward in a trial."""
         for at, name in zip(self.members, self.names, strict=True):
             order = at[np.argsort(time[at], kind="stable")]
             for k in np.flatnonzero(np.diff(time[order]) == 0):
@@ -187,7 +187,7 @@ def seconds(cells: pd.Series, source: str) -> Array:
 
 
 def require_real(cells: pd.Series, column: str, source: str) -> None:
-    """Raise where numbers have an imaginary part, which nothing here could keep."""
+    """Raise if numbers have an imaginary part, which nothing here could keep."""
     if pd.api.types.is_complex_dtype(cells) or any(
         isinstance(cell, complex) for cell in cells
     ):
@@ -260,7 +260,7 @@ def read_csv(path: Path) -> pd.DataFrame:
 
 
 def _require_commas(path: Path) -> None:
-    """Raise where the header's cells are parted by something else."""
+    """Raise if the header's cells are parted by something else."""
     with path.open(encoding="utf-8-sig") as file:
         lines = (line.strip() for line in file)
         header = next((line for line in lines if line and line[0] != "#"), "")

@@ -14,7 +14,7 @@ from sbi_active.criticism.effects.effect import Context, Effect
 def applied(
     effect: Effect, value: Any, phi: Tensor, action: Tensor, context: Context
 ) -> Any:
-    """Return what an effect makes of a value.
+    """Return a value as an effect changes it.
 
     It gets copies, so that it may change them in place, and what it gives back is
     copied, so that it may be a view of what it keeps.

@@ -344,7 +344,7 @@ class AugmentedSimulator(SimulatorModel):
         return x[place]
 
     def _check_null(self, theta: Tensor, action: Tensor, context: Context) -> None:
-        """Raise where an effect at its null changes x."""
+        """Raise if an effect at its null changes x."""
         x = self._seeded(theta, {}, action, context)
         shapes = [x.shape, *(u.shape for u in (context.inputs or {}).values())]
         if any(len(x) in shape[1:] for shape in shapes) and len(x) > 1:

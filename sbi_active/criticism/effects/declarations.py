@@ -13,7 +13,7 @@ STEP = 1e-6
 
 
 def require_nested(effects: Sequence[Effect]) -> None:
-    """Raise where a prior excludes the null, so that no phi is close to no effect.
+    """Raise if a prior excludes the null, so that no phi is close to no effect.
 
     The edge of a support counts as within, and so does an infinite null. Nuisances of
     each trial are always there and need none.
@@ -28,7 +28,7 @@ def require_nested(effects: Sequence[Effect]) -> None:
 
 
 def require_distinct(effects: Sequence[Effect], parameters: Sequence[str] = ()) -> None:
-    """Raise where two numbers would have one name in tables and records.
+    """Raise if two numbers would have one name in tables and records.
 
     Args:
         effects: Effects by their own names, whose parts between " + " must not come

@@ -42,7 +42,7 @@ class Context:
     start: Tensor | dict[str, Tensor] | None = None
 
     def at(self, rows: slice) -> Context:
-        """Return what is known of some rows."""
+        """Return the context of some rows."""
         times = self.times
         return Context(
             self.index[rows],
@@ -215,7 +215,7 @@ class _Keywords:
 
 
 def _require_parts(effect: Effect) -> None:
-    """Raise where a part of an effect is of another type than it should be."""
+    """Raise if a part of an effect is of another type than it should be."""
     texts = {"name": effect.name, "units": effect.units}
     texts |= {
         name: value
@@ -269,7 +269,7 @@ def _sound_null(effect: Effect) -> Any:
 
 
 def _require_finite_draws(effect: Effect) -> None:
-    """Raise where the prior gives phi that is no number."""
+    """Raise if the prior gives phi that is no number."""
     lost = ~effect.declared_draws().isfinite()
     if bool(lost.any()):
         raise ValueError(

@@ -29,7 +29,7 @@ def change_at_null(reference: Tensor, at_null: Any, effect: Effect) -> float:
 def require_positive(
     effect: Effect, one: Tensor, action: Tensor, context: Context
 ) -> None:
-    """Raise where an effect on the noise makes a deviation that is none."""
+    """Raise if an effect on the noise makes a deviation that is none."""
     with forked_generators(0, "noise of an effect"):
         phi = effect.sample(len(one)).to(one.dtype)
     sd = applied(effect, one, phi, action, context)

@@ -9,8 +9,8 @@ the lagged input at the grid's points alone would be flat,
     \bar y_k = u_k + (y_k - u_k) \frac{\tau}{h} (1 - a), \qquad
     y_{k+1} = u_k + (y_k - u_k)\, a, \qquad a = e^{-h / \tau}.
 
-The measured x is a line between its samples instead: with slope :math:`s_k = (x_{k+1} -
-x_k) / h_k` the lagged sensor reads
+The measured x is a line between its samples instead: with slope
+:math:`s_k = (x_{k+1} - x_k) / h_k` the lagged sensor reads
 
 .. math::
     y_{k+1} = x_{k+1} - \tau s_k + (y_k - x_k + \tau s_k)\, e^{-h_k / \tau}.

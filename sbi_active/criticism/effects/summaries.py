@@ -134,7 +134,7 @@ def summarize(
 
 
 def obstacle(model: SimulatorModel, trials: Trials, effects: Sequence[Effect]) -> str:
-    """Return what stands against summaries, in words; "" for nothing."""
+    """Return the obstacle to summaries, in words; "" for none."""
     reason = ""
     if not isinstance(model.noise, GaussianNoise):
         reason = f"noise {model.noise}"

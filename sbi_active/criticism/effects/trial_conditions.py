@@ -17,7 +17,7 @@ from sbi_active.simulation.conditions import typed
 def conditions_of_trials(
     trials: Trials, rows: Tensor, model: SimulatorModel
 ) -> Context:
-    """Return how the trial of each row was run.
+    """Return the conditions of each row's trial.
 
     Args:
         trials: Measured trials.

@@ -1,7 +1,7 @@
 """Errors on trials that a model was not fitted to, and its intervals.
 
-A model is refitted by linear algebra without each part of the trials by least squares,
-from its linearization at the best fit to all.
+A model is refitted by least squares without each part of the trials, from its
+linearization at the best fit to all.
 """
 
 from __future__ import annotations

@@ -83,7 +83,7 @@ class Rival:
         return self.dim - phi
 
     def columns(self) -> dict[str, slice]:
-        """Return where each effect's phi stands among the coordinates, by name."""
+        """Return the places of each effect's phi among the coordinates, by name."""
         sizes = [(e.name, e.phi_dim) for e in self.effects]
         num = self.coordinates.num_trials
         sizes += [(e.name, e.phi_dim * num) for e in self.coordinates.nuisances]
@@ -164,7 +164,7 @@ class Rival:
         return False
 
     def whitener(self, u: Array | None = None) -> Whitener:
-        """Return what whitens residuals, by the likeliest error at u, shape (1, dim).
+        """Return the whitener of residuals by the likeliest error at u, shape (1, dim).
 
         The same object where the error has nothing unknown, and without u.
         """
@@ -173,7 +173,7 @@ class Rival:
         return self.error.whitener(self.residual(u)[0][0])
 
     def regimes(self, u: Array) -> list[Whitener]:
-        """Return what whitens residuals where the error leaves other widths."""
+        """Return whiteners of residuals where the error leaves other widths."""
         return self.error.regimes(self.residual(u)[0][0])
 
     def log_likelihood(self, u: Array, *, floor: float = -np.inf) -> Array:

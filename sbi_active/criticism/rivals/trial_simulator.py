@@ -86,7 +86,7 @@ class TrialSimulator:
     def predict(
         self, theta: Tensor, phi: dict[str, Tensor]
     ) -> tuple[Array, Array | None, Array]:
-        """Return what the simulator predicts for the measured numbers.
+        """Return the simulator's predictions of the measured numbers.
 
         Args:
             theta: Parameters, shape (n, theta_dim).

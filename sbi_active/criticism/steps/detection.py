@@ -164,7 +164,7 @@ def _least_chi_square(rivals: RivalSet) -> tuple[float, float]:
 
 
 def num_determined(rivals: RivalSet) -> float:
-    r"""Return how many of the bare model's parameters the data determine.
+    r"""Return the number of the bare model's parameters that the data determine.
 
     .. math::
         \gamma = \sum_i (1 - \lambda_i)_+

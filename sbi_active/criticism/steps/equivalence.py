@@ -116,7 +116,7 @@ def equivalent_effects(
 
 
 def noise_unit(rivals: RivalSet, simulator: TrialSimulator) -> Array:
-    """Return what counts as large in each number of some trials, shape (N,)."""
+    """Return the size that counts as large in each number of trials, shape (N,)."""
     noise = declared_noise(rivals.model.noise, simulator.measurements)
     unit = noise.typical_sd
     if rivals.model.noise is None:
@@ -194,7 +194,7 @@ class _Neighborhood:
         return True
 
     def rest(self, aim: Array, both: NDArray[np.bool_]) -> tuple[Array, bool, bool]:
-        """Return what parameters leave of some predictions, by Gauss-Newton steps.
+        """Return the rest of predictions that parameters leave, by Gauss-Newton steps.
 
         It also returns whether they were free, since at an edge of the prior the edge
         may be what stands against them; and whether the search has ended, so that no

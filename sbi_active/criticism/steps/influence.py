@@ -85,7 +85,7 @@ def is_left_to_chance(tracing: Tracing) -> bool:
 
 
 def unless_refuted(tracing: Tracing, evaluation: Evaluation | None) -> Tracing:
-    """Return what was traced, its effects withdrawn where further trials refute them.
+    """Return the tracing, its effects withdrawn where further trials refute them.
 
     Their squared error is then the larger with the effects, and their density the
     smaller by a Bayes factor of 20. Where every model misses, what was said to predict
@@ -162,7 +162,7 @@ def _rmse(evaluation: Evaluation, told: NDArray[np.bool_]) -> tuple[float, float
 
 
 def withdrawn(tracing: Tracing) -> Tracing:
-    """Return what was traced with the effects of the verdict not to be added."""
+    """Return the tracing with the effects of the verdict not to be added."""
     p = tracing.probabilities
     outlier, other = p.get(OUTLIER, 0.0), p.get(UNEXPLAINED, 0.0)
     by_chance = is_left_to_chance(tracing) or outlier > other

@@ -117,7 +117,7 @@ class Sampled:
         return self.rivals.fit(both).evidence.log_evidence
 
     def record(self, key: ModelKey) -> Evidence:
-        """Return what is recorded of a model, its evidence under unknown scales."""
+        """Return the record of a model, its evidence under unknown scales."""
         value, error = log_evidence(self.rivals, key)
         own = self.rivals.fit(key).evidence
         return replace(own, log_evidence=value, standard_error=error)

@@ -117,7 +117,7 @@ class Evidences(Protocol):
         ...
 
     def record(self, key: ModelKey) -> Evidence:
-        """Return what is recorded of a model."""
+        """Return the record of a model."""
         ...
 
     def outliers(self) -> dict[float, float]:
@@ -283,7 +283,7 @@ def verdict_of(probabilities: Mapping[ModelKey, float], found: Evidences) -> Mod
 
 
 def kind_of(key: ModelKey, found: Evidences) -> frozenset[str]:
-    """Return what a set is about: families of forces, groups of what is alike."""
+    """Return the subject of a set: families of forces, or groups of similar effects."""
     effects = [found.rivals.effects[name] for name in key.effects]
     groups = [group for group in found.equivalent if NONE not in group]
 

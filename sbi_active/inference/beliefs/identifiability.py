@@ -121,7 +121,7 @@ class Combinations:
         return "; ".join(parts)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it in a form that JSON can hold."""
+        """Return the combinations in a form that JSON can hold."""
         parts = {"known": self.known, "unknown": self.unknown}
         return {k: [dict(vars(c)) for c in own] for k, own in parts.items() if own}
 
@@ -133,7 +133,7 @@ def combinations_of(
     *,
     seed: int = 0,
 ) -> Combinations:
-    r"""Return which combinations of parameters a belief knows, and which it does not.
+    r"""Return the combinations of parameters that a belief knows, and does not know.
 
     From 2,000 draws of each: a parameter is open where its standard deviation is above
     0.3 of the prior's; a combination of open parameters is known where it has, in prior
@@ -163,7 +163,7 @@ def combinations_of(
 def combinations_of_draws(
     after: Array, before: Array, names: Sequence[str] | None = None
 ) -> Combinations:
-    """Return the same from draws of a belief and of the prior, (m, d) and (n, d)."""
+    """Return combinations by draws of a belief and of the prior, (m, d) and (n, d)."""
     dim = before.shape[1]
     if dim < 2 or not (np.isfinite(before).all() and np.isfinite(after).all()):
         return Combinations()

@@ -89,7 +89,7 @@ def find_contradiction(
     level: float = LEVEL,
     rng: np.random.Generator,
 ) -> Contradiction | None:
-    """Return what contradicts at the best fit; None where the noise explains it.
+    """Return the contradiction at the best fit; None where the noise explains it.
 
     Args:
         likelihood: Likelihood of all trials under the declared noise.
@@ -133,7 +133,7 @@ def contradiction_at(
     level: float = LEVEL,
     rng: np.random.Generator,
 ) -> Contradiction | None:
-    """Return what contradicts at parameters that are about the best, shape (1, d)."""
+    """Return the contradiction at parameters that are about the best, shape (1, d)."""
     squares = []
     for action, x in zip(likelihood.action, likelihood.x, strict=True):
         gap = x - torch.from_numpy(likelihood.table.mean(theta, action)[0])
@@ -160,7 +160,7 @@ def compared(
     num_fitted: int,
     level: float = LEVEL,
 ) -> Contradiction | None:
-    """Return what contradicts by the squares alone; None where nothing does.
+    """Return the contradiction by the squares alone; None where there is none.
 
     Args:
         action: Executed actions, shape (t, action_dim).

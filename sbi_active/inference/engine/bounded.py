@@ -148,7 +148,7 @@ class LineMoves(Moves):
             self._normals.append((np.linalg.solve(precision, center), precision))
 
     def propose(self, u: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Return where particles may go, and the log ratio of the normal densities."""
+        """Return proposed particles, and the log ratio of the normal densities."""
         mean, precision = self._normals[rng.integers(len(self._normals))]
         new = u.copy()
         pull = (new - mean) @ precision

@@ -163,7 +163,7 @@ class Conditioning(nn.Module):
         return -self.theta_factor.diagonal().log().sum()
 
     def forward(self, condition: Tensor) -> tuple[Tensor, Frames]:
-        """Return what the network sees, (n, x_dim + action_dim + ...), and the frames.
+        """Return the network's inputs, (n, x_dim + action_dim + ...), and the frames.
 
         Numbers of x that are missing are zero; a row with any has trivial frames.
         """

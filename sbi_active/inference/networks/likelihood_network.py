@@ -102,7 +102,7 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         return nn.Identity()
 
     def residual_rows(self, x: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what the mixture is trained on: residuals and their conditions."""
+        """Return the training rows of the mixture: residuals and their conditions."""
         valid = _valid(x)
         with torch.no_grad():
             z, _ = self._standardize(x[valid].double(), condition[valid])

@@ -106,7 +106,7 @@ def round_rows(
 
 
 def require_whole(x: Tensor) -> None:
-    """Raise where numbers of an outcome (n, *x_shape) are missing and others not."""
+    """Raise if numbers of an outcome (n, *x_shape) are missing and others not."""
     present = torch.as_tensor(x).reshape(len(x), -1).isfinite()
     partly = present.any(1) & ~present.all(1)
     if bool(partly.any()):

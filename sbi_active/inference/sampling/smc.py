@@ -177,7 +177,7 @@ class Moves(Protocol):
         ...
 
     def propose(self, u: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Return where particles may go (n, d), and the log ratio of own densities.
+        """Return proposed particles (n, d), and the log ratio of own densities.
 
         The ratio is the density where they are over that where they go, shape (n,).
         """
@@ -218,7 +218,7 @@ class NormalMoves:
         self._factor = np.linalg.cholesky(cov + 1e-14 * np.eye(u.shape[1]))
 
     def propose(self, u: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Return where particles may go, and the log ratio of the normal densities."""
+        """Return proposed particles, and the log ratio of the normal densities."""
         mean, factor, length = self._mean, self._factor, self._length
         new = mean + np.sqrt(1 - length**2) * (u - mean)
         new = new + length * rng.standard_normal(u.shape) @ factor.T

@@ -107,7 +107,7 @@ def disagreements(
     belief: Distribution | None,
     gain: Tensor,
 ) -> list[str]:
-    """Say what an estimate gives to know, and compare it with others that apply.
+    """Return cautions about an estimate, which is compared with others that apply.
 
     In short sentences, one a disagreement, by the estimator's contributions (a, n).
     """

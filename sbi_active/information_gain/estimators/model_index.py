@@ -60,7 +60,7 @@ class NoisyRivalPredictive(RivalPredictive, Protocol):
     def predict_mean(
         self, action: Tensor, num_samples: int, seed: int
     ) -> tuple[Tensor, Tensor]:
-        """Return what the draws of ``predict`` with the same arguments are made of.
+        """Return means and deviations behind the draws of ``predict``.
 
         Returns:
             The outcomes without noise, and the standard deviations of the noise in

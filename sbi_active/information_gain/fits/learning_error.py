@@ -9,7 +9,7 @@ from torch import Tensor
 def learning_error(
     slope: Tensor, z: Tensor, difference: Tensor, residual: Tensor, share: Tensor
 ) -> Tensor:
-    r"""Return what the noise of each pair does to the information, to first order.
+    r"""Return the effect of each pair's noise on the information, to first order.
 
     With :math:`x = f(\theta) + \epsilon`, standard normal noise, and errors
     :math:`\delta f` of the mean and :math:`\delta S` of the covariance,

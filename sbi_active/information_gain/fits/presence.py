@@ -58,7 +58,7 @@ def presence_problems(simulations: CandidateSimulations) -> list[str]:
 
 
 def presence_notes(simulations: CandidateSimulations) -> list[str]:
-    """Say where outcomes without all their numbers make the estimate a bound."""
+    """Return notes where incomplete outcomes make the estimate a bound."""
     notes = []
     random = int(random_presence(simulations).sum())
     if random:

@@ -50,7 +50,7 @@ def mjcf_effects(
     include: str | Sequence[str] = "*",
     exclude: str | Sequence[str] = (),
 ) -> list[Effect]:
-    r"""Return what a plain model may lack, with names, units, nulls and priors.
+    r"""Return effects that a plain model may lack, with names, units, nulls and priors.
 
     Each effect is called by its element, as in "hinge friction loss". Elements that are
     alike, such as the knees of four legs, are offered together, as in "all knee
@@ -96,7 +96,7 @@ def mjcf_effects(
 
 
 def likely_effects(robot: Robot, trials: Trials) -> list[Effect]:
-    """Return what joints and drives most often have and an MJCF does not say.
+    """Return effects that joints and drives most often have and an MJCF does not say.
 
     Args:
         robot: Robot from its MJCF.

@@ -150,7 +150,7 @@ class Machine:
         return {**vars(self), "_models": {}}
 
     def require_inertia(self) -> None:
-        """Raise where a joint has no inertia at the lowest parameters.
+        """Raise if a joint has no inertia at the lowest parameters.
 
         Every state is then NaN, which would pass for an outcome that was invalid.
         """
@@ -179,7 +179,7 @@ class Machine:
             size: Most rows at a time.
 
         Returns:
-            What ``run`` returned, in the order of the rows.
+            Results of ``run``, in the order of the rows.
         """
         found: Array | None = None
         for inserted, places, weights in self._groups(rows):

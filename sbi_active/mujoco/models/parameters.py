@@ -160,7 +160,7 @@ def writer_of(
     edit: Callable[[Any, Array], Any] | None = None,
     text: Callable[[], Any] | None = None,
 ) -> Writer:
-    """Return what writes parameters into a model.
+    """Return the writer of parameters into a model.
 
     Args:
         spec: Returns a spec that compiles to the model.

@@ -81,7 +81,7 @@ class Quantity:
         return ATTRIBUTES[self.kind][self.attribute](model, i)
 
     def value(self, model: Any) -> float:
-        """Return what the model has."""
+        """Return the value in the model."""
         first = self.entries(model)[0]
         now = field_of(model, first.field)
         return float(now[first.index] if first.index else now) / first.factor

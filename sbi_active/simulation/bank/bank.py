@@ -212,7 +212,7 @@ class Bank:
         return LabeledStore(self, proposal, label or "", torch.as_tensor(log_action))
 
     def load(self, run: str) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Return what is stored of a run: index (k,), x (k, *x_shape), status (k,).
+        """Return the stored rows of a run: index (k,), x (k, *x_shape), status (k,).
 
         Args:
             run: Name of the run.
@@ -290,7 +290,7 @@ class Bank:
         return dict(zip(names, self._rows.gather([*names], None), strict=True))
 
     def verify(self) -> list[str]:
-        """Return what is wrong with the file, one line each; none where all is well.
+        """Return the problems of the file, one line each; none where all is well.
 
         Every byte of every column is compared with its checksum.
         """

@@ -57,7 +57,7 @@ class LockedError(Explained, OSError):
 
 
 def require_no_link(path: Path) -> None:
-    """Raise where a file that is written to is a link: it would lead elsewhere.
+    """Raise if a file that is written to is a link: it would lead elsewhere.
 
     Raises:
         OSError: If the path is a symbolic link.
@@ -70,10 +70,10 @@ def require_no_link(path: Path) -> None:
 
 
 def require(path: Path, holds: bool, reason: str) -> None:
-    """Raise where something does not hold.
+    """Raise if something does not hold.
 
     Raises:
-        CorruptSegmentError: With the reason.
+        CorruptSegmentError: If it does not hold, with the reason.
     """
     if not holds:
         raise CorruptSegmentError(path, reason)

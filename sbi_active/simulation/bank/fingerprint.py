@@ -54,7 +54,7 @@ def fingerprint(simulator: Callable[..., Any], *, version: str = "") -> dict[str
 
 
 def differences(expected: Mapping[str, Any], got: Mapping[str, Any]) -> list[str]:
-    """Return where two fingerprints differ, one line each; none for one simulator."""
+    """Return the differences of two fingerprints, one line each; none if they agree."""
     if expected["version"] != got["version"]:
         return [f"version {expected['version']!r} there, {got['version']!r} here"]
     lines = _compare("simulator", expected["simulator"], got["simulator"])

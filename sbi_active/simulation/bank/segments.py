@@ -78,7 +78,7 @@ def write_segment(
 
 
 def find_segment(store: Store, name: str, number: int) -> Segment:
-    """Return what is known of a segment.
+    """Return the header of a segment.
 
     Raises:
         CorruptSegmentError: If it is not there, or not what a bank writes.
@@ -152,10 +152,10 @@ def _is_known(known: Mapping[str, Any]) -> bool:
 
 
 def require_header(path: Path, header: Mapping[str, Any]) -> None:
-    """Raise where the header of a bank is none that a bank writes.
+    """Raise if the header of a bank is none that a bank writes.
 
     Raises:
-        CorruptSegmentError: It names the entry.
+        CorruptSegmentError: If an entry is missing or wrong; it names the entry.
     """
     for name, is_valid in _ENTRIES.items():
         require(path, name in header, f"no entry {name!r}")

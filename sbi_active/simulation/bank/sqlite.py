@@ -233,7 +233,7 @@ def explained(error: Exception, path: Path, what: str) -> Exception:
 
 
 def advice(folder: Path, otherwise: str) -> str:
-    """Return what to do with a folder that has no store."""
+    """Return advice on a folder that has no store."""
     if any((folder / name).exists() for name in ("bank.json", "campaign.json")):
         return f"bring it up to date by: sbi-active migrate {folder}"
     return otherwise

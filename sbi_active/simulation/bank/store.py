@@ -145,7 +145,7 @@ class Store:
         return self._look("length(content)", table, kind, number)
 
     def remains(self, table: str, kind: str, number: int) -> str:
-        """Return what is left of a damaged record, for people."""
+        """Return the rest of a damaged record, for people."""
         try:
             left = self._look("content", table, kind, number)
             return left.decode(errors="replace")
@@ -166,7 +166,7 @@ class Store:
         return None if content is None else parsed(self.path, content)
 
     def length(self, table: str, series: str) -> int:
-        """Return how many records of a series were written."""
+        """Return the number of records of a series."""
         found = self.text(f"{table} of {series}")
         count: Any = 0 if found is None else found.get("length")
         require(self.path, is_count(count), f"{count!r} as length of {series!r}")
@@ -285,7 +285,7 @@ class Store:
         self._connection, self._signature = None, ()
 
     def problems(self) -> list[str]:
-        """Return what is wrong with the file and its objects, one line each."""
+        """Return the problems of the file and its objects, one line each."""
         wrong = self._structure("9")  # as many as are listed
         for kind in [] if wrong else self.kinds():
             try:

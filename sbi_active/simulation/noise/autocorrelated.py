@@ -241,7 +241,7 @@ def innovations(
 def chained(
     residual: Tensor, tau: Tensor, times: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    r"""Return what is new at each time, and its variance in those of the residual.
+    r"""Return the innovation at each time, and its variance in those of the residual.
 
     Arguments are those of :func:`innovations`.
 

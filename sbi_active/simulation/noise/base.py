@@ -223,7 +223,7 @@ class ScaleNoise(NoiseModel):
         return torch.stack(terms).logsumexp(0) - math.log(len(draws))
 
     def _check(self, parameters: Tensor) -> None:
-        """Raise where parameters (..., p) are outside their range."""
+        """Raise if parameters (..., p) are outside their range."""
         sd = parameters[..., : self._num_sd]
         if not bool((sd.isfinite() & (sd >= 0)).all()):
             raise ValueError(
@@ -232,7 +232,7 @@ class ScaleNoise(NoiseModel):
             )
 
     def _check_shape(self, shape: torch.Size) -> None:
-        """Raise where outcomes (n, *x_shape) do not fit the channels."""
+        """Raise if outcomes (n, *x_shape) do not fit the channels."""
         if len(shape) < 2 or self._num_sd not in (1, shape[-1]):
             raise ValueError(
                 f"expected outcomes of shape (n, ..., {self._num_sd}), one standard "

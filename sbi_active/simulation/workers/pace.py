@@ -101,7 +101,7 @@ _PACES: WeakKeyDictionary[Any, dict[str, Pace]] = WeakKeyDictionary()
 
 
 def pace_of(simulator: Callable[..., Any]) -> Pace:
-    """Return what is known of a simulator in this process."""
+    """Return the known pace of a simulator in this process."""
     owner = getattr(simulator, "__self__", simulator)
     try:
         paces = _PACES.setdefault(owner, {})

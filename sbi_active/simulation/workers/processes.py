@@ -88,7 +88,7 @@ class Worker:
             self.connection.send_bytes(pickle.dumps(call, protocol=5))
 
     def reply(self) -> Reply | None:
-        """Return what came of the call; None while it runs."""
+        """Return the reply of the call; None while it runs."""
         try:
             while self.connection.poll():
                 reply = pickle.loads(self.connection.recv_bytes())

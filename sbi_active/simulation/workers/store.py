@@ -44,7 +44,7 @@ class RowStore(Protocol):
     """
 
     def load(self, run: str) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Return what is stored of a set of rows, or None.
+        """Return the stored rows of a set, or None.
 
         Args:
             run: Digest of the set, see :func:`run_digest`.
