@@ -20,7 +20,7 @@ def made_given(
     nuisances: Sequence[str],
     warm_up: float,
 ) -> Iterator[str]:
-    """Yield what was not looked at, and why, a sentence each.
+    """Yield the limits of a comparison and their reasons, a sentence each.
 
     Args:
         trials: Trials that were compared.
@@ -28,8 +28,8 @@ def made_given(
         sampling: Sampling that was found; None where nobody looked.
         left_out: Names of effects of an order that is unknown.
         screening: Screening by linear evidence; None where all were fitted.
-        nuisances: Names of those that each trial has anew.
-        warm_up: In which trials that were not fitted tell of theirs.
+        nuisances: Names of the effects that each trial has anew.
+        warm_up: Time in which trials that were not fitted tell of theirs.
     """
     if num_summaries:
         yield (

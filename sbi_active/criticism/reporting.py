@@ -119,7 +119,7 @@ def report_of(
 
 
 def _outlying(loop: Steps, tracing: Tracing) -> list[str]:
-    """Return which fitted trials err far more than the others, a sentence each."""
+    """Return the fitted trials that err far more than the others, a sentence each."""
     misfit = tracing.misfit
     trials = loop.rivals.trials
     if misfit is None or misfit.left_out != "trials":

@@ -48,7 +48,7 @@ class ModelKey:
         return cls(() if name == NONE else (name,))
 
     def without(self, name: str) -> ModelKey:
-        """Return the same without one effect."""
+        """Return the key without one effect."""
         return ModelKey(tuple(n for n in self.effects if n != name), self.error)
 
     @property

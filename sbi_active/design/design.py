@@ -168,7 +168,7 @@ def action_labels(actions: ActionSpace) -> tuple[str, ...]:
 
 
 def are_categories(actions: ActionSpace) -> tuple[bool, ...]:
-    """Return which entries of an action are of a list, where others have no end."""
+    """Return a mask of an action's entries that are of a list beside endless ones."""
     listed = [(part.listed() is not None, part.action_dim) for part in actions.parts()]
     mixed = len({is_listed for is_listed, _ in listed}) > 1
     return tuple(mixed and is_listed for is_listed, dim in listed for _ in range(dim))

@@ -37,7 +37,7 @@ class DesignLimits:
     least: float = 0.0
 
     def __call__(self, action: Tensor) -> Tensor:
-        """Return which of actions (n, action_dim) are permitted, shape (n,), bool."""
+        """Return a mask of permitted actions (n, action_dim), shape (n,), bool."""
         inside = self.actions.permits(action)
         if self.constraint is not None:
             answer = torch.as_tensor(self.constraint(action))
@@ -94,7 +94,7 @@ class DesignLimits:
         return self.price(action)
 
     def reached_by(self, valid: Tensor) -> Tensor:
-        """Return which shares of measurements suffice, shape (a,).
+        """Return a mask of sufficient shares of measurements, shape (a,).
 
         They are NaN where every simulation was lost.
 

@@ -120,7 +120,7 @@ class GainEvaluator:
     def disagreements(
         self, simulations: CandidateSimulations, gain: Tensor
     ) -> Sequence[str]:
-        """Return where other estimators differ, see :func:`disagreements`."""
+        """Return the disagreements of other estimators, see :func:`disagreements`."""
         if self.num_others:
             return self.estimator.cautions(gain)
         with single_thread():

@@ -112,7 +112,7 @@ class Target:
         *,
         most_numbers: float,
     ) -> tuple[CandidateSampler | RivalSampler, InformationGainEstimator | None]:
-        """Return what draws outcomes of candidates (a, action_dim), and the estimator.
+        """Return the sampler of outcomes of candidates (a, action_dim), and estimator.
 
         Outcomes with more than so many numbers are summarized where noise allows.
 

@@ -120,7 +120,7 @@ class MotionLimits:
         self._theta = drawn.double()
 
     def __call__(self, action: Tensor) -> Tensor:
-        """Return which of actions (n, action_dim) stay within all limits, bool (n,)."""
+        """Return a mask of actions (n, action_dim) within all limits, bool (n,)."""
         action = torch.as_tensor(action).double()
         inside = np.ones(len(action), dtype=bool)
         # Most that leave their limits do so at any parameters.

@@ -16,7 +16,7 @@ ON_TIME = 1e-3
 
 
 def num_steps(times: Array, start: float, step: float) -> int:
-    """Return how many readings, one a step from the start, reach the last time."""
+    """Return the number of readings, one a step from the start, up to the last time."""
     last = float(np.nanmax(times)) - start
     return max(int(np.ceil(last / step - ON_TIME)), 0) + 1
 

@@ -178,7 +178,7 @@ def regression(
 def _score(
     progress: Progress, optimism: float
 ) -> tuple[Callable[[Tensor], Tensor], GaussianProcess]:
-    """Return what to ascend, and the regression of the utility in it."""
+    """Return the score to ascend, and the regression of the utility in it."""
     objective, coordinates, found = progress
     point = coordinates.points(found.action)
     c = coordinates.num_continuous

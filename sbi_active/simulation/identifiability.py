@@ -130,7 +130,7 @@ def find_undetermined(
 def _formulas(
     probe: Sensitivities, names: Sequence[str], where: str, practical: bool
 ) -> tuple[Undetermined, ...]:
-    """Return what has a formula that holds where it was tried."""
+    """Return groups with a formula that holds where it was tried."""
     covariances = probe.covariances(practical)
     place = {i: k for k, i in enumerate(probe.free)}
     theta = probe.theta.double().numpy()
@@ -184,7 +184,7 @@ def _holds(
 def _local(
     probe: Sensitivities, names: Sequence[str], where: str
 ) -> tuple[Undetermined, ...]:
-    """Return what changes nothing at each of the parameters, without a formula."""
+    """Return groups that change nothing at each parameter set, without a formula."""
     size, vectors = probe.singular()
     if not (size == 0).any(1).all():
         return ()

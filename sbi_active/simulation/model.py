@@ -318,7 +318,7 @@ class SimulatorModel:
     def _own_conditions(
         self, theta: Tensor, action: Tensor, given: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """Return what the model itself knows of how its trials are run."""
+        """Return the conditions of trials that the model itself knows."""
         found = {}
         if "times" in self.conditions and self.sample_times is not None:
             times = self.sample_times.to(theta.dtype)

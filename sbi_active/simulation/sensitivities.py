@@ -72,7 +72,7 @@ class Sensitivities:
         return np.where(np.isfinite(x), x, np.nan)
 
     def _noise(self) -> Array:
-        """Return what counts as large in x, by action and number, (1, a, numbers)."""
+        """Return sizes that count as large, by action and number, (1, a, numbers)."""
         gap = self.base - self.x(self.theta, "noise")
         with np.errstate(invalid="ignore"):
             noise = np.sqrt(0.5 * _mean(gap**2, 0))

@@ -40,7 +40,7 @@ def conditions_of_trials(
 def conditions_for(
     model: SimulatorModel, trials: Trials, rows: Tensor, dtype: torch.dtype
 ) -> dict[str, Any]:
-    """Return how trials were run as keyword arguments that a model's function takes.
+    """Return conditions of trials as keyword arguments that a model's function takes.
 
     Args:
         model: The simulator.

@@ -343,7 +343,7 @@ class RivalSet:
         return Fit(rival, sample, evidence)
 
     def names_of(self, rival: Rival) -> tuple[str, ...]:
-        """Return what the parameters of a rival and its effects are called."""
+        """Return the names of the parameters of a rival and its effects."""
         names = self.model.parameter_names
         if names is None:
             names = [f"theta_{i + 1}" for i in range(self.prior.event_shape[0])]

@@ -69,7 +69,7 @@ class _Recorder:
 def trajectories(
     model: SimulatorModel, prior: Distribution, trials: Trials, *, seed: int = 0
 ) -> Trajectories:
-    """Return how joints move in some trials, at draws of the prior.
+    """Return the motion of joints in some trials, at draws of the prior.
 
     Args:
         model: Simulator that takes ``force=``.

@@ -60,7 +60,7 @@ class Linear:
         unit: Array,
         tried: float | None = None,
     ) -> Linear:
-        """Return it around a fit of some of the effects.
+        """Return the linear model around a fit of some of the effects.
 
         Args:
             model: Linear model in units, without the others.

@@ -81,7 +81,7 @@ def identify(
     seed: int = 0,
     settings: IdentifySettings = IdentifySettings(),  # noqa: B008  (frozen)
 ) -> IdentifiedBelief:
-    r"""Return what trajectories tell of the parameters, with intervals that hold.
+    r"""Return the belief of trajectories over the parameters, with valid intervals.
 
     The best fit is found by least squares, and the model is linear around it. Errors
     of each channel may be white or last, for a time and in a size that nobody knows
@@ -279,7 +279,7 @@ def _beside(found: Fitted) -> dict[str, float]:
 
 
 def _errors(found: Fitted, model: SimulatorModel) -> dict[str, dict[str, float]]:
-    """Return what the errors of each channel are like, posterior medians."""
+    """Return the errors of each channel, as posterior medians."""
     draws, known, said = found.draws, found.errors, {}
     names = model.channel_names
     for c, unit in enumerate(found.sizes.tolist()):
@@ -311,7 +311,7 @@ def _beyond(
 
 
 def _opened(inside: Array, sd: float, half: float) -> Array:
-    """Return how far draws are inside a bound, as half a Gaussian at least, (n,).
+    """Return distances of draws from a bound, as half a Gaussian at least, (n,).
 
     Where trials ask for what is far beyond it, the posterior within has no width, which
     says nothing of the parameter.
@@ -328,7 +328,7 @@ def _opened(inside: Array, sd: float, half: float) -> Array:
 
 
 def _at_bounds(belief: IdentifiedBelief) -> list[str]:
-    """Return which parameters may be beyond a bound of the prior."""
+    """Return the parameters that may be beyond a bound of the prior."""
     notes, found = [], belief.interval()
     for (name, (low, high)), side in zip(found.items(), belief.sides, strict=True):
         if side:

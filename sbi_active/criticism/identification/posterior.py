@@ -221,7 +221,7 @@ class _Swept:
 def _present(
     swept: _Swept, p: Unknowns, present: Flags, absent: float, rng: np.random.Generator
 ) -> Flags:
-    """Return which effects are there, one after the other given all others.
+    """Return the effects that are there, one after the other given all others.
 
     Args:
         swept: Gaussians given the effects that are there; changed in place.

@@ -48,7 +48,7 @@ class Spread:
 
 
 def spread(found: Fitted, fewest: int) -> Spread:
-    """Return how parts of the trials disagree about theta.
+    """Return the disagreement of parts of the trials about theta.
 
     Args:
         found: The model, linear.

@@ -250,7 +250,7 @@ class Errors:
         )
 
     def weight(self, posterior: Posterior) -> Array:
-        """Return how much the squared errors of a trial count, mean one, shape (N,).
+        """Return weights of the squared errors of trials, mean one, shape (N,).
 
         Weights are the inverse of their mean variance: where a parameter differs from
         trial to trial, a trial that depends on it more tells less of everything else.

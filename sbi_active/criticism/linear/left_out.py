@@ -158,7 +158,7 @@ def _expected(
     precision: Array,
     is_free: NDArray[np.bool_],
 ) -> Array:
-    r"""Return what of the squared errors of parts the refits were unsure of, (f,).
+    r"""Return the part of squared errors that the refits were unsure about, (f,).
 
     Without a part coordinates have the covariance :math:`P_{-f}`, and by Woodbury's
     identity with :math:`P` of the fit to all

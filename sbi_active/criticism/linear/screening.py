@@ -93,7 +93,7 @@ def _with_kin(found: Screening, search: Search) -> Screening:
 
 
 def _best_of(linear: Library, every: Collection[str]) -> Screening | None:
-    """Return which effects of a library are worth a fit; None for all."""
+    """Return the effects of a library that are worth a fit; None for all."""
     singles = {n: linear.score((n,)) for n in linear.names}
     ranked = sorted(singles, key=singles.__getitem__)[::-1]
     best = dict(singles)

@@ -325,7 +325,7 @@ class Search:
         )
 
     def _starts(self, key: ModelKey, parent: ModelKey) -> Array:
-        """Return where a set's fit begins beside its linear optimum, shape (n, d)."""
+        """Return starts of a set's fit beside its linear optimum, shape (n, d)."""
         own, rival, model = self.settings, self._rival(key), self.found[parent].model
         c, shared = rival.coordinates, self.columns(key, parent)
         u = c.sample(own.num_drawn, seed=derive_seed(self._seed, str(key)))

@@ -186,7 +186,7 @@ class BySensor:
         return self.search.found[self._predicting(key)].posterior.log_process
 
     def record(self, key: ModelKey) -> Evidence:
-        """Return what is recorded of a model, and keep its draws."""
+        """Return the record of a model, and keep its draws."""
         log_z, bare = self._log_z[key], ModelKey()
         if key.error is not None:
             return replace(self.record(bare), key=key, log_evidence=log_z)

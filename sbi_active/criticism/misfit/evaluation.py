@@ -71,7 +71,7 @@ def evaluate_linear(misfit: Fitted, trials: Trials) -> Evaluation | None:
 
 
 def _prediction(misfit: Fitted, key: ModelKey, fold: int, place: int) -> Prediction:
-    """Return what a model that was fitted without a trial predicts of it."""
+    """Return the prediction of a trial by a model that was fitted without it."""
     search, m = misfit.search, misfit.rivals.measurements
     candidate, errors = search.found[key], search.errors
     posterior = misfit.posterior(key, np.arange(errors.num_folds) != fold)

@@ -203,7 +203,7 @@ def _distinct(
 
 
 def _variables(search: Search, own: NDArray[np.bool_]) -> Iterator[tuple[str, Array]]:
-    """Yield what a residual of some numbers may follow, shape (N,)."""
+    """Yield variables that a residual of some numbers may follow, shape (N,)."""
     trials, m = search.rivals.trials, search.rivals.measurements
     predicted = m.x - search.found[ModelKey()].model.residual * search.unit
     action = trials.action.double().numpy()

@@ -72,7 +72,7 @@ def beside_misfit(
 
 
 def _within(rivals: RivalSet) -> Callable[[ModelKey, Array], Array]:
-    """Return what moves draws of a model into the bounds of its prior."""
+    """Return a function that moves draws of a model into the bounds of its prior."""
     return lambda key, z: rivals.rival(key).coordinates.within(z)
 
 

@@ -52,13 +52,13 @@ CLOSE = 1.0
 
 
 def detected(misfit: Misfit) -> Detection:
-    """Return that the bare model misses the trials, by the evidence of the verdict."""
+    """Return the detection of the bare model's misfit, by the verdict's evidence."""
     bare = misfit.search.found[ModelKey()]
     return detection_of(bare, misfit.log_bayes_factor, LEVEL)
 
 
 def detection_of(bare: Candidate, log_b: float, level: float) -> Detection:
-    """Return what a linear bare model says of the trials.
+    """Return the detection by a linear bare model.
 
     Args:
         bare: The model.

@@ -120,7 +120,7 @@ def choose(
     timed: bool = True,
     guessed: Callable[[ModelKey, str], float] | None = None,
 ) -> Choice:
-    """Return what helps, and the probability that it is the cause.
+    """Return the effects that help, and their probability of being the cause.
 
     Args:
         models: Fitted models; with a set of effects, the sets with one effect less.
@@ -209,7 +209,7 @@ def _probabilities(
 
 
 def _cost(key: ModelKey, *, timed: bool) -> float:
-    """Return what a set is to gain for being so large, nats."""
+    """Return the gain that a set of this size needs, nats."""
     num = len(key.effects)
     second = 0.0 if timed or num < 2 else SECOND_FEW
     return second + DECISIVE * max(num - 2, 0)
@@ -218,7 +218,7 @@ def _cost(key: ModelKey, *, timed: bool) -> float:
 def stand_ins(
     models: Mapping[ModelKey, Scored], key: ModelKey, names: Sequence[str]
 ) -> dict[str, tuple[str, ...]]:
-    """Return what may stand in the place of each effect of a set, where anything may.
+    """Return the effects that may stand in the place of each effect of a set, if any.
 
     With it in the place of the effect, and the others as they are, a new trial is not
     predicted worse with a probability of .9.

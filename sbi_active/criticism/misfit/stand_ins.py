@@ -21,7 +21,7 @@ PROCESS = 1.1
 def judged(
     rivals: RivalSet, tracing: Tracing, evaluation: Evaluation | None
 ) -> Tracing:
-    """Return what was traced, and whether its forces are stand-ins.
+    """Return the tracing, and whether its forces are stand-ins.
 
     A force is adopted as an explanation only where the chi-square of its model has a
     tail probability of at least .01, and the error on trials that had no part in it

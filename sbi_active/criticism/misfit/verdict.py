@@ -196,7 +196,7 @@ class Misfit:
 def standard_errors(
     search: Search, use: NDArray[np.bool_] | None = None
 ) -> Callable[[Candidate], Array]:
-    """Return what gives a model's squared errors on left-out parts, once each, (f,).
+    """Return a function of a model's squared errors on left-out parts, (f,), cached.
 
     Trials count as much as the likeliest model has them vary, the same for all models.
 
@@ -222,7 +222,7 @@ def standard_errors(
 
 
 def scored(search: Search, c: Candidate, log_p: float, square: Array) -> Scored:
-    """Return what the rule is to know of a model.
+    """Return the scores of a model that the rule uses.
 
     Args:
         search: Search that has fitted it.
@@ -295,7 +295,7 @@ def settled(
     equivalent: Sequence[frozenset[str]],
     guessed: Callable[[ModelKey, str], float] | None = None,
 ) -> Choice:
-    """Return what helps, once every part of the top model is fitted.
+    """Return the choice, once every part of the top model is fitted.
 
     Args:
         search: The models so far.

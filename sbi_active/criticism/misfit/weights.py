@@ -35,7 +35,7 @@ NUM_BOOTSTRAP = 400
 def weights_by_error(
     square: Mapping[ModelKey, Array], log_prior: Mapping[ModelKey, float], seed: int
 ) -> dict[ModelKey, float]:
-    """Return how much each model counts, largest first, adding up to one.
+    """Return the weight of each model, largest first, adding up to one.
 
     Args:
         square: Mean squared errors on left-out parts of the trials, shape (f,); NaN for

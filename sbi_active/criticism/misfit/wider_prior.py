@@ -34,7 +34,7 @@ NEAR = 1e-6
 
 
 def beyond_bounds(rivals: RivalSet, tracing: Tracing) -> Tracing:
-    """Return what was traced, and what a wider prior would give.
+    """Return the tracing with the parameters at bounds, and fits with a wider prior.
 
     Parameters of the bare model and of that of the verdict that lie at a bound are
     fitted again with it moved. Where the bare model then explains the trials as well
@@ -74,7 +74,7 @@ def beyond_bounds(rivals: RivalSet, tracing: Tracing) -> Tracing:
 
 
 def _unless_none(tracing: Tracing, bounds: Bounds) -> Tracing:
-    """Return what was traced without effects that are the bare model's parameters."""
+    """Return the tracing without effects that are the bare model's parameters."""
     as_none = frozenset().union(*[g for g in tracing.equivalent if NONE in g])
     if tracing.chosen and as_none.issuperset(tracing.chosen):
         bounds = replace(bounds, replaces=str(ModelKey(tracing.chosen)))
@@ -107,7 +107,7 @@ def _sides(rivals: RivalSet, key: ModelKey) -> NDArray[np.int64]:
 
 
 def _explained(rivals: RivalSet, key: ModelKey) -> tuple[Whitener, float]:
-    """Return what whitens residuals of a model's best fit, and its chi-square."""
+    """Return the whitener of residuals of a model's best fit, and its chi-square."""
     rival = rivals.rival(ModelKey(key.effects))
     start = _start(rivals, key)
     whiten = rivals.noise.whitener(rival.residual(start[None])[0][0])
@@ -123,7 +123,7 @@ def _start(rivals: RivalSet, key: ModelKey) -> Array:
 
 
 def _starts(rivals: RivalSet, key: ModelKey, other: ModelKey) -> Array:
-    """Return where a refit starts: a model's own best fit, and theta of another's."""
+    """Return starts of a refit: a model's own best fit, and theta of another's."""
     own, dim = _start(rivals, key), rivals.prior.event_shape[0]
     return np.stack([own, np.r_[_start(rivals, other)[:dim], own[dim:]]])
 

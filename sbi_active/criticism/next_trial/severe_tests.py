@@ -107,7 +107,7 @@ def _difference(verdict: Prediction, free: Prediction, num: int) -> Array:
 
 
 def _affordable(rivals: RivalSet) -> int:
-    """Return how many candidates the residual process predicts in passable memory."""
+    """Return the number of candidates that the residual process predicts in memory."""
     m = rivals.measurements
     return max(MAX_ENTRIES // (len(m) * int(np.prod(m.shape[1:]))), 2)
 

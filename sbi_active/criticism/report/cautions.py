@@ -65,7 +65,7 @@ def find_warnings(
     exploratory: bool = False,
     designed: bool = False,
 ) -> tuple[Message, ...]:
-    """Return what limits the conclusions, a sentence each.
+    """Return the cautions that limit the conclusions, a sentence each.
 
     Args:
         trials: The measured trials.

@@ -38,7 +38,7 @@ def misfit_line(verdict: str, misfit: Misfit) -> str:
 
 
 def misfit_sentences(report: Contents, misfit: Misfit) -> str:
-    """Return what was found, what remains of the error, and what to make of it."""
+    """Return the findings, the remaining error, and its meaning."""
     begin = f"The bare model misses the {report.num_trials} trials by more than the "
     begin += f"sensor's error of {_size(report, misfit.sensor)}"
     if not misfit.helps:
@@ -176,7 +176,7 @@ def admitted_models(report: Contents, misfit: Misfit) -> Section:
 
 
 def _outdone(nats: float) -> str:
-    """Return what elementary formulas gain over an effect, where they do."""
+    """Return the gain of elementary formulas over an effect, if any."""
     return f"; guesses in its place gain {nats:.0f} nats over it" if nats > 1 else ""
 
 

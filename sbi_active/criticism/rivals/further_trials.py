@@ -50,7 +50,7 @@ def are_known(model: SimulatorModel, trials: Trials, action: Tensor) -> Tensor:
 def conditions_at(
     model: SimulatorModel, trials: Trials, action: Tensor
 ) -> dict[str, Any]:
-    """Return how trials at some actions would be run, as arguments of ``Trials``.
+    """Return conditions of trials at some actions, as arguments of ``Trials``.
 
     Inputs and start state are those of the first trial of the action; at an action that
     none has, inputs are the model's signals and the start is the mean of those
@@ -86,7 +86,7 @@ def conditions_at(
 
 
 def together(trials: Trials, further: dict[str, Any]) -> dict[str, Any]:
-    """Return how trials were run, with further ones behind them.
+    """Return the conditions of trials, with further ones behind them.
 
     Args:
         trials: Measured trials.
@@ -119,7 +119,7 @@ def _signals(
 
 
 def _same(trials: Trials, action: Tensor) -> Tensor:
-    """Return which trials have which actions, shape (a, t)."""
+    """Return a mask of the trials that have each action, shape (a, t)."""
     own, asked = trials.action.double(), action.double()
     return torch.isclose(asked[:, None], own[None], rtol=RTOL, atol=ATOL).all(-1)
 

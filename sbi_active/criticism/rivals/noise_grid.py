@@ -164,7 +164,7 @@ def _correlated(
 
 
 def _channel_of(measurements: Measurements, num: int) -> NDArray[np.int64]:
-    """Return which of the declared standard deviations each number has."""
+    """Return the index of the declared standard deviation of each number."""
     if num == 1:
         return np.zeros(len(measurements), dtype=np.int64)
     last = measurements.shape[-1]

@@ -221,7 +221,7 @@ class ResidualProcess(ErrorModel):
         return spread * np.median(sd / spread)
 
     def _inputs(self, action: Array, order: Array | None) -> list[Array]:
-        """Return where trials lie for each process, in its lengths, (t, columns)."""
+        """Return the places of trials for each process, in lengths, (t, columns)."""
         inputs = [action / length for length in self.lengths]
         if order is not None:
             inputs.append(order[:, None] / ORDER_LENGTH)
@@ -242,7 +242,7 @@ class ResidualProcess(ErrorModel):
         return log_p + self._log_constant(basis, num)
 
     def grams(self, rows: Array) -> tuple[Array, Array]:
-        """Return what rows whitened by each process come to, amplitude by amplitude.
+        """Return Gram matrices of rows whitened by each process and amplitude.
 
         Args:
             rows: Residual and its derivatives, shape (N, k).

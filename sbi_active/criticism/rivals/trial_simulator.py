@@ -130,7 +130,7 @@ class TrialSimulator:
         return np.concatenate(mean), joined, np.concatenate(valid)
 
     def _num_inputs(self) -> int:
-        """Return how many numbers all trials' inputs have."""
+        """Return the count of numbers in all trials' inputs."""
         inputs, source = self.trials.inputs, self.model.base.inputs
         if inputs is None and source is not None:
             inputs = source.inputs(self.trials.action)

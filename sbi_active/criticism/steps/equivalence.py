@@ -296,7 +296,7 @@ def _small(effect: Effect, step: float) -> tuple[torch.Tensor, float]:
 
 
 def _alike(left: list[tuple[Array, float]], local: list[bool]) -> Array:
-    """Return which pairs (none first) have the same direction, and which can be told.
+    """Return masks of pairs (none first) that have the same direction, and can be told.
 
     At parameters where nothing is left of an effect, it tells nothing of a pair.
     """

@@ -219,7 +219,7 @@ def _draws(distribution: Distribution, seed: int, key: str) -> Array:
 
 
 def _effective(draws: Array) -> float:
-    """Return how many different draws there are, repetitions weighed."""
+    """Return the number of different draws, repetitions weighed."""
     count = np.unique(draws, axis=0, return_counts=True)[1]
     return float(count.sum() ** 2 / (count**2).sum())
 
@@ -255,7 +255,7 @@ def _known(
 def _left(
     group: Sequence[Combination], moments: Any, own: Array, names: Sequence[str]
 ) -> UnknownCombination:
-    """Return what known combinations leave open of their parameters."""
+    """Return the combination that the known ones leave open."""
     if len(group) == 1 and len(group[0].terms) == 2:
         other = group[0].mirrored()
         wide = width(other.weight, *moments(other.terms))

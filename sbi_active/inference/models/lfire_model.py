@@ -115,7 +115,7 @@ def fit_log_ratios(
 
 
 def _places(rows: Tensor, known: Tensor, name: str, what: str) -> Tensor:
-    """Return where each row is among those known, shape (n,)."""
+    """Return the place of each row among those known, shape (n,)."""
     rows = torch.as_tensor(rows, dtype=torch.float32)
     rows, inverse = rows.unique(dim=0, return_inverse=True)
     same = (rows[:, None] == known).all(-1)

@@ -265,7 +265,7 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         return (logits + component + log_det).logsumexp(-1) - logits.logsumexp(-1)
 
     def _see(self, condition: Tensor) -> tuple[Tensor, Frames | None]:
-        """Return what the layers see of a condition, and the frames of its row."""
+        """Return the layers' input for a condition, and the frames of its row."""
         if self.conditioning is None:
             z, frames = (condition - self.condition_mean) / self.condition_scale, None
         else:

@@ -123,7 +123,7 @@ class Response(nn.Module):
         return curved if exceeds_chance(gain) else linear
 
     def weights(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        r"""Return what makes the noise of an action standard normal, and f's weights.
+        r"""Return the whitener of an action's noise, and f's weights.
 
         A root of :math:`S^{-1}`, shape (n, m, m), and :math:`\beta` for
         :math:`\psi(u)`, in the outcome's own units, shape (n, p, m).

@@ -56,7 +56,7 @@ class RowCache(Generic[T]):
 
 
 def _count(value: Any) -> int:
-    """Return how many numbers a value holds."""
+    """Return the count of numbers in a value."""
     if isinstance(value, tuple):
         return sum(_count(part) for part in value)
     return 0 if value is None else value.size

@@ -166,7 +166,7 @@ class ActionRounds(ActiveInference):
 
     @abstractmethod
     def _model(self, estimator: Any, *arguments: Any) -> Any:
-        """Return what was learned, of the arguments of ``_create_posterior``."""
+        """Return the learned model, from the arguments of ``_create_posterior``."""
 
     def _create_posterior(
         self,

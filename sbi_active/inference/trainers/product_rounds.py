@@ -223,7 +223,7 @@ class ProductRounds(ActionRounds):
         return belief
 
     def _places(self, belief: Distribution, num: int, seed: int) -> Tensor:
-        """Return where to simulate, around a belief, shape (num, theta_dim)."""
+        """Return parameters to simulate around a belief, shape (num, theta_dim)."""
         prior = require_support(self._prior)
         with forked_generators(seed, "theta"):
             theta = belief.sample(torch.Size([num]))

@@ -44,7 +44,7 @@ def presence_information(simulations: CandidateSimulations) -> Tensor:
 
 
 def random_presence(simulations: CandidateSimulations) -> Tensor:
-    """Return where outcomes at the same parameters differ in what is present, (a,)."""
+    """Return a mask of candidates whose outcomes differ in what is present, (a,)."""
     first, second = _patterns(simulations).unbind(1)
     return ((first != second) & simulations.counted).any(1)
 

@@ -150,7 +150,7 @@ def _all(
 def _that_matter(
     simulator: SimulatorModel, effects: Sequence[Effect], call: dict[str, Any]
 ) -> list[Effect]:
-    """Return those that are no parameter and change what is read."""
+    """Return the effects that are no parameter and change the readings."""
     function = simulator.fn
     assert isinstance(function, MujocoFunction)
     bare = SimulatorModel(

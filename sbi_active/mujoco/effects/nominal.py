@@ -203,7 +203,7 @@ def _scalars(model: Any, data: Any) -> Array:
 
 
 def _zeros(model: Any) -> Array:
-    """Return what joints read where :func:`_scalars` counts from, (nv,)."""
+    """Return the joints' readings where :func:`_scalars` counts from, (nv,)."""
     zeros = np.zeros(model.nv)
     for name, place in start_places(model).items():
         if place < model.nq and "[" not in name:

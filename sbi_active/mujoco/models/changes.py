@@ -82,7 +82,7 @@ class StateChange(ModelChange):
 
     @abstractmethod
     def values(self, q: Array, v: Array, load: Array, phi: Array) -> Array:
-        """Return what is added for each joint, shape (n, joints).
+        """Return the values added for each joint, shape (n, joints).
 
         Args:
             q: Positions of the joints, shape (n, joints).

@@ -212,7 +212,7 @@ class Machine:
         return [known[key] for key in keys]
 
     def _groups(self, rows: Rows) -> list[tuple[tuple[Insertion, ...], Array, Array]]:
-        """Return what is inserted, in which rows, and its weight in what they read."""
+        """Return the insertions, their rows, and their weights in the readings."""
         insertions = [c for c in rows.changes if isinstance(c, Insertion)]
         if not insertions:
             return [((), np.arange(len(rows)), np.ones(len(rows)))]
@@ -251,7 +251,7 @@ class Machine:
         return self._models[inserted]
 
     def _order(self, base: Any) -> tuple[Array, Array]:
-        """Return where the machine's positions and velocities are in a model."""
+        """Return the places of the machine's positions and velocities in a model."""
         own, other = start_places(self.model), start_places(base)
         places = np.array([other[name] for name in sorted(own, key=own.__getitem__)])
         nq, nv = self.model.nq, self.model.nv

@@ -271,7 +271,7 @@ class _Compiled:
 def _affine(
     compiled: Callable[[Array], Any], low: Array, high: Array
 ) -> _Affine | None:
-    """Return what writes affine numbers, None where some are not."""
+    """Return the writer of affine numbers, None where some are not."""
     middle, half = 0.5 * (low + high), 0.25 * (high - low)
     base = _numbers(compiled(middle))
     steps = []

@@ -193,7 +193,7 @@ class Bank:
         label: str | None,
         log_action: float | Tensor = float("nan"),
     ) -> LabeledStore:
-        """Return this bank as a store for simulations whose theta has one proposal.
+        """Return this bank as a store of simulations whose theta has one proposal.
 
         Args:
             proposal: Proposal that theta was drawn from, as in :meth:`append`.

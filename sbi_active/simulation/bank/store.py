@@ -295,7 +295,7 @@ class Store:
         return wrong
 
     def _structure(self, what: str) -> list[str]:
-        """Return what SQLite finds wrong with the file, or a table of it."""
+        """Return the problems that SQLite finds in the file, or in a table of it."""
         try:
             with self.reading() as connection:
                 check = f"PRAGMA integrity_check({what})"
@@ -356,7 +356,7 @@ class Store:
         return digest.digest()
 
     def _found(self) -> tuple[int, ...]:
-        """Return what changes where the file is another one, or is changed."""
+        """Return a value that changes if the file is another one, or is changed."""
         with suppress(OSError):
             state = self.path.stat()
             return state.st_ino, state.st_size, state.st_mtime_ns
