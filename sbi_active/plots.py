@@ -36,7 +36,7 @@ def plot_belief(
         limits: Lower and upper ends of the axes, shape (2, theta_dim).
         theta_true: True parameters, marked by a cross where given.
         pair: Pair of parameters to draw.
-        num_samples: Points.
+        num_samples: Number of samples to draw.
     """
     i, j = pair
     theta = belief.sample((num_samples,)).numpy()
@@ -67,11 +67,11 @@ def plot_rounds(
     The arrangement of figure 3 of Kim & Matsubara (2025).
 
     Args:
-        beliefs: Before the first round and after each, one more than designs.
+        beliefs: Beliefs before the first round and after each, one more than designs.
         designs: Designs, one a round.
         parameter_names: Names of the parameters.
         theta_true: True parameters, marked where given.
-        exact_gains: The exact gain of every candidate, one a round, where known.
+        exact_gains: Exact gains of every candidate, one tensor a round, where known.
 
     Returns:
         The figure.

@@ -35,10 +35,11 @@ class Trial:
             which is information; "missing" where a fault unrelated to the parameters
             hit it, and "withdrawn" where it was taken back, which are ignored.
         design: The design behind the action; None where the trial was not asked for.
-        target: What the action was chosen for: "theta" or names of parameters, "model",
-            "check" for one where no trial was, "random"; None where it was not asked
-            for.
-        information_gained: Realized, KL(belief after || before) in nats.
+        target: Target of the action: "theta" or names of parameters, "model", "check"
+            for an action far from all others, "random"; None for an action that was not
+            asked for.
+        information_gained: Realized information gain, KL(belief after || before) in
+            nats.
         surprise: Tail probability of x under the posterior predictive of the belief
             before the trial; uniform where the simulator is right.
         belief_error: Nats that the belief before the trial is off for want of
@@ -48,19 +49,19 @@ class Trial:
         misfit: Tail probability of all trials so far under the belief after this one,
             which was fitted to them; None for a belief that was not refined, or that is
             off by more than 0.2 nats.
-        outlyingness: How far x lies beyond all simulations from the prior at this
+        outlyingness: Distance of x beyond all simulations from the prior at this
             action, in their range, by its farthest number; inf where none of them had
             such a number, None where it is as others from the belief before are. Above
             5 nothing in the prior explains the trial, and the belief leaves it out.
-        network_used_by: What asked the network of this round: the "design", whose
-            estimate rests on it, or the design's "notes", which compare the estimate
-            with it; the "belief", where it is the network's word; where the belief is
-            refined, its "start", which adds simulations there and no weight, and its
+        network_used_by: Users of this round's network: the "design", whose estimate
+            rests on it, or the design's "notes", which compare the estimate with it;
+            the "belief", where it is the network's word; where the belief is refined,
+            its "start", which adds simulations there and no weight, and its
             "diagnostics", which compare the two; and :attr:`.Campaign.posterior`, as
             "posterior".
         summary: The summary of the outcome that the belief rests on, where the action
             chooses among several.
-        reason: Why it was withdrawn.
+        reason: Reason for which it was withdrawn.
         version: Number of the model that scored the trial.
         seconds: Wall time by stage; this and what follows add up where the campaign is
             computed again.

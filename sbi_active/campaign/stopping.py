@@ -19,12 +19,13 @@ NUM_DRAWS = 2_000  # of the belief; 1.6 % error of a standard deviation
 class StopRules:
     """Rules by which :meth:`.Campaign.run` ends before its last round.
 
-    Any one ends it, but the first two not while the campaign's health is not "ok": a
-    simulator that lacks something makes a belief narrow at a wrong place, which is what
-    both wait for.
+    Any one ends it, but the first two only while the campaign's health is "ok": with a
+    simulator that lacks something, a belief becomes narrow at a wrong place, and both
+    would stop.
 
     Attributes:
-        min_information_gain: The next trial is expected to tell less than this, nats.
+        min_information_gain: Smallest expected information gain of the next trial,
+            nats.
         max_sd: Largest standard deviation of any parameter under the belief: one
             number, or one a parameter, in the parameters' units.
         calibration_lost: The verdict of :mod:`sbi_active.diagnostics` is "stop":

@@ -85,7 +85,7 @@ class CampaignTrials(CampaignView):
         A pending trial stays pending.
 
         Args:
-            action: The executed one, shape (action_dim,).
+            action: Executed action, shape (action_dim,).
             x: Outcome, as in :meth:`tell`.
             status: Status of the trial, as in :meth:`tell`.
 
@@ -108,8 +108,8 @@ class CampaignTrials(CampaignView):
     ) -> Trial:
         """Replace what was told of a trial; the log keeps what was told before.
 
-        The next :meth:`update` computes everything that rests on it again, as if it had
-        been told so at once. :meth:`tell` with ``trial=`` is the same without a reason.
+        The next :meth:`update` recomputes everything that depends on it, as if this had
+        been told at once. :meth:`tell` with ``trial=`` is the same without a reason.
 
         Args:
             trial: The trial or its index.
@@ -156,7 +156,7 @@ class CampaignTrials(CampaignView):
     def withdraw(self, trial: Trial | int, *, reason: str = "") -> Trial:
         """Take a trial out; it stays in the history, with the status "withdrawn".
 
-        The next :meth:`update` computes everything again without it, as if it had been
+        The next :meth:`update` recomputes everything without it, as if it had been
         "missing". :meth:`tell` with ``trial=`` brings it back.
 
         Args:

@@ -76,15 +76,15 @@ class Criticism:
             are left out where that is unknown.
         actions: The permitted actions, for what no action separates and for the next
             one; None leaves both to the trials at hand.
-        summaries: Compare at most this many summaries of x in place of all its numbers,
-            0 for none; None takes 20 where a trial has more than 500 numbers without a
-            time axis, with independent noise.
+        summaries: Number of summaries of x to compare instead of all its numbers, at
+            most; 0 for none. None takes 20 if a trial has more than 500 numbers without
+            a time axis, with independent noise.
         warm_up: Time from its first sample, in the unit of the sample times, in which a
             held-out or left-out trial tells of its nuisances (effects of scope
             "trial"), and is not scored; 0 draws them from their priors.
-        thin: Leave out samples of trajectories that say again what others say, as the
-            bare model's fit shows, where the sensor's error is declared by
-            ``measurement_sd``. What the simulator is given stays as it is.
+        thin: Whether to thin trajectories to a rate at which innovations of the bare
+            model's fit are uncorrelated, if ``measurement_sd`` declares the sensor's
+            error. The inputs of the simulator stay as they are.
         seed: Seed of all draws.
         show_progress: Whether to draw a bar of what is being done. The logger
             "sbi_active" says it of all that takes 2 s anyway.
@@ -379,14 +379,14 @@ class Criticism:
         """Return the report of all steps.
 
         Args:
-            evaluate: Without held-out trials the error costs one verdict a trial; False
-                leaves it out.
-            plan: Name the next action, and those that would test the verdict most,
+            evaluate: Whether to report the error before and after. Without held-out
+                trials it costs one verdict a trial.
+            plan: Whether to name the next action and the severest tests of the verdict,
                 which takes about as long as the verdict.
-            designed: The trials' actions were chosen for their information, of which
-                the report then warns.
-            exploratory: Library or priors were changed after the data were seen, of
-                which it warns too.
+            designed: Whether the trials' actions were chosen for their information; the
+                report then warns of it.
+            exploratory: Whether library or priors were changed after the data were
+                seen; the report then warns of it.
         """
         from sbi_active.criticism.reporting import report_of
 

@@ -147,7 +147,7 @@ class Detection:
     Attributes:
         log_bayes_factor: Log Bayes factor of the mixture of effects and catch-alls
             against the bare model, nats.
-        standard_error: Monte Carlo, nats.
+        standard_error: Monte Carlo standard error, nats.
         lower: log_bayes_factor minus twice its standard error.
         threshold: log 20.
         chi_square: Smallest whitened residual sum of squares of the bare model.
@@ -214,7 +214,8 @@ class Estimate:
         family: Family of the effect.
         units: Units of phi.
         describe: Sentence of the effect, or "".
-        probability: Probability that the effect is missing, alone or with others.
+        probability: Probability that the simulator lacks the effect, alone or with
+            others.
         log_bayes_factor: Log Bayes factor of the effect alone against the bare model.
         mean: Mean of phi given the effect alone, shape (phi_dim,).
         sd: Standard deviation of phi given the effect alone, shape (phi_dim,).
@@ -255,26 +256,26 @@ class Tracing:
             (log evidence within log 20 of the best) with predictions closer than the
             noise over the permitted actions; repeated trials may separate them.
         estimates: Estimates, one an effect, most probable first.
-        evidences: Evidence of every model tried, by name; effects have priors of
+        evidences: Evidence of every model tried, by name. Priors of effects have
             unknown scale.
         robust: Whether effect priors a third and three times as wide agree.
         guesses: Formula effects, best first: (formula, log evidence above
             "unexplained"), which is empty unless nothing declared explains the data.
         beside: Effects that explain most of what is "unexplained", the residual process
             taking the rest; empty where it takes all, and for any other verdict.
-        outliers: Probability that each trial is the one, if one has a gross error, by
-            its index, most probable first; empty without an alarm.
+        outliers: Probability that each trial has a gross error, if one has, by its
+            index, most probable first; empty without an alarm.
         needed: Indices of the trials without any one of which the data do not point to
             the effects that explain them best.
-        instead_of: Effects that the evidence is for and the verdict does not name,
+        instead_of: Effects that the evidence favors and the verdict does not name,
             since a trial that may have a gross error alone speaks for them, or further
             trials speak against them; "" for none.
         refuted: The RMSE of these further trials, or of left-out ones, before and
             after, which is why; None where it is not.
         refuted_on: Name of these trials; "" for all that had no part in the verdict.
-        misfit: Why, where every model misses by more than the sensor's error. Effects
-            that help are then ``chosen``, those that are probably the cause are the
-            verdict, and the rest stand in ``beside``.
+        misfit: Account of the misfit if every model misses by more than the sensor's
+            error. Effects that help are then ``chosen``, those that are probably the
+            cause are the verdict, and the rest stand in ``beside``.
         trial_names: Names of the trials by index; others are called by their index.
         stand_in: Reasons why forces of the dictionary that are chosen only stand in for
             something that nobody declared, a clause each; empty where they may be it.

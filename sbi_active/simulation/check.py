@@ -47,7 +47,7 @@ def check_simulator(
     workers: Workers | int | None = None,
     seed: int = 0,
 ) -> SimulatorReport:
-    """Run a simulator over draws of the prior and say what a campaign would meet.
+    """Run a simulator over draws of the prior and report its defects before a campaign.
 
     A defect keeps a campaign from working: the simulator raises, gives rows of another
     number or shape, is deterministic, has no measurement at all, mixes its rows, or

@@ -65,23 +65,23 @@ class SimulatorModel:
         noise: Noise added to the output of ``fn``; None where ``fn`` is itself the
             draw. A number is the standard deviation of Gaussian noise.
         batched: Whether ``fn`` takes all rows at once.
-        setup: Called without arguments once a process, before the first run; ``fn``
-            receives what it returns as keyword argument ``context``. It is neither
+        setup: Function called without arguments once a process, before the first run;
+            ``fn`` receives its result as keyword argument ``context``. It is neither
             pickled nor freed before the process ends.
         parameter_names: Names of the parameters.
         channel_names: Names of the entries of x's last axis; a single one where x is a
             trajectory of one channel, which has no axis of its own.
         sample_times: Time stamps of x's first axis in seconds, shape (T,), for the
             noise.
-        inputs: Where actions are parameters of a signal, alone or beside others, their
-            space: ``fn`` receives its signals as ``inputs``, unless trials bring those
-            that were recorded.
+        inputs: Space of the actions if they are parameters of signals, alone or beside
+            others: ``fn`` receives the signals as ``inputs``, unless trials have
+            recorded ones.
 
     Attributes:
         noise: Noise with the time stamps, where there are any.
         effect_names: Names of the effects that ``fn`` declares.
-        conditions: Which of ``times``, ``inputs``, ``input_times`` and ``start`` ``fn``
-            takes as keyword arguments.
+        conditions: Keyword arguments of ``fn`` among ``times``, ``inputs``,
+            ``input_times`` and ``start``.
         is_batched: Whether ``fn`` takes all rows at once.
         fn_takes_seeds: Whether each row of ``fn`` is a function of its seed.
 

@@ -37,7 +37,7 @@ class Trials:
 
     Ragged observations are padded with NaN. NaN is masked, and so is inf, with a
     warning; a trial of NaN alone is *invalid*: the system ran and gave no measurement.
-    What is given is copied, and may change afterwards.
+    All arguments are copied, and may change afterwards.
 
     Args:
         action: Actions as commanded, shape (n, action_dim), or (n,) for scalar ones.

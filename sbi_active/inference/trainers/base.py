@@ -23,8 +23,9 @@ class Told:
 
     Attributes:
         trials: Trials, all of them, the new one last.
-        simulator: To refine the belief with; None takes the word of the network.
-        refinement: Budget of that; None is ``RefinementOptions()``.
+        simulator: If given, simulator to refine the belief with; otherwise use the
+            network.
+        refinement: Budget of the refinement; None is ``RefinementOptions()``.
         given_seed: Seed given by the caller; None for none.
         afresh: Whether to begin at the prior, without the belief before the last trial
             and without this round's network.
@@ -65,7 +66,7 @@ class ActiveInference(ABC):
             ``model.belief`` draws.
         starts_at_network: Whether a refinement begins at this round's network, where
             there is one.
-        network_serves: A refinement that does: as its "start", or also for the
+        network_serves: Use of that network: the "start" of a refinement, or also its
             "diagnostics", which compare it with the refined belief.
     """
 

@@ -30,8 +30,9 @@ class ReusedRows:
     Attributes:
         bank: Bank that has the rows.
         rows: Positions of the rows, shape (k,), int64.
-        weights: Sum to one, shape (k,), float64.
-        denominator: "mixture" of all proposals, or each row's "own" proposal.
+        weights: Weights that sum to one, shape (k,), float64.
+        denominator: Denominator of the weights: "mixture" of all proposals, or each
+            row's "own".
         share: Share of the weight, by label of the proposal.
     """
 

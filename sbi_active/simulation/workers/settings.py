@@ -12,8 +12,8 @@ class Workers:
     """Workers that run simulations, and the cost of a row; x does not depend on them.
 
     Attributes:
-        num_workers: Calls at a time; -1 means one a core. One worker without a time
-            limit is this process.
+        num_workers: Number of calls at a time; -1 means one a core. One worker without
+            a time limit is this process.
         time_limit: Seconds a row, loading the simulator not counted; a batch may take
             as much as its rows. None waits for ever. With it, or with more than one
             worker, a simulator that ends its process costs a row.
