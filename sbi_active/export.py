@@ -51,7 +51,7 @@ def to_inference_data(
         parameter_names: Names of the parameters; None takes the simulator's, which
             beliefs remember, else theta_1, ...
         num_samples: Draws of all chains together.
-        num_chains: Chains; draws that do not fill all are left out.
+        num_chains: Number of chains; draws that do not fill all are left out.
         model: Model of a report, by a name among ``report.tracing.evidences``.
         seed: Seed of the draws.
 
@@ -92,7 +92,7 @@ def to_datatree(
             :func:`to_inference_data`.
         parameter_names: Names of the parameters.
         num_samples: Draws of all chains together.
-        num_chains: Chains.
+        num_chains: Number of chains.
         model: Model of a report, by its name.
         seed: Seed of the draws.
     """

@@ -28,15 +28,15 @@ class SummaryAction(DiscreteActions):
             tensor, that returns (n, d); or an object with ``fit`` and ``transform`` of
             NumPy arrays, such as ``sklearn.decomposition.PCA``, of which copies are
             fitted to the simulations of a round.
-        use: Which summary a belief rests on: at each trial the "best", that of which
-            the outcome is expected to tell most at the executed action, since all of
-            them are at hand; or the "chosen" one, as in Kim & Matsubara (2025).
+        use: Summary that a belief rests on: at each trial the "best", which is expected
+            to be most informative at the executed action, since all of them are at
+            hand; or the "chosen" one, as in Kim & Matsubara (2025).
         name: Name of the entry.
 
     Attributes:
         summaries: Summaries by name, as given.
         labels: Names of the summaries, in the order of :math:`\delta`.
-        use: Which summary a belief rests on, "best" or "chosen".
+        use: Summary that a belief rests on, "best" or "chosen".
 
     Raises:
         ValueError: If there is no summary, or ``use`` is another word.

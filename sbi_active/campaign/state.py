@@ -165,7 +165,7 @@ class CampaignState:
             shape (n, theta_dim); of the parameters that the model had then.
         batches: Simulations made for the current model where belief, designs and scores
             share their simulations.
-        meter: Counts the campaign's simulations.
+        meter: Counter of the campaign's simulations.
         watch: Context that is entered around whatever may take long, with the state,
             the index of the trial that it is for (of the next one where it is for none)
             and its name.

@@ -86,7 +86,7 @@ def make_task(name: str, options: Sequence[str]) -> Task:
     """Return a task with the options of a command line.
 
     Args:
-        name: One of ``TASKS``.
+        name: Name among ``TASKS``.
         options: Options, each ``NAME=VALUE``.
 
     Raises:

@@ -48,7 +48,7 @@ class Design:
         num_simulations: Simulations spent.
         name: Name of the action, with its unit.
         labels: Names of its entries, with their units.
-        categorical: Which entries are those of a list beside a space without end.
+        categorical: Mask of the entries that are of a list beside a space without end.
         estimator: Class that estimated.
         num_samples: Simulations of each candidate, shape (a,). Candidates that were
             eliminated early have fewer.

@@ -115,8 +115,8 @@ class InformationGainEstimator(ABC):
     r"""Estimator of :math:`I(\theta; x | \xi)` in nats for a set of candidates.
 
     Attributes:
-        bound: Which side of the information the estimate's expectation lies on,
-            whatever the model.
+        bound: Side of the information that the estimate's expectation lies on, whatever
+            the model.
         needs_noise: Whether it uses the declared noise, or else replicates.
         needs_model: Whether it uses something learned.
         rowwise: Whether a contribution depends on its own row alone, as given by

@@ -49,7 +49,8 @@ class MotionLimits:
         torque: Largest force by actuator, N m or N, of the actuator's own; None takes
             the ``forcerange`` of the MJCF where it has one.
         belief: Belief over the parameters; None takes the prior.
-        num_draws: Draws of the parameters. The first alone refuses most.
+        num_draws: Number of draws of the parameters. The first one already refuses
+            most.
         seed: Seed of the draws.
 
     Raises:

@@ -62,8 +62,9 @@ class Robot(NamedTuple):
     """The parts of a robot that a campaign or the closed loop needs.
 
     Attributes:
-        simulator: Runs MuJoCo; ``simulator.fn`` is a :class:`.MujocoFunction`.
-        prior: Uniform within the bounds of the parameters, with ``names`` and
+        simulator: Simulator that runs MuJoCo; ``simulator.fn`` is a
+            :class:`.MujocoFunction`.
+        prior: Prior, uniform within the bounds of the parameters, with ``names`` and
             ``units``.
         actions: Actions that the robot may take; None where only recordings say that.
         trials: The recordings; None where there are none.
@@ -100,7 +101,7 @@ def from_mjcf(
             edit)}`` with ``edit(spec, value)`` for what only the spec can say. The
             prior is uniform within these bounds.
         inputs: Actuators that recordings drive, None for all; or a space of signals
-            named by actuators, which are then the actions.
+            named by actuators. These signals are then the actions.
         sensors: Sensors of the MJCF that are read, None for all; also joints, as in
             "hinge" or "hinge velocity", for which it has no sensor.
         actions: Actions that are chosen in each trial, beside a signal too: its names
@@ -112,10 +113,10 @@ def from_mjcf(
         noise: Noise of the sensors, as ``SimulatorModel`` takes it, or standard
             deviations by sensor; None takes ``noise`` of the sensors in the MJCF, where
             it is given.
-        start: Start of every trial whose action or recording does not say: positions,
-            velocities, controls that are held ("motor control") and poses of mocap
-            bodies ("target mocap[0]") by name, or the name of a keyframe, which gives
-            all of these. None is the model's.
+        start: Start state of trials whose action or recording does not give it:
+            positions, velocities, controls that are held ("motor control") and poses of
+            mocap bodies ("target mocap[0]") by name, or the name of a keyframe, which
+            gives all of these. None is the model's.
         recordings: Logs, one a trial, as in :func:`.trials_of`.
         threads: Number of threads of MuJoCo's rollout, in each process. Results do
             not depend on it.

@@ -65,9 +65,9 @@ def from_sysid(
         model_sequences: One ``ModelSequences`` or several; or a ``residual_fn`` of
             ``build_residual_fn``, which is taken as a simulator as it is: an outcome is
             then minus its residual, whose measured value is 0.
-        params: A ``ParameterDict``. A uniform prior within ``get_bounds()``.
-        transform: A ``SignalTransform``; of its weights and its normalization nothing
-            is needed where noise is declared.
+        params: A ``ParameterDict``; the prior is uniform within its ``get_bounds()``.
+        transform: A ``SignalTransform``. Its weights and normalization are not needed
+            if noise is declared.
         actions: Actions that the robot may take; None takes the recorded sequences, of
             which the action is the number. Entries are those of
             :class:`.MujocoFunction`; "model" is the number of a ``ModelSequences``.

@@ -33,8 +33,8 @@ class RobustBelief(Belief):
         1[\theta \in \mathrm{supp}\, p] / Z, \qquad x_i \sim p(x | x_o)
 
     Args:
-        estimator: q over packed conditions.
-        condition: (x_i, action), shape (n, condition_dim).
+        estimator: Estimator q over packed conditions.
+        condition: Conditions (x_i, action), shape (n, condition_dim).
         prior: The original prior.
         denoised: Denoised outcomes that it was drawn with.
     """
@@ -91,11 +91,11 @@ class RobustBelief(Belief):
 
 
 class RobustASBI(ASBI):
-    r"""ASBI that does not take an outcome at its word.
+    r"""ASBI that is robust to errors of an outcome.
 
     A trial's outcome is denoised with the error model and the predictive under the
     belief before it, and the belief becomes the network's posterior averaged over
-    denoised outcomes. The simulator serves the predictive alone, and nothing is
+    denoised outcomes. The simulator is only used for the predictive, and nothing is
     refined: the result is a chained approximation as that of :class:`ASBI` without one.
 
     Args:
@@ -131,7 +131,7 @@ class RobustASBI(ASBI):
                 what the predictive says given the others.
             action: The executed action.
             simulator: Simulator of the predictive; required.
-            refinement: Not used; anything but None is an error.
+            refinement: Refinement, which must be None.
             seed: Seed of all draws; None draws one from torch's global generator.
 
         Raises:

@@ -51,8 +51,8 @@ class Objective:
         actions: The space.
         permitted: Function of actions (n, action_dim) that says which may be chosen,
             shape (n,), bool.
-        evaluate: Simulate actions (k, action_dim), all at the same parameters, also
-            from call to call.
+        evaluate: Function that simulates actions (k, action_dim), all at the same
+            parameters, also from call to call.
         num_evaluations: Actions that may be evaluated.
         seed: Seed of the search's draws.
         min_probability_valid: Share of measurements that a choice needs.

@@ -116,7 +116,8 @@ class Learner:
         """Go on where ``state.processed`` ends.
 
         Args:
-            belief: Returns the belief of then, read when it is first asked for.
+            belief: Function that returns the belief of that time, read when it is first
+                asked for.
         """
         self._saved = belief
 

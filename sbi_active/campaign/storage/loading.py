@@ -54,7 +54,8 @@ class StoredLearner:
         prior: Prior that the campaign began with.
         x_shape: Shape of an outcome.
         state: State of the campaign.
-        belief: Returns the belief, read when it is first asked for; None for none.
+        belief: Function that returns the belief, read when it is first asked for; None
+            for none.
         parameter_names: Names of the parameters, if they have any.
 
     Attributes:

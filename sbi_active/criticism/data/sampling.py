@@ -40,7 +40,7 @@ class Sampling:
 
     Attributes:
         step: Median time between samples, s.
-        every: Which samples to keep: every 1st, 2nd, ...
+        every: Interval of the samples to keep: every 1st, 2nd,
         before: Largest correlation of neighboring innovations at the higher rates that
             were looked at, of all samples where they are all kept.
         after: Largest correlation of neighboring innovations of the samples that are

@@ -26,7 +26,7 @@ class InputRows:
         time: Times in s, shape (n,).
         members: Rows of each trial.
         trials: Names of the trials; one empty name where all share the series.
-        place: Returns what a message calls a row.
+        place: Function that returns the name of a row in messages.
         source: Name of the table in messages.
     """
 
@@ -64,7 +64,7 @@ class InputRows:
         """Warn of rows with a measurement in which no input stands.
 
         Args:
-            measured: Which rows have one, shape (n,), bool.
+            measured: Mask of the rows that have one, shape (n,), bool.
         """
         lost = np.flatnonzero(measured & ~np.isfinite(self.values).any(1))
         if len(lost):
@@ -100,7 +100,7 @@ class InputRows:
         Args:
             row: Number of the trial in each row of x, shape (k,).
             time: Times of x in s, shape (k,).
-            place: Returns what a message calls a row of x.
+            place: Function that returns the name of a row of x in messages.
             source: Name of the table of x in messages.
         """
         for t, at in enumerate(self.members):

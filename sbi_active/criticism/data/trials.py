@@ -46,27 +46,26 @@ class Trials:
         x: Shape (n, \*x_shape), or a list of n arrays of shape (k_i, \*channels).
         role: "fit", or "held out" of everything that is fitted or chosen; one a
             trial, or None for all "fit".
-        mask: True where x is a measurement, of its shape; None takes what is not NaN.
+        mask: Mask of x, true where it is a measurement; None takes all that is not NaN.
         index: Place of each trial in the order of execution, shape (n,); None counts
             from 0.
         order: "known", or "unknown" where the index does not say when a trial was
             executed: nothing is then traced to wear or drift from trial to trial.
         sample_times: Times of x's first axis, shape (k,), (n, k), or a list of n.
-        names: Names of the trials in reports, warnings and figures; None takes their
-            indices. A selection keeps them.
-        repeat_of: Position of the trial that each one repeats, shape (n,), -1 for
-            none; None takes trials of equal actions as repeats of the first. A repeat
-            of a repeat is one of the first.
+        names: Names of the trials in reports; None takes their indices. A selection
+            keeps them.
+        repeat_of: Position of the trial that each one repeats, (n,), -1 for none; None
+            takes trials of equal actions. A repeat of a repeat is one of the first.
         action_labels: Labels of the action's entries in reports, with units.
         channel_labels: Labels of the entries of x's last axis, likewise.
-        inputs: What varies in time, {name: series}, each of shape (n, m), (m,) where
-            all trials share it, or a list of n arrays. An array (n, m) or a list
-            without a name is "input"; (n, m, c) is "input 1" to "input c".
+        inputs: Signals over time, {name: series}, each of shape (n, m), (m,) where all
+            trials share it, or a list of n arrays. An array (n, m) or a list without a
+            name is "input"; (n, m, c) is "input 1" to "input c".
         input_times: Times of the inputs, shape (m,), (n, m), a list of n, or such by
             name, from the same origin as ``sample_times``, which they are where there
             are as many.
-        input_hold: Between two of its times an input has the "previous" value, as a
-            command is held, or is "linear".
+        input_hold: Value of an input between its times: the "previous" one, as commands
+            are held, or "linear".
         input_labels: Labels of the inputs in reports, with units.
         start: Measured start state, shape (n, d), or {name: (n,)}.
 
@@ -228,9 +227,10 @@ class Trials:
         Args:
             path: Path of a file, in which lines after # are comments, or a folder with
                 ``trials.csv`` or such files: one with times and no "trial" is a trial.
-            columns: Which columns are "trial", "time", "action", "x", "input", "start",
-                "role", "index" and "repeat_of", where they have other names; those left
-                out are then ignored. Several columns may name a trial together.
+            columns: Names of the columns that are "trial", "time", "action", "x",
+                "input", "start", "role", "index" and "repeat_of", where they have other
+                names; those left out are then ignored. Several columns may name a trial
+                together.
             units: Units by column, where the header has none. Numbers are taken as they
                 are, but for the time, which is converted to seconds.
             order: Order of execution; "unknown" where rows are in any order.

@@ -55,7 +55,7 @@ class AugmentedSimulator(SimulatorModel):
 
     Attributes:
         base: The simulator without any effect.
-        effects: All effects.
+        effects: Effects, all of them.
         takes_times: Whether the simulator's function has an argument ``times``, shape
             (n, k), for the times at which each row is measured.
     """
@@ -135,8 +135,8 @@ class AugmentedSimulator(SimulatorModel):
                 and times.
             seeds: Seeds, one a row, for a simulator that takes them; None gives each
                 row 0 where the noise is declared.
-            merge: Simulate rows once that the simulator would be asked for twice, as
-                where an action was repeated.
+            merge: Whether to simulate equal rows only once, as where an action was
+                repeated.
 
         Returns:
             Shape (n, *x_shape).

@@ -22,8 +22,8 @@ def conditions_of_trials(
     Args:
         trials: Measured trials.
         rows: Position of each row's trial, shape (n,).
-        model: Where it has sample times of its own and takes no others, x is simulated
-            at its own.
+        model: Simulator. If it has sample times of its own and takes no others, x is
+            simulated at these.
     """
     times = None if has_own_times(model, trials) else trials.sample_times
     if times is not None and times.ndim == 2:

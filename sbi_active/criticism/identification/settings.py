@@ -72,8 +72,8 @@ class IdentifySettings:
             which such a belief is not to be trusted, as for other beliefs.
         largest_shape: Shape of the tail of weights above which it is not either, as for
             other beliefs: the linear model lacks places that the simulator explains.
-        fewest_kept: Those that weights leave at least: few would make for a narrow
-            interval.
+        fewest_kept: Effective draws that weights leave at least: few would make for a
+            narrow interval.
         fewest_parts: Parts of the trials at least, for which trials are divided in
             time.
         level: Tail probability below which they disagree.

@@ -127,8 +127,8 @@ def choose(
         names: Names of all effects.
         equivalent: Groups of them that nothing separates, which share their mass.
         timed: Whether x has a time axis.
-        guessed: Returns the nats that guesses in the place of an effect of a set gain
-            over it; None where none were made.
+        guessed: Function that returns the nats that guesses in the place of an effect
+            of a set gain over it; None where none were made.
     """
     probabilities = _probabilities(models, timed=timed)
     inclusion = {

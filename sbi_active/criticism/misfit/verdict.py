@@ -60,8 +60,8 @@ class Misfit:
         rivals: Rivals that the models are made of.
         equivalent: Groups of effects that nothing separates.
         choice: Choice of what helps.
-        standard: Returns a model's squared errors on left-out parts, as the rule takes
-            them.
+        standard: Function that returns a model's squared errors on left-out parts, as
+            the rule takes them.
         log_bayes_factor: Log Bayes factor of anything with a residual process against
             the bare model with the sensor's error alone, nats.
     """
@@ -301,8 +301,8 @@ def settled(
         search: The models so far.
         score: Function that returns what the rule needs of a model.
         equivalent: Groups of effects that nothing separates.
-        guessed: Returns what guesses in the place of an effect gain over it, nats; None
-            asks none.
+        guessed: Function that returns the nats that guesses in the place of an effect
+            gain over it; None asks none.
     """
     scored: dict[ModelKey, Scored] = {}
     timed = search.rivals.measurements.is_sequence

@@ -227,7 +227,8 @@ class NoiseGrid(ErrorModel):
         """Return this noise with one unknown size, where each channel has its own.
 
         Args:
-            residual: Returns one that tells the ratio of sizes, shape (N,).
+            residual: Function that returns a residual that tells the ratio of sizes,
+                shape (N,).
         """
         return self
 

@@ -195,7 +195,7 @@ class Rival:
 
         Args:
             u: Coordinates, shape (n, dim).
-            whiten: Maps (..., N) to (..., N).
+            whiten: Whitener, which maps (..., N) to (..., N).
             step: Step in u, one or one a coordinate, shape (dim,).
 
         Returns:

@@ -185,7 +185,7 @@ def _change(
     Args:
         rivals: The models.
         key: Key of one model.
-        enough: From here on it need not be precise, shape (k,).
+        enough: Value beyond which it need not be precise, shape (k,).
     """
     change, effective = _reweighted(rivals, key)
     least = change - rivals.fit(key).evidence.log_evidence - OVERESTIMATED

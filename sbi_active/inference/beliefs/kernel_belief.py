@@ -35,7 +35,7 @@ class KernelBelief(Belief):
     Args:
         prior: The original prior, which gives the support.
         draws: Draws, shape (n, theta_dim).
-        weight: Normalized, shape (n,); None weighs all alike.
+        weight: Normalized weights, shape (n,); None weighs all alike.
 
     References:
         Scott, *Multivariate Density Estimation*, 1992; Kim & Matsubara, Applied

@@ -76,7 +76,7 @@ class LFIRE:
         Args:
             x: Outcomes, shape (n, *x_shape); NaN where there was no measurement.
             center: Subtracted from the numbers before powers are taken, (x_dim,).
-            scale: They are divided by, shape (x_dim,).
+            scale: Scale by which they are divided, shape (x_dim,).
         """
         flat = x.double().flatten(1)
         valid = flat.isfinite().all(1, keepdim=True)

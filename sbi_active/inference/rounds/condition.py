@@ -87,7 +87,7 @@ class ActionEmbedding(nn.Module):
     condition, the network inside sees x in its own shape.
 
     Args:
-        net: Maps x of shape (n, *x_shape) to (n, num_features).
+        net: Network that maps x of shape (n, *x_shape) to (n, num_features).
         x_shape: Shape of one outcome, for example (1, 32, 32).
         action_dim: Numbers in an action.
 

@@ -35,8 +35,8 @@ class RowCache(Generic[T]):
         Args:
             label: Label that the rows belong to, such as an action.
             rows: Parameters, shape (n, dim); always of one dtype for a label.
-            simulate: Maps places among the rows, shape (m,), to m values: arrays,
-                tuples of them, or None.
+            simulate: Function that maps places among the rows, shape (m,), to m values:
+                arrays, tuples of them, or None.
         """
         keys = [(label, row.tobytes()) for row in np.ascontiguousarray(rows)]
         known, new = self._known, {}

@@ -60,9 +60,9 @@ def systematic(weight: Array, num: int, offset: float) -> NDArray[np.intp]:
     Each index is drawn as often as its weight times ``num`` says, rounded up or down.
 
     Args:
-        weight: Normalized, shape (n,).
+        weight: Normalized weights, shape (n,).
         num: Indices to return.
-        offset: Uniform in [0, 1); a fixed one gives indices without randomness.
+        offset: Offset, uniform in [0, 1); a fixed one gives indices without randomness.
 
     References:
         Douc, Cappe & Moulines, Comparison of resampling schemes, ISPA 2005.

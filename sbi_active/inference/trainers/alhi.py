@@ -48,8 +48,8 @@ class ALHI(ProductRounds, MixtureRounds, NLE_A):
             ``MixtureDensity.faithful()`` is the paper's.
         args: Further arguments of sbi's; without a tracker nothing is tracked.
         kwargs: Further arguments of sbi's by name.
-        posterior: How beliefs are sampled, see :class:`.ProductRounds`; "kde" is the
-            paper's.
+        posterior: Sampling method for beliefs, see :class:`.ProductRounds`; "kde" is
+            the paper's.
 
     References:
         Kim & Matsubara, Applied Intelligence 2025, arXiv:2510.15331; Papamakarios,

@@ -123,13 +123,13 @@ class ASBI(MixtureRounds, NPE_C):
         Args:
             theta: Parameters, shape (n, theta_dim), drawn from the belief.
             x: Outcomes, shape (n, *x_shape); NaN where there was no measurement.
-            proposal: Without actions as in sbi. With them, None, the belief itself or
-                sbi's ``RestrictedPrior`` of it.
-            exclude_invalid_x: With actions, None keeps rows with NaN as information
-                for :class:`MixtureDensity`, and drops them for sbi's networks, which
-                cannot take them, with a warning. True drops them: information gain is
-                then biased towards actions that fail, since what failures tell about
-                theta is lost and what is left is all success.
+            proposal: Proposal, without actions as in sbi. With them, None, the belief
+                itself or sbi's ``RestrictedPrior`` of it.
+            exclude_invalid_x: Whether to drop rows with NaN. With actions, None keeps
+                them with NaN as information for :class:`MixtureDensity`, and drops them
+                for sbi's networks, which cannot take them, with a warning. True drops
+                them: information gain is then biased towards actions that fail, since
+                what failures tell about theta is lost and what is left is all success.
             data_device: Device that keeps the rows.
             action: Actions, shape (n, action_dim), or (action_dim,) for all rows.
             belief: The distribution of theta in this round; None is the current one.

@@ -61,7 +61,7 @@ class ProductRounds(ActionRounds):
 
     Args:
         args: Arguments of :class:`.ActionRounds`.
-        posterior: How the belief is sampled: "importance", tempered importance
+        posterior: Sampling method for the belief: "importance", tempered importance
             sampling; or "kde", the paper's: draws of the belief before times the last
             trial's factor, as a kernel density estimate.
         kwargs: Arguments of :class:`.ActionRounds` by name.
@@ -105,9 +105,9 @@ class ProductRounds(ActionRounds):
             theta: Parameters, shape (n, theta_dim), drawn from the belief.
             x: Outcomes, shape (n, *x_shape); NaN throughout a row where there was no
                 measurement.
-            exclude_invalid_x: With actions, None keeps rows without a measurement for
-                this library's networks, which learn their probability, and drops them
-                for sbi's, with a warning.
+            exclude_invalid_x: Whether to drop rows without a measurement. With actions,
+                None keeps them for this library's networks, which learn their
+                probability, and drops them for sbi's, with a warning.
             from_round: Round number, as in sbi; without meaning where there are
                 actions.
             algorithm: Algorithm name, as in sbi; None is sbi's.

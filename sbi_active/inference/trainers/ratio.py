@@ -47,7 +47,7 @@ class AmortizedRounds(ProductRounds, RatioEstimatorTrainer):
             default ("resnet") without actions and ``RatioClassifier()`` with them.
         args: Further arguments of sbi's; without a tracker nothing is tracked.
         kwargs: Further arguments of sbi's by name.
-        posterior: How beliefs are sampled, see :class:`.ProductRounds`.
+        posterior: Sampling method for beliefs, see :class:`.ProductRounds`.
     """
 
     _factor = ActionRatio

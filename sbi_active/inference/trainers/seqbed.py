@@ -59,8 +59,8 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         prior: The prior over parameters, with a support.
         settings: Settings of the logistic regressions; None is ``LFIRE()``.
         num_particles: Particles of a round; None makes as many as each has simulations.
-        tracker: Not used: no network is trained.
-        show_progress_bars: Not used.
+        tracker: Tracker, which is not used: no network is trained.
+        show_progress_bars: Flag that is not used.
 
     References:
         Kleinegesse, Drovandi & Gutmann, Bayesian Analysis 2021, arXiv:2003.09379.

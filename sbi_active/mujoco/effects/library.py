@@ -52,11 +52,12 @@ def mjcf_effects(
 ) -> list[Effect]:
     r"""Return effects that a plain model may lack, with names, units, nulls and priors.
 
-    Each effect is called by its element, as in "hinge friction loss". Elements that are
-    alike, such as the knees of four legs, are offered together, as in "all knee
-    friction loss", and one by one. Priors are as wide as what moves the robot allows: a
-    friction's deviation is a fifth of the generalized force along nominal trajectories.
-    What is a parameter already, and what changes nothing there, is left out.
+    Each effect is named after its element, as in "hinge friction loss". Similar
+    elements, such as the knees of four legs, are offered together, as in "all knee
+    friction loss", and one by one. Priors are scaled by the forces that move the robot:
+    a friction's deviation is a fifth of the generalized force along nominal
+    trajectories. Effects that are parameters already, or that change nothing there, are
+    left out.
 
     ============= ==================================================================
     of            effects
@@ -79,7 +80,7 @@ def mjcf_effects(
             its start.
         actions: Actions in place of the robot's.
         include: Pattern of names that are kept, as in "\* friction loss", or several.
-        exclude: Patterns of those that are not.
+        exclude: Patterns of names that are left out.
 
     Raises:
         ValueError: If a pattern fits no effect.

@@ -163,12 +163,12 @@ def writer_of(
     """Return the writer of parameters into a model.
 
     Args:
-        spec: Returns a spec that compiles to the model.
+        spec: Function that returns a spec that compiles to the model.
         model: Compiled model.
         parameters: Parameters in the order of theta.
         edit: ``edit(spec, theta)`` of all parameters at once, in place of theirs.
-        text: Returns a spec as another process has it, for parameters that are
-            compiled there; None takes ``spec``.
+        text: Function that returns a spec as another process has it, for parameters
+            that are compiled there; None takes ``spec``.
     """
     if edit is None and all(p.edit is None for p in parameters):
         quantities = [p.quantity for p in parameters if p.quantity is not None]

@@ -182,7 +182,7 @@ class Store:
         """Write a record in place of another; for use in :meth:`writing`.
 
         Args:
-            table: One of the tables.
+            table: Name of the table.
             kind: Kind of the record.
             number: Number of the record.
             content: Bytes, or JSON data of an object.

@@ -93,7 +93,7 @@ def simulate(
         show_progress: Show a progress bar.
         store: Keeps finished rows, every half second, and gives those that it has;
             None takes that of the campaign whose directory this is called for, if any.
-        check_noise: Simulate the first rows under a second seed and raise where
+        check_noise: Whether to simulate the first rows under a second seed and raise if
             nothing differs.
 
     Returns:

@@ -44,7 +44,8 @@ class Schedule:
             a short simulation is one call, a long one is cut.
         workers: The seconds that a row may take, and how often a missing one is tried
             again.
-        on_rows: Told about finished rows: index (k,), x (k, *x_shape), status (k,).
+        on_rows: Function that is told about finished rows: index (k,), x (k, *x_shape),
+            status (k,).
 
     Attributes:
         x: Outcomes, shape (n, *x_shape), NaN where there is none; None until a call

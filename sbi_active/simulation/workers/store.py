@@ -20,7 +20,7 @@ class StoredRows(TypedDict):
     """Rows of a set, as a store gets them.
 
     Attributes:
-        index: Which of the set's rows these are, shape (k,), int64.
+        index: Indices of these rows in the set, shape (k,), int64.
         theta: Parameters, shape (k, theta_dim).
         action: Actions, shape (k, action_dim).
         x: Outcomes, shape (k, *x_shape), float32.
@@ -75,7 +75,7 @@ def storing(find: FindStore) -> Iterator[None]:
     """Have all simulations in the block stored that are given no store of their own.
 
     Args:
-        find: Returns the store of a simulator's rows.
+        find: Function that returns the store of a simulator's rows.
     """
     token = _FINDERS.set(find)
     try:
