@@ -70,7 +70,7 @@ class Campaign(CampaignTrials):
             that :meth:`load` can resume it after a crash. None keeps it in memory
             alone.
         show_progress: Whether to draw a bar of what is being done, and of the rounds of
-            :meth:`run`. The logger "sbi_active" says it of all that takes 2 s anyway.
+            :meth:`run`. The logger "sbi_active" reports all that takes 2 s anyway.
 
     Raises:
         ValueError: If the method is unknown, the prior has no support, or no width that

@@ -42,7 +42,7 @@ class Trial:
             nats.
         surprise: Tail probability of x under the posterior predictive of the belief
             before the trial; uniform where the simulator is right.
-        belief_error: Nats that the belief before the trial is off for want of
+        belief_error: Error in nats of the belief before the trial due to few
             simulations, by its own estimate; above 0.2 the surprise says nothing about
             the simulator.
         log_score: Log density of x under it, nats.

@@ -28,11 +28,12 @@ class StopRules:
             nats.
         max_sd: Largest standard deviation of any parameter under the belief: one
             number, or one a parameter, in the parameters' units.
-        calibration_lost: The verdict of :mod:`sbi_active.diagnostics` is "stop":
-            inferred twice again, the refined belief excludes what these hold; or, where
-            beliefs are the network's word, the network excludes the truth too often at
-            some action. It ends a campaign whatever its health, at the cost of two
-            inferences, or of 1,000 simulations, a trial.
+        calibration_lost: Whether to stop if the verdict of
+            :mod:`sbi_active.diagnostics` is "stop": the refined belief excludes what
+            two new inferences contain; or, if beliefs are the network's posterior, the
+            network excludes the truth too often at some action. This ends a campaign
+            whatever its health, at the cost of two inferences, or of 1,000 simulations,
+            a trial.
 
     Example:
         >>> StopRules(min_information_gain=0.1, max_sd=[0.05, 0.2])

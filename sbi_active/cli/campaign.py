@@ -168,7 +168,7 @@ def open_campaign(
         repair: Whether to give up what is damaged.
 
     Raises:
-        ValueError: If there is no campaign, or nobody knows where its simulator is, or
+        ValueError: If there is no campaign, or its simulator is not known, or
             only the folder says so.
     """
     declared = Declared(folder, trusts=trust)

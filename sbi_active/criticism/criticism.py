@@ -87,7 +87,7 @@ class Criticism:
             error. The inputs of the simulator stay as they are.
         seed: Seed of all draws.
         show_progress: Whether to draw a bar of what is being done. The logger
-            "sbi_active" says it of all that takes 2 s anyway.
+            "sbi_active" reports all that takes 2 s anyway.
 
     Raises:
         ValueError: If fewer than two trials can be fitted, shapes differ, an effect
@@ -138,7 +138,7 @@ class Criticism:
         if actions is not None:
             actions = with_known_inputs(model, trials.fit, actions)
         self.actions = actions
-        #: What was found of the sampling of trajectories; None where nobody looked.
+        #: What was found of the sampling of trajectories; None if not looked for.
         self.sampling: Sampling | None = None
         if thin:
             with stage("rate of sampling", show_progress=show_progress):
@@ -340,7 +340,7 @@ class Criticism:
         dictionary that leave more than the sensor's error are called stand-ins.
 
         Args:
-            evaluation: The error before and after; None where nobody asked.
+            evaluation: The error before and after; None if not requested.
         """
         return judged(self.rivals, self.trace(), evaluation)
 

@@ -25,7 +25,7 @@ def made_given(
     Args:
         trials: Trials that were compared.
         num_summaries: Number of summaries that stand for x; 0 for none.
-        sampling: Sampling that was found; None where nobody looked.
+        sampling: Sampling that was found; None if not looked for.
         left_out: Names of effects of an order that is unknown.
         screening: Screening by linear evidence; None where all were fitted.
         nuisances: Names of the effects that each trial has anew.

@@ -278,9 +278,9 @@ class Tracing:
             cause are the verdict, and the rest stand in ``beside``.
         trial_names: Names of the trials by index; others are called by their index.
         stand_in: Reasons why forces of the dictionary that are chosen only stand in for
-            something that nobody declared, a clause each; empty where they may be it.
+            something that was not declared, a clause each; empty where they may be it.
         p_value: Tail probability of the chi-square of the verdict's model, its
-            parameters all taken as determined; NaN where nobody asked.
+            parameters all taken as determined; NaN if not requested.
         log_process: Log Bayes factor of a residual process beside that model, nats.
         bounds: Parameters at bounds of the prior, and what a wider one would give.
         set_aside: Trials that every model misses by far more than the others, and that

@@ -46,7 +46,7 @@ class Odds:
     The more effects are declared, the less is left out, up to nine of them. What gains
     little and what leaves much may be an imitation, and little is a few nats more where
     a trial is a few numbers without a time axis; there elementary formulas, which stand
-    for what nobody declared, compete with it. Several effects imitate more easily than
+    for what was not declared, compete with it. Several effects imitate more easily than
     one, and so does one that drives parameters of the simulator to their bounds; and a
     simulator that still misses by tens of the sensor's deviations lacks something
     large. These factors share what they know, so that their product is tempered. All of
@@ -115,7 +115,7 @@ class ModelError:
         held_out: Root mean square on held-out trials, likewise; None without any.
         remains: Share of the bare model's excess error on left-out trials.
         parts: Mean squared error of each left-out trial, or part of one, in sensor
-            variances, (f,); empty where nobody asked.
+            variances, (f,); empty if not requested.
     """
 
     name: str

@@ -35,7 +35,7 @@ class GainEvaluator:
         belief: Belief over the parameters.
 
     Attributes:
-        notes: Notes on what speaks against the estimator, or why others were not taken.
+        notes: Notes on failed checks of the estimator, or why others were not taken.
         num_others: Actions whose outcomes will be known as well.
         replicates: Whether every row is simulated twice; None before the first.
     """

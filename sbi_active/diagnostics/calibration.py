@@ -64,10 +64,10 @@ class Calibration:
     ``print(calibration)`` says it in words, the verdict first.
 
     Attributes:
-        verdict: "trust" where nothing speaks against the network; "refine" where its
-            regions are off or it loses much of what outcomes tell, so that beliefs need
-            the simulator or the network more training; "stop" where it excludes the
-            truth too often, or tells less than the belief did.
+        verdict: Verdict: "trust" if the network passes; "refine" if its regions are off
+            or it loses much of the outcomes' information, so that beliefs need the
+            simulator or the network more training; "stop" if it excludes the truth too
+            often, or is less informative than the belief before.
         reasons: Reasons for the verdict, a sentence each; empty for "trust".
         overall: Figures of all rows.
         strata: Figures by action and round.

@@ -96,7 +96,7 @@ def find_undetermined(
         prior: Prior of its parameters.
         actions: Actions to try, shape (a, action_dim); the first 16 are.
         names: Names of the parameters.
-        skip: Parameters that are left alone, since they change nothing anyhow.
+        skip: Parameters that are skipped since they change nothing.
         num_rows: Rows a call of the simulator; it is called 2 d + 2 times, and twice
             for what is found.
         num_numbers: Number of an outcome's numbers; many of them get fewer rows.

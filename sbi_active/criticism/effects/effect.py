@@ -72,8 +72,8 @@ class Effect:
             ``context.input_times``. For "dynamics", it is a dict of keyword arguments.
             For "noise", it is the standard deviation, of the shape of x.
         units: Units of phi.
-        family: Effects of one family share a prior probability, so that variants of an
-            idea dilute nobody; None takes the hook.
+        family: Name of the family. Effects of one family share a prior probability, so
+            that variants of an idea do not dilute others; None takes the hook.
         scope: "campaign" for one phi in all trials; "trial" for a nuisance that every
             trial draws afresh and every rival model marginalizes.
         describe: A sentence for the report.

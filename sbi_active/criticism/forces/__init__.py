@@ -1,4 +1,4 @@
-"""Generalized forces that nobody declared: a dictionary of what a joint may lack.
+"""Generalized forces that was not declared: a dictionary of what a joint may lack.
 
 Here live the forces, their sizes along nominal trajectories, and the effects made of
 them. Whether one explains trials is found elsewhere.

@@ -38,7 +38,7 @@ def beside_misfit(
     """Return a verdict by models with a residual process, where none explains.
 
     Along a trajectory it takes the place of any other. Of numbers without a time axis
-    it is asked for several effects as well, which fit much that nobody declared; it
+    it is asked for several effects as well, which fit much that was not declared; it
     takes the place where it says more, and else gives the intervals.
 
     Args:

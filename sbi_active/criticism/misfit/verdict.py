@@ -246,7 +246,7 @@ def find_misfit(
 
     So it is where no model gains a Bayes factor of 20 by a residual process, or where
     one trial alone asks for it, which may have a gross error. A set of several effects
-    that fits proves little: so many imitate what nobody declared. It is judged as if
+    that fits proves little: so many imitate what was not declared. It is judged as if
     it missed, and so by what left-out trials say of each of its effects.
 
     Args:

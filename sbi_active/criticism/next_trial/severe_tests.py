@@ -1,6 +1,6 @@
 r"""Actions at which a verdict would be put to the test most.
 
-A verdict may be the alias of an effect that nobody declared: it explains the trials at
+A verdict may be the alias of an effect that was not declared: it explains the trials at
 hand about as well, with other parameters. The data cannot tell, another action can. The
 rival without a cause is a free residual, the bare model and the residual process as
 fitted to the trials. Where it expects an outcome far from the verdict's prediction, the

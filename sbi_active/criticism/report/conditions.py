@@ -29,7 +29,7 @@ def first_paragraph(report: Contents) -> str:
 def conditions(report: Contents) -> Iterator[str]:
     """Yield the conditions of a verdict that names effects, a sentence each.
 
-    An effect that nobody declared can pass for declared ones, with parameters that are
+    An effect that was not declared can pass for declared ones, with parameters that are
     wrong and residuals that are as small. The data at hand cannot tell.
     """
     if not report.tracing.chosen:

@@ -30,7 +30,7 @@ def misfit_line(verdict: str, misfit: Misfit) -> str:
     causes = joined([f"{n} ({stated(misfit.cause[n])})" for n in named])
     line = f"Verdict: {verdict}, probably the cause"
     line += f" ({stated(misfit.cause[named[0]])})" if len(named) == 1 else f": {causes}"
-    # An effect that imitates one that nobody declared leaves something of it.
+    # An effect that imitates one that was not declared leaves something of it.
     line += "" if misfit.passes else f", beside {UNDECLARED}"
     rest = [n for n in misfit.helps if n not in named]
     verb = "helps" if len(rest) == 1 else "help"

@@ -252,7 +252,7 @@ def probabilities_of(log_p: dict[ModelKey, float]) -> dict[ModelKey, float]:
 def beside_imitations(p: dict[ModelKey, float]) -> dict[ModelKey, float]:
     """Return probabilities where a set may owe its fit to something undeclared.
 
-    Along a trajectory two effects imitate a force that nobody declared to the sensor's
+    Along a trajectory two effects imitate a force that was not declared to the sensor's
     error more often than one: each beyond the first is real with a probability of .85
     (in six such worlds of ``benchmarks/misfit``, none of which judge, 7 of 15 were).
     """

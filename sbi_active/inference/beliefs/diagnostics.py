@@ -40,9 +40,8 @@ class Diagnostics:
     ``print(belief.diagnostics)`` says it in words.
 
     Attributes:
-        trustworthy: Whether nothing that was checked speaks against the belief; None
-            where nothing was.
-        warnings: Warnings of what speaks against it and what to do, a sentence each.
+        trustworthy: Whether the belief passed all checks; None if nothing was checked.
+        warnings: Warnings about the belief with advice, a sentence each.
         network_warnings: Warnings of the amortized network beside a refined belief.
         assumptions: Assumptions by name, each with the figure that it was judged by.
         num_simulations: Rows that the belief cost.

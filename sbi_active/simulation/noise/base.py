@@ -42,7 +42,7 @@ class NoiseModel(ABC):
         posterior: Posterior of the parameters, event shape (p,); None where they are
             declared exactly.
         times: Time stamps of the first axis of x in seconds, shape (T,); None where
-            nobody gave them.
+            they were not given.
     """
 
     parameter_names: tuple[str, ...] = ()
