@@ -283,7 +283,7 @@ def _spread(draws: np.ndarray, num: int, rng: np.random.Generator) -> np.ndarray
 def _rival_log_likelihood(report: Any, found: Any, draws: np.ndarray) -> Any:
     """Return the log likelihood of each trial under a rival, shape (n, t).
 
-    None where it is more than the simulator, effects and declared noise: a residual
+    None if it is more than the simulator, effects and declared noise: a residual
     process, an unknown size of noise, nuisances of single trials.
     """
     simulator, key = report.simulator, found.key

@@ -57,7 +57,7 @@ class News:
 
     Args:
         what: Name of the work.
-        expected: Seconds that it took before; None where it is the first.
+        expected: Seconds that it took before; None if it is the first.
         before: Place where that was, such as "trial 3".
         has_bar: Whether to draw a bar.
         count: Steps done, from which the seconds are estimated in place of that.

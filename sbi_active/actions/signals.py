@@ -37,7 +37,7 @@ class SignalActions(BoxActions):
             :func:`.chirp`, :func:`.step`, :func:`.multisine` and :func:`.recorded` of
             ``sbi_active.actions.waveforms``.
         low: Lower limits of the parameters, a number or shape (action_dim,).
-        high: Upper limits, as ``low``. Neither is needed where the generator lists its
+        high: Upper limits, as ``low``. Neither is needed if the generator lists its
             actions.
         input_times: Uniform grid of the signal in s, shape (m,); None takes that of the
             generator.

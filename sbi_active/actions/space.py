@@ -14,7 +14,7 @@ class ActionSpace(ABC):
 
     Attributes:
         names: Names of the entries of the action.
-        units: Units of the entries of the action; empty where unknown.
+        units: Units of the entries of the action; empty if unknown.
     """
 
     names: list[str]
@@ -60,7 +60,7 @@ class ActionSpace(ABC):
         return torch.ones(len(action)).bool()
 
     def listed(self) -> Tensor | None:
-        """Return all actions, shape (a, action_dim); None where there is no end."""
+        """Return all actions, shape (a, action_dim); None if there is no end."""
         return None
 
     def parts(self) -> list[ActionSpace]:

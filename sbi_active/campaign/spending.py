@@ -36,7 +36,7 @@ def require_left(state: CampaignState) -> None:
 
 
 def learned(learner: Any, state: CampaignState, trial: Trial) -> bool:
-    """Score a trial and learn from it; False where simulations did not suffice.
+    """Score a trial and learn from it; False if simulations did not suffice.
 
     The trial stays recorded and the belief as it is.
     """

@@ -34,7 +34,7 @@ class Trial:
         status: "pending"; "ok"; "invalid" where the trial ran and gave no measurement,
             which is information; "missing" where a fault unrelated to the parameters
             hit it, and "withdrawn" where it was taken back, which are ignored.
-        design: The design behind the action; None where the trial was not asked for.
+        design: The design behind the action; None if the trial was not asked for.
         target: Target of the action: "theta" or names of parameters, "model", "check"
             for an action far from all others, "random"; None for an action that was not
             asked for.
@@ -50,8 +50,8 @@ class Trial:
             which was fitted to them; None for a belief that was not refined, or that is
             off by more than 0.2 nats.
         outlyingness: Distance of x beyond all simulations from the prior at this
-            action, in their range, by its farthest number; inf where none of them had
-            such a number, None where it is as others from the belief before are. Above
+            action, in their range, by its farthest number; inf if none of them had
+            such a number, None if it is as others from the belief before are. Above
             5 nothing in the prior explains the trial, and the belief leaves it out.
         network_used_by: Users of this round's network: the "design", whose estimate
             rests on it, or the design's "notes", which compare the estimate with it;

@@ -162,7 +162,7 @@ def open_campaign(
         folder: Folder of the campaign.
         simulates: Whether its simulator is needed; else nothing of the folder is
             imported without --trust.
-        simulator: Place of the simulator; None where the folder says it.
+        simulator: Place of the simulator; None if the folder says it.
         trust: Whether to import what the folder names.
         simulator_changed: Whether to take another simulator than before.
         repair: Whether to give up what is damaged.

@@ -130,7 +130,7 @@ class Problem(NamedTuple):
     Attributes:
         simulator: Simulator with its noise.
         prior: Prior of its parameters.
-        actions: Permitted actions; None where none were needed.
+        actions: Permitted actions; None if none were needed.
         effects: Effects that a task's simulator may lack.
     """
 

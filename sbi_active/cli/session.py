@@ -63,7 +63,7 @@ class Session:
         Args:
             name: Name of the command.
             trust: Whether to import what the folder names.
-            simulator: Place of the simulator; None where the folder says it.
+            simulator: Place of the simulator; None if the folder says it.
             simulator_changed: Whether to take another simulator than before.
             **options: Options of the command.
         """

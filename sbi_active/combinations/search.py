@@ -60,7 +60,7 @@ def search(
             all of twelve parameters. Each takes some 50 ms.
 
     Returns:
-        Each with its width; empty where there are none.
+        Each with its width; empty if there are none.
     """
     found: list[tuple[Combination, float]] = []
     rows: list[Array] = []  # directions that are known, in prior deviations

@@ -17,7 +17,7 @@ class MissedTrial:
     Attributes:
         position: Place among the held-out trials.
         name: Name of the trial in reports.
-        size: Root mean square error; inf where the model is sure of no measurement.
+        size: Root mean square error; inf if the model is sure of no measurement.
         unit: Unit of ``size``: sensor deviations, or the simulator's where it is the
             draw.
         p_value: Probability of an error as large, if the model holds.

@@ -73,7 +73,7 @@ class Criticism:
         prior: Prior of its parameters.
         trials: Measured trials.
         effects: Effects that the simulator may lack; those of the order of the trials
-            are left out where that is unknown.
+            are left out if that is unknown.
         actions: The permitted actions, for what no action separates and for the next
             one; None leaves both to the trials at hand.
         summaries: Number of summaries of x to compare instead of all its numbers, at
@@ -191,7 +191,7 @@ class Criticism:
     def misfit(self) -> Misfit | None:
         """Return the models where none explains the trials to the sensor's error.
 
-        None where one does, or where the size of that error is not declared, x has no
+        None if one does, or where the size of that error is not declared, x has no
         time axis, or the simulator is random or jumps.
         """
         if not self._is_searched:

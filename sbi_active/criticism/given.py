@@ -27,7 +27,7 @@ def made_given(
         num_summaries: Number of summaries that stand for x; 0 for none.
         sampling: Sampling that was found; None if not looked for.
         left_out: Names of effects of an order that is unknown.
-        screening: Screening by linear evidence; None where all were fitted.
+        screening: Screening by linear evidence; None if all were fitted.
         nuisances: Names of the effects that each trial has anew.
         warm_up: Time in which trials that were not fitted tell of theirs.
     """

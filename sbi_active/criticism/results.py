@@ -80,9 +80,9 @@ class Residuals:
         noise: "declared", "estimated" (from repeats or the trajectories themselves), or
             "stochastic" (the simulator is the draw).
         probability_valid: Probability that each trial has a measurement, shape (t,);
-            None where it was not computed.
+            None if it was not computed.
         roughness: Deviation of the simulator, which jumps, from any smooth function of
-            its parameters, shape of x; it counts as noise here. None where it is
+            its parameters, shape of x; it counts as noise here. None if it is
             smooth.
         names: Names of the trials; empty for positions from 0.
     """
@@ -156,7 +156,7 @@ class Detection:
         level: Level below which it is an alarm; 0 where something is unknown of the
             noise.
         null_log_evidence: Log evidence by least squares, nats.
-        null_cross_check: Log evidence from other starts; None where no alarm was near
+        null_cross_check: Log evidence from other starts; None if no alarm was near
             or these ended in the same place.
         least_chi_square: The smallest of any parameters that were tried; NaN where the
             size of the noise is not declared.
@@ -262,7 +262,7 @@ class Tracing:
         guesses: Formula effects, best first: (formula, log evidence above
             "unexplained"), which is empty unless nothing declared explains the data.
         beside: Effects that explain most of what is "unexplained", the residual process
-            taking the rest; empty where it takes all, and for any other verdict.
+            taking the rest; empty if it takes all, and for any other verdict.
         outliers: Probability that each trial has a gross error, if one has, by its
             index, most probable first; empty without an alarm.
         needed: Indices of the trials without any one of which the data do not point to
@@ -271,14 +271,14 @@ class Tracing:
             since a trial that may have a gross error alone speaks for them, or further
             trials speak against them; "" for none.
         refuted: The RMSE of these further trials, or of left-out ones, before and
-            after, which is why; None where it is not.
+            after, which is why; None if it is not.
         refuted_on: Name of these trials; "" for all that had no part in the verdict.
         misfit: Account of the misfit if every model misses by more than the sensor's
             error. Effects that help are then ``chosen``, those that are probably the
             cause are the verdict, and the rest stand in ``beside``.
         trial_names: Names of the trials by index; others are called by their index.
         stand_in: Reasons why forces of the dictionary that are chosen only stand in for
-            something that was not declared, a clause each; empty where they may be it.
+            something that was not declared, a clause each; empty if they may be it.
         p_value: Tail probability of the chi-square of the verdict's model, its
             parameters all taken as determined; NaN if not requested.
         log_process: Log Bayes factor of a residual process beside that model, nats.
@@ -369,13 +369,13 @@ class NextAction:
     """The action whose outcome tells most about which model is right.
 
     Attributes:
-        action: Action, shape (action_dim,); None where nothing is to be gained.
+        action: Action, shape (action_dim,); None if nothing is to be gained.
         candidates: Candidates, shape (a, action_dim).
         information_gain: Lower bound on I(model; x | action) a candidate, nats.
         separates: Names that remain in question.
         inseparable: Groups of them that no permitted action separates.
         outside: An action that is not permitted and separates such a group, shape
-            (action_dim,); None where none was found, or none was looked for.
+            (action_dim,); None if none was found, or none was looked for.
         outside_separates: The group that it separates; empty without.
         outside_gain: Lower bound on the information about which of the group is right,
             all taken as equally likely, nats; 0 without.

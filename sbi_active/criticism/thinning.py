@@ -38,7 +38,7 @@ def thinned_to_need(
 
     Returns:
         The trials, as they are where nothing is to be left out; and what was found of
-        their sampling, None where it was not looked at.
+        their sampling, None if it was not looked at.
     """
     fit = trials.fit
     own = fit.sample_times is not None

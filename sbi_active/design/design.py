@@ -39,7 +39,7 @@ class Design:
             one.
         probability_best: Probability that a candidate has the largest expectation of
             the estimate, by its cost if there is one, given the simulations, shape
-            (a,); zero where a candidate is excluded.
+            (a,); zero if a candidate is excluded.
         probability_valid: Share of the simulations of each candidate that gave a
             measurement, partly observed ones included, shape (a,). Rows lost to a fault
             do not count; NaN where nothing else is left.
@@ -57,7 +57,7 @@ class Design:
         num_missing: Simulations of them all that were lost to faults of the simulator.
         notes: Notes on the estimates: estimators that failed a check or disagree, where
             an estimate is a bound, candidates that were excluded.
-        cost: Cost of each candidate, shape (a,); None where there is none.
+        cost: Cost of each candidate, shape (a,); None if there is none.
         steps: Designs of the actions of a batch in turn, each given the former and the
             pending ones; empty for a single action.
     """

@@ -136,7 +136,7 @@ class InformationGainDesigner:
 
         Args:
             model: Model that the estimator needs, for :class:`PosteriorGain` anything
-                with ``log_posterior(theta, x, action)``; None where it needs nothing.
+                with ``log_posterior(theta, x, action)``; None if it needs nothing.
                 For the target "model" the rivals, a sequence of
                 :class:`.RivalPredictive`.
             simulator: ``simulator(theta, action)``; not used for the target "model".

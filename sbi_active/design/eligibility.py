@@ -116,7 +116,7 @@ class DesignLimits:
         )
 
     def excluded_note(self, eligible: Tensor) -> tuple[str, ...]:
-        """Return a note on the number of excluded candidates; empty where none is."""
+        """Return a note on the number of excluded candidates; empty if none is."""
         num = int((~eligible).sum())
         if num == 0:
             return ()

@@ -84,7 +84,7 @@ class Target:
         return Target(name, estimator, model, simulator, belief)
 
     def gain(self) -> InformationGainEstimator | None:
-        """Return the estimator; None where the simulations are to decide.
+        """Return the estimator; None if the simulations are to decide.
 
         Raises:
             ValueError: If it needs a model and there is none, or a name is unknown.

@@ -24,7 +24,7 @@ class CandidateSimulations:
         theta: Draws from the belief, shape (n, theta_dim), common to all candidates.
         action: Candidates, shape (a, action_dim).
         x: Outcomes, shape (a, n, *x_shape); NaN where there was no measurement.
-        mean: Noise-free outcomes, as x; None where the noise is not declared.
+        mean: Noise-free outcomes, as x; None if the noise is not declared.
         noise: The declared noise around the mean.
         replicate: Second outcomes at the same parameters, as x; None for none.
         missing: Rows lost to a fault that has nothing to do with the parameters, shape
@@ -139,7 +139,7 @@ class InformationGainEstimator(ABC):
         Args:
             model: Model that was learned, see the estimator.
             simulations: Fresh simulations, not those the model was trained on.
-            belief: Density of theta in the simulations; None where an estimator has no
+            belief: Density of theta in the simulations; None if an estimator has no
                 use for it.
 
         Returns:

@@ -117,7 +117,7 @@ class CandidateSampler:
     ) -> CandidateSimulations | None:
         """Simulate actions (a, action_dim) at parameters (n, theta_dim).
 
-        Twice where paired; None where the declared mean turns out to change from run to
+        Twice where paired; None if the declared mean turns out to change from run to
         run. The label is the seeds': outcomes that are joined have noise of their own.
         """
         num = len(theta)

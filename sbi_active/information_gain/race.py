@@ -62,7 +62,7 @@ class Race:
         return Race(leader, best.double() / DRAWS, regret, in_reach)
 
     def reason(self) -> str | None:
-        """Why no further simulations are needed; None where they are."""
+        """Why no further simulations are needed; None if they are."""
         if float(self.probability_best[self.leader]) > SURE:
             return "leader separated"
         if self.regret < NEGLIGIBLE:

@@ -149,7 +149,7 @@ def _entries(path: Path) -> list[Mapping[str, Any]]:
 
 
 def _content(path: Path) -> bytes | None:
-    """Return what a file holds after its checksum; None where it is not that."""
+    """Return what a file holds after its checksum; None if it is not that."""
     if not path.exists():
         return None
     digest, _, content = path.read_bytes().partition(b"\n")

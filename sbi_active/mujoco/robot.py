@@ -66,8 +66,8 @@ class Robot(NamedTuple):
             :class:`.MujocoFunction`.
         prior: Prior, uniform within the bounds of the parameters, with ``names`` and
             ``units``.
-        actions: Actions that the robot may take; None where only recordings say that.
-        trials: The recordings; None where there are none.
+        actions: Actions that the robot may take; None if only recordings say that.
+        trials: The recordings; None if there are none.
     """
 
     simulator: SimulatorModel

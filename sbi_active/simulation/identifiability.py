@@ -47,7 +47,7 @@ class Undetermined:
 
     Attributes:
         parameters: Names of the parameters.
-        known: The combinations through which the outcome depends on them; empty where
+        known: The combinations through which the outcome depends on them; empty if
             it does not, or where there is no short formula.
         is_exact: Whether the outcome is the same, rather than within a tenth of the
             noise.
@@ -104,7 +104,7 @@ def find_undetermined(
         seed: Seed of the draws.
 
     Returns:
-        One a group of parameters; empty where all are told apart.
+        One a group of parameters; empty if all are told apart.
 
     References:
         Rothenberg, Identification in parametric models, Econometrica 1971; Raue et al.,

@@ -62,7 +62,7 @@ class SimulatorModel:
             ``fn(theta, action, rng)`` of one row: float64 NumPy arrays of shapes
             (theta_dim,) and (action_dim,), and a NumPy generator from the row's seed,
             which a ``fn`` without random numbers may leave out.
-        noise: Noise added to the output of ``fn``; None where ``fn`` is itself the
+        noise: Noise added to the output of ``fn``; None if ``fn`` is itself the
             draw. A number is the standard deviation of Gaussian noise.
         batched: Whether ``fn`` takes all rows at once.
         setup: Function called without arguments once a process, before the first run;

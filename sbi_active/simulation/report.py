@@ -16,7 +16,7 @@ class SimulatorReport:
 
     Attributes:
         num_rows: Rows that each check simulated.
-        x_shape: Shape of one outcome; None where there was none.
+        x_shape: Shape of one outcome; None if there was none.
         output: Type of the simulator's output, "torch.float32".
         takes_seeds: Whether it is given one seed a row.
         is_deterministic: Whether two seeds gave identical x.
@@ -32,7 +32,7 @@ class SimulatorReport:
             tried, and the combinations of them that actions do determine.
         seconds_batch: Time of ``num_rows`` rows at once.
         seconds_row: Time of a call with one row.
-        seconds_round: Measured wall time of a campaign's round; None where it was not.
+        seconds_round: Measured wall time of a campaign's round; None if it was not.
         num_rounds: Rounds of that campaign.
         num_simulations: Simulations that a campaign needs.
         num_workers: Workers that share them.

@@ -28,7 +28,7 @@ class Spread:
         mean: Means, shape (q,).
         scale: Standard deviations, shape (q,).
         share: :math:`\lambda`.
-        z: Standardized rows, zero where not measured, shape (n, q).
+        z: Standardized rows, zero if not measured, shape (n, q).
         distance: Squared Mahalanobis distance of each row, shape (n,).
 
     References:

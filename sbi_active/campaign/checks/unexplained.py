@@ -62,7 +62,7 @@ def outlyingness(x: Tensor, drawn: Tensor) -> float:
         \max_j \frac{\max(x_j - \max_i x_{ij},\; \min_i x_{ij} - x_j,\; 0)}
         {\max_i x_{ij} - \min_i x_{ij}}
 
-    over the numbers j that were measured; infinite where no simulation had one of them.
+    over the numbers j that were measured; infinite if no simulation had one of them.
     The range of a number that never varies is its size.
 
     Args:

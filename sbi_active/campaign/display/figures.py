@@ -45,7 +45,7 @@ def plot_campaign(
 
     Args:
         state: State of the campaign.
-        simulator: Simulator of a trial, by its index; None where there is none.
+        simulator: Simulator of a trial, by its index; None if there is none.
         prior: Prior of the current parameters.
         parameter_names: Names of the parameters.
         theta_true: True parameters, shape (theta_dim,), where known.

@@ -206,7 +206,7 @@ def _model_design(
         exclude: Actions not to repeat, shape (t, action_dim).
 
     Returns:
-        None where no permitted action tells anything: one rival is left, or those left
+        None if no permitted action tells anything: one rival is left, or those left
         predict the same.
     """
     spent = criticism.rivals.simulator.num_simulations

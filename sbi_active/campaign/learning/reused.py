@@ -87,7 +87,7 @@ def _earlier(
     num_rows: int,
     seed: int,
 ) -> Simulations | None:
-    """Return as many earlier rows as they are worth; None where that is too few."""
+    """Return as many earlier rows as they are worth; None if that is too few."""
     if not num_earlier:
         return None
     try:

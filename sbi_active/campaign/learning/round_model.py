@@ -15,7 +15,7 @@ class RoundModel:
 
     Args:
         train: Function that returns the model, trained in this call if needed; None
-            where none can be, as of discrete parameters.
+            if none can be, as of discrete parameters.
         model: The trained model; None leaves it untrained until something asks for one
             of its densities.
 

@@ -116,7 +116,7 @@ class CampaignDirectory:
 
         Args:
             state: State of the campaign.
-            belief: Belief after ``state.processed``; None where that is the prior.
+            belief: Belief after ``state.processed``; None if that is the prior.
             known: Objects that the reader has too, see :func:`.encode`.
         """
         content = None
@@ -158,7 +158,7 @@ class CampaignDirectory:
                 computed again.
 
         Returns:
-            The name of the belief; None where it is the prior, or to be computed.
+            The name of the belief; None if it is the prior, or to be computed.
         """
         saved, self._saved = self._saved, None
         name, lines = None, 0

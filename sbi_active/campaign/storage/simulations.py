@@ -58,7 +58,7 @@ class CampaignBanks:
         self._own, self._model = simulator, model
 
     def find(self, simulator: Callable[..., Any]) -> RowStore | None:
-        """Return the store of a simulator's rows; None where they are not stored."""
+        """Return the store of a simulator's rows; None if they are not stored."""
         form = self._form(simulator)
         return None if form is None else self.bank(simulator, form)
 

@@ -272,7 +272,7 @@ def _length(what: str, values: Tensor, times: Tensor) -> int:
 def _grid(
     stamps: Mapping[str, Tensor], lengths: Mapping[str, list[int]]
 ) -> Array | None:
-    """Return the grid, None where all are on one that is uniform already."""
+    """Return the grid, None if all are on one that is uniform already."""
     every = [*stamps.values()]
     first = every[0][0]
     whole = all(k == len(first) for each in lengths.values() for k in each)

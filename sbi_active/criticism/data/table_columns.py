@@ -26,10 +26,10 @@ class Columns:
         input: Columns of the inputs over time.
         start: Columns of the measured start state.
         trial: Columns that name the trial together, in a table with one row a sample;
-            empty where a row is a trial.
-        time: Column of the time stamps; None where a row is a trial.
+            empty if a row is a trial.
+        time: Column of the time stamps; None if a row is a trial.
         optional: Columns of "role", "index" and "repeat_of", where there are such.
-        units: Units by column, "" where none is known.
+        units: Units by column, "" if none is known.
     """
 
     action: tuple[str, ...]

@@ -98,7 +98,7 @@ class Rows:
         return f"row {i + 1}{trial}"
 
     def words(self, column: str) -> Array:
-        """Return a column as text, shape (n,), "" where it is empty."""
+        """Return a column as text, shape (n,), "" if it is empty."""
         cells = self.frame[column]
         if pd.api.types.is_float_dtype(cells):  # 1.0 and 1 name one trial
             text = [_digits(value) for value in cells]
@@ -218,7 +218,7 @@ def _if_it_varies(column: str) -> str:
 
 
 def _remedy(column: str, text: str) -> str:
-    """Return what to do about a cell that is no number; "" where it says nothing."""
+    """Return what to do about a cell that is no number; "" if it says nothing."""
     if re.fullmatch(r"[-+]?[\d.]+([eE][-+]?\d+)?\s*[^\d\s,;].*", text):
         name = f"{column.split('[')[0]}[unit]"
         return f"write the unit once, in the header as {name}, with all numbers in it"

@@ -41,7 +41,7 @@ class Trials:
 
     Args:
         action: Actions as commanded, shape (n, action_dim), or (n,) for scalar ones.
-            None where the inputs say what was commanded: the action is then the trial's
+            None if the inputs say what was commanded: the action is then the trial's
             number, a label that no effect changes.
         x: Shape (n, \*x_shape), or a list of n arrays of shape (k_i, \*channels).
         role: "fit", or "held out" of everything that is fitted or chosen; one a
@@ -72,7 +72,7 @@ class Trials:
     Attributes:
         inputs: Inputs by name, shape (n, m), on one uniform grid for all trials: its
             step is the smallest median step of a trial, and before and after a trial's
-            own times its first and last value are held. None where there are none.
+            own times its first and last value are held. None if there are none.
         input_times: The grid, shape (m,).
         action_is_label: Whether the action is only the trial's number.
 
@@ -296,7 +296,7 @@ class Trials:
 
     @property
     def mask(self) -> Tensor:
-        """True where x is a measurement, of the shape of x."""
+        """True if x is a measurement, of the shape of x."""
         return self.x.isfinite()
 
     @property
@@ -316,7 +316,7 @@ class Trials:
 
     @property
     def held_out(self) -> Trials | None:
-        """The held-out trials; None where there are none."""
+        """The held-out trials; None if there are none."""
         return self._of("held out") if self.held_out_positions else None
 
     def template(self) -> tuple[Tensor, Tensor | None]:

@@ -78,7 +78,7 @@ class Effect:
             trial draws afresh and every rival model marginalizes.
         describe: A sentence for the report.
         needs_order: Whether it acts by ``context.index``, the order of the trials; it
-            is then left out where that is unknown.
+            is then left out if that is unknown.
 
     Raises:
         ValueError: If the hook or scope is unknown, a part is of another type, null and

@@ -77,7 +77,7 @@ def generic_effects(
         model: The simulator.
         actions: The permitted actions, or the measured trials.
         prior: Prior of the simulator's parameters, for the spread of its predictions;
-            needed where the simulator declares no noise.
+            needed if the simulator declares no noise.
 
     Raises:
         ValueError: If neither noise nor prior says how large x and its errors are.

@@ -13,7 +13,7 @@ from sbi_active.seeding import forked_generators
 
 
 def change_at_null(reference: Tensor, at_null: Any, effect: Effect) -> float:
-    """Return the largest change of x at the null; inf where it turns into NaN."""
+    """Return the largest change of x at the null; inf if it turns into NaN."""
     difference = torch.inf
     is_finite = bool(effect.null_phi(1).isfinite().all())
     for finite in (True,) if is_finite else (False, True):

@@ -26,7 +26,7 @@ class Fit:
         evidence: Evidence that is recorded of it.
         best: Point from which other trials are predicted, shape (dim,); None takes the
             draws.
-        mode: Point at which it is linear, shape (dim,); None where it was sampled.
+        mode: Point at which it is linear, shape (dim,); None if it was sampled.
     """
 
     rival: Rival

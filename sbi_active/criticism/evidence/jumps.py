@@ -47,7 +47,7 @@ def look_for_jumps(rival: Rival, *, seed: int) -> tuple[float, bool, Array]:
 
     Returns:
         The step, in prior deviations; whether the simulator is smooth; and the
-        deviation of its jumps, shape (N,), zero where it is.
+        deviation of its jumps, shape (N,), zero if it is.
     """
     noise = rival.error
     assert isinstance(noise, NoiseGrid)

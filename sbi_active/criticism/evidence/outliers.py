@@ -209,7 +209,7 @@ class OneOutlier(ErrorModel):
 
 
 def _smooth(cell: NoiseCell, measurements: Measurements, at: Array) -> _Smooth | None:
-    """Return the smooth error of a trial; None where it has one number, or t noise."""
+    """Return the smooth error of a trial; None if it has one number, or t noise."""
     if at.sum() < 2 or np.isfinite(cell.df) or not measurements.has_time:
         return None
     own = smooth_features(measurements, at)

@@ -225,7 +225,7 @@ class RivalSet:
         return action / np.where(width > 0, width, 1.0)
 
     def scaled_order(self, trials: Trials | None = None) -> Array | None:
-        """Return the order of trials in the span of the fit; None where it has none.
+        """Return the order of trials in the span of the fit; None if it has none.
 
         Among a few trials it is no structure: any differences of theirs follow it. Nor
         is one that is not that of execution.

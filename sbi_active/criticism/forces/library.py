@@ -160,7 +160,7 @@ def _forces(
 
 
 def _sized(force: FormForce, nominal: Trajectories, scale: float) -> FormForce | None:
-    """Return the force of size one at phi = 1; None where it does nothing."""
+    """Return the force of size one at phi = 1; None if it does nothing."""
     begin = float(nominal.time[0])
     squares = []
     for k, t in enumerate(nominal.time):

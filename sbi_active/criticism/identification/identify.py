@@ -228,7 +228,7 @@ def _weighed(
 ) -> tuple[Array, float, float | None]:
     """Return draws of u - origin, how many they count for, and the weights' tail.
 
-    Its shape is None where the model is linear. Of effects that were not fitted a chord
+    Its shape is None if the model is linear. Of effects that were not fitted a chord
     is all that is known: draws that have one are not compared with the simulator.
     """
     own, draws = settings, found.draws

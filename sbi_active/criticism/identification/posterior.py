@@ -102,7 +102,7 @@ def sample(
         grams: Gram matrices of (r_0, J), by channel.
         processes: Hypotheses of the errors, white noise first, of size one.
         unknowns: Priors of the unknowns.
-        known_size: Deviation of the white part by channel; None where it is unknown.
+        known_size: Deviation of the white part by channel; None if it is unknown.
         rng: Source of the draws.
         sweeps: Sweeps of each chain, after those that are left out.
         settings: Numbers of draws, and priors.

@@ -103,7 +103,7 @@ class Errors:
         cells: The sensor's error in its units, with what is unknown of its correlation.
         log_cells: Log prior probability of each, shape (c,).
         is_scored: Numbers that are predicted where their part is left out, bool, (N,).
-        varying: Derivatives of mean square one, zero where nothing depends on it.
+        varying: Derivatives of mean square one, zero if nothing depends on it.
     """
 
     def __init__(

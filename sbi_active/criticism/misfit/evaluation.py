@@ -47,7 +47,7 @@ def evaluate_linear(misfit: Fitted, trials: Trials) -> Evaluation | None:
     """Return the error on each trial of models chosen and fitted without it.
 
     The linearizations are those of all trials; evidence, left-out errors, the choice
-    and the refits are made again without each. None where parts of trials are left out.
+    and the refits are made again without each. None if parts of trials are left out.
 
     Args:
         misfit: The models.

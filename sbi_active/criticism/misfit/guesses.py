@@ -68,7 +68,7 @@ def guess_residual(search: Search) -> tuple[tuple[str, float], ...]:
 
     Returns:
         Formulas and their log evidence above that of the bare model with its process,
-        nats; empty where there is none.
+        nats; empty if there is none.
     """
     if not search.rivals.measurements.is_sequence:
         return _guess_of_numbers(search)

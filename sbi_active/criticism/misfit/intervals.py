@@ -98,7 +98,7 @@ def shared_process(
         action: Action of each trial, shape (t, action_dim).
 
     Returns:
-        Shapes (d,) and (d, d); None where trials are not sampled at the same times.
+        Shapes (d,) and (d, d); None if trials are not sampled at the same times.
     """
     m, num = errors.measurements, errors.num_folds
     patterns = alike(m, errors.fold)

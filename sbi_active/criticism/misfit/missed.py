@@ -47,7 +47,7 @@ def beside_misfit(
         rivals: The models.
         equivalent: Groups of effects that nothing separates.
         held_out: Trials on which models are scored; None for none.
-        search: Fits the models; None where the error of the sensor is not known.
+        search: Fits the models; None if the error of the sensor is not known.
 
     Returns:
         The verdict, and the models if it is theirs.

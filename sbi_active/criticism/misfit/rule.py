@@ -128,7 +128,7 @@ def choose(
         equivalent: Groups of them that nothing separates, which share their mass.
         timed: Whether x has a time axis.
         guessed: Function that returns the nats that guesses in the place of an effect
-            of a set gain over it; None where none were made.
+            of a set gain over it; None if none were made.
     """
     probabilities = _probabilities(models, timed=timed)
     inclusion = {

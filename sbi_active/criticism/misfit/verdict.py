@@ -242,7 +242,7 @@ def find_misfit(
     *,
     is_known: bool = False,
 ) -> Misfit | None:
-    """Return the models and what helps; None where one fits to the sensor's error.
+    """Return the models and what helps; None if one fits to the sensor's error.
 
     So it is where no model gains a Bayes factor of 20 by a residual process, or where
     one trial alone asks for it, which may have a gross error. A set of several effects
@@ -250,7 +250,7 @@ def find_misfit(
     it missed, and so by what left-out trials say of each of its effects.
 
     Args:
-        search: Fits the models; None where the error of the sensor is not known.
+        search: Fits the models; None if the error of the sensor is not known.
         equivalent: Groups of effects that no permitted action separates.
         is_known: No model fits: what remains was found to be no error of a sensor.
             Without a time axis nothing else tells.

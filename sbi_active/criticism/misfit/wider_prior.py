@@ -147,7 +147,7 @@ def _moved(rival: Rival, side: NDArray[np.int64]) -> Rival:
 def _best(
     rivals: RivalSet, rival: Rival, whiten: Whitener, starts: Array
 ) -> Array | None:
-    """Return the best fit of a rival, (d,); None where the simulator has none."""
+    """Return the best fit of a rival, (d,); None if the simulator has none."""
     if not rivals.is_smooth:
         return starts[0]
     try:

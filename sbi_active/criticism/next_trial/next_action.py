@@ -171,7 +171,7 @@ def _most_telling(
     p: Array,
     candidates: Tensor,
 ) -> tuple[Array | None, Array]:
-    """Return the best candidate, None where it tells nothing, and what each tells."""
+    """Return the best candidate, None if it tells nothing, and what each tells."""
     design = _select(rivals, tracing, names, p, candidates)
     gain = design.expected_information_gain.clamp_min(0.0).numpy()
     told = gain[design.index]

@@ -37,11 +37,11 @@ class Contents:
 
     Attributes:
         residuals: Residuals of the bare model.
-        residuals_after: Residuals of the augmented one; None where nothing was added.
+        residuals_after: Residuals of the augmented one; None if nothing was added.
         detection: Whether the bare model misses the data.
         tracing: Tracing with the effect that the data point to.
-        evaluation: Error before and after; None where no trial was scored.
-        next_action: Action to take next; its ``action`` is None where nothing is to be
+        evaluation: Error before and after; None if no trial was scored.
+        next_action: Action to take next; its ``action`` is None if nothing is to be
             gained. None without permitted actions.
         simulator: The augmented simulator, or the bare one where nothing was added.
         prior: Prior of its parameters (never a posterior).

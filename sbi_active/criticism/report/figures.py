@@ -40,7 +40,7 @@ def plot_residuals(
 
     Args:
         before: Residuals of the bare model, the upper row.
-        after: Residuals of the augmented one, the lower row; None where nothing was
+        after: Residuals of the augmented one, the lower row; None if nothing was
             added.
         action_labels: Labels of the entries of the action, with their units; none where
             the action is only the trial's number.

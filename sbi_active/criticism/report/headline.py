@@ -64,7 +64,7 @@ def verdict_line(report: Contents) -> str:
 
 
 def _withdrawn_for(tracing: Tracing) -> str:
-    """Return the reason not to name effects, "" where only the warnings say it."""
+    """Return the reason not to name effects, "" if only the warnings say it."""
     if tracing.bounds.replaces:
         return f", and not {tracing.instead_of}: {narrow_prior(tracing)}"
     if tracing.misfit is not None and tracing.refuted and tracing.verdict != OUTLIER:

@@ -37,7 +37,7 @@ def declared_noise(
     represented by draws, or summed if it is a grid of a size and a correlation time.
 
     Args:
-        noise: Noise of the simulator; None where the simulator is the draw, and its own
+        noise: Noise of the simulator; None if the simulator is the draw, and its own
             deviation is the unit.
         measurements: Measured numbers.
         seed: Seed of the draws of the posterior.
@@ -119,7 +119,7 @@ def _product(
 
 
 def measurement_sds(noise: NoiseModel | None, measurements: Measurements) -> Any:
-    """Return the declared error of the sensor alone, None where there is none.
+    """Return the declared error of the sensor alone, None if there is none.
 
     Args:
         noise: The simulator's.

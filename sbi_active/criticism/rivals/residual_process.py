@@ -182,7 +182,7 @@ class ResidualProcess(ErrorModel):
             action: Actions of all trials, those at hand first, in ranges of the action
                 space.
             order: Order of all trials, likewise, in the span of those at hand; needed
-                where there is a process over it.
+                if there is a process over it.
             spread: Spread of the new measurements, shape (M,), where there is one of
                 the old.
 

@@ -95,7 +95,7 @@ class TrialSimulator:
 
         Returns:
             The mean, shape (n, N), NaN where the simulator gives no number; the
-            deviation, shape (n, N), None where the noise is declared; the probability
+            deviation, shape (n, N), None if the noise is declared; the probability
             that each trial has an outcome, shape (n, t).
         """
         names = [name for name in phi if name not in self._of_noise]

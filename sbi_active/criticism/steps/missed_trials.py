@@ -199,7 +199,7 @@ def _beside_process(misfit: Misfit, m: Measurements, num: int, seed: int) -> Arr
 
 
 def _sensor(rivals: RivalSet, misfit: Misfit | None, m: Measurements) -> Array | None:
-    """Return the sensor's deviation, (N,); None where the simulator is the draw."""
+    """Return the sensor's deviation, (N,); None if the simulator is the draw."""
     noise = rivals.model.noise
     if misfit is not None:
         return misfit.sensor[m.channel]

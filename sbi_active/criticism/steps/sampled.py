@@ -56,7 +56,7 @@ class Sampled:
     Attributes:
         rivals: The models.
         equivalent: Groups of effects that no permitted action separates.
-        linear: Linear models; None where there are none.
+        linear: Linear models; None if there are none.
     """
 
     rivals: RivalSet

@@ -95,7 +95,7 @@ class UnknownCombination:
 class Combinations:
     """Knowledge of parameters that a belief does not know one by one.
 
-    False where there is nothing to say: every parameter is known by itself, or nothing
+    False if there is nothing to say: every parameter is known by itself, or nothing
     is known much better than anything else.
 
     Attributes:

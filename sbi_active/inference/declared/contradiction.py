@@ -89,7 +89,7 @@ def find_contradiction(
     level: float = LEVEL,
     rng: np.random.Generator,
 ) -> Contradiction | None:
-    """Return the contradiction at the best fit; None where the noise explains it.
+    """Return the contradiction at the best fit; None if the noise explains it.
 
     Args:
         likelihood: Likelihood of all trials under the declared noise.
@@ -160,7 +160,7 @@ def compared(
     num_fitted: int,
     level: float = LEVEL,
 ) -> Contradiction | None:
-    """Return the contradiction by the squares alone; None where there is none.
+    """Return the contradiction by the squares alone; None if there is none.
 
     Args:
         action: Executed actions, shape (t, action_dim).
@@ -215,7 +215,7 @@ def _beyond_noise(
 def _repeats(
     action: Tensor, x: Tensor, whiten: Callable[[Tensor], Tensor], level: float
 ) -> str:
-    """Return the repeats of one action that contradict most; "" where none does."""
+    """Return the repeats of one action that contradict most; "" if none does."""
     worst, text = level, ""
     for own in action.unique(dim=0):
         same = torch.nonzero((action == own).all(1)).flatten().tolist()

@@ -170,7 +170,7 @@ def _gone_on(
     own: Settings,
     rng: np.random.Generator,
 ) -> Fit | None:
-    """Return the posterior from draws of the earlier trials; None where it fails."""
+    """Return the posterior from draws of the earlier trials; None if it fails."""
     pool = past.with_trials(potential, own)
     if not len(pool.u):
         return None

@@ -49,7 +49,7 @@ class Fit(WeightedDraws):
         tail_shape: Shape of the tail of the weights; NaN where they are equal.
         is_rough: Whether the likelihood had to be tempered often.
         free: Parameters that keep their prior, shape (d,).
-        found: Result of the search; None where it got nowhere.
+        found: Result of the search; None if it got nowhere.
         particles: Particles of sequential Monte Carlo; None of importance sampling.
         pool: Draws to go on from after a further trial.
     """

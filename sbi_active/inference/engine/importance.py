@@ -70,7 +70,7 @@ def importance_sample(
         rng: Source of the draws.
         num_components: Number of components of a proposal at most.
         settings: Numbers of draws.
-        found: Modes, to propose along ridges from; None where there are none.
+        found: Modes, to propose along ridges from; None if there are none.
         rivaled: Log evidence of a better model.
     """
     own, start = settings, potential.num_simulations

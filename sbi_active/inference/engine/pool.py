@@ -80,7 +80,7 @@ class Pool:
 
     @property
     def log_weight(self) -> Array:
-        """Log weights of the posterior, shape (n,); -inf where it does not rest."""
+        """Log weights of the posterior, shape (n,); -inf if it does not rest."""
         log_weight = self.log_prior + self.log_likelihood - self.log_own
         return np.where(self.is_final, log_weight, -np.inf)
 

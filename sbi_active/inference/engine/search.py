@@ -97,7 +97,7 @@ def search(
     near: Array | None = None,
     settings: SearchSettings = SearchSettings(),  # noqa: B008  (frozen)
 ) -> Found | None:
-    r"""Return normal approximations at the modes; None where no search gets anywhere.
+    r"""Return normal approximations at the modes; None if no search gets anywhere.
 
     Searches begin at the best of some draws of the prior and at points near, and again
     at the best of more draws until the best mode was found several times and explains

@@ -67,7 +67,7 @@ def bridge(
     max_moves: int = 100,
     forgotten: float = FORGOTTEN,
 ) -> Bridged | None:
-    r"""Return particles of :math:`p(u) L(u)`, or None where it takes too many moves.
+    r"""Return particles of :math:`p(u) L(u)`, or None if it takes too many moves.
 
     They go from the guess q along
 

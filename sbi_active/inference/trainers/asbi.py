@@ -246,7 +246,7 @@ class ASBI(MixtureRounds, NPE_C):
     def _chained(self, trial: Observation, *, required: bool) -> Belief | None:
         """Return the network's value at the trial.
 
-        It is None where there is no network, or it has never seen such an outcome; if
+        It is None if there is no network, or it has never seen such an outcome; if
         a belief is required, the first is an error and the second the belief before.
         """
         network, previous = self._neural_net, self.belief

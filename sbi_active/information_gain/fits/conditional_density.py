@@ -71,7 +71,7 @@ class _Residual:
     Attributes:
         location: m, shape (s,).
         factor: L, shape (s, s).
-        slope: Slope of log s in features of x; None where s is 1.
+        slope: Slope of log s in features of x; None if s is 1.
         offset: Offset of log s.
     """
 

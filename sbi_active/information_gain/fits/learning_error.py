@@ -33,7 +33,7 @@ def learning_error(
         slope: J, shape (n, q, d).
         z: Coordinates of the parameters, shape (n, d).
         difference: d, shape (n, q); zero for incomplete pairs.
-        residual: Residual of the pairs' averages, shape (n, q); zero where there is
+        residual: Residual of the pairs' averages, shape (n, q); zero if there is
             none.
         share: Share of a pair that is complete, shape (n,).
 

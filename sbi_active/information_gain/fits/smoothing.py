@@ -31,7 +31,7 @@ class Learned:
             where smoothing misses nothing, shape (a, q).
         difference: Difference of each pair, of unit mean square; zero for incomplete
             ones, (a, n, q).
-        residual: Residual of each pair's average to the smoothed mean; zero where there
+        residual: Residual of each pair's average to the smoothed mean; zero if there
             is none, shape (a, n, q).
     """
 

@@ -30,7 +30,7 @@ def of_sensors(
     Args:
         channels: Channels of x.
         sizes: Sizes of the model.
-        sds: Standard deviations of the noise, one or one a channel; None where they are
+        sds: Standard deviations of the noise, one or one a channel; None if they are
             not known.
     """
     times = torch.as_tensor(sizes.times)

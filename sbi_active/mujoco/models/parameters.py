@@ -66,7 +66,7 @@ class Bounded:
         low: Lowest value.
         high: Highest value.
         unit: Unit of the values.
-        quantity: Quantity whose value it is; None where it edits the spec.
+        quantity: Quantity whose value it is; None if it edits the spec.
         edit: ``edit(spec, value)`` before the model is compiled; None for a quantity.
     """
 
@@ -88,7 +88,7 @@ class Writer(Protocol):
     fields: tuple[str, ...]
 
     def model(self, theta: Array) -> Any | None:
-        """Return a model of its own for parameters (d,), None where it writes them."""
+        """Return a model of its own for parameters (d,), None if it writes them."""
         ...
 
     def write(self, model: Any, theta: Array) -> None:
@@ -271,7 +271,7 @@ class _Compiled:
 def _affine(
     compiled: Callable[[Array], Any], low: Array, high: Array
 ) -> _Affine | None:
-    """Return the writer of affine numbers, None where some are not."""
+    """Return the writer of affine numbers, None if some are not."""
     middle, half = 0.5 * (low + high), 0.25 * (high - low)
     base = _numbers(compiled(middle))
     steps = []

@@ -100,7 +100,7 @@ class Quantity:
 
 
 def joint_of_actuator(model: Any, quantity: Quantity) -> str | None:
-    """Return the joint that an actuator drives, None where it is something else."""
+    """Return the joint that an actuator drives, None if it is something else."""
     mujoco = mujoco_of()
     i = element_id(model, "actuator", quantity.name)
     joints = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT

@@ -143,7 +143,7 @@ class Bank:
 
     @property
     def labels(self) -> list[str]:
-        """Names of the proposals, in order of appearance; "" where not known."""
+        """Names of the proposals, in order of appearance; "" if not known."""
         return [*dict.fromkeys(segment.label for segment in self._rows.segments())]
 
     @property
@@ -165,7 +165,7 @@ class Bank:
         Args:
             simulations: Simulations of this bank's simulator.
             seed: Seed that they were simulated with.
-            proposal: Proposal that theta was drawn from; None where it is not known,
+            proposal: Proposal that theta was drawn from; None if it is not known,
                 and then the rows cannot be reweighted.
             label: Label of the proposal, "prior" or "round 3"; given with it.
             log_action: Log density, or log mass, of the actions, a number or (n,).
@@ -218,7 +218,7 @@ class Bank:
             run: Name of the run.
 
         Returns:
-            None where there is nothing.
+            None if there is nothing.
         """
         parts = []
         for segment in self._rows.segments():

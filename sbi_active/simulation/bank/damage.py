@@ -41,7 +41,7 @@ class LockedError(Explained, OSError):
     """Somebody else is writing.
 
     Attributes:
-        pid: Process that holds the lock, None where it did not say.
+        pid: Process that holds the lock, None if it did not say.
     """
 
     code = "SA608"

@@ -136,7 +136,7 @@ class Rows:
 
 
 def positions(rows: Any, total: int) -> np.ndarray | None:
-    """Return the positions of rows, int64; None where all are meant.
+    """Return the positions of rows, int64; None if all are meant.
 
     Args:
         rows: Positions, a slice, a mask over all rows, or None.

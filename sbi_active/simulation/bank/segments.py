@@ -45,7 +45,7 @@ class Segment:
         counts: Counts of rows by outcome.
         run: Name of the run that its rows belong to.
         seed: Seed of the run.
-        label: Label of the run's proposal; "" where it is not known.
+        label: Label of the run's proposal; "" if it is not known.
     """
 
     number: int

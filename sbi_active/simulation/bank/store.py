@@ -125,7 +125,7 @@ class Store:
                 raise explained(error, self.path, self._what) from error
 
     def get(self, table: str, kind: str, number: int = 0) -> bytes | None:
-        """Return the content of a record; None where there is none."""
+        """Return the content of a record; None if there is none."""
         with self.reading() as connection:
             found = connection.execute(
                 f"SELECT content, digest FROM {table} WHERE kind = ? AND number = ?",
@@ -141,7 +141,7 @@ class Store:
         return found[0]
 
     def size(self, table: str, kind: str, number: int = 0) -> int | None:
-        """Return the bytes of a record without reading it; None where there is none."""
+        """Return the bytes of a record without reading it; None if there is none."""
         return self._look("length(content)", table, kind, number)
 
     def remains(self, table: str, kind: str, number: int) -> str:

@@ -43,7 +43,7 @@ class AutocorrelatedNoise(ScaleNoise):
         posterior: Posterior of (sd, correlation_time), event shape (p,).
         measurement_sd: Known standard deviation of the measurement alone, where the
             rest of an unknown sd is what a simulator gets wrong, a number or one a
-            channel; None where nothing is known of it.
+            channel; None if nothing is known of it.
 
     Raises:
         ValueError: If a parameter is negative or not finite.
@@ -229,7 +229,7 @@ def innovations(
         times: Times, shape (T,) or (n, T); None for 0, 1, 2, ...
 
     Returns:
-        :math:`u_t^2` and :math:`\log(1 - \rho^2)`, zero where not observed, shapes (n,
+        :math:`u_t^2` and :math:`\log(1 - \rho^2)`, zero if not observed, shapes (n,
         T, rest).
     """
     change, variance = chained(residual, tau, times)

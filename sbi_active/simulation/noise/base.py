@@ -39,9 +39,9 @@ class NoiseModel(ABC):
     Attributes:
         parameter_names: Names of the parameters.
         parameters: Values of the parameters in natural units, shape (p,), float64.
-        posterior: Posterior of the parameters, event shape (p,); None where they are
+        posterior: Posterior of the parameters, event shape (p,); None if they are
             declared exactly.
-        times: Time stamps of the first axis of x in seconds, shape (T,); None where
+        times: Time stamps of the first axis of x in seconds, shape (T,); None if
             they were not given.
     """
 
@@ -301,7 +301,7 @@ def declared_sds(noise: NoiseModel) -> Tensor:
 
 
 def observed_terms(terms: Tensor, residual: Tensor) -> Tensor:
-    """Return terms of a sum, zero where the residual was not observed."""
+    """Return terms of a sum, zero if the residual was not observed."""
     return torch.where(residual.isnan(), 0.0, terms)
 
 

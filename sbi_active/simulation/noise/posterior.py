@@ -135,7 +135,7 @@ class NoisePosterior(Distribution):
     Args:
         sd: Standard deviations given the cell of the shared parameter.
         shared: Cells and weights (shape (cells,)) of the shared parameter :math:`\psi`;
-            None where there is none.
+            None if there is none.
     """
 
     arg_constraints: dict[str, Any] = {}  # pyright: ignore

@@ -85,7 +85,7 @@ class Reply:
     """The result of a call.
 
     Attributes:
-        x: Outcomes, shape (k, *x_shape), float32; None where there is a fault.
+        x: Outcomes, shape (k, *x_shape), float32; None if there is a fault.
         seconds: Wall time that the simulator took.
         fault: Fault that occurred; None if nothing did.
         traceback: Text that tells it.
