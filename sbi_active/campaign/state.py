@@ -245,7 +245,7 @@ class CampaignState:
     def stage(self, index: int, name: str) -> Iterator[None]:
         """Add the time spent in the block to a trial's account, less stages within.
 
-        Work ahead of a trial that was not asked for yet is on no account.
+        Work before a trial is asked for is not added to any account.
         """
         with self.watch(self, index, name):
             if index == len(self.trials):

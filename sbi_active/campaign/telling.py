@@ -125,7 +125,7 @@ def recorded(state: CampaignState, facts: Mapping[str, Any]) -> Trial:
 def outcome_told(x: Any, status: Status, x_shape: torch.Size) -> Tensor | None:
     """Return the outcome, NaN where not measured, shape x_shape.
 
-    None for a missing trial. A number that is infinite was not measured either.
+    It is None for a missing trial. Infinite numbers count as not measured.
 
     Raises:
         ValueError: If there is no outcome, or one of another shape, or what was told

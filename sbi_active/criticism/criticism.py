@@ -336,7 +336,7 @@ class Criticism:
     def judged(self, evaluation: Evaluation | None) -> Tracing:
         """Return the tracing, unless trials that had no part in it speak against it.
 
-        Effects with which these are predicted worse are withdrawn, and forces of the
+        Effects that predict these trials worse are withdrawn, and forces of the
         dictionary that leave more than the sensor's error are called stand-ins.
 
         Args:

@@ -24,7 +24,7 @@ CATCH_ALLS = (UNEXPLAINED, SCATTER, OUTLIER)
 class ModelKey:
     """Key of a model of the trials, as ``rivals.fit(key)`` takes it.
 
-    ``str(key)`` is what reports and results call it.
+    ``str(key)`` is its name in reports and results.
 
     Attributes:
         effects: Names of the effects, in the order of the library.

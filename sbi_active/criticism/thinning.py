@@ -26,8 +26,8 @@ def thinned_to_need(
 ) -> tuple[Trials, Sampling | None]:
     """Return trials without samples that the bare model's fit shows to be redundant.
 
-    Only where the sensor's error is declared by ``measurement_sd``: errors beyond it
-    are the simulator's, and smooth.
+    Trials are thinned only if ``measurement_sd`` declares the sensor's error: errors
+    beyond it are the simulator's, and smooth.
 
     Args:
         model: The bare simulator.

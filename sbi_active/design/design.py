@@ -135,10 +135,10 @@ class Design:
     def plot(self, ax: Axes | None = None) -> Axes:
         """Plot the expected information gain of the candidates.
 
-        Over one entry of the action with two standard errors; over two as a map with
-        the candidates that were evaluated; over more as the best of them in order.
-        Entries of a list beside a space without end have a panel for each of their
-        values.
+        The plot is over one entry of the action with two standard errors, over two as a
+        map with the candidates that were evaluated, and over more as the best of them
+        in order. Entries of a list beside a space without end have a panel for each of
+        their values.
 
         Args:
             ax: Axes to draw on; None makes a figure.

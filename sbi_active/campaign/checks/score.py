@@ -62,10 +62,10 @@ def score_outcome(
     numbers, and independent of the trials before it. It is at least 1 / (n + 1),
     however far the outcome lies: what no draw reaches is no evidence beyond that.
 
-    Outcomes without a measurement, or those with one, lie further out where they are
-    rarer. Of a trial that was partly measured only what was measured is compared, with
-    the same numbers of the simulations, so that a sensor that drops out is no surprise.
-    A simulator that itself leaves numbers out may be the cause as well; p is then the
+    Outcomes without a measurement, or those with one, lie further out the rarer they
+    are. Of a trial that was partly measured only the measured numbers are compared with
+    those of the simulations, so that a sensor that drops out is no surprise. A
+    simulator that itself leaves numbers out may be the cause as well; p is then the
     larger of the two tail probabilities. Numbers that are there where simulations
     seldom have them do count.
 

@@ -20,9 +20,9 @@ class Spread:
     .. math::
         C = (1 - \lambda) \hat C + \lambda \operatorname{diag} \hat C,
 
-    with the :math:`\lambda` of the largest leave-one-out Gaussian likelihood: C serves
-    with more numbers than rows. What was not measured counts as at the mean. All
-    are the same functions of the rows in any order.
+    with the :math:`\lambda` of the largest leave-one-out Gaussian likelihood, so that C
+    can be used with more numbers than rows. Missing numbers count as the mean. No
+    result depends on the order of the rows.
 
     Attributes:
         mean: Means, shape (q,).

@@ -133,7 +133,7 @@ def outcome_labels(
 def expected_gain(design: Design | None) -> tuple[float, float]:
     """Return the expected information gain of an action and its standard error, nats.
 
-    NaN where it was not designed.
+    They are NaN for a trial that was not designed.
     """
     if design is None:
         return float("nan"), float("nan")
@@ -147,7 +147,7 @@ def expected_gain(design: Design | None) -> tuple[float, float]:
 def health_after(state: CampaignState, trial: Trial) -> str | None:
     """Return the campaign's health when a trial had been used.
 
-    None for one that was not used, or not scored.
+    It is None for a trial that was not used, or not scored.
     """
     if trial.index not in state.processed:
         return None

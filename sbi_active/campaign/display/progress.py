@@ -12,7 +12,7 @@ from sbi_active.progress import News, is_asked_for
 class StageWatch:
     """Tells of each stage of a campaign while it runs.
 
-    How long one takes is known from the same stage of the trial before.
+    The duration of a stage is estimated from the same stage of the trial before.
 
     Args:
         show_progress: Whether to draw a bar.

@@ -217,7 +217,7 @@ class Learner:
     def learn(self, trial: Trial) -> None:
         """Bring the belief up to date with one more trial.
 
-        One that nothing in the prior explains leaves it as it is.
+        A trial that nothing in the prior explains leaves the belief as it is.
         """
         if trial.is_explained:
             try:

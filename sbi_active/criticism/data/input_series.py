@@ -106,8 +106,8 @@ def on_one_grid(
     """Return series on one uniform grid, and the grid.
 
     Its step is the smallest median step of an input in a trial, and it reaches from the
-    earliest to the latest time. What is on one uniform grid already stays as it is.
-    Beyond a trial's end its last value is held, before its begin its first.
+    earliest to the latest time. Series on one uniform grid stay as they are. After a
+    trial's end its last value is held, and before its start its first.
 
     Args:
         series: Series by name, shape (t, m), NaN after the last value of a trial.

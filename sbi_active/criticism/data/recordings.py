@@ -30,8 +30,9 @@ def read_trials(
 
     A folder's trials are those of its ``trials.csv``, or else of all its files
     ``*.csv``, by name with numbers in their order. A file with times and without a
-    column "trial" is one trial, called as the file; trials in another file with times
-    have its name in front; where a row is a trial, rows go on from file to file.
+    column "trial" is one trial, named after the file; trials in another file with times
+    have its name as a prefix; if a row is a trial, rows are numbered on from file to
+    file.
 
     Args:
         path: Path of the file or folder.

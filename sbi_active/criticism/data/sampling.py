@@ -61,10 +61,10 @@ class Sampling:
 def suggested_sampling(trials: Trials, residuals: Any, times: Any = None) -> Sampling:
     """Return the sampling of trials, and the sampling that they need.
 
-    It is the highest rate at which neighboring innovations are correlated by no more
-    than .2, or three standard errors, and below which they are not for want of motion:
-    at a very high rate the sensor's error is larger than what the simulator gets wrong
-    from sample to sample, and hides it. At least 8 samples of a trial are left.
+    The needed rate is the highest one at which neighboring innovations are correlated
+    by no more than .2, or three standard errors, at this and all lower rates: at a very
+    high rate the sensor's error hides the simulator's error from sample to sample. At
+    least 8 samples of a trial are left.
 
     Args:
         trials: Trials with sample times.
@@ -127,9 +127,9 @@ def suggested_sampling(trials: Trials, residuals: Any, times: Any = None) -> Sam
 def thinned(trials: Trials, sampling: Sampling, times: Any = None) -> Trials:
     """Return trials of which only samples as far apart as suggested count as measured.
 
-    The others are masked, in each trial and channel by itself: times, and what else the
-    simulator is given, stay as they are. The first samples, often the start that the
-    simulator is given, go; of a trial that is shorter the last one stays.
+    The others are masked, in each trial and channel by itself: times and other inputs
+    of the simulator stay as they are. The first samples, often the start that the
+    simulator is given, are masked too; a shorter trial keeps its last one.
 
     Args:
         trials: Trials with x of shape (n, k, ...).

@@ -216,7 +216,7 @@ class Trials:
         A row is a sample where there are columns "trial" and "time" (in s, or as in
         "time_ms"). Either way "action_\*" is the action, which like all else that
         belongs to a trial stands in each of its rows, and "x_\*" the observation.
-        What stands in "trial" is what reports call it.
+        Reports name a trial by its entry in "trial".
         Optional are "role", "index" (the place in the order of execution; without it
         that of the first row) and "repeat_of" (the index of the trial that is
         repeated). An empty cell of x is what was not measured. A unit stands in

@@ -16,8 +16,8 @@ def applied(
 ) -> Any:
     """Return a value as an effect changes it.
 
-    It gets copies, so that it may change them in place, and what it gives back is
-    copied, so that it may be a view of what it keeps.
+    The effect gets copies, so that it may change them in place, and its result is
+    copied, so that it may be a view of a buffer.
 
     Args:
         effect: Effect of any hook.

@@ -123,7 +123,7 @@ class AugmentedSimulator(SimulatorModel):
     ) -> Tensor:
         """Return the output of the simulator's function with some effects switched on.
 
-        It is noise-free where the model declares its noise, else a draw.
+        It is noise-free if the model declares its noise, else a draw.
 
         Args:
             theta: Parameters of the base simulator, shape (n, theta_dim).

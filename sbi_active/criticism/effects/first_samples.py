@@ -153,7 +153,7 @@ def zero_from_first_samples(
 ) -> tuple[Trials, Effect]:
     """Return the trials less the mean of their first samples, and what is left of it.
 
-    For a sensor whose zero is another one in each trial and shows before anything
+    Use it for a sensor whose zero differs from trial to trial and shows before anything
     moves, as that of a load cell.
 
     Args:

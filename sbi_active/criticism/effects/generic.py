@@ -64,14 +64,14 @@ def generic_effects(
     prior predictive. Noise inflation needs no effect: it is always among the rivals.
     The drift is left out of a comparison with trials whose order is unknown.
 
-    Trials in place of the actions say more, and so do the signals of a model that has
-    some. An action that is a label, or stands for a signal, is left as it is. Of each
-    input over time there are gain, offset, saturation, dead zone, delay, first-order
-    lag and backlash of its actuator, with the input's name where there are several.
-    Where x has sample times, a drift along them, delay, first-order lag and quantum of
-    the sensor take the place of the clock's offset; up to four sensors have theirs
-    each, with the channel's name. Delays and lags are a fiftieth of a recording, and
-    ten samples at most.
+    Trials in place of the actions give more effects, and so do the signals of a model.
+    An action that is a label, or stands for a signal, is left as it is. Effects on each
+    input over time are gain, offset, saturation, dead zone, delay, first-order lag and
+    backlash of its actuator, with the input's name where there are several. Where x has
+    sample times, a drift along them, delay, first-order lag and quantum of the sensor
+    take the place of the clock's offset; up to four sensors have theirs each, with the
+    channel's name. Delays and lags are a fiftieth of a recording, and ten samples at
+    most.
 
     Args:
         model: The simulator.

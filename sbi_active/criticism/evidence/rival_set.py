@@ -227,8 +227,8 @@ class RivalSet:
     def scaled_order(self, trials: Trials | None = None) -> Array | None:
         """Return the order of trials in the span of the fit; None if it has none.
 
-        Among a few trials it is no structure: any differences of theirs follow it. Nor
-        is one that is not that of execution.
+        The order of a few trials is no structure: any differences between them follow
+        it. Nor is an order that is not that of execution.
 
         Args:
             trials: Further trials.

@@ -1,4 +1,4 @@
-"""Generalized forces that was not declared: a dictionary of what a joint may lack.
+"""Undeclared generalized forces: a dictionary of what a joint may lack.
 
 This package contains the forces, their sizes along nominal trajectories, and the
 effects made of them. The comparison of forces with trials is elsewhere.

@@ -84,7 +84,7 @@ def identify(
     r"""Return the belief of trajectories over the parameters, with valid intervals.
 
     The best fit is found by least squares, and the model is linear around it. Errors
-    of each channel may be white or last, for a time and in a size that nobody knows
+    of each channel may be white or last, for an unknown time and in an unknown size
     (:mod:`..linear.processes`). Effects ``beside`` may be there or not, each with its
     own parameter (:mod:`.posterior`); fits follow where they are. Where single trials
     disagree all the same, the model lacks something else, and the belief is as wide as

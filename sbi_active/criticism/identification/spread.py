@@ -1,9 +1,9 @@
 r"""The disagreement between single parts of the trials.
 
-Where the model is right, parameters fitted to single trials differ by no more than
-their errors allow. Where it is wrong they follow what it lacks: beside dry friction
-nobody declared, damping falls as the motion grows. The spread between trials is then a
-measure of how far all of them may be off, and it does not average out.
+If the model is right, parameters fitted to single trials differ by no more than their
+errors allow. If it is wrong they follow what it lacks: with undeclared dry friction,
+damping falls as the motion grows. The spread between trials is then a measure of how
+far all of them may be off, and it does not average out.
 
 References:
     DerSimonian & Laird, Controlled Clinical Trials 7 (1986).

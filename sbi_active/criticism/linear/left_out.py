@@ -112,8 +112,8 @@ def leave_out(
 def bounded(system: Array, right: Array, low: Array, high: Array) -> Array:
     r"""Return the x within bounds that minimize :math:`x^T A x / 2 - b^T x`, (n, d).
 
-    Clipped alone, the best x without bounds would leave other coordinates where they
-    are right only with what was clipped.
+    If the best x without bounds were only clipped, other coordinates would keep values
+    that are right only with the clipped ones.
 
     Args:
         system: A, shape (n, d, d), positive definite.

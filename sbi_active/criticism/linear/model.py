@@ -74,7 +74,7 @@ class LinearModel:
     def promised(self) -> float:
         """Fall of the sum of squares at its linear optimum.
 
-        In sensor variances, with the residual's own size as that of the errors.
+        It is in sensor variances, with the residual's own size as that of the errors.
         """
         scale = max(self.rms, 1.0) ** 2
         bounded = np.isfinite(self.low) & np.isfinite(self.high)

@@ -201,7 +201,7 @@ class Search:
     ) -> tuple[LinearModel, NDArray[np.bool_]]:
         """Return a model with a further effect where it vanishes, and its columns.
 
-        A chord and no tangent: many effects are flat at their null.
+        The column is a chord and no tangent: many effects are flat at their null.
         """
         key = self._joined(base, [name])
         rival, model = self._rival(key), self.found[base].model

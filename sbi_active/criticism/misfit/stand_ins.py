@@ -23,9 +23,9 @@ def judged(
 ) -> Tracing:
     """Return the tracing, and whether its forces are stand-ins.
 
-    A force is adopted as an explanation only where the chi-square of its model has a
-    tail probability of at least .01, and the error on trials that had no part in it
-    falls. One with which that error rises is withdrawn, and so are effects that a wider
+    A force is adopted as an explanation only if the chi-square of its model has a tail
+    probability of at least .01, and the error on trials that were not used falls. A
+    force with which that error rises is withdrawn, and so are effects that a wider
     prior makes up for.
 
     Args:

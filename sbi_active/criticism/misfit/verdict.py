@@ -1,7 +1,7 @@
 """Whether every model misses the trials by more than the sensor's error, and then what.
 
-Where one fits to the sensor's error, evidence on the simulator itself decides, and
-nothing of this is needed.
+If one fits to the sensor's error, evidence on the simulator itself decides, and this
+module is not needed.
 """
 
 from __future__ import annotations
@@ -244,10 +244,11 @@ def find_misfit(
 ) -> Misfit | None:
     """Return the models and what helps; None if one fits to the sensor's error.
 
-    So it is where no model gains a Bayes factor of 20 by a residual process, or where
-    one trial alone asks for it, which may have a gross error. A set of several effects
-    that fits proves little: so many imitate what was not declared. It is judged as if
-    it missed, and so by what left-out trials say of each of its effects.
+    A model fits if no model is improved by a residual process by a Bayes factor of 20,
+    or if a single trial, which may have a gross error, accounts for the improvement. A
+    set of several effects that fits proves little: so many imitate what was not
+    declared. It is judged as if it missed, and so by what left-out trials say of each
+    of its effects.
 
     Args:
         search: Fits the models; None if the error of the sensor is not known.

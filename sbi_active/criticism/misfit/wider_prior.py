@@ -36,11 +36,12 @@ NEAR = 1e-6
 def beyond_bounds(rivals: RivalSet, tracing: Tracing) -> Tracing:
     """Return the tracing with the parameters at bounds, and fits with a wider prior.
 
-    Parameters of the bare model and of that of the verdict that lie at a bound are
-    fitted again with it moved. Where the bare model then explains the trials as well
-    as with the effects of the verdict, which have no Bayes factor of 20 left against
-    it, nothing tells these from a prior that is too narrow: they are not named. Nor is
-    what no permitted action tells from the bare model, whatever its prior is.
+    Parameters of the bare model and of the verdict's model that lie at a bound are
+    fitted again with the bound moved. If the bare model then explains the trials as
+    well as the effects of the verdict, which have no Bayes factor of 20 left against
+    it, these cannot be told from a prior that is too narrow, and are not named. Neither
+    are effects that no permitted action separates from the bare model, whatever its
+    prior is.
 
     Args:
         rivals: The models.

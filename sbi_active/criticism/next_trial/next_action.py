@@ -125,8 +125,8 @@ def choose_action(
     .02 nats for every permitted action, or some of the rivals are equivalent, actions
     beyond the permitted range are tried: one that separates them is named.
 
-    Where every model misses, rivals count by their errors on left-out trials: their
-    probabilities are too sure. What they leave is a part of their predictions.
+    If every model misses, rivals are weighted by their errors on left-out trials, since
+    their probabilities are too sure. Their residuals are a part of their predictions.
 
     Args:
         rivals: The models.

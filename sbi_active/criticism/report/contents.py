@@ -125,8 +125,8 @@ class Contents:
     def parameters(self) -> pd.DataFrame:
         """Columns parameter, before, before_sd, after, after_sd; phi has no before.
 
-        Means and deviations of posteriors; of a model that misses the trials the best
-        fit, with a deviation that knows of it.
+        Values are means and deviations of posteriors. A model that misses the trials
+        has its best fit, with a deviation that includes the misfit.
         """
         evidences = self.tracing.evidences
         before, after = evidences[NONE], evidences.get(self.tracing.model)

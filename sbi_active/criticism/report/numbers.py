@@ -33,7 +33,7 @@ def number(value: float) -> str:
 def estimated(mean: float, sd: float, draws: float) -> str:
     """Return a mean with its deviation, or alone where few draws are behind them.
 
-    Nothing for NaN.
+    The text is empty for NaN.
 
     Args:
         mean: Mean of the draws.

@@ -22,9 +22,9 @@ def with_known_inputs(
 ) -> ActionSpace:
     """Return the permitted actions that could be simulated.
 
-    Where inputs over time were recorded, and the model knows of no signals, what would
-    be played at another action is not known: those are left that some trial has, with
-    its inputs.
+    If inputs over time were recorded and the model has no signals, the inputs at
+    another action are not known: only actions of recorded trials remain, with their
+    inputs.
 
     Args:
         model: The simulator.

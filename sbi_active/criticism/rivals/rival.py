@@ -166,7 +166,7 @@ class Rival:
     def whitener(self, u: Array | None = None) -> Whitener:
         """Return the whitener of residuals by the likeliest error at u, shape (1, dim).
 
-        The same object where the error has nothing unknown, and without u.
+        It is the same object if the error has nothing unknown, and without u.
         """
         if u is None or self.error.is_known:
             return self._white

@@ -106,7 +106,7 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
 def promise(rivals: RivalSet, key: ModelKey) -> float:
     """Return the largest log posterior density that a search finds of a model.
 
-    It costs a part of a fit, which then goes on from there.
+    It costs a part of a fit, which then continues from there.
 
     Args:
         rivals: Set of all models.
@@ -187,8 +187,9 @@ def alternatives(
 ) -> dict[str, float]:
     """Return the weights of the alternatives to the bare model, which sum to one.
 
-    The residual process, noise inflation and each effect count alike, effects that
-    nothing separates as one. What nothing separates from the bare model is none.
+    The residual process, noise inflation and each effect have equal weights; effects
+    that nothing separates count as one, and effects that nothing separates from the
+    bare model do not count.
 
     Args:
         effects: Names of the effects.

@@ -73,8 +73,8 @@ def _is_known(rivals: RivalSet) -> bool:
 def tail(prediction: Prediction, trials: Trials) -> float:
     r"""Return the tail probability of :math:`e^T (S + R)^{-1} e`.
 
-    With S the covariance of the predictions over the posterior, and R the noise, whose
-    errors are taken as independent.
+    S is the covariance of the predictions over the posterior, and R that of the noise,
+    whose errors are taken as independent.
 
     Args:
         prediction: Prediction of some trials.

@@ -73,8 +73,8 @@ def needed_trials(rivals: RivalSet, key: ModelKey) -> tuple[float, ...]:
 def is_left_to_chance(tracing: Tracing) -> bool:
     """Return whether the effects of a verdict may be one trial's gross error.
 
-    So it is where the verdict falls without the trial that a gross error would be in,
-    and the odds of declared effects against such an error are below 50.
+    This is the case if the verdict falls without the trial that a gross error would be
+    in, and the odds of declared effects against such an error are below 50.
     """
     if not tracing.chosen or not tracing.outliers:
         return False
