@@ -61,10 +61,11 @@ class Sampling:
 def suggested_sampling(trials: Trials, residuals: Any, times: Any = None) -> Sampling:
     """Return the sampling of trials, and the sampling that they need.
 
-    The needed rate is the highest one at which neighboring innovations are correlated
-    by no more than .2, or three standard errors, at this and all lower rates: at a very
-    high rate the sensor's error hides the simulator's error from sample to sample. At
-    least 8 samples of a trial are left.
+    The needed rate is the first one, from high to low, at which neighboring innovations
+    are correlated by no more than .2, or three standard errors, after a rate at which
+    they are: at a very high rate the sensor's error hides the simulator's. All samples
+    are kept if no rate has correlated innovations. At least 8 samples of a trial are
+    left.
 
     Args:
         trials: Trials with sample times.
