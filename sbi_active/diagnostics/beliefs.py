@@ -1,6 +1,6 @@
 r"""Is a refined belief right? Asked at run time, without any further truth.
 
-Two questions, which find different errors:
+There are two checks, which find different errors:
 
 - Refits. The same trials are inferred again with other seeds. A belief that lost a
   mode, or is too wide or narrow by accident, differs from these in nats.

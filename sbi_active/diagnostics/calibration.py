@@ -61,7 +61,7 @@ class Stratum:
 class Calibration:
     """Whether an amortized posterior can be trusted, action by action.
 
-    ``print(calibration)`` says it in words, the verdict first.
+    ``print(calibration)`` reports it in words, the verdict first.
 
     Attributes:
         verdict: Verdict: "trust" if the network passes; "refine" if its regions are off

@@ -12,11 +12,10 @@ from torch import Tensor
 class LikelihoodModel(Protocol):
     """Anything with a conditional density of outcomes.
 
-    Where its likelihood is exact rather than learned, ``exact_likelihood = True`` says
-    so. It may have ``log_likelihood_table(x, theta, action)`` as well: outcomes
-    (n, *x_shape), parameters (m, theta_dim) and one action (action_dim,), all pairs of
-    them, -> (n, m). A network whose condition is (theta, action) then runs m times, not
-    n m times.
+    An exact likelihood, rather than a learned one, has ``exact_likelihood = True``. It
+    may have ``log_likelihood_table(x, theta, action)`` as well: outcomes (n, *x_shape),
+    parameters (m, theta_dim) and one action (action_dim,), all pairs of them, -> (n,
+    m). A network whose condition is (theta, action) then runs m times, not n m times.
     """
 
     def log_likelihood(self, x: Tensor, theta: Tensor, action: Tensor) -> Tensor:

@@ -31,7 +31,7 @@ NUM_COMPARED = 5_000  # draws behind a realized information gain
 class Belief(Distribution, ABC):
     r"""Distribution over the parameters after zero or more trials.
 
-    A torch distribution in float32 with an empty batch shape, the support of the
+    It is a torch distribution in float32 with an empty batch shape, the support of the
     original prior and a normalized ``log_prob``, so that it can be the prior of the
     next round, and of anything else that takes a prior.
 
@@ -100,7 +100,7 @@ class Belief(Distribution, ABC):
     def smooth_log_prob(self, value: Tensor) -> Tensor:
         """Return a log density that costs no simulations, for many places (..., d).
 
-        It is :meth:`log_prob` but for beliefs that simulate that.
+        It is :meth:`log_prob` except for beliefs that simulate it.
         """
         theta = torch.as_tensor(value, dtype=torch.float32)
         rows = theta.reshape(-1, theta.shape[-1])

@@ -37,7 +37,7 @@ class Assumption:
 class Diagnostics:
     """Diagnostics of a belief's quality.
 
-    ``print(belief.diagnostics)`` says it in words.
+    ``print(belief.diagnostics)`` reports them in words.
 
     Attributes:
         trustworthy: Whether the belief passed all checks; None if nothing was checked.

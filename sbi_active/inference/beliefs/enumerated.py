@@ -43,7 +43,7 @@ class Enumeration:
     def of(prior: Any) -> Enumeration | None:
         """Return the mixture; None of any other prior than independent parts.
 
-        Some parts must be discrete with finitely many values, and some continuous.
+        Some parts must be discrete with finitely many values, and others continuous.
         """
         if not isinstance(prior, MultipleIndependent):
             return None

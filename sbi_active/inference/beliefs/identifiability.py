@@ -135,14 +135,15 @@ def combinations_of(
 ) -> Combinations:
     r"""Return the combinations of parameters that a belief knows, and does not know.
 
-    From 2,000 draws of each: a parameter is open where its standard deviation is above
-    0.3 of the prior's; a combination of open parameters is known where it has, in prior
-    deviations of its own, at most a tenth of the width of any of them. The formulas are
-    sums, products and ratios with weights, products with an exponential, and products
-    of the kind a (b + c), see :func:`.search`. A parameter that is in none of them is
-    not known where it has more than half of the prior's deviation while something else
-    has a tenth of that. It is the belief that speaks: a further trial may determine
-    what this says is open; :func:`.check_simulator` tells whether any action could.
+    They are found from 2,000 draws of each. A parameter is open if its standard
+    deviation is above 0.3 of the prior's; a combination of open parameters is known if
+    it has, in prior deviations of its own, at most a tenth of the width of any of them.
+    The formulas are sums, products and ratios with weights, products with an
+    exponential, and products of the kind a (b + c), see :func:`.search`. A parameter
+    that is in none of them is not known where it has more than half of the prior's
+    deviation while something else has a tenth of that. It is the belief that speaks: a
+    further trial may determine what this says is open; :func:`.check_simulator` tells
+    whether any action could.
 
     Args:
         belief: Belief after some trials.

@@ -1,8 +1,8 @@
 r"""Trials that contradict one another: how much wider the noise must be.
 
-Where even the best fit is far outside the declared noise, the posterior under that
-noise has no width: it lies at the best fit, or at another place to which the search was
-led, with deviations of 0. The noise is then inflated by one factor s for all trials,
+If even the best fit is far outside the declared noise, the posterior under that noise
+has no width: it lies at the best fit, or at another place that the search found, with
+deviations of 0. The noise is then inflated by one factor s for all trials,
 
 .. math::
     s^2 = \max\Bigl(\frac{\sum_k |r_k|^2}{N - d},\;

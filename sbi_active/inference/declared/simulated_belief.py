@@ -57,7 +57,7 @@ class SimulatedBelief(Belief):
         b(\theta) = (1 - \epsilon)\, \frac{p(\theta)}{Z} \prod_k
         p\big(x_k \mid f(\theta, \xi_k)\big) + \epsilon\, p(\theta)
 
-    Draws are the weighted ones of a fit, again and again, whose density costs nothing.
+    Draws are resampled from the weighted ones of a fit, whose density costs nothing.
     Parameters that no trial informs, and that are independent of the others under the
     prior, are drawn from the prior afresh. ``log_prob`` elsewhere costs a simulation a
     trial and row; ``smooth_log_prob`` has a mixture fitted to the draws in place of the

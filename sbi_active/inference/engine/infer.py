@@ -7,7 +7,7 @@
    while few of them outweigh all others. Otherwise particles are led from the modes to
    it by sequential Monte Carlo, whose cost grows little with the number of parameters.
 
-A model far behind another is known well enough by the Laplace approximation.
+The Laplace approximation is precise enough for a model far behind another.
 """
 
 from __future__ import annotations

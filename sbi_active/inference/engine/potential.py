@@ -76,7 +76,7 @@ class Potential(Density, LeastSquares, Protocol):
     def whitener(self, u: Array | None = None) -> Whitener:
         """Return the whitener of residuals by the likeliest error at u, shape (1, dim).
 
-        The same object where nothing of the error is unknown; None begins a search.
+        It is the same object if nothing of the error is unknown; None begins a search.
         """
         ...
 

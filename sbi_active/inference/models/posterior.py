@@ -21,9 +21,9 @@ from sbi_active.messages import warn
 class ActionPosterior:
     r"""Amortized posterior :math:`q(\theta | x, \xi)`.
 
-    It has the methods of sbi's posteriors with ``x=`` and ``action=`` together. What
-    only knows a posterior over x takes :meth:`at`, and one over packed (x, action)
-    takes :meth:`packed`.
+    It has the methods of sbi's posteriors with ``x=`` and ``action=`` together. Code
+    that only knows a posterior over x takes :meth:`at`, and code that knows one over
+    packed (x, action) takes :meth:`packed`.
 
     Args:
         packed: sbi's posterior over packed conditions.
@@ -154,7 +154,7 @@ class ActionPosterior:
     def log_posterior(self, theta: Tensor, x: Tensor, action: Tensor) -> Tensor:
         r"""Return :math:`\log q(\theta_i | x_i, \xi_i)` row by row, shape (n,).
 
-        Without leakage correction, which a bound on the information does not need.
+        There is no leakage correction, which a bound on the information does not need.
 
         Args:
             theta: Parameters, shape (n, theta_dim).

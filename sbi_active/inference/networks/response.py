@@ -110,8 +110,8 @@ class Response(nn.Module):
     def best(u: Tensor, y: Tensor, action: Tensor) -> Response:
         """Return the linear or the curved regression, by held-out log score.
 
-        The curved one has many more coefficients to be wrong about, so what it gains
-        must be beyond chance.
+        The curved one has many more coefficients to fit, so its gain must be beyond
+        chance.
         """
         linear = Response(u, y, action, kind="linear")
         if linear.bend(u, y, action) <= STRAIGHT:
@@ -125,7 +125,7 @@ class Response(nn.Module):
     def weights(self, action: Tensor) -> tuple[Tensor, Tensor]:
         r"""Return the whitener of an action's noise, and f's weights.
 
-        A root of :math:`S^{-1}`, shape (n, m, m), and :math:`\beta` for
+        They are a root of :math:`S^{-1}`, shape (n, m, m), and :math:`\beta` for
         :math:`\psi(u)`, in the outcome's own units, shape (n, p, m).
         """
         phi = self.action_basis(action)

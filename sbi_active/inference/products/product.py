@@ -66,7 +66,7 @@ def widened(
 ) -> Array:
     """Return draws spread up to twice as wide as those of a belief, within the support.
 
-    A belief may be off by as much as it is wide; a likelihood can be learned from
+    The error of a belief may be as large as its width; a likelihood can be learned from
     parameters of any distribution. Each component of a Gaussian mixture of z, shape (n,
     d), is doubled, so that modes stay apart.
     """

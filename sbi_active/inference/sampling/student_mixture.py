@@ -227,7 +227,7 @@ class Defended(Proposal):
 def lower_factors(cov: Array) -> Array:
     """Return lower Cholesky factors of covariances, shape (..., dim, dim).
 
-    One that is singular in floating point, as where a few trials are believed to many
+    A covariance that is singular in floating point, as if a few trials determine many
     digits, has its smallest variances raised to 1e-12 of the largest.
     """
     try:

@@ -63,12 +63,12 @@ class ASBI(MixtureRounds, NPE_C):
     (:func:`.refine`). That needs no network; where one was trained in this round,
     ``belief.diagnostics`` compares the two.
 
-    NaN in x_o is information, as it is in the simulations: "no measurement" where it is
-    NaN throughout, else a number that was not observed. Where no simulation of this
-    round lacked those numbers, the network has never seen such an outcome and what it
-    would say is arbitrary. Without a simulator the belief then stays "unchanged", with
-    a warning: that the outcome is rare all over the belief says nothing about where it
-    is less rare, so there is no reason to widen it either.
+    NaN in x_o is information, as it is in the simulations: "no measurement" if it is
+    NaN throughout, else a number that was not observed. If no simulation of this round
+    lacked those numbers, the network has never seen such an outcome and its answer
+    would be arbitrary. Without a simulator the belief then stays "unchanged", with a
+    warning: an outcome that is rare everywhere under the belief does not say where it
+    is less rare, so there is no reason to widen the belief either.
 
     Args:
         prior: The prior over parameters. Rounds with actions need one with a support.

@@ -51,7 +51,7 @@ class Told:
 class ActiveInference(ABC):
     r"""A method that learns from simulations and updates a belief by real trials.
 
-    A round: rows drawn under the current belief go to ``append_simulations(theta, x,
+    In a round, rows drawn under the current belief go to ``append_simulations(theta, x,
     action=, belief=)``, ``train()`` learns from them, ``build_posterior()`` gives the
     model that actions are designed with, and :meth:`update` takes the real trial. The
     model has ``log_posterior``, ``log_likelihood`` or ``log_ratio``, which is all that

@@ -45,9 +45,9 @@ NUM_PROBES = 64  # draws of the prior, at one of which a factor is finite
 class ProductRounds(ActionRounds):
     r"""Rounds of a method that learns a factor of each trial's likelihood.
 
-    The belief is the original prior times the product over the history, in which every
-    trial counts by what the latest network says of it, within the region of its
-    training rows:
+    The belief is the original prior times the product over the history, in which the
+    latest network gives the factor of every trial, within the region of its training
+    rows:
 
     .. math::
         b_r(\theta) \propto p(\theta)\, 1[\theta \in R_r]
