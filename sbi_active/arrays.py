@@ -63,7 +63,8 @@ def measured(value: Any, *, name: str = "x") -> Tensor:
 def all_finite(x: Tensor) -> bool:
     """Return whether no number is NaN or infinite.
 
-    A sum, several times as fast as asking each number, is finite only then.
+    It takes a sum, which is finite only then, and is several times as fast as a test of
+    each number.
     """
     return math.isfinite(x.sum()) or bool(x.isfinite().all())
 

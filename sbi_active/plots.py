@@ -64,7 +64,7 @@ def plot_rounds(
 ) -> Figure:
     """Draw each round in a row: belief, information gain of the actions, next belief.
 
-    The arrangement of figure 3 of Kim & Matsubara (2025).
+    The layout is that of figure 3 of Kim & Matsubara (2025).
 
     Args:
         beliefs: Beliefs before the first round and after each, one more than designs.

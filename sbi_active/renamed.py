@@ -1,6 +1,6 @@
 """Names of packages: imported when they are used, and those of the last version.
 
-The latter still work, and a warning says the new one. So do keywords of that version.
+Former names and keywords still work, and a warning gives the new ones.
 """
 
 from __future__ import annotations
@@ -96,7 +96,8 @@ def grouped(values: Mapping[str, Any], groups: Mapping[str, Any]) -> dict[str, A
 def takes_loose(**groups: Any) -> Callable[[Taking], Taking]:
     """Let a function or a dataclass take fields of its settings as keywords.
 
-    For one version, with a warning. A dataclass has them as attributes as well.
+    They work for one version, with a warning. A dataclass has them as attributes as
+    well.
 
     Args:
         **groups: Groups of options, as in :func:`grouped`.

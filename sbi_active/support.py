@@ -27,9 +27,10 @@ Array = NDArray[Any]
 def support_of(distribution: Distribution) -> Any:
     """Return the support of a distribution's draws, as a torch constraint.
 
-    It is what the distribution says, but where torch says too much: a transformed
-    distribution has the image of its base, not all that its last transform can reach;
-    an angle lies between -pi and pi; components of a mixture have bounds each.
+    It is the support that the distribution states, except where torch's is too large: a
+    transformed distribution has the image of its base, not all that its last transform
+    can reach; an angle lies between -pi and pi; components of a mixture have bounds
+    each.
     """
     if isinstance(distribution, Independent):
         base = support_of(distribution.base_dist)

@@ -1,7 +1,7 @@
 """The commands of ``sbi-active`` and their options, each option declared once.
 
-Nothing here imports torch, so that help, the version and a slip of the pen are answered
-at once. A command's module is imported when the command is called.
+Nothing here imports torch, so that help, the version and typing errors are answered at
+once. A command's module is imported when the command is called.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The programs that a campaign's folder names, and whether to trust it.
 
-A folder may have come from anybody. What its ``command.json`` names is imported where
-this account wrote that file, or was told once by ``--trust`` to follow it; both are
-remembered outside of the folder. Nothing here imports torch.
+A folder may come from an untrusted source. Programs that its ``command.json`` names are
+imported if this account wrote that file, or was told once by ``--trust`` to follow it;
+both are remembered outside of the folder. Nothing here imports torch.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """``sbi-active watch DIR``: a campaign in a browser, while another process runs it.
 
 The page is made of the folder alone, which is only read; nothing that it names is
-imported. Who asks from elsewhere than this machine, or for anything else, gets nothing.
+imported. Requests from other machines, or for anything else, are refused.
 """
 
 from __future__ import annotations

@@ -34,8 +34,8 @@ ADDED = {"draws": {}, "batches": [], "num_simulated": 0}
 def migrate(folder: Path) -> dict[str, int]:
     """Bring a bank, several in a folder, or a campaign of release 0.1 up to date.
 
-    The files of before are kept, in a folder "version-1" within. A migration that was
-    cut short is done again.
+    The former files are kept in a subfolder "version-1". An interrupted migration is
+    done again.
 
     Args:
         folder: Folder of the campaign or bank, or that of ``CampaignOptions(bank=)``.

@@ -49,9 +49,9 @@ def trials_of(
 ) -> Trials:
     """Return logs as trials.
 
-    Each has a column "time", s from the start of the trial, one of each input and one
-    of each sensor, and may have "start hinge" or "start hinge velocity", of which the
-    first row counts. Where a sensor is called as an input, the input's column is
+    Each log has a column "time", s from the start of the trial, one for each input and
+    one for each sensor, and may have "start hinge" or "start hinge velocity", of which
+    the first row counts. If a sensor has the name of an input, the input's column is
     "hinge control". A sensor may have NaN where it was not read; an input is held.
 
     Args:
@@ -103,7 +103,7 @@ def trials_of(
 def require_in_range(model: Any, name: str, values: Array, what: str) -> None:
     """Raise if a control is outside the range that its actuator has.
 
-    MuJoCo would clip it without a word.
+    MuJoCo would clip it without a warning.
 
     Args:
         model: Compiled model.

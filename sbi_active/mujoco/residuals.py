@@ -47,7 +47,7 @@ def free_parameters(params: Any) -> tuple[Bounded, ...]:
 def from_residuals(residual_fn: Any, params: Any, *, noise: Any) -> Robot:
     """Return a robot whose outcome is minus the residual of each sequence.
 
-    It runs in this process: a spec does not go to others.
+    It runs in this process, since a spec is not sent to others.
 
     Args:
         residual_fn: ``residual_fn(x, params)`` of ``build_residual_fn``.

@@ -39,7 +39,7 @@ __all__ = ["Robot", "from_mjcf", "from_spec", "named_box", "require_alike"]
 def named_box(parameters: Sequence[Bounded]) -> BoxUniform:
     """Return a uniform prior whose sides have ``names`` and ``units``.
 
-    It is sbi's own class, which a campaign's folder keeps and makes again.
+    It is sbi's own class, which a campaign's folder can store.
 
     Args:
         parameters: Parameters with bounds, names and units.

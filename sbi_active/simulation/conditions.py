@@ -34,7 +34,7 @@ def conditions_of(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the conditions that a function takes, and those that it requires.
 
-    A ``functools.partial`` that binds one has decided it.
+    A condition that a ``functools.partial`` binds does not count.
 
     Args:
         fn: The function.

@@ -85,11 +85,11 @@ def find_undetermined(
     where noise is added to the outcome). Its mean over the sets gives formulas by
     :func:`.search`.
 
-    Each formula is then put to the test: parameters are moved along it, most of a prior
-    deviation where the support allows that, and where x moves by more than a tenth of
-    the noise nothing is said. The same outcome under the same random numbers is the
-    same distribution, so that what is said holds at the places that were tried,
-    whatever the noise; the reverse is not true, and more may be undetermined.
+    Each formula is then tested: parameters are moved along it, by most of a prior
+    deviation if the support allows it, and if x moves by more than a tenth of the noise
+    the formula is dropped. The same outcome under the same random numbers is the same
+    distribution, so that the result holds at the places that were tried, whatever the
+    noise; the reverse is not true, and more may be undetermined.
 
     Args:
         simulate: The simulator.

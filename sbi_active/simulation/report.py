@@ -77,7 +77,7 @@ class SimulatorReport:
     def minutes(self) -> float | None:
         """Time of a campaign, as the round that was measured, or of its simulations.
 
-        The latter, shared evenly by the workers, where no round was measured.
+        If no round was measured, simulations are shared evenly by the workers.
         """
         if self.seconds_round is not None:
             return self.num_rounds * self.seconds_round / 60

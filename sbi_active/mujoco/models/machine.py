@@ -152,7 +152,7 @@ class Machine:
     def require_inertia(self) -> None:
         """Raise if a joint has no inertia at the lowest parameters.
 
-        Every state is then NaN, which would pass for an outcome that was invalid.
+        Every state would then be NaN, and the outcome would count as invalid.
         """
         low = np.array([p.low for p in self.parameters])
         with quiet():

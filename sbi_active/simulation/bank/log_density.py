@@ -13,7 +13,8 @@ from sbi_active.support import support_of
 def log_density(distribution: Any, theta: Tensor) -> Tensor:
     """Return the log density of rows, -inf outside the support.
 
-    A torch distribution that validates its arguments raises outside of its support.
+    Otherwise a torch distribution that validates its arguments would raise outside of
+    its support.
 
     Args:
         distribution: Anything with ``log_prob``.

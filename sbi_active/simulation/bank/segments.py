@@ -1,7 +1,7 @@
 """Segments of rows in a store: columns as bytes, and what is known of them.
 
-A segment belongs to one run, and is never changed. What a file holds is compared with
-what a bank writes: anybody can make records whose checksums are right.
+A segment belongs to one run, and is never changed. The content of a file is compared
+with what a bank writes, since valid checksums alone can be forged.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Connections to a store's file, which may come from anybody: it is never executed.
 
-SQLite is made to refuse what a file could have it do: tables are compared with those of
-a store before anything is read from them, no journal is played back that none leaves,
-and no link is followed.
+SQLite is configured to refuse commands that a file may contain: tables are compared
+with those of a store before anything is read from them, no journal is played back that
+none leaves, and no link is followed.
 """
 
 from __future__ import annotations

@@ -315,7 +315,7 @@ class Store:
     def salvage(self) -> None:
         """Write the file anew from the records that are whole.
 
-        The former one is kept, its name ending in ".damaged".
+        The former file is kept, its name ending in ".damaged".
         """
         self.acquire()
         fresh = self.folder / f"{TEMPORARY}{os.getpid()}-{NAME}"

@@ -83,9 +83,9 @@ class AutocorrelatedNoise(ScaleNoise):
     ) -> Self:
         r"""Return noise of which only the orders of magnitude are known.
 
-        Its parameters have log-uniform priors. For trajectories without error bars:
-        what is wrong with the simulator itself passes for such errors as long as
-        nothing better explains it.
+        Its parameters have log-uniform priors. Use it for trajectories without error
+        bars: errors of the simulator itself count as such noise as long as nothing
+        explains them better.
 
         Args:
             sd: Bounds of the standard deviation, in the units of x; or a pair a

@@ -108,7 +108,7 @@ class NoiseModel(ABC):
 class ScaleNoise(NoiseModel):
     r"""Noise with a standard deviation and further parameters common to all channels.
 
-    Checks and shapes stand here; a kind of noise implements ``_draw`` and
+    This class has the checks and shapes; a kind of noise implements ``_draw`` and
     ``_log_density`` given parameters, and ``_marginal`` where it has a closed form.
 
     Args:
@@ -286,7 +286,7 @@ class ScaleNoise(NoiseModel):
 def declared_sds(noise: NoiseModel) -> Tensor:
     """Return the standard deviations of a noise model, shape (1,) or (channels,).
 
-    One that has no such parameter is sampled around zero.
+    A noise model that has no such parameter is sampled around zero.
     """
     sds = [
         v

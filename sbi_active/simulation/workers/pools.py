@@ -81,9 +81,9 @@ class InProcess(Pool):
 class WorkerPool(Pool):
     """Runs calls in processes of its own, each of which has one call at a time.
 
-    So a worker that dies or is killed at its time limit takes no other call with it,
-    and the guilty call is known. Those that have answered are kept for the next pool
-    of the same simulator, folder, path and environment.
+    A worker that dies or is killed at its time limit therefore loses no other call, and
+    the guilty call is known. Workers that have answered are kept for the next pool of
+    the same simulator, folder, path and environment.
 
     Args:
         simulator: Simulator, sent once to each worker.
