@@ -192,7 +192,7 @@ def _add_trials(
     made.coords["round"] = [t.index + 1 for t in trials]
     made.coords["action_entry"] = [*campaign.actions.names]
     shape = (len(theta), len(trials))
-    # The same draws of the posterior stand behind predictive and likelihood.
+    # Predictive and likelihood use the same draws of the posterior.
     predicted = () if campaign.simulator is None else ("posterior", "prior")
     for group, draws in zip(predicted, (theta, before), strict=False):
         pairs = draws.repeat_interleave(len(trials), 0), action.repeat(len(draws), 1)

@@ -128,7 +128,7 @@ class ModelVersion:
     trials: tuple[int, ...] = ()
 
 
-#: Of a trial that was not scored.
+#: Fields of a trial that was not scored.
 UNSCORED: dict[str, Any] = {
     "information_gained": None,
     "surprise": None,

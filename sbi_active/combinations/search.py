@@ -19,7 +19,7 @@ Array = NDArray[Any]
 #: than each of its parameters: a tenth, so that three decimals of sampling error or a
 #: strong correlation (.99) are not taken for it.
 KNOWN = 0.1
-#: The same of formulas of different kinds, each of which was rounded before.
+#: Factor of the smallest width within which formulas of different kinds are as good.
 ABOUT_AS_GOOD = 1.3
 #: Width of the best pair from which a shift, as in a * (b + 0.5), is looked for.
 WORTH_A_SHIFT = 0.5

@@ -150,7 +150,7 @@ class Criticism:
         if summaries is None:
             many = trials.x[0].numel() > MANY and not obstacle(*self._parts)
             summaries = MOST if many else 0
-        #: Of x, that are compared in its place; 0 for all of its numbers.
+        #: Number of summaries that are compared in place of x; 0 for all its numbers.
         self.num_summaries = summaries
         if summaries:
             short = summarize(

@@ -138,7 +138,7 @@ class CandidateSampler:
             noise, short = self.simulator.noise, self.summaries
             assert noise is not None
             means, lost = [], []
-            # Of many numbers, those of one action at a time are in memory.
+            # Many numbers are kept in memory for one action at a time.
             for some in action.split(len(action) if short is None else 1):
                 mean, missing = run(self.simulator.mean, some, "x")
                 rows = _rows(theta, some)

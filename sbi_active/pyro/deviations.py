@@ -121,7 +121,7 @@ def _swept(
             pulled = np.einsum("kij,kj->ki", precision, residual)
             own = precision[:, c, c]
             off, spread = pulled[:, c] / own, 1 / own
-            # Of all other channels: the whole without this one given them.
+            # Density of all other channels: the whole without this one given them.
             square = (residual * pulled).sum(1) - off**2 * own
             rest = log_weight - 0.5 * (square + log_volume - np.log(spread))
             v = np.maximum(spread - variance[c], SMALLEST)[:, None] + variances

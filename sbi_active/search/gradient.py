@@ -18,7 +18,7 @@ from sbi_active.search.sequential import (
 NUM_STEPS = 50  # of the ascent
 STEP = 0.03  # in the unit cube
 RANGE = 0.1  # of the penalty on being close, in the unit cube
-#: Of the penalty at its largest, in standard deviations of the utility between actions.
+#: Largest penalty, in standard deviations of the utility between actions.
 REPULSION = 0.3
 OPTIMISM = 2.0  # standard deviations of the regression that a proposal may hope for
 APART = 0.02  # least distance of actions chosen together, in the unit cube

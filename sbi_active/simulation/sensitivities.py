@@ -22,8 +22,9 @@ Array = NDArray[Any]
 Simulate = Callable[[Tensor, Tensor, str], Tensor]
 
 STEP = 0.01  # of a derivative, in prior deviations
-#: Of the largest singular value, below which one is an error of the differences: they
-#: are cut off at STEP**2 / 6 of what turns within a deviation, and rounded in float32.
+#: Share of the largest singular value below which one is an error of the differences:
+#: these are cut off at STEP**2 / 6 of what turns within a deviation, and rounded in
+#: float32.
 NUMERIC = 5e-4
 #: Trials of each action with which a parameter that is not known is hardly determined.
 TRIALS = 100.0

@@ -79,7 +79,7 @@ _ALHI = {
     "estimator": "likelihood",
     "details": CampaignDetails(posterior="kde", eliminate=False),
 }
-#: Of 52,000 simulations a round, as the others: LFIRE needs those to learn from.
+#: Options for 52,000 simulations a round, as the others: LFIRE learns from those.
 _SEQBED = {
     "estimator": "ratio",
     "density_estimator": LFIRE(),

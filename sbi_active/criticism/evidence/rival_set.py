@@ -258,7 +258,7 @@ class RivalSet:
         near = starts_near_parents(self.fits, rival, seed)
         how = THOROUGH if near is None else NESTED
         if key in self.best_fits:
-            # Of the bare model every mode counts, of others what is beside the best.
+            # Every mode of the bare model counts; of others what is beside the best.
             near = self.best_fits[key][None]
             how = THOROUGH if key == ModelKey() else KNOWN
         how = how if self.is_smooth else ROUGH

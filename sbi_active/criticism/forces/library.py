@@ -26,7 +26,7 @@ from sbi_active.simulation import SimulatorModel
 
 #: How families of forces begin: their forms are alternatives of one cause.
 FAMILY = "force in "
-#: The same, of forces that depend on another joint.
+#: Prefix of forces that depend on another joint.
 COUPLING = "coupling with "
 #: Prior deviation of a force, in root mean squares of what the motion takes.
 SHARE = 0.2

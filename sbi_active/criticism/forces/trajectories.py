@@ -53,7 +53,7 @@ class _Recorder:
         self.dof, self.seen = dof, dict[float, tuple[Array, Array]]()
 
     def __call__(self, q: Array, v: Array, t: float, phi: Array) -> Array:
-        # Of several looks the last counts: the first are those at the effect's null.
+        # The last of several looks counts: the first are those at the effect's null.
         self.seen[float(t)] = q.copy(), v.copy()
         force = np.zeros_like(v)
         if self.dof is not None:

@@ -73,7 +73,7 @@ def spread(found: Fitted, fewest: int) -> Spread:
     square, freedom = (weight * (each - mean) ** 2).sum(0), len(each) - 1
     of_parts = weight.sum(0) - (weight**2).sum(0) / weight.sum(0)
     variance = np.maximum(square - freedom, 0.0) / np.maximum(of_parts, 1e-300)
-    # Of their own deviations, those that are far off by their errors count less.
+    # Deviations that are far off by their errors count less.
     off = np.sqrt(weight) * (each - mean)
     off = off / np.maximum(np.linalg.norm(off, axis=0), 1e-300)
     p_value = chi2.sf(square, max(freedom, 1))

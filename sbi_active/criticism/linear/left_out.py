@@ -20,7 +20,7 @@ Array = NDArray[Any]
 
 #: Factor on the scale of effects' priors in refits, which are to follow the trials.
 WIDTH = 3.0
-#: Of a search within bounds, each of which ends at one or at the best x.
+#: Steps of a search within bounds, each of which ends at one or at the best x.
 STEPS = 30
 
 

@@ -154,7 +154,7 @@ class Search:
         """Fit one set of effects from its parts, once."""
         if key not in self.found:
             known = [p for p in key.parts if p in self.found]
-            # Of a set that sampling found, its effects alone may be what was fitted.
+            # The effects alone of a set that sampling found may be what was fitted.
             alone = [ModelKey((n,)) for n in key.effects]
             alone = [k for k in alone if k in self.found]
             self.keep(self._fit(key, known or alone or [ModelKey()]))
@@ -279,7 +279,7 @@ class Search:
 
     def _fit_bare(self) -> LinearModel:
         rival = self._rival(ModelKey())
-        # Those of the prior predictive, which are simulated already.
+        # Draws of the prior predictive, which are simulated already.
         seed = derive_seed(self.rivals.seed, "spread")
         u = rival.coordinates.sample(NUM_DRAWS, seed=seed)
         return best_fit(rival, u, self.unit, self.settings)

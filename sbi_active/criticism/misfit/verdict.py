@@ -368,7 +368,7 @@ def _is_one_trial(search: Search) -> bool:
     best = max(models, key=lambda c: c.log_prior + c.posterior.log_sensor)
     square = np.bincount(trial, best.model.residual**2)
     for suspect in np.argsort(-square)[:NUM_SUSPECTS]:
-        # Of few trials a part is a piece of one: all pieces of the suspect go.
+        # A part of few trials is a piece of one: all pieces of the suspect go.
         use = np.ones(errors.num_folds, bool)
         use[np.unique(errors.fold[trial == suspect])] = False
         if not _misses(search, use, 1):

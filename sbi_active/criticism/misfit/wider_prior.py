@@ -23,13 +23,13 @@ Array = NDArray[Any]
 
 #: Draws of a posterior that say whether it lies at a bound, and steps of a refit.
 NUM_DRAWS, STEPS = 400, 30
-#: By how much a bound is moved, in widths of the prior. Half of it still reaches what a
-#: prior barely excludes, twice asks of the simulator what nobody meant.
+#: Move of a bound, in widths of the prior. Half of it still reaches what a
+#: prior barely excludes, twice asks too much of the simulator.
 WIDER = 1.0
 #: Share of a positive parameter's bound that a moved one keeps of it: what has a sign
 #: keeps it, since a simulator may not know what a negative friction is.
 KEPT = 0.1
-#: Of the null of an effect to a bound, in deviations of its prior: what rounding is.
+#: Distance of an effect's null to a bound, in prior deviations, that is rounding.
 NEAR = 1e-6
 
 

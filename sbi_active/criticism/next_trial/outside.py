@@ -7,7 +7,7 @@ from torch import Tensor
 
 from sbi_active.actions import ActionSpace
 
-#: By which the range of the actions is widened about its center.
+#: Factors by which the range of the actions is widened about its center.
 WIDER = (1.5, 2.0)
 
 

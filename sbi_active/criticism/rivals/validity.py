@@ -15,7 +15,7 @@ Array = NDArray[Any]
 
 #: Probability that a trial has no outcome where the simulator has one, or vice versa.
 DISAGREEMENT = 0.02
-#: The same where nothing declared explains the outcomes, equally likely.
+#: Rates where nothing declared explains the outcomes, equally likely.
 UNKNOWN_RATES = (DISAGREEMENT, 0.1, 0.3, 0.5)
 #: Probability below which an outcome is named.
 SURPRISING = 0.05

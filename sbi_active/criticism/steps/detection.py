@@ -24,10 +24,10 @@ SURE = 0.3
 NO_MORE = 1.0
 #: Tail probability of the refitted chi-square that is an alarm by itself.
 LEVEL = 0.01
-#: That of a chi-square which is too small for the declared noise; rounds of steps to
-#: the smallest one then.
+#: Tail probability of a chi-square which is too small for the declared noise; rounds of
+#: steps to the smallest one then.
 TOO_SMALL, ROUNDS, MOST_STEPS = 1e-4, 2, 10
-#: That of what a verdict leaves over, below which it is not all that is missing.
+#: Tail probability of a verdict's residual below which something else is missing.
 REFUTED = 0.001
 
 

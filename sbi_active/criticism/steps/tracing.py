@@ -32,11 +32,11 @@ from sbi_active.inference.sampling.weights import log_sum_exp
 Array = NDArray[Any]
 
 PROBABILITY_OF_NONE = 0.5  # by convention, neither for nor against
-#: That what is missing, if anything is, is each of the catch-alls.
+#: Probability that what is missing, if anything is, is each of the catch-alls.
 PROBABILITY_OF_CATCH_ALL = 0.1
 MASS = 0.9  # of the credible set
-#: That an effect beyond the first, beside which a set fits to the sensor's error, is
-#: real and imitates nothing; empirical.
+#: Probability that an effect beyond the first, beside which a set fits to the sensor's
+#: error, is real and imitates nothing; empirical.
 REAL = 0.85
 #: Factors on the scale of the effects' priors under which a verdict should stand.
 RESCALED = (1 / 3, 3.0)

@@ -144,7 +144,7 @@ class Pool:
         log_past = np.zeros(len(u))
         if self.num_past:
             assert isinstance(potential, SimulatedPotential)  # as in with_trials
-            # Of what counts every trial has been simulated; this only looks it up.
+            # Every trial of draws that count has been simulated; this only looks it up.
             log_past = potential.log_likelihood(u, last=self.num_past)
         self.log_past = np.concatenate([self.log_past, log_past])
         self.is_final = np.concatenate([self.is_final, np.ones(len(u), dtype=bool)])

@@ -115,7 +115,7 @@ class Baseline(Response):
         residual = y[:, None] - self.parameter_basis(self.centers) @ beta
         misfit = 0.5 * (residual.square().sum(-1) + self.centers.square().sum(-1))
         first = self._descend(self.centers[misfit.argmin(1)][:, None], y, beta)
-        # Of the quadratic around the first solution, the centers' distances to it.
+        # Distances of the centers to the quadratic around the first solution.
         step = self.centers - first[0]
         quadratic = (step * (step @ first[2][:, 0])).sum(-1) * 0.5 + first[1]
         second = (misfit.log() - quadratic.clamp_min(1e-12).log()).argmin(1)

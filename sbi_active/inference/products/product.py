@@ -19,7 +19,7 @@ from sbi_active.threads import single_thread
 
 Array = NDArray[Any]
 
-#: Of the mixture whose level set is a region: a choice, enough for a few modes.
+#: Components of the mixture whose level set is a region: enough for a few modes.
 NUM_COMPONENTS = 6
 NUM_FITTED = 2_000  # rows that a region is fitted to
 LOST = 2e-3  # share of the rows that may lie outside

@@ -60,7 +60,7 @@ class NormalCoordinates:
         self.line = Unbounding(bounded & ~kept)
         y = self.line.to_line(z)
         shift, spread = y.mean(0), y.std(0)
-        # Those of a uniform number are known.
+        # The moments of a uniform number are known.
         is_flat = kept & (np.abs(spread - UNIFORM) < CHANCE * FLAT_ERROR)
         self._shift = np.where(is_flat, 0.0, shift)
         spread = np.where(is_flat, UNIFORM, spread)

@@ -132,7 +132,7 @@ def bridge(
         u, target, start, b = u[which], target[which], start[which], power
         kept = 1.0
         for _ in range(max_moves):
-            # Of the last step's particles all count, but for what they share.
+            # All particles of the last step count, but for what they share.
             if kept <= forgotten or (b == 1 and kept**2 * shared <= SHARED):
                 break
             new, gain = moves.propose(u, rng)

@@ -50,7 +50,7 @@ class ActionRounds(ActiveInference):
     _sbi_default: ClassVar[str]
     _sbi_builder: ClassVar[Callable[..., Any]]
 
-    # Of sbi's trainers.
+    # Attributes of sbi's trainers.
     _device: str
     _round: int
     _neural_net: Any

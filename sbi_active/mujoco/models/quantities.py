@@ -271,7 +271,7 @@ NEVER_NEGATIVE = frozenset(
     }
 )
 
-#: Of hinges and slides.
+#: Units on hinges and on slides.
 _UNITS = {
     "joint": {
         "damping": ("N m s/rad", "N s/m"),

@@ -84,7 +84,7 @@ def _end(workers: Sequence[Worker]) -> None:
         worker.end()
 
 
-#: Those of this process.
+#: Idle workers of this process.
 IDLE = IdleWorkers()
 
 atexit.register(IDLE.end)
