@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import pickle
-import random
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
@@ -13,45 +12,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from benchmarks.robustness.attacks import Attacks
+from benchmarks.robustness.bank_damage import ATTACKS as DAMAGE
+from benchmarks.robustness.bank_files import (
+    FILE,
+    execute,
+    filled,
+    prior,
+    refused,
+    rows_of,
+    same_or_refused,
+    simulator,
+)
 from benchmarks.robustness.bank_in_use import ATTACKS as IN_USE
 from sbi_active import Bank
 from sbi_active.cli import main
-from sbi_active.simulation import Simulations, reuse
-from sbi_active.simulation.bank import CorruptSegmentError
+from sbi_active.simulation import reuse
 from sbi_active.simulation.bank.store import Store
 
-ATTACKS = Attacks(IN_USE)
-FILE = "store.db"
-
-
-def simulator(theta: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-    return theta
-
-
-def prior() -> torch.distributions.MultivariateNormal:
-    return torch.distributions.MultivariateNormal(torch.zeros(2), torch.eye(2))
-
-
-def rows_of(seed: int, num_rows: int = 5) -> Simulations:
-    theta = torch.full((num_rows, 2), float(seed))
-    return Simulations(theta, theta[:, :1], theta)
-
-
-def filled(name: str = "bank", seeds: Any = range(4)) -> Path:
-    with Bank(name, simulator=simulator) as bank:
-        for seed in seeds:
-            bank.append(rows_of(seed), seed=seed, proposal=prior(), label="prior")
-    return Path(name)
-
-
-def execute(folder: Path, statement: str, *values: Any) -> None:
-    """Change the file as anybody can who has SQLite."""
-    with closing(sqlite3.connect(folder / FILE, isolation_level=None)) as connection:
-        connection.execute(statement, values)
-        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+ATTACKS = Attacks([*IN_USE, *DAMAGE])
 
 
 def crafted_record(folder: Path, table: str, kind: str, number: int, new: Any) -> None:
@@ -68,17 +48,6 @@ def remove(folder: Path, number: int) -> None:
 
 def renumber(folder: Path, number: int, another: int) -> None:
     execute(folder, "UPDATE segments SET number = ? WHERE number = ?", another, number)
-
-
-def refused(act: Callable[[], Any], named: Path) -> None:
-    """Raise unless the one error comes, which names a file or its folder."""
-    try:
-        act()
-    except CorruptSegmentError as error:
-        said = str(error)
-    else:
-        raise AssertionError("read without a word")
-    assert str(named) in said, said
 
 
 # Segments that are not where they belong ---------------------------------------------
@@ -189,7 +158,7 @@ def misplaced(case: str) -> None:
     expected = Bank(folder).read()
     MISPLACED[case](folder)
     if case == "sparse":  # all is there, and a terabyte of nothing
-        _same_or_refused(folder, expected)
+        same_or_refused(folder, expected)
         return
     refused(lambda: Bank(folder).read(), folder / FILE)
     refused(lambda: Bank(folder).read(), folder / FILE)  # still
@@ -363,42 +332,3 @@ class _Executed:
 
     def __reduce__(self) -> Any:
         return os.mkdir, ("executed",)
-
-
-@ATTACKS.add("bits are flipped", cases=range(8), seconds=600)
-def flipped(case: int) -> None:
-    folder = filled(seeds=(0, 1))
-    expected = Bank(folder).read()
-    path = folder / FILE
-    content = path.read_bytes()
-    for place in range(case, len(content), 64):
-        damaged = bytearray(content)
-        damaged[place] ^= 1 << random.Random(place).randrange(8)
-        path.write_bytes(damaged)
-        _same_or_refused(folder, expected)
-
-
-@ATTACKS.add("files are cut", cases=range(4), seconds=600)
-def cut(case: int) -> None:
-    folder = filled(seeds=(0, 1))
-    expected = Bank(folder).read()
-    path = folder / FILE
-    content = path.read_bytes()
-    for length in range(case, len(content) - 1, 64):
-        path.write_bytes(content[:length])
-        refused(lambda: Bank(folder).read(), folder)
-    path.write_bytes(content)
-    assert torch.equal(Bank(folder).read().x, expected.x)
-
-
-def _same_or_refused(folder: Path, expected: Simulations) -> None:
-    try:
-        rows = Bank(folder).read()
-    except CorruptSegmentError:
-        return
-    except ValueError as error:  # a flipped digit is another format
-        if "expected a bank of format 2" not in str(error):
-            raise
-        return
-    assert torch.equal(rows.x, expected.x)
-    assert torch.equal(rows.theta, expected.theta)

@@ -13,7 +13,8 @@ import numpy as np
 import torch
 
 from benchmarks.robustness.attacks import Attacks
-from benchmarks.robustness.bank import crafted_record, execute
+from benchmarks.robustness.bank import crafted_record
+from benchmarks.robustness.bank_files import execute
 from benchmarks.robustness.campaign_problem import campaign, tell
 from sbi_active import Campaign
 from sbi_active.campaign.storage import DamagedCampaignError

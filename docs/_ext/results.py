@@ -110,6 +110,7 @@ TABLES = {
         "table cost/network.json",
         "table cost/training.json",
         "table cost/doors.json --only cpu_s*",
+        "table cost/walls.json",
     ),
     "Robust updates": ("chain.robust --summary",),
     "sbi's own tests with the class swapped": (

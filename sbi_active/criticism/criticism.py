@@ -30,6 +30,7 @@ from sbi_active.criticism.misfit.by_sensor import BySensor
 from sbi_active.criticism.misfit.evaluation import evaluate_linear
 from sbi_active.criticism.misfit.missed import beside_misfit
 from sbi_active.criticism.misfit.record import detected, traced
+from sbi_active.criticism.misfit.rule import Rule
 from sbi_active.criticism.misfit.stand_ins import judged
 from sbi_active.criticism.misfit.verdict import Misfit, find_misfit, without
 from sbi_active.criticism.next_trial.next_action import choose_action
@@ -72,10 +73,9 @@ class Criticism:
             deterministic one without is estimated from repeated trials.
         prior: Prior of its parameters.
         trials: Measured trials.
-        effects: Effects that the simulator may lack; those of the order of the trials
-            are left out if that is unknown.
-        actions: The permitted actions, for what no action separates and for the next
-            one; None leaves both to the trials at hand.
+        effects: Effects that the simulator may lack. Those of the order of the trials
+            are left out if the order is unknown.
+        actions: Permitted actions; None takes those of the trials.
         summaries: Number of summaries of x to compare instead of all its numbers, at
             most; 0 for none. None takes 20 if a trial has more than 500 numbers without
             a time axis, with independent noise.
@@ -84,10 +84,10 @@ class Criticism:
             "trial"), and is not scored; 0 draws them from their priors.
         thin: Whether to thin trajectories to a rate at which innovations of the bare
             model's fit are uncorrelated, if ``measurement_sd`` declares the sensor's
-            error. The inputs of the simulator stay as they are.
+            error.
+        rule: Rule of what helps and what is named if every model misses.
         seed: Seed of all draws.
-        show_progress: Whether to draw a bar of what is being done. The logger
-            "sbi_active" reports all that takes 2 s anyway.
+        show_progress: Whether to draw a progress bar.
 
     Raises:
         ValueError: If fewer than two trials can be fitted, shapes differ, an effect
@@ -123,22 +123,23 @@ class Criticism:
         summaries: int | None = None,
         warm_up: float = 0.0,
         thin: bool = True,
+        rule: Rule = Rule(),  # noqa: B008  (frozen)
         seed: int = 0,
         show_progress: bool = False,
     ) -> None:
-        self.show_progress = show_progress
+        self.show_progress, self.rule = show_progress, rule
         model = with_noise(model, prior, trials)
         actions = None if actions is None else action_space(actions)
         self.model, self.prior, self.seed = model, prior, seed
         unordered = trials.order == "unknown"
-        #: Names of effects of the order of the trials where that is unknown.
+        #: Effects of the order of the trials where that is unknown.
         self.left_out = [e.name for e in effects if unordered and e.needs_order]
         self.effects = [e for e in effects if e.name not in self.left_out]
         require_fitting(model, prior, trials, self.effects, actions)
         if actions is not None:
             actions = with_known_inputs(model, trials.fit, actions)
         self.actions = actions
-        #: What was found of the sampling of trajectories; None if not looked for.
+        #: Sampling of the trajectories; None if not looked for.
         self.sampling: Sampling | None = None
         if thin:
             with stage("rate of sampling", show_progress=show_progress):
@@ -182,7 +183,6 @@ class Criticism:
             self.rivals.warm_up = self._warm_up
             #: Effects that linear evidence set aside; None where all are fitted.
             self._linear, self.screening = linear_models(self.rivals)
-        # Effects of a large library, told by linear models, are compared no further.
         self._is_large = self._linear is not None and is_large(self.rivals.library)
         self._fewer = {"num_draws": FEW_DRAWS} if self._is_large else {}
         # Each model's held-out errors would take as much as the verdict.
@@ -196,7 +196,7 @@ class Criticism:
         """
         if not self._is_searched:
             groups = self.equivalent()
-            self._misfit = find_misfit(self._linear, groups)
+            self._misfit = find_misfit(self._linear, groups, rule=self.rule)
             if self._misfit is not None and not self.set_aside:
                 self.set_aside = found = self._misfit.outlying()
                 if found:  # they are not to decide what the others say
@@ -260,7 +260,7 @@ class Criticism:
                     actions=None if self._is_large else self.actions,
                     near=not self._is_large,
                 )
-            given = self.rivals, groups, self._scored, self._linear
+            given = self.rivals, groups, self._scored, self._linear, self.rule
             tracing, self._misfit = beside_misfit(tracing, detection, *given)
             if self._misfit is not None:
                 self._residuals = None

@@ -11,6 +11,7 @@ from sbi_active.actions.discrete import Actions
 from sbi_active.criticism.criticism import Criticism
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.misfit.rule import Rule
 from sbi_active.simulation import SimulatorModel
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ def close_loop(
     summaries: int | None = None,
     warm_up: float = 0.0,
     thin: bool = True,
+    rule: Rule = Rule(),  # noqa: B008  (frozen)
     seed: int = 0,
     evaluate: bool = True,
     plan: bool = True,
@@ -46,6 +48,7 @@ def close_loop(
         summaries=summaries,
         warm_up=warm_up,
         thin=thin,
+        rule=rule,
         seed=seed,
         show_progress=show_progress,
     ).report(evaluate=evaluate, plan=plan, designed=designed)

@@ -37,9 +37,7 @@ QUICK = {
     "identify": ("decay", "missing"),
 }
 #: What is wrong today, each with the reason; strict, so that a cure shows.
-KNOWN: dict[tuple[str, str], str] = {
-    ("hard_edged", "refine, noise drawn"): "regression errors are taken as Gaussian",
-}
+KNOWN: dict[tuple[str, str], str] = {}
 
 
 def rng_of(name: str) -> np.random.Generator:

@@ -28,7 +28,7 @@ from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.identifiability import note_combinations
 from sbi_active.inference.emulation.joint import candidate_gains
 from sbi_active.inference.emulation.pool import Pool
-from sbi_active.inference.emulation.posterior import PooledPosterior, PooledTrial
+from sbi_active.inference.emulation.processes import PooledTrial, Processes
 from sbi_active.inference.emulation.summaries import fitted_summaries
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import SimulatorModel, simulate
@@ -121,13 +121,15 @@ class PooledLearner(Learner):
             simulator = simulator.without_noise()
         return Pool(simulator, self._state.batches, workers)
 
-    def _posterior(self, *key: int | str) -> PooledPosterior:
-        return PooledPosterior(
+    def _processes(self, *key: int | str) -> Processes:
+        return Processes(
             self.prior,
             self.pool,
             self.noise,
             tuple(self.x_shape),
             fitted_summaries(self._choice, self.pool.rows.x),
+            self._state.options.refinement,
+            self.belief,
             seed=derive_seed(self._state.seed, "pooled", *key),
         )
 
@@ -248,14 +250,14 @@ class PooledLearner(Learner):
         self._add(self._drawn(num), places.repeat_interleave(counts, 0), self.belief)
 
     def _gains(self, places: Tensor, seed: int) -> tuple[Any, Any]:
-        posterior = self._posterior("design", seed)
+        processes = self._processes("design", seed)
         return candidate_gains(
             self.pool,
-            posterior.draws(self.belief),
+            processes.near,
             places,
-            posterior.summaries,
+            processes.summaries,
             self.noise,
-            posterior.coordinates,
+            processes.coordinates,
             seed=seed,
         )
 
@@ -289,13 +291,11 @@ class PooledLearner(Learner):
         with state.stage(trial.index, "scoring"):
             own = self._trial(trial)
             self._require_rows([own], self._rows_left("belief", trial.index))
-            posterior = self._posterior("score", trial.index)
-            reference = posterior.draws(self.belief)
-            fitted = posterior.fit(
-                own, posterior.best_summary(own, reference), reference
-            )
+            processes = self._processes("score", trial.index)
+            near, label = processes.near, processes.best_summary(own)
+            fitted = processes.fit_trial(own, label, near)
             rng = np.random.default_rng(derive_seed(state.seed, "score", trial.index))
-            z = reference[rng.integers(len(reference), size=NUM_PREDICTED)]
+            z = near[rng.integers(len(near), size=NUM_PREDICTED)]
             if fitted.processes:
                 drawn = torch.from_numpy(fitted.draw(z, rng))
                 surprise, log_score = compared(drawn, torch.from_numpy(fitted.observed))
@@ -337,11 +337,11 @@ class PooledLearner(Learner):
         allowed, start = self._rows_left("belief", index), self._state.meter.spent
         self._require_rows(own, allowed)
         allowed -= self._state.meter.spent - start
-        belief, labels = self._posterior("belief", key).run(
-            own, before=self.belief, allowance=max(allowed, 0)
-        )
+        processes = self._processes("belief", key)
+        processes.begin(own, max(allowed, 0))
+        belief = processes.run()
         if self._choice is not None:
-            for trial, label in zip(trials, labels, strict=True):
+            for trial, label in zip(trials, processes.labels, strict=True):
                 self._state.change(trial.index, summary=label)
         note_combinations(belief, self._names, seed=self._state.seed)
         self._trainer.resume(belief, [self._observation(t) for t in trials])

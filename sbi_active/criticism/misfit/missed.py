@@ -14,7 +14,7 @@ from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.guesses import guess_residual
 from sbi_active.criticism.misfit.record import traced, with_intervals
 from sbi_active.criticism.misfit.refuted import widened
-from sbi_active.criticism.misfit.rule import PASSES
+from sbi_active.criticism.misfit.rule import Rule
 from sbi_active.criticism.misfit.verdict import Misfit, find_misfit
 from sbi_active.criticism.results import (
     SCATTER,
@@ -34,6 +34,7 @@ def beside_misfit(
     equivalent: Sequence[frozenset[str]],
     held_out: Trials | None,
     search: Search | None,
+    rule: Rule,
 ) -> tuple[Tracing, Misfit | None]:
     """Return a verdict by models with a residual process, where none explains.
 
@@ -48,15 +49,16 @@ def beside_misfit(
         equivalent: Groups of effects that nothing separates.
         held_out: Trials on which models are scored; None for none.
         search: Fits the models; None if the error of the sensor is not known.
+        rule: Rule that decides which effects help.
 
     Returns:
         The verdict, and the models if it is theirs.
     """
     misfit, timed = None, rivals.measurements.is_sequence
     several = len(tracing.chosen) > 1 and not timed
-    if _is_missed(tracing, detection, rivals) or several:
+    if _is_missed(tracing, detection, rivals, rule) or several:
         # It is no error of a sensor: a process that follows the action is.
-        misfit = find_misfit(search, equivalent, is_known=True)
+        misfit = find_misfit(search, equivalent, is_known=True, rule=rule)
     is_bare = tracing.verdict == UNEXPLAINED and not tracing.chosen
     if is_bare and search is not None and (misfit is None or not timed):
         tracing = replace(tracing, guesses=guess_residual(search))
@@ -76,7 +78,9 @@ def _within(rivals: RivalSet) -> Callable[[ModelKey, Array], Array]:
     return lambda key, z: rivals.rival(key).coordinates.within(z)
 
 
-def _is_missed(tracing: Tracing, detection: Detection, rivals: RivalSet) -> bool:
+def _is_missed(
+    tracing: Tracing, detection: Detection, rivals: RivalSet, rule: Rule
+) -> bool:
     """Return whether the model of a verdict misses the trials nevertheless."""
     if tracing.verdict in (UNEXPLAINED, SCATTER):
         return True
@@ -85,4 +89,4 @@ def _is_missed(tracing: Tracing, detection: Detection, rivals: RivalSet) -> bool
     if any(e.hook == "noise" for e in rivals.effects.values()):  # that it may be
         return False
     evidence = rivals.fit(ModelKey(tracing.chosen)).evidence
-    return detection.refutes(evidence, PASSES)
+    return detection.refutes(evidence, rule.passes)

@@ -241,6 +241,7 @@ def _found(
         left_out="trials" if search.errors.is_by_trial else "parts of trials",
         weights={str(key): weight for key, weight in weights.items()},
         instead=choice.instead,
+        least=misfit.rule.odds.named,
     )
 
 

@@ -43,20 +43,10 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.under_misfit import Odds
+from sbi_active.criticism.under_misfit import Odds, OddsSettings
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
-
-ADMITTED = 1.1  # times the smallest root mean square error on left-out trials
-ADMITTED_FEW = 1.2  # likewise, without a time axis
-INCLUDED, BETTER, SURE = 0.5, 0.8, 0.9
-NEEDED = 2.0  # times the error on left-out trials without an effect
-PASSES = 0.01  # tail probability of a chi-square against the sensor
-SMALLEST_EXCESS = 1e-2
-DECISIVE = float(np.log(100.0))  # for each effect beyond the second, nats
-SECOND_FEW = float(np.log(5.0))  # for the second one, without a time axis
-AHEAD = 10.0  # nats from which a model is admitted whatever its error
 
 
 @dataclass(frozen=True)
@@ -85,7 +75,7 @@ class Scored:
     @property
     def excess(self) -> float:
         """Excess of the fit's residual beyond the sensor's error."""
-        return max(self.fitted - 1, SMALLEST_EXCESS)
+        return max(self.fitted - 1, 1e-2)  # so that ratios are finite
 
 
 @dataclass(frozen=True)
@@ -99,8 +89,8 @@ class Choice:
         cause: Probability of each effect that helps of being the cause.
         better: Probability that a left-out trial is predicted better with it.
         odds: Odds of being a cause and no imitation, by effect that helps.
-        instead: Effects that may stand in the place of an effect that helps, where
-            anything may (:func:`stand_ins`).
+        instead: Effects that may stand in the place of an effect that helps, if any
+            (:meth:`Rule.stand_ins`).
     """
 
     key: ModelKey
@@ -112,164 +102,232 @@ class Choice:
     instead: dict[str, tuple[str, ...]]
 
 
-def choose(
-    models: Mapping[ModelKey, Scored],
-    names: Sequence[str],
-    equivalent: Sequence[frozenset[str]] = (),
-    *,
-    timed: bool = True,
-    guessed: Callable[[ModelKey, str], float] | None = None,
-) -> Choice:
-    """Return the effects that help, and their probability of being the cause.
+@dataclass(frozen=True, kw_only=True)
+class Rule:
+    """The rule that decides which effects help, and which is the cause.
 
-    Args:
-        models: Fitted models; with a set of effects, the sets with one effect less.
-        names: Names of all effects.
-        equivalent: Groups of them that nothing separates, which share their mass.
-        timed: Whether x has a time axis.
-        guessed: Function that returns the nats that guesses in the place of an effect
-            of a set gain over it; None if none were made.
+    The values are those of ``benchmarks/misfit``, tuned on seeds that do not judge.
+
+    Attributes:
+        admitted_within: Error of an admitted model on left-out trials, in times the
+            smallest. With 1.05 models that are as good are left out, with 1.2 ones that
+            imitate by evidence alone are let in.
+        admitted_untimed: Error of an admitted model if x has no time axis.
+        ahead: Nats by which a model must be more probable than all admitted ones to be
+            admitted whatever its error.
+        included: Inclusion probability from which an effect may help.
+        better: Probability of predicting a left-out trial better from which it helps.
+        sure: Probability from which one model surely predicts better than another.
+        needed: Error without an effect, in times that with it, from which it helps.
+        decisive: Bayes factor that each effect beyond the second has to gain.
+        second_untimed: Bayes factor that the second has to gain without a time axis.
+        passes: Tail probability of a chi-square from which a model fits to the sensor.
+        odds: Settings of the odds of being a cause.
     """
-    probabilities = _probabilities(models, timed=timed)
-    inclusion = {
-        n: sum(v for k, v in probabilities.items() if n in k.effects) for n in names
-    }
-    alike = {n: next((g for g in equivalent if n in g), frozenset({n})) for n in names}
 
-    def helping(top: ModelKey) -> tuple[ModelKey, dict[str, float], dict[str, float]]:
-        near = stand_ins(models, top, names)
-        groups = {n: group.union(near.get(n, ())) for n, group in alike.items()}
-        pooled = {
-            n: sum(v for k, v in probabilities.items() if groups[n] & {*k.effects})
-            for n in names
+    admitted_within: float = 1.1
+    admitted_untimed: float = 1.2
+    ahead: float = 10.0
+    included: float = 0.5
+    better: float = 0.8
+    sure: float = 0.9
+    needed: float = 2.0
+    decisive: float = 100.0
+    second_untimed: float = 5.0
+    passes: float = 0.01
+    odds: OddsSettings = OddsSettings()
+
+    def choose(
+        self,
+        models: Mapping[ModelKey, Scored],
+        names: Sequence[str],
+        equivalent: Sequence[frozenset[str]] = (),
+        *,
+        timed: bool = True,
+        guessed: Callable[[ModelKey, str], float] | None = None,
+    ) -> Choice:
+        """Return the effects that help, and their probability of being the cause.
+
+        Args:
+            models: Fitted models; with a set of effects, the sets with one effect less.
+            names: Names of all effects.
+            equivalent: Groups of them that nothing separates, which share their mass.
+            timed: Whether x has a time axis.
+            guessed: Function that returns the nats that guesses in the place of an
+                effect of a set gain over it; None where none were made.
+        """
+        probabilities = self._probabilities(models, timed=timed)
+        inclusion = {
+            n: sum(v for k, v in probabilities.items() if n in k.effects) for n in names
         }
-        return *_pruned(models, top, pooled), pooled
+        alike = {
+            n: next((g for g in equivalent if n in g), frozenset({n})) for n in names
+        }
 
-    top, *larger = starts(models, names, timed=timed)
-    key, better, pooled = helping(top)
-    for start in larger:
-        again = helping(start)
-        # What a further effect drives out was not there for it.
-        if {*again[0].effects} > {*key.effects}:
-            key, better, pooled = again
-    odds, cause = {}, {}
-    for n in key.effects:
-        odds[n] = Odds(
-            declared=len(names),
-            helping=len(key.effects),
-            at_bounds=models[key].at_bounds,
-            gained=max(models[key].log_p - models[key.without(n)].log_p, 0.0),
-            remains=_remains(models, key, n),
-            error=models[key].error,
-            timed=timed,
-            guessed=-np.inf if guessed is None else guessed(key, n),
+        def helping(
+            top: ModelKey,
+        ) -> tuple[ModelKey, dict[str, float], dict[str, float]]:
+            near = self.stand_ins(models, top, names)
+            groups = {n: group.union(near.get(n, ())) for n, group in alike.items()}
+            pooled = {
+                n: sum(v for k, v in probabilities.items() if groups[n] & {*k.effects})
+                for n in names
+            }
+            return *self._pruned(models, top, pooled), pooled
+
+        top, *larger = self.starts(models, names, timed=timed)
+        key, better, pooled = helping(top)
+        for start in larger:
+            again = helping(start)
+            # What a further effect drives out was not there for it.
+            if {*again[0].effects} > {*key.effects}:
+                key, better, pooled = again
+        odds, cause = {}, {}
+        for n in key.effects:
+            odds[n] = Odds(
+                declared=len(names),
+                helping=len(key.effects),
+                at_bounds=models[key].at_bounds,
+                gained=max(models[key].log_p - models[key.without(n)].log_p, 0.0),
+                remains=_remains(models, key, n),
+                error=models[key].error,
+                timed=timed,
+                guessed=-np.inf if guessed is None else guessed(key, n),
+                own=self.odds,
+            )
+            # Which of several that no action separates it is nobody can tell.
+            either = sum(v for k, v in probabilities.items() if alike[n] & {*k.effects})
+            cause[n] = either * odds[n].probability
+        instead = self.stand_ins(models, key, names)
+        return Choice(key, probabilities, inclusion, cause, better, odds, instead)
+
+    def starts(
+        self,
+        models: Mapping[ModelKey, Scored],
+        names: Sequence[str],
+        *,
+        timed: bool = True,
+    ) -> list[ModelKey]:
+        """Return the sets that the rule prunes; :func:`choose` needs all their parts.
+
+        Args:
+            models: Fitted models.
+            names: Names of all effects.
+            timed: Whether x has a time axis.
+
+        Returns:
+            The most probable set. Relatives share the probability of a further effect:
+            where the sets with one of them are together more probable than the set
+            without, that with the likeliest of them follows.
+        """
+        probabilities = self._probabilities(models, timed=timed)
+        found = [next(iter(probabilities))]
+        while larger := [k for k in probabilities if found[-1] in k.parts]:
+            (new,) = {*larger[0].effects} - {*found[-1].effects}
+            near = {new, *self.stand_ins(models, larger[0], names).get(new, ())}
+            alike = [k for k in larger if near & {*k.effects}]
+            if sum(probabilities[k] for k in alike) <= probabilities[found[-1]]:
+                break
+            found.append(larger[0])
+        return found
+
+    def _probabilities(
+        self, models: Mapping[ModelKey, Scored], *, timed: bool
+    ) -> dict[ModelKey, float]:
+        """Return the probabilities of the admitted models, most probable first."""
+        keys = self.admitted(models, timed=timed)
+        log_p = np.array(
+            [models[key].log_p - self._cost(key, timed=timed) for key in keys]
         )
-        # Which of several that no action separates it is nobody can tell.
-        either = sum(v for k, v in probabilities.items() if alike[n] & {*k.effects})
-        cause[n] = either * odds[n].probability
-    instead = stand_ins(models, key, names)
-    return Choice(key, probabilities, inclusion, cause, better, odds, instead)
+        p = np.exp(log_p - log_sum_exp(log_p))
+        return {keys[i]: float(p[i]) for i in np.argsort(-p, kind="stable")}
 
+    def _cost(self, key: ModelKey, *, timed: bool) -> float:
+        """Return the gain that a set of this size needs, nats."""
+        num = len(key.effects)
+        second = 0.0 if timed or num < 2 else np.log(self.second_untimed)
+        return second + np.log(self.decisive) * max(num - 2, 0)
 
-def starts(
-    models: Mapping[ModelKey, Scored], names: Sequence[str], *, timed: bool = True
-) -> list[ModelKey]:
-    """Return the sets that the rule prunes; :func:`choose` needs all their parts.
+    def stand_ins(
+        self, models: Mapping[ModelKey, Scored], key: ModelKey, names: Sequence[str]
+    ) -> dict[str, tuple[str, ...]]:
+        """Return the effects that may stand in the place of each effect of a set.
 
-    Args:
-        models: Fitted models.
-        names: Names of all effects.
-        timed: Whether x has a time axis.
+        With it there, and the others as they are, a new trial is not surely predicted
+        worse.
 
-    Returns:
-        The most probable set. Relatives share the probability of a further effect:
-        where the sets with one of them are together more probable than the set
-        without, that with the likeliest of them follows.
-    """
-    probabilities = _probabilities(models, timed=timed)
-    found = [next(iter(probabilities))]
-    while larger := [k for k in probabilities if found[-1] in k.parts]:
-        (new,) = {*larger[0].effects} - {*found[-1].effects}
-        near = {new, *stand_ins(models, larger[0], names).get(new, ())}
-        alike = [k for k in larger if near & {*k.effects}]
-        if sum(probabilities[k] for k in alike) <= probabilities[found[-1]]:
-            break
-        found.append(larger[0])
-    return found
+        Args:
+            models: Fitted models; sets that were not fitted do not count.
+            key: The set.
+            names: Names of all effects, in the order of the sets.
+        """
+        square = models[key].square
+        found: dict[str, tuple[str, ...]] = {}
+        for n in key.effects:
+            rest = {*key.effects} - {n}
+            sets = {
+                other: ModelKey(tuple(m for m in names if m in {*rest, other}))
+                for other in names
+                if other not in key.effects
+            }
+            near = tuple(
+                other
+                for other, k in sets.items()
+                if k in models and predicts_better(square, models[k].square) < self.sure
+            )
+            if near:
+                found[n] = near
+        return found
 
+    def _pruned(
+        self,
+        models: Mapping[ModelKey, Scored],
+        key: ModelKey,
+        pooled: Mapping[str, float],
+    ) -> tuple[ModelKey, dict[str, float]]:
+        """Return the part of a set whose effects all help, and how surely each does."""
+        while True:
+            better = {
+                n: predicts_better(models[key].square, models[key.without(n)].square)
+                for n in key.effects
+            }
+            without = {n: models[key.without(n)].error for n in key.effects}
+            # Few trials that are badly predicted without an effect hide from a t test
+            # how much it is needed.
+            most = self.needed**2 * models[key].error
+            failing = [
+                n
+                for n in key.effects
+                if pooled[n] < self.included
+                or (better[n] < self.better and without[n] < most)
+            ]
+            if not failing:
+                return key, better
+            key = key.without(min(failing, key=without.__getitem__))
 
-def _probabilities(
-    models: Mapping[ModelKey, Scored], *, timed: bool
-) -> dict[ModelKey, float]:
-    """Return the probabilities of the admitted models, most probable first."""
-    keys = admitted(models, timed=timed)
-    log_p = np.array([models[key].log_p - _cost(key, timed=timed) for key in keys])
-    p = np.exp(log_p - log_sum_exp(log_p))
-    return {keys[i]: float(p[i]) for i in np.argsort(-p, kind="stable")}
+    def admitted(
+        self, models: Mapping[ModelKey, Scored], *, timed: bool = True
+    ) -> list[ModelKey]:
+        """Return the models that predict left-out trials about as well as the best.
 
+        It also returns those that are far more probable than all of them.
+        """
+        best = min(models.values(), key=lambda m: m.error)
+        smallest = max(best.error, 1.0)  # below the sensor's, by chance
 
-def _cost(key: ModelKey, *, timed: bool) -> float:
-    """Return the gain that a set of this size needs, nats."""
-    num = len(key.effects)
-    second = 0.0 if timed or num < 2 else SECOND_FEW
-    return second + DECISIVE * max(num - 2, 0)
+        most = (
+            self.admitted_within if timed else self.admitted_untimed
+        ) ** 2 * smallest
 
+        def is_as_good(model: Scored) -> bool:
+            if model.error <= most:
+                return True
+            return timed and predicts_better(best.square, model.square) < self.sure
 
-def stand_ins(
-    models: Mapping[ModelKey, Scored], key: ModelKey, names: Sequence[str]
-) -> dict[str, tuple[str, ...]]:
-    """Return the effects that may stand in the place of each effect of a set, if any.
-
-    With it in the place of the effect, and the others as they are, a new trial is not
-    predicted worse with a probability of .9.
-
-    Args:
-        models: Fitted models; sets that were not fitted do not count.
-        key: The set.
-        names: Names of all effects, in the order of the sets.
-    """
-    square = models[key].square
-    found: dict[str, tuple[str, ...]] = {}
-    for n in key.effects:
-        rest = {*key.effects} - {n}
-        sets = {
-            other: ModelKey(tuple(m for m in names if m in {*rest, other}))
-            for other in names
-            if other not in key.effects
-        }
-        near = tuple(
-            other
-            for other, k in sets.items()
-            if k in models and predicts_better(square, models[k].square) < SURE
-        )
-        if near:
-            found[n] = near
-    return found
-
-
-def _pruned(
-    models: Mapping[ModelKey, Scored],
-    key: ModelKey,
-    pooled: Mapping[str, float],
-) -> tuple[ModelKey, dict[str, float]]:
-    """Return the part of a set whose effects all help, and how surely each does."""
-    while True:
-        better = {
-            n: predicts_better(models[key].square, models[key.without(n)].square)
-            for n in key.effects
-        }
-        without = {n: models[key.without(n)].error for n in key.effects}
-        # Few trials that are badly predicted without an effect hide from a t test how
-        # much it is needed.
-        most = NEEDED**2 * models[key].error
-        failing = [
-            n
-            for n in key.effects
-            if pooled[n] < INCLUDED or (better[n] < BETTER and without[n] < most)
-        ]
-        if not failing:
-            return key, better
-        key = key.without(min(failing, key=without.__getitem__))
+        as_good = {key for key, m in models.items() if is_as_good(m)}
+        net = {key: m.log_p - self._cost(key, timed=timed) for key, m in models.items()}
+        enough = max(net[key] for key in as_good) + self.ahead
+        return [key for key in models if key in as_good or net[key] > enough]
 
 
 def _remains(models: Mapping[ModelKey, Scored], key: ModelKey, name: str) -> float:
@@ -277,29 +335,6 @@ def _remains(models: Mapping[ModelKey, Scored], key: ModelKey, name: str) -> flo
     own, other, bare = models[key], models[key.without(name)], models[ModelKey()]
     u = max(own.excess / other.excess, own.excess / bare.excess)
     return float(np.clip(u, 0.0, 1.0))
-
-
-def admitted(
-    models: Mapping[ModelKey, Scored], *, timed: bool = True
-) -> list[ModelKey]:
-    """Return the models that predict left-out trials about as well as the best.
-
-    It also returns those that are far more probable than all of them.
-    """
-    best = min(models.values(), key=lambda m: m.error)
-    smallest = max(best.error, 1.0)  # below the sensor's, by chance
-
-    most = (ADMITTED if timed else ADMITTED_FEW) ** 2 * smallest
-
-    def is_as_good(model: Scored) -> bool:
-        if model.error <= most:
-            return True
-        return timed and predicts_better(best.square, model.square) < SURE
-
-    as_good = {key for key, m in models.items() if is_as_good(m)}
-    net = {key: m.log_p - _cost(key, timed=timed) for key, m in models.items()}
-    enough = max(net[key] for key in as_good) + AHEAD
-    return [key for key in models if key in as_good or net[key] > enough]
 
 
 def predicts_better(one: Array, other: Array) -> float:

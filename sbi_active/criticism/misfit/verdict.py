@@ -24,22 +24,13 @@ from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.guesses import gained_by_guesses
 from sbi_active.criticism.misfit.intervals import covariance
-from sbi_active.criticism.misfit.rule import (
-    DECISIVE,
-    PASSES,
-    SURE,
-    Choice,
-    Scored,
-    choose,
-    starts,
-)
+from sbi_active.criticism.misfit.rule import Choice, Rule, Scored
 from sbi_active.criticism.misfit.weights import weights_by_error
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, ModelKey
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.criticism.steps.equivalence import is_large
 from sbi_active.criticism.steps.missed_trials import outlying_trials
 from sbi_active.criticism.steps.tracing import RESCALED
-from sbi_active.criticism.under_misfit import NAMED
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed
 
@@ -64,6 +55,7 @@ class Misfit:
             the rule takes them.
         log_bayes_factor: Log Bayes factor of anything with a residual process against
             the bare model with the sensor's error alone, nats.
+        rule: Rule that decides which effects help.
     """
 
     search: Search
@@ -72,6 +64,7 @@ class Misfit:
     choice: Choice
     standard: Callable[[Candidate], Array]
     log_bayes_factor: float
+    rule: Rule
 
     def model(self, key: ModelKey) -> LinearModel:
         """Return a fitted model."""
@@ -79,7 +72,7 @@ class Misfit:
 
     def passes(self, key: ModelKey) -> bool:
         """Return whether a model's chi-square passes against the sensor."""
-        return self.model(key).chi_square[2] > PASSES
+        return self.model(key).chi_square[2] > self.rule.passes
 
     def posterior(self, key: ModelKey, use: NDArray[np.bool_]) -> Posterior:
         """Return the posterior of a model by some parts of the trials."""
@@ -111,10 +104,10 @@ class Misfit:
         if verdict == UNEXPLAINED:
             return bool(choice.key.effects)
         own, bare = (self.search.found[k].log_p for k in (choice.key, ModelKey()))
-        if verdict == SCATTER and own - bare > DECISIVE:
+        if verdict == SCATTER and own - bare > np.log(self.rule.decisive):
             return True
-        surely = [n for n in choice.key.effects if choice.better[n] > SURE]
-        return any(choice.cause[n] > NAMED for n in surely)
+        surely = [n for n in choice.key.effects if choice.better[n] > self.rule.sure]
+        return any(choice.cause[n] > self.rule.odds.named for n in surely)
 
     @cached_property
     def weights(self) -> dict[ModelKey, float]:
@@ -154,7 +147,7 @@ class Misfit:
             log_p = c.log_prior + posterior.log_process
             return scored(self.search, c, log_p, standard(c))
 
-        return settled(self.search, score, self.equivalent).key
+        return settled(self.search, score, self.equivalent, self.rule).key
 
     def outlying(self) -> tuple[OutlyingTrial, ...]:
         """Return the trials that err far more than the others let expect.
@@ -188,7 +181,8 @@ class Misfit:
                 log_p = c.log_prior + posterior.log_process
                 return scored(self.search, c, log_p, self.standard(c))
 
-            if settled(self.search, score, self.equivalent).key != self.choice.key:
+            again = settled(self.search, score, self.equivalent, self.rule)
+            if again.key != self.choice.key:
                 return False
         return True
 
@@ -241,6 +235,7 @@ def find_misfit(
     equivalent: Sequence[frozenset[str]] = (),
     *,
     is_known: bool = False,
+    rule: Rule = Rule(),  # noqa: B008  (frozen)
 ) -> Misfit | None:
     """Return the models and what helps; None if one fits to the sensor's error.
 
@@ -255,6 +250,7 @@ def find_misfit(
         equivalent: Groups of effects that no permitted action separates.
         is_known: No model fits: what remains was found to be no error of a sensor.
             Without a time axis nothing else tells.
+        rule: What decides which effects help.
     """
     if search is None or not (is_known or search.rivals.measurements.is_sequence):
         return None
@@ -276,11 +272,12 @@ def find_misfit(
 
     timed = rivals.measurements.is_sequence
     guessed = None if timed else partial(gained_by_guesses, search)
-    choice = settled(search, score, equivalent, guessed)
+    choice = settled(search, score, equivalent, rule, guessed)
     log_p = [c.log_p for c in search.found.values()]
     sensor_alone = search.found[ModelKey()].posterior.log_sensor
     log_b = log_sum_exp(np.array(log_p)) - sensor_alone
-    return Misfit(search, rivals, equivalent, choice, standard, float(log_b))
+    given = search, rivals, equivalent, choice, standard
+    return Misfit(*given, float(log_b), rule)
 
 
 def without(trials: Trials, outlying: Sequence[OutlyingTrial]) -> Trials:
@@ -294,6 +291,7 @@ def settled(
     search: Search,
     score: Callable[[Candidate], Scored],
     equivalent: Sequence[frozenset[str]],
+    rule: Rule,
     guessed: Callable[[ModelKey, str], float] | None = None,
 ) -> Choice:
     """Return the choice, once every part of the top model is fitted.
@@ -302,6 +300,7 @@ def settled(
         search: The models so far.
         score: Function that returns what the rule needs of a model.
         equivalent: Groups of effects that nothing separates.
+        rule: Rule that decides which effects help.
         guessed: Function that returns the nats that guesses in the place of an effect
             gain over it; None asks none.
     """
@@ -311,10 +310,10 @@ def settled(
         for key, candidate in search.found.items():
             if key not in scored:
                 scored[key] = score(candidate)
-        tops = starts(scored, search.names, timed=timed)
+        tops = rule.starts(scored, search.names, timed=timed)
         missing = [key for top in tops for key in _missing(search, top)]
         if not missing:
-            return choose(
+            return rule.choose(
                 *(scored, search.names, equivalent), timed=timed, guessed=guessed
             )
         for key in missing:

@@ -22,7 +22,7 @@ from torch import Tensor
 from sbi_active.inference.emulation.gain import mixture_gain
 from sbi_active.inference.emulation.likelihood import correlation_root
 from sbi_active.inference.emulation.pool import Pool
-from sbi_active.inference.emulation.posterior import nearest
+from sbi_active.inference.emulation.processes import nearest
 from sbi_active.inference.emulation.statistics import FEW, learned_statistic
 from sbi_active.inference.emulation.summaries import Summary
 from sbi_active.inference.regression.process import GaussianProcess, ProcessSettings

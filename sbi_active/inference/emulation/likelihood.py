@@ -23,6 +23,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.special import gammaln
+from scipy.stats import chi2
 
 from sbi_active.inference.regression.outcomes import TrialOutcome
 from sbi_active.inference.regression.process import GaussianProcess
@@ -116,6 +117,20 @@ class TrialLikelihood:
             ratio = variance / self.learned_sd**2
             return float(0.5 * (ratio.mean(0) + 1 / self.freedom).sum())
         return float(0.5 * (variance / self.declared_sd**2).mean(0).sum())
+
+    def tail(self, z: Array) -> float:
+        """Return how often simulations at draws (n, d) lie as far out as the trial."""
+        if not self.processes:
+            return 1.0
+        mean, variance = self.predict(z)
+        is_learned = self.noise is None
+        sd = np.sqrt(
+            (self.learned_sd if is_learned else self.declared_sd) ** 2 + variance
+        )
+        white = (self.observed - mean) / sd
+        if is_learned:
+            white = np.linalg.solve(self.root, white.T).T
+        return float(chi2.sf((white**2).sum(1), mean.shape[1]).mean())
 
     @property
     def learned_sd(self) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -11,13 +10,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.simulation.outcomes import (
-    MissingRowsWarning,
-    Outcome,
-    SimulationError,
-    Simulations,
-)
-from sbi_active.simulation.workers.engine import simulate
+from sbi_active.inference.regression.rows import rows_of
+from sbi_active.simulation.outcomes import Outcome, Simulations
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 
@@ -119,21 +113,13 @@ class Pool:
                 self._add(batch)
 
     def _add(self, batch: Batch) -> None:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
-            try:
-                drawn = simulate(
-                    self.simulator,
-                    batch.theta,
-                    batch.action,
-                    seed=batch.seed,
-                    workers=self.workers,
-                )
-            except SimulationError:  # of a few rows, all may be lost
-                if not self._rows:
-                    raise
-                self.num_missing += len(batch.theta)
-                return
+        drawn = rows_of(
+            *(self.simulator, batch.theta, batch.action, batch.seed, self.workers),
+            is_first=not self._rows,
+        )
+        if drawn is None:
+            self.num_missing += len(batch.theta)
+            return
         known = drawn.status != Outcome.MISSING
         self.num_missing += int((~known).sum())
         self._rows.append(drawn.without_missing())

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
-from sbi_active.inference.refinement.stages import Stages
+from sbi_active.inference.refinement.regional import Regions
 from sbi_active.seeding import forked_generators
 
 Array = NDArray[Any]
@@ -69,25 +69,25 @@ class Confirmation:
 
 
 def by_replicates(
-    stages: Stages, belief: LearnedBelief, rng: np.random.Generator
+    regions: Regions, belief: LearnedBelief, rng: np.random.Generator
 ) -> Confirmation:
     """Compare with fresh simulations at draws of the belief.
 
     Args:
-        stages: Refinement that led to the belief.
+        regions: Simulations that led to the belief.
         belief: Learned belief.
         rng: Source of the draws.
     """
-    own, coordinates = stages.own, stages.coordinates
-    num = max(FEWEST, int(own.checked_share * stages.settings.num_histories))
+    own, coordinates = regions.own, regions.coordinates
+    num = max(FEWEST, int(own.checked_share * regions.budget))
     with forked_generators(int(rng.integers(2**62))):
         theta = belief.sample(torch.Size([num])).float()
-    histories = stages.histories
+    histories = regions.histories
     before = histories.num_simulations
     x, lost = histories.fresh(theta)
     z = coordinates.to_z(theta)
     sds, d = z.std(0) + 1e-300, z.shape[1]
-    last = stages.course.stages[-1].surrogate
+    last = regions.course.stages[-1].surrogate
     label, moves = last.assign(z), np.full(z.shape, np.nan)
     for k, fit in enumerate(last.regressions):
         rows = np.flatnonzero((label == k) & ~lost)

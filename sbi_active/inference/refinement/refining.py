@@ -21,8 +21,8 @@ from sbi_active.inference.declared.simulated_belief import DeclaredRecord
 from sbi_active.inference.refinement.confirmation import by_replicates
 from sbi_active.inference.refinement.enumerating import enumerated
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
+from sbi_active.inference.refinement.regional import Regions, Task
 from sbi_active.inference.refinement.settings import StageSettings
-from sbi_active.inference.refinement.stages import Stages, Task
 from sbi_active.inference.regression.histories import HistoryRecord
 from sbi_active.seeding import derive_seed
 from sbi_active.threads import single_thread
@@ -136,31 +136,31 @@ def _within_memory(task: Task, past: object, seed: int) -> LearnedBelief:
 def _learned(task: Task, past: object, seed: int) -> LearnedBelief:
     """Return the belief of a regression, of a wider noise where trials contradict."""
     known = past if isinstance(past, HistoryRecord) else None
-    stages = Stages(task, known, seed)
-    belief, contradiction = stages.run(), stages.contradiction()
+    regions = Regions(task, known, seed)
+    belief, contradiction = regions.run(), regions.contradiction()
     if contradiction is not None:
-        return _inflated(stages, belief, contradiction, seed)
+        return _inflated(regions, belief, contradiction, seed)
     rng = np.random.default_rng(derive_seed(seed, "confirm"))
-    found = by_replicates(stages, belief, rng)
+    found = by_replicates(regions, belief, rng)
     belief.diagnostics = found.noted(belief.diagnostics)
     return belief
 
 
 def _inflated(
-    stages: Stages, belief: LearnedBelief, first: Contradiction, seed: int
+    regions: Regions, belief: LearnedBelief, first: Contradiction, seed: int
 ) -> LearnedBelief:
     """Return a belief by simulations with noise as large as the trials scatter."""
-    task, contradiction = stages.task, first
-    histories, sds, inflation = belief.histories, stages.histories.noise_sds, 1.0
+    contradiction, inflation = first, 1.0
+    histories, sds = belief.histories, regions.histories.noise_sds
     for number in range(MAX_INFLATIONS):
         inflation *= contradiction.inflation
-        stages = Stages(
-            task,
+        wider = Regions(
+            regions.task,
             None,
             derive_seed(seed, "inflated", number),
             further_noise=np.sqrt(max(inflation**2 - 1, 0.0)) * sds,
         )
-        belief, now = stages.run(), stages.contradiction()
+        belief, now = wider.run(), wider.contradiction()
         if now is None:
             break
         contradiction = now

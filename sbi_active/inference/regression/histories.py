@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -12,8 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sbi_active.inference.regression.noise_shape import ShapeSettings
 from sbi_active.inference.regression.outcomes import outcomes_of
 from sbi_active.inference.regression.regions import Region
+from sbi_active.inference.regression.rows import rows_of
 from sbi_active.inference.regression.surrogate import (
     LocalRegression,
     estimate_noise,
@@ -22,12 +23,9 @@ from sbi_active.inference.regression.surrogate import (
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation.outcomes import (
-    MissingRowsWarning,
     Outcome,
-    SimulationError,
 )
 from sbi_active.simulation.simulator import require_noise
-from sbi_active.simulation.workers.engine import simulate
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 Array = NDArray[Any]
@@ -248,22 +246,14 @@ class Histories:
 
         NaN stands for no number, LOST for faults.
         """
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
-            try:
-                rows = simulate(
-                    self.simulator,
-                    theta,
-                    self.action[trial],
-                    seed=seed,
-                    workers=self.workers,
-                )
-            except SimulationError:  # of a few rows, all may be lost
-                if self.num_simulations == 0:
-                    raise
-                self.num_simulations += len(theta)
-                self.num_missing += len(theta)
-                return np.full((len(theta), self._seen.shape[1]), LOST)
+        rows = rows_of(
+            *(self.simulator, theta, self.action[trial], seed, self.workers),
+            is_first=self.num_simulations == 0,
+        )
+        if rows is None:
+            self.num_simulations += len(theta)
+            self.num_missing += len(theta)
+            return np.full((len(theta), self._seen.shape[1]), LOST)
         self.num_simulations += len(rows)
         x = rows.x.double().flatten(1).numpy()
         if x.shape[1] != self._seen.shape[1]:
@@ -345,8 +335,13 @@ class Histories:
         present = self.present.reshape(len(self), *self._seen.shape)
         return float((~present.any(2)).mean()) if len(self) else 0.0
 
-    def regress(self, region: Region) -> LocalRegression | None:
-        """Regress the histories in a region, or the nearest where it holds few."""
+    def regress(
+        self, region: Region, shapes: ShapeSettings | None = None
+    ) -> LocalRegression | None:
+        """Regress the histories in a region, or the nearest where it holds few.
+
+        With settings of noise that is not Gaussian its shape is looked at too.
+        """
         distance, valid, agrees = region.distance(self.z), self.valid, self.agrees
         needed = 2 * fewest_rows(self.coordinates.dim)
         rows = _nearest(np.where(valid, distance, np.inf), needed)
@@ -380,6 +375,8 @@ class Histories:
                 mixed.tolist(),
             ),
             used=self.used,
+            observed=self.observed,
+            shapes=shapes,
         )
 
 

@@ -20,7 +20,7 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, f
 
 from sbi_active.inference.regression.basis import Basis
+from sbi_active.inference.regression.noise_shape import NoiseShape, ShapeSettings
 from sbi_active.inference.regression.outcomes import TrialOutcome
 from sbi_active.inference.regression.regions import Region, nearest_region
 from sbi_active.inference.regression.residual_covariance import (
@@ -97,6 +98,7 @@ class LocalRegression:
         standardized: Residuals over their deviations, not rotated, shape (n, q).
         covariance: S, of the outcomes in use.
         leverage: h of the simulations, as part of the fit, shape (n,).
+        shape: Another density of the noise, not Gaussian; None where that is none.
     """
 
     region: Region
@@ -112,6 +114,13 @@ class LocalRegression:
     standardized: Array
     covariance: ResidualCovariance
     leverage: Array
+    shape: NoiseShape | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Residuals have served the diagnostics and would only weigh on a pickle.
+        empty = np.zeros((0, len(self.used)))
+        shape = self.shape and replace(self.shape, score=empty[:, self.used])
+        return {**vars(self), "residual": empty, "standardized": empty, "shape": shape}
 
     @property
     def has_misfit(self) -> bool:
@@ -128,6 +137,8 @@ class LocalRegression:
         num_trials: int,
         outcomes: tuple[TrialOutcome, ...] = (),
         used: NDArray[np.bool_] | None = None,
+        observed: Array | None = None,
+        shapes: ShapeSettings | None = None,
     ) -> LocalRegression | None:
         """Fit the basis with the smallest generalized cross-validation score.
 
@@ -139,6 +150,8 @@ class LocalRegression:
             num_trials: Trials stacked in q.
             outcomes: Whether trials gave a measurement.
             used: Outcomes that were observed, shape (q,); None is all.
+            observed: What was observed, shape (q,), for a noise that grows with it.
+            shapes: Settings of noise that is not Gaussian; None takes it for Gaussian.
 
         Returns:
             The regression; None where simulations are too few.
@@ -182,7 +195,13 @@ class LocalRegression:
         covariance = ResidualCovariance.of(
             standardized, deviation, freedom, trial, independent=excess <= MISFIT
         )
+        shape = None
+        if shapes is not None and observed is not None:
+            shape = NoiseShape.fit(
+                *(basis(u), coefficient, residual, observed[used], trial, shapes)
+            )
         return LocalRegression(
+            shape=shape,
             region=region,
             basis=basis,
             coefficient=_spread(covariance.whiten(coefficient), used),
@@ -243,6 +262,9 @@ class LocalRegression:
             2 * np.pi * widening * caution
         )
         log_likelihood = -0.5 * square - log_volume
+        if self.shape is not None:
+            other = self.shape.log_likelihood(features, widening * caution)
+            log_likelihood = 0.5 * (log_likelihood + other)
         for outcome in self.outcomes:
             log_likelihood = log_likelihood + outcome.log_prob(z)
         return log_likelihood

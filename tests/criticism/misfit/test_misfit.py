@@ -85,7 +85,7 @@ def test_a_misfit_that_passes_for_the_sensor_is_known_once_nothing_explains_it(
 ):
     """As correlated errors do, until a process that follows the action is tried."""
 
-    def late(search, equivalent, *, is_known=False):
+    def late(search, equivalent, *, is_known=False, rule=None):
         return find_misfit(search, equivalent, is_known=True) if is_known else None
 
     monkeypatch.setattr("sbi_active.criticism.criticism.find_misfit", late)

@@ -5,14 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sbi_active.criticism.misfit.rule import (
-    Scored,
-    choose,
-    predicts_better,
-    starts,
-)
+from sbi_active.criticism.misfit.rule import Rule, Scored, predicts_better
 from sbi_active.criticism.results import ModelKey
 
+choose, starts = Rule().choose, Rule().starts
 WIGGLE = 1 + 0.05 * np.sin(np.arange(8))
 
 

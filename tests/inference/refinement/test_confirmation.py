@@ -7,7 +7,7 @@ from torch.distributions import Independent, Normal
 
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.refinement.confirmation import by_replicates
-from sbi_active.inference.refinement.stages import Stages, Task
+from sbi_active.inference.refinement.regional import Regions, Task
 
 PRIOR = Independent(Normal(torch.zeros(2), torch.ones(2)), 1)
 ACTION = torch.tensor([[1.0], [2.0]])
@@ -35,7 +35,7 @@ def test_a_mean_that_the_regression_is_right_about_holds(by):
     settings = RefinementOptions(num_histories=1_000)
     task = Task(simulator, PRIOR, ACTION, x.double(), [], settings)
     torch.manual_seed(0)
-    stages = Stages(task, None, 0)
+    stages = Regions(task, None, 0)
     belief = stages.run()
     # Fresh simulations judge the regression, wherever the draws lie.
     found = by_replicates(stages, Moved(belief, by), np.random.default_rng(0))
@@ -50,7 +50,7 @@ def test_a_regression_that_is_off_does_not():
         simulator, PRIOR, ACTION, x.double(), [], RefinementOptions(num_histories=1_000)
     )
     torch.manual_seed(0)
-    stages = Stages(task, None, 0)
+    stages = Regions(task, None, 0)
     belief = stages.run()
     fresh = stages.histories.fresh
 

@@ -1,4 +1,4 @@
-"""The posterior of all trials, from few simulations that are put where they tell."""
+"""Gaussian processes on few simulations, a trial each, put where they tell most."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.stats import chi2
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.beliefs.diagnostics import Diagnostics
+from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.emulation.gain import mixture_gain
 from sbi_active.inference.emulation.likelihood import (
     PooledLikelihood,
@@ -24,9 +23,11 @@ from sbi_active.inference.emulation.pool import Pool
 from sbi_active.inference.emulation.statistics import learned_statistic
 from sbi_active.inference.emulation.summaries import Summary
 from sbi_active.inference.engine.importance import fitted
-from sbi_active.inference.engine.learned import CHEAP, LearnedFit, learned_fit
+from sbi_active.inference.engine.learned import CHEAP
 from sbi_active.inference.engine.pool import PriorDraws
-from sbi_active.inference.refinement.learned_belief import LearnedBelief
+from sbi_active.inference.refinement.course import Stage
+from sbi_active.inference.refinement.settings import StageSettings
+from sbi_active.inference.refinement.stages import Stages
 from sbi_active.inference.regression.outcomes import TrialOutcome
 from sbi_active.inference.regression.process import (
     GaussianProcess,
@@ -42,14 +43,20 @@ from sbi_active.simulation.noise.base import NoiseModel
 
 Array = NDArray[Any]
 
+#: The loop of few simulations. It begins with rows that are there, and ends where the
+#: processes' own errors are small: no stage is spent on seeing that one more changes
+#: nothing. A check by fresh rows would take more than a belief has.
+FEW_ROWS = StageSettings(
+    first_share=0.0,
+    stage_share=0.35,
+    fewest=12,
+    oversampling=15.0,
+    settled=np.inf,
+    untrusted=0.2,
+    checked_share=0.0,
+)
 NUM_REFERENCE = 400  # draws of a belief that say where simulations matter
 MOST_ROWS = {True: 160, False: 400}  # behind a trial, with declared noise and without
-NUM_STAGES = 5
-STAGE_SHARE = 0.35  # of the allowance
-FEWEST_ROWS = 12  # of a stage
-ENOUGH = 0.01  # nats: then no further simulation
-LARGE = 0.2  # nats that a belief is off
-DEFENSIVE = 1e-5
 NUM_OUTER, NUM_INNER = 128, 600  # draws behind the gain of a summary
 REACH = 6.0  # deviations of the belief within which rows are near it
 SHARE_OF_PRIOR = 0.1  # of new rows, so that no place is never looked at
@@ -71,8 +78,8 @@ class PooledTrial:
     label: str | None = None
 
 
-class PooledPosterior:
-    """Learns the likelihood of each trial and samples the posterior of all.
+class Processes(Stages):
+    """Learns the likelihood of each trial from the rows at its action.
 
     Args:
         prior: The original prior.
@@ -80,6 +87,8 @@ class PooledPosterior:
         noise: That was declared; None where the simulator is the noise.
         x_shape: Of a raw outcome.
         summaries: Of raw outcomes.
+        settings: Of the belief.
+        before: The belief before the last trial; it says where to look first.
         seed: Of everything random here.
     """
 
@@ -90,75 +99,78 @@ class PooledPosterior:
         noise: NoiseModel | None,
         x_shape: tuple[int, ...],
         summaries: Sequence[Summary],
+        settings: RefinementOptions,
+        before: Distribution,
         *,
         seed: int,
     ) -> None:
-        self.prior, self.pool, self.noise = prior, pool, noise
+        rng = np.random.default_rng(derive_seed(seed, "pooled"))
+        coordinates = PriorCoordinates(prior, np.random.default_rng(0))
+        super().__init__(prior, settings, FEW_ROWS, 0, rng, coordinates)
+        self.pool, self.noise = pool, noise
         self.x_shape, self.summaries, self.seed = x_shape, summaries, seed
-        self.rng = np.random.default_rng(derive_seed(seed, "pooled"))
-        self.coordinates = PriorCoordinates(prior, np.random.default_rng(0))
+        with forked_generators(derive_seed(seed, "reference")):
+            theta = before.sample(torch.Size([NUM_REFERENCE]))
+        self.near: Array = self.coordinates.to_z(theta.float())
+        self.trials: Sequence[PooledTrial] = ()
+        self.labels: list[str] = []
+        self._at_start = self._num_rows
 
-    def run(
-        self, trials: Sequence[PooledTrial], *, before: Distribution, allowance: int
-    ) -> tuple[LearnedBelief, list[str]]:
-        """Return the belief, and the summary that each trial is seen by.
+    def begin(self, trials: Sequence[PooledTrial], budget: int) -> None:
+        """Settle the summary that each trial is seen by.
 
         Args:
             trials: All of them.
-            before: The belief before the last one; it says where to look first.
-            allowance: Simulations at most.
-
-        Raises:
-            UnexplainedOutcomeError: If nothing has a likelihood.
+            budget: Simulations at most.
         """
-        at_start, start = len(self.pool), self.pool.num_missing
-        reference = self.draws(before)
-        labels = [self.best_summary(t, reference) for t in trials]
-        left = allowance
-        for stage in range(NUM_STAGES + 1):
-            fits = tuple(
-                self.fit(t, label, reference)
-                for t, label in zip(trials, labels, strict=True)
-            )
-            likelihood = PooledLikelihood(self.coordinates, fits)
-            fit = learned_fit(likelihood, self.rng, near=reference)
-            if fit is None:
-                raise UnexplainedOutcomeError(
-                    "expected outcomes that some parameters may explain; got none with "
-                    "a likelihood; correct the outcome, or leave the trial out"
-                )
-            reference = fit.draws(NUM_REFERENCE, self.rng)
-            errors = np.array([one.error(reference) for one in fits])
-            size = min(left, max(FEWEST_ROWS, int(STAGE_SHARE * allowance)))
-            size = left if left - size < FEWEST_ROWS else size
-            if size < FEWEST_ROWS or errors.sum() < ENOUGH or stage == NUM_STAGES:
-                break
-            self._simulate(trials, errors, fit, reference, size)
-            left -= size
-        spent = len(self.pool) + self.pool.num_missing - at_start - start
-        return self._belief(fit, fits, errors, spent), labels
+        self.trials, self.budget = trials, budget
+        self.labels = [self.best_summary(trial) for trial in trials]
 
-    def draws(self, belief: Distribution) -> Array:
-        """Return coordinates of draws from a belief, shape (n, d)."""
-        with forked_generators(derive_seed(self.seed, "reference")):
-            theta = belief.sample(torch.Size([NUM_REFERENCE]))
-        return self.coordinates.to_z(theta.float())
+    @property
+    def _num_rows(self) -> int:
+        return len(self.pool) + self.pool.num_missing
 
-    def best_summary(self, trial: PooledTrial, reference: Array) -> str:
+    def spent(self) -> tuple[int, int]:
+        """Return the rows simulated here, twice."""
+        num = self._num_rows - self._at_start
+        return num, num
+
+    def fit(self, near: Array | None, *, is_last: bool) -> PooledLikelihood:
+        """Return the likelihood of all trials."""
+        assert near is not None
+        fits = [
+            self.fit_trial(trial, label, near)
+            for trial, label in zip(self.trials, self.labels, strict=True)
+        ]
+        return PooledLikelihood(self.coordinates, tuple(fits))
+
+    def judged(
+        self, surrogate: PooledLikelihood, draws: Array
+    ) -> tuple[float, Array, float]:
+        """Return no misfit, one region, and the expected error."""
+        errors = [trial.error(draws) for trial in surrogate.trials]
+        return 0.0, np.ones(1), float(sum(errors))
+
+    def tails(self, stage: Stage) -> tuple[list[float], float]:
+        """Return tail probabilities of the trials and of all together."""
+        tails = [trial.tail(stage.draws) for trial in stage.surrogate.trials]
+        return tails, min(1.0, len(tails) * min(tails))
+
+    def best_summary(self, trial: PooledTrial) -> str:
         """Return the summary by which a trial is expected to tell most."""
         if trial.label is not None or len(self.summaries) == 1:
             return trial.label or self.summaries[0].label
         gains = [
-            self.gain(self.fit(trial, summary.label, reference), reference)
+            self.gain(self.fit_trial(trial, summary.label, self.near))
             for summary in self.summaries
         ]
         return self.summaries[int(np.argmax(gains))].label
 
-    def gain(self, fitted: TrialLikelihood, reference: Array) -> float:
+    def gain(self, fitted: TrialLikelihood) -> float:
         """Return the information of an outcome at a trial's action, nats."""
         if not fitted.processes:
             return 0.0
-        z = np.resize(reference, (NUM_OUTER + NUM_INNER, reference.shape[1]))
+        z = np.resize(self.near, (NUM_OUTER + NUM_INNER, self.near.shape[1]))
         mean, variance = fitted.predict(z)
         if self.noise is None:
             root = fitted.learned_sd[:, None] * fitted.root
@@ -168,7 +180,9 @@ class PooledPosterior:
         normal = rng.standard_normal((NUM_OUTER, mean.shape[1]))
         return float(mixture_gain(mean, variance, root, normal, NUM_OUTER).mean())
 
-    def fit(self, trial: PooledTrial, label: str, reference: Array) -> TrialLikelihood:
+    def fit_trial(
+        self, trial: PooledTrial, label: str, reference: Array
+    ) -> TrialLikelihood:
         """Return the likelihood of a trial from the rows of its action."""
         rows = self.pool.at(trial.action)
         summary = next(s for s in self.summaries if s.label == label)
@@ -246,67 +260,32 @@ class PooledPosterior:
         pairs = np.zeros((0, 2), dtype=bool)
         return TrialOutcome.fit(whole_space(z.shape[1]), 0, z, agrees, pairs)
 
-    def _simulate(
-        self,
-        trials: Sequence[PooledTrial],
-        errors: Array,
-        fit: LearnedFit,
-        reference: Array,
-        size: int,
-    ) -> None:
-        """Add rows at the trials that know least, where the posterior is."""
-        own, c = CHEAP, fit.potential.coordinates
-        weight = np.full(len(reference), 1 / len(reference))
-        near = fitted(c.from_z(reference), weight, own.num_components, own, self.rng)
-        where = Defended(near, PriorDraws(fit.potential), SHARE_OF_PRIOR)
-        counts = self.rng.multinomial(size, (errors + 1e-9) / (errors + 1e-9).sum())
+    def simulate(self, size: int) -> None:
+        """Add rows at the trials that know least."""
+        if size == 0:
+            return
+        stage = self.course.stages[-1]
+        own, potential = CHEAP, stage.fit.potential
+        c, draws = potential.coordinates, stage.draws[:NUM_REFERENCE]
+        weight = np.full(len(draws), 1 / len(draws))
+        near = fitted(c.from_z(draws), weight, own.num_components, own, self.rng)
+        where = Defended(near, PriorDraws(potential), SHARE_OF_PRIOR)
+        errors = [t.error(draws) + 1e-9 for t in stage.surrogate.trials]
+        counts = self.rng.multinomial(size, np.array(errors) / sum(errors))
         kept: list[Array] = []
         while sum(map(len, kept)) < size:
-            u = fit.potential.simulated(where.sample(2 * size + 20, self.rng))
+            u = potential.simulated(where.sample(2 * size + 20, self.rng))
             kept.append(self.rng.permutation(u))
         u = np.concatenate(kept)[:size]
         z = c.to_z(u)
         log_q = where.log_prob(u) + c.log_slope(u) - self.coordinates.log_jacobian(z)
-        action = torch.cat(
-            [t.action.expand(int(n), -1) for t, n in zip(trials, counts, strict=True)]
-        )
+        pairs = zip(self.trials, counts, strict=True)
         self.pool.simulate(
             self.coordinates.to_theta(z),
-            action,
+            torch.cat([t.action.expand(int(n), -1) for t, n in pairs]),
             seed=derive_seed(self.seed, "rows", len(self.pool.batches)),
             log_proposal=torch.from_numpy(log_q),
         )
-
-    def _belief(
-        self,
-        fit: LearnedFit,
-        fits: Sequence[TrialLikelihood],
-        errors: Array,
-        spent: int,
-    ) -> LearnedBelief:
-        belief = LearnedBelief(self.prior, fit, defensive=DEFENSIVE)
-        z = fit.draws(NUM_REFERENCE, self.rng)
-        tails = tuple(_tail(one, z, self.rng) for one in fits)
-        effective = float(fit.fit.effective_sample_size)
-        error = float(errors.sum())
-        found = Diagnostics(
-            trustworthy=True,
-            num_simulations=spent,
-            effective_sample_size=effective,
-            error_nats=error,
-            error_nats_if_explained=error,
-            tail_probability=min(1.0, len(tails) * min(tails)),
-            tail_probability_of_trial=tails,
-        )
-        if error > LARGE:
-            found = found.warned(
-                f"SA105 the belief is off by about {error:.2g} nats for want of "
-                "simulations; allow more of them"
-            )
-        if effective < 100:
-            found = found.warned("SA114 few effective draws; allow more simulations")
-        belief.diagnostics = found
-        return belief
 
 
 def nearest(
@@ -339,16 +318,3 @@ def _wide(numbers: Array, width: int) -> Array:
     full = np.full((len(numbers), width), np.nan)
     full[:, : numbers.shape[1]] = numbers
     return full
-
-
-def _tail(fitted: TrialLikelihood, z: Array, rng: np.random.Generator) -> float:
-    """Return how often a simulation from the belief lies as far out as a trial."""
-    if not fitted.processes:
-        return 1.0
-    mean, variance = fitted.predict(z)
-    if fitted.noise is None:
-        sd, root = np.sqrt(fitted.learned_sd**2 + variance), fitted.root
-    else:
-        sd, root = np.sqrt(fitted.declared_sd**2 + variance), np.eye(mean.shape[1])
-    white = np.linalg.solve(root, ((fitted.observed - mean) / sd).T).T
-    return float(chi2.sf((white**2).sum(1), mean.shape[1]).mean())

@@ -1,0 +1,305 @@
+"""Polynomials in regions around what is plausible, on all trials of a history."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.inference.declared.contradiction import Contradiction, compared
+from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.refinement.course import UNSETTLED, Stage
+from sbi_active.inference.refinement.learned_belief import LearnedBelief
+from sbi_active.inference.refinement.outcome_checks import check_outcomes
+from sbi_active.inference.refinement.regression_error import expected_error, widened
+from sbi_active.inference.refinement.residuals import (
+    has_hard_edges,
+    noise_shape,
+    trial_correlation,
+)
+from sbi_active.inference.refinement.settings import StageSettings
+from sbi_active.inference.refinement.stages import Stages
+from sbi_active.inference.refinement.tails import tail_probability
+from sbi_active.inference.refinement.trust import LIVE, Doubt
+from sbi_active.inference.regression.histories import Histories, HistoryRecord
+from sbi_active.inference.regression.regions import around, cover, whole_space
+from sbi_active.inference.regression.surrogate import Surrogate, fewest_rows
+from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.messages import warn
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.simulation.outcomes import MissingRowsWarning
+
+Array = NDArray[Any]
+
+ROUGH = 0.5  # share of the variance that a cubic misses over the whole prior
+SERIOUS_MISFIT = 1.5  # residual over noise variance, chance removed
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is to be refined, as in :func:`.refine`.
+
+    Attributes:
+        stages: Settings of the stages.
+    """
+
+    simulator: Callable[..., Any]
+    prior: Distribution
+    action: Tensor
+    outcome: Tensor
+    hints: list[Distribution]
+    settings: RefinementOptions
+    stages: StageSettings = StageSettings()
+
+
+class Regions(Stages):
+    """Histories in regions, and a polynomial in each.
+
+    Args:
+        task: What is to be refined.
+        past: Histories of the first of its trials.
+        seed: Of everything random here.
+        further_noise: Standard deviations of noise to add, shape (t, q).
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        past: HistoryRecord | None,
+        seed: int,
+        *,
+        further_noise: Array | None = None,
+    ) -> None:
+        rng = np.random.default_rng(derive_seed(seed, "refine"))
+        coordinates = PriorCoordinates(task.prior, rng)
+        budget = task.settings.num_histories
+        super().__init__(
+            *(task.prior, task.settings, task.stages, budget, rng, coordinates)
+        )
+        self.task = task
+        observed = task.outcome.numpy().reshape(len(task.outcome), -1)
+        self.histories = Histories(
+            *(task.simulator, task.action, observed, coordinates),
+            *(seed, past, task.settings.workers),
+            further_noise=further_noise,
+        )
+        self.regions = [whole_space(self.coordinates.dim)]
+        near: list[Array] = []
+        for hint in task.hints:
+            with forked_generators(derive_seed(seed, "start")):
+                draws = hint.sample(torch.Size([1_000])).float()
+            z = self.coordinates.to_z(draws)
+            near.append(z[self.coordinates.inside(z)])
+            self.regions.append(around(near[-1]))
+        self.near = np.concatenate(near) if near else None
+        self.num_forced, self.is_shaped, self.change = 1, False, 0.0
+        self.least = max(self.own.fewest, 2 * fewest_rows(self.coordinates.dim))
+
+    def spent(self) -> tuple[int, int]:
+        """Return the histories simulated or taken over, and the rows."""
+        return self.histories.num_drawn, self.histories.num_simulations
+
+    def run(self) -> LearnedBelief:
+        """Return the belief with its histories, and what they say of lost outcomes.
+
+        Measurements are judged by what was fitted before simulations from further off.
+        """
+        belief, histories, stage = super().run(), self.histories, self.course.stages[-1]
+        fits = stage.surrogate.regressions
+        live = [f.ratio for f, m in zip(fits, stage.mass, strict=True) if m > LIVE]
+        known = belief.diagnostics.extended(
+            error_nats_if_explained=expected_error(
+                stage.surrogate, stage.draws, self.rng, explained=True
+            ),
+            residual_to_noise=float(max(live, default=np.inf)),
+            share_invalid=histories.share_invalid,
+        )
+        belief.diagnostics = check_outcomes(known, stage.fitted, stage.draws, histories)
+        belief.histories = histories.record()
+        if histories.num_missing:
+            warn(
+                f"SA301 {histories.num_missing} of {histories.num_simulations} "
+                "simulations of the refinement are missing, by faults of the "
+                "simulator; the histories they belong to were left out",
+                MissingRowsWarning,
+                stacklevel=4,
+            )
+        return belief
+
+    def _propose(self, stage: Stage, size: int) -> None:
+        """Put the next stage's regions around what is still plausible."""
+        many = 2 * max(self.num_forced, len(self.regions))
+        fewer = max(1, self.num_forced // 2)
+        is_stuck = self.course.is_stuck
+        self.num_forced = min(many, self.own.max_forced) if is_stuck else fewer
+        limit = max(1, int(size / (1.2 * fewest_rows(self.coordinates.dim))))
+        self.regions = cover(
+            stage.draws,
+            self.rng,
+            min_regions=min(self.num_forced, limit),
+            max_regions=min(max(self.own.max_regions, self.num_forced), limit),
+            generous=stage.excess < 3,
+        )
+
+    def simulate(self, size: int) -> None:
+        """Bring the stage's regions to their numbers, past histories first."""
+        if self.course.stages:
+            self._propose(self.course.stages[-1], size)
+        histories, regions = self.histories, self.regions
+        is_first = histories.num_drawn == 0
+        num_places = size - max(int(self.own.replicate_share * size), 12)
+        shares = np.full(len(regions), 1 / len(regions))
+        if is_first and len(regions) > 2:  # the overview keeps half of the stage
+            shares = np.array([0.5, *[0.5 / (len(regions) - 1)] * (len(regions) - 1)])
+        bounds = num_places * np.concatenate([[0.0], shares.cumsum()])
+        counts = np.diff(np.round(bounds, 6).astype(int))
+        for k, (region, count) in enumerate(zip(regions, counts, strict=True)):
+            # The first stage's first region is the whole space, seen from the prior.
+            is_overview = is_first and k == 0
+            before = len(histories) - len(histories.second)
+            histories.reuse(region, int(count), is_overview=is_overview)
+            missing = int(count) - (len(histories) - len(histories.second) - before)
+            if missing <= 0:
+                continue
+            z = region.sample_inside(missing, self.coordinates, self.rng)
+            z = self.rng.permutation(z)
+            if len(z) == 0:  # it lies beside the support, as of an outcome far away
+                z = self.coordinates.sample_prior(missing, self.rng)
+            num_replicates = missing * (size - num_places) // num_places
+            histories.add(z, min(num_replicates, len(z)), is_overview=is_overview)
+
+    def fit(self, near: Array | None, *, is_last: bool) -> Surrogate:
+        """Return the regressions of the regions that have simulations enough."""
+        histories = self.histories
+        fits = [histories.regress(region) for region in self.regions]
+        regressions = [fit for fit in fits if fit is not None]
+        if regressions:
+            return Surrogate(self.coordinates, regressions, is_cautious=not is_last)
+        num_valid, num = int(histories.valid.sum()), histories.num_drawn
+        if 2 * num_valid > len(histories.valid):  # it is not the outcomes that lack
+            raise ValueError(
+                f"expected at least {self.least} histories for "
+                f"{self.coordinates.dim} parameters; got {num}; raise num_histories"
+            )
+        raise UnexplainedOutcomeError(
+            "expected simulations with a measurement, since trials had one; got none "
+            f"or NaN in {num - num_valid} of {num} histories; check the simulator at "
+            "the executed actions, or the prior"
+        )
+
+    def judged(self, surrogate: Surrogate, draws: Array) -> tuple[float, Array, float]:
+        """Return the worst misfit, the mass of each region and the expected error."""
+        label, fits = surrogate.assign(draws), surrogate.regressions
+        mass = np.bincount(label[label >= 0], minlength=len(fits))
+        mass = mass / max(mass.sum(), 1)
+        live = [f.excess for f, m in zip(fits, mass, strict=True) if m > LIVE]
+        error = expected_error(surrogate, draws, self.rng)
+        return max(live, default=np.inf), mass, error
+
+    def with_more(self, stage: Stage) -> tuple[Surrogate, float]:
+        """Return regressions of simulations from further off that agree."""
+        return widened(
+            self.histories, stage.surrogate, stage.error, stage.draws, self.rng
+        )
+
+    def last(self, stage: Stage) -> Stage:
+        """Return the stage with noise that is not Gaussian, where it is not."""
+        own, c = self.own.shapes, self.coordinates
+        fits = [
+            self.histories.regress(f.region, own) for f in stage.surrogate.regressions
+        ]
+        shaped = [fit for fit in fits if fit is not None]
+        if all(fit.shape is None for fit in shaped):
+            return stage
+        other = self.sample(Surrogate(c, shaped), stage.draws)
+        change = other.log_prob(other.draws) - stage.log_prob(other.draws)
+        self.is_shaped, self.change = True, float(change.mean())
+        return replace(other, fitted=stage.fitted, error=max(stage.error, other.error))
+
+    def tails(self, stage: Stage) -> tuple[list[float], float]:
+        """Return tail probabilities of the trials and of all together."""
+        num_trials = len(self.task.action)
+        return tail_probability(stage.surrogate, stage.draws, num_trials)
+
+    def doubts(self) -> dict[str, Doubt]:
+        """Return what the regressions take for granted."""
+        course, last = self.course, self.course.stages[-1]
+        fits = last.surrogate.regressions
+        live = [fit for fit, mass in zip(fits, last.mass, strict=True) if mass > LIVE]
+        roughness = course.stages[0].surrogate.regressions[0].roughness
+        negentropy, is_gaussian = noise_shape(live, self.own.shapes.left, self.rng)
+        is_gaussian &= not has_hard_edges(course.stages)
+        dim = self.coordinates.dim
+        # Of d parameters known to e nats, a mean is off by (2 e / d)^(1/2) deviations.
+        allowed = 0.5 * dim * self.own.known**2
+        known = last.error / allowed, self.change / (UNSETTLED * dim)
+        correlation, is_independent = trial_correlation(live, len(self.task.action))
+        return {
+            "gaussian_noise": (
+                is_gaussian,
+                negentropy,
+                "SA110 the noise is not Gaussian (it differs by {:.2g} nats a number), "
+                "and the belief, which takes it for Gaussian, may be too wide or too "
+                "narrow; check against a belief of a trained network",
+            ),
+            "noise_known": (
+                not self.is_shaped or max(known) <= 1,
+                max(known) if self.is_shaped else 0.0,
+                "SA110 the noise is not Gaussian, and the simulations are too few to "
+                "tell what it is ({:.2g} times the error that is allowed for); raise "
+                "num_histories",
+            ),
+            "smooth_response": (
+                roughness <= ROUGH,
+                roughness,
+                "SA111 over the prior the outcomes have more turns than a cubic, which "
+                "misses {:.0%} of their variance, so that four or more narrow modes "
+                "are possible and one may be lost; check against another seed or a "
+                "narrower prior",
+            ),
+            "no_misfit": (
+                last.excess <= SERIOUS_MISFIT,
+                max((fit.ratio for fit in live), default=np.inf),
+                "SA112 the residuals of the surrogate have {:.2g} times the variance "
+                "of the noise, so that the belief is too wide; raise num_histories",
+            ),
+            "independent_trials": (
+                is_independent,
+                correlation,
+                "SA104 simulated trials correlate at the same parameters ({:.2f}), yet "
+                "the likelihood is a product over trials; check how the simulator "
+                "seeds its noise",
+            ),
+        }
+
+    def contradiction(self) -> Contradiction | None:
+        """Return what contradicts at the draw that the last stage explains best."""
+        task, stage = self.task, self.course.stages[-1]
+        t, label = len(task.action), stage.surrogate.assign(stage.draws)
+        best: Array | None = None
+        for k, fit in enumerate(stage.surrogate.regressions):
+            if not (label == k).any():
+                continue
+            error, widening = fit.whitened(stage.draws[label == k])
+            squares = (error.reshape(len(error), t, -1) ** 2).sum(2)
+            squares = squares / np.minimum(widening, 2.0)[:, None]
+            least = squares[squares.sum(1).argmin()]
+            best = least if best is None or least.sum() < best.sum() else best
+        if best is None:
+            return None
+        sds = torch.from_numpy(self.histories.noise_sds).mean(0)
+        sds = torch.where(sds > 0, sds, torch.inf)
+        return compared(
+            task.action,
+            task.outcome,
+            lambda gap: gap.flatten(1) / sds,
+            best,
+            num_fitted=self.coordinates.dim,
+        )
