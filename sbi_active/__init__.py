@@ -3,8 +3,8 @@
 Choose the action whose outcome tells most about the simulator's parameters, update a
 neural posterior with the measurement, and go on. An extension of sbi.
 
-Here stand the names that most programs need; each is imported when it is first used.
-All others are in the packages: ``actions``, ``simulation``, ``inference``,
+This module has the names that most programs need; each is imported when it is first
+used. All others are in the packages: ``actions``, ``simulation``, ``inference``,
 ``information_gain``, ``search``, ``design``, ``diagnostics``, ``campaign``,
 ``criticism`` and ``mujoco``.
 """

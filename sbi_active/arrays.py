@@ -18,8 +18,8 @@ def own_tensor(
     Args:
         value: A number, tensor, array, or nested sequences of them; NaN stands for
             what a masked array masks, and for None among other numbers.
-        dtype: Of the result; None keeps a floating one.
-        name: Of the numbers, for errors.
+        dtype: Type of the result; None keeps a floating one.
+        name: Name of the numbers, for errors.
 
     Raises:
         ValueError: If they are no real numbers, but complex, text, dates or None; if
@@ -50,11 +50,11 @@ def measured(value: Any, *, name: str = "x") -> Tensor:
     """Return real numbers in float64 on the CPU, apart from any graph.
 
     Args:
-        value: As in :func:`own_tensor`.
-        name: Of the numbers, for errors.
+        value: Numbers, as :func:`own_tensor` takes them.
+        name: Name of the numbers, for errors.
 
     Raises:
-        ValueError: As :func:`own_tensor` does.
+        ValueError: If :func:`own_tensor` refuses the value.
     """
     with torch.inference_mode(False):  # tensors of that mode are barred from training
         return own_tensor(value, torch.float64, name=name).detach().cpu()
@@ -63,7 +63,8 @@ def measured(value: Any, *, name: str = "x") -> Tensor:
 def all_finite(x: Tensor) -> bool:
     """Return whether no number is NaN or infinite.
 
-    A sum, several times as fast as asking each number, is finite only then.
+    It takes a sum, which is finite only then, and is several times as fast as a test of
+    each number.
     """
     return math.isfinite(x.sum()) or bool(x.isfinite().all())
 

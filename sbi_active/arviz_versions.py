@@ -19,9 +19,9 @@ class Groups:
     """Draws and data by group, before they take a library's form.
 
     Attributes:
-        num_chains: Over which independent draws are split.
+        num_chains: Number of chains over which independent draws are split.
         coords: Labels by dimension.
-        attrs: Of the whole.
+        attrs: Attributes of the whole.
         variables: Array, dimensions and attributes by group and name.
     """
 
@@ -87,7 +87,8 @@ def pareto_smoothed(
     """Return smoothed log weights of leaving out each trial, and Pareto shapes k.
 
     Args:
-        log_likelihood: Of each trial given each posterior draw, shape (n, t).
+        log_likelihood: Log likelihood of each trial given each posterior draw, shape
+            (n, t).
         relative_efficiency: Effective number of draws over their number.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What an argument has to be: one form of words for all settings."""
+"""Errors of arguments, in one form of words for all settings."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from typing import Any
 
 
 def require(holds: bool, expected: str, got: Any, advice: str) -> None:
-    """Raise where a setting is not what it has to be.
+    """Raise if a setting is not what it has to be.
 
     Args:
         holds: Whether it is.
         expected: Name and range of the setting.
-        got: What was given.
-        advice: What to do.
+        got: Value that was given.
+        advice: Advice on what to do.
 
     Raises:
-        ValueError: With all three.
+        ValueError: If it does not hold, with all three in its text.
 
     Example:
         >>> require(False, "num_rows >= 1", 0, "use some thousand")

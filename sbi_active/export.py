@@ -48,12 +48,12 @@ def to_inference_data(
 
     Args:
         source: A belief, a campaign, a report, or a dict of arrays.
-        parameter_names: One a parameter; None takes the simulator's, which beliefs
-            remember, else theta_1, ...
+        parameter_names: Names of the parameters; None takes the simulator's, which
+            beliefs remember, else theta_1, ...
         num_samples: Draws of all chains together.
-        num_chains: Chains; draws that do not fill all are left out.
-        model: Of a report: a name among ``report.tracing.evidences``.
-        seed: Of the draws.
+        num_chains: Number of chains; draws that do not fill all are left out.
+        model: Model of a report, by a name among ``report.tracing.evidences``.
+        seed: Seed of the draws.
 
     Returns:
         ``InferenceData`` of ArviZ 0.x, ``DataTree`` of 1.x.
@@ -82,18 +82,19 @@ def to_datatree(
     model: str | None = None,
     seed: int = 0,
 ) -> Any:
-    """Return the same as an xarray ``DataTree``, which ArviZ 1.x takes.
+    """Return draws and data as an xarray ``DataTree``, which ArviZ 1.x takes.
 
     It needs xarray alone, so that one Python may write what another one reads: by
     ``to_netcdf``, or ``to_zarr``.
 
     Args:
-        source: As in :func:`to_inference_data`, with what follows.
-        parameter_names: One a parameter.
+        source: Belief, campaign, report or dict of arrays, as for
+            :func:`to_inference_data`.
+        parameter_names: Names of the parameters.
         num_samples: Draws of all chains together.
-        num_chains: Chains.
-        model: Of a report.
-        seed: Of the draws.
+        num_chains: Number of chains.
+        model: Model of a report, by its name.
+        seed: Seed of the draws.
     """
     return data_tree(
         _groups(source, parameter_names, num_samples, num_chains, model, seed)
@@ -191,7 +192,7 @@ def _add_trials(
     made.coords["round"] = [t.index + 1 for t in trials]
     made.coords["action_entry"] = [*campaign.actions.names]
     shape = (len(theta), len(trials))
-    # The same draws of the posterior stand behind predictive and likelihood.
+    # Predictive and likelihood use the same draws of the posterior.
     predicted = () if campaign.simulator is None else ("posterior", "prior")
     for group, draws in zip(predicted, (theta, before), strict=False):
         pairs = draws.repeat_interleave(len(trials), 0), action.repeat(len(draws), 1)
@@ -282,7 +283,7 @@ def _spread(draws: np.ndarray, num: int, rng: np.random.Generator) -> np.ndarray
 def _rival_log_likelihood(report: Any, found: Any, draws: np.ndarray) -> Any:
     """Return the log likelihood of each trial under a rival, shape (n, t).
 
-    None where it is more than the simulator, effects and declared noise: a residual
+    None if it is more than the simulator, effects and declared noise: a residual
     process, an unknown size of noise, nuisances of single trials.
     """
     simulator, key = report.simulator, found.key

@@ -24,7 +24,7 @@ class SBIActiveWarning(UserWarning):
 
     @property
     def code(self) -> str:
-        """Of what is said, such as "SA301"."""
+        """Code of the message, such as "SA301"."""
         return Message(str(self)).code
 
 
@@ -45,11 +45,11 @@ class SimulatorWarning(SBIActiveWarning):
 
 
 class LoopWarning(SBIActiveWarning):
-    """What a closed loop concludes is limited."""
+    """The conclusions of a closed loop are limited."""
 
 
 class StorageWarning(SBIActiveWarning):
-    """What is on disk is not as it should be."""
+    """Stored files are not as they should be."""
 
 
 class RenamedWarning(SBIActiveWarning, DeprecationWarning):
@@ -74,7 +74,7 @@ CATEGORIES = {
 class Message(str):
     """A sentence that knows its code.
 
-    Where it is said the code comes first: "SA301 3 of 9 rows are missing".
+    In the text the code comes first: "SA301 3 of 9 rows are missing".
 
     Example:
         >>> said = Message("SA301 3 of 9 rows are missing: 3 raised")
@@ -97,7 +97,7 @@ class Message(str):
 
     @property
     def code(self) -> str:
-        """Its code, "" for a text without one."""
+        """Code of the message, "" for a text without one."""
         place = _PLACE.search(self)
         if place is None:
             return ""
@@ -133,7 +133,7 @@ def _slug(title: str) -> str:
 
 
 def place(code: str) -> str:
-    """Return where a code is explained, as the end of a message."""
+    """Return the place where a code is explained, as the end of a message."""
     return f" (see {PAGE}#{code.lower()}-{_slug(explanations()[code][0])})"
 
 
@@ -158,7 +158,7 @@ class Explained:
     """An error whose text names its place on the page.
 
     Attributes:
-        code: Its code.
+        code: Code of the message.
     """
 
     code: str

@@ -31,12 +31,12 @@ def plot_belief(
 
     Args:
         belief: The belief.
-        ax: Where to draw.
-        parameter_names: One a parameter.
+        ax: Axes to draw on.
+        parameter_names: Names of the parameters.
         limits: Lower and upper ends of the axes, shape (2, theta_dim).
-        theta_true: Marked by a cross where given.
-        pair: Which two parameters.
-        num_samples: Points.
+        theta_true: True parameters, marked by a cross where given.
+        pair: Pair of parameters to draw.
+        num_samples: Number of samples to draw.
     """
     i, j = pair
     theta = belief.sample((num_samples,)).numpy()
@@ -64,14 +64,14 @@ def plot_rounds(
 ) -> Figure:
     """Draw each round in a row: belief, information gain of the actions, next belief.
 
-    The arrangement of figure 3 of Kim & Matsubara (2025).
+    The layout is that of figure 3 of Kim & Matsubara (2025).
 
     Args:
-        beliefs: Before the first round and after each, one more than designs.
-        designs: One a round.
-        parameter_names: One a parameter.
-        theta_true: Marked where given.
-        exact_gains: The exact gain of every candidate, one a round, where known.
+        beliefs: Beliefs before the first round and after each, one more than designs.
+        designs: Designs, one a round.
+        parameter_names: Names of the parameters.
+        theta_true: True parameters, marked where given.
+        exact_gains: Exact gains of every candidate, one tensor a round, where known.
 
     Returns:
         The figure.

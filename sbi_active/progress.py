@@ -1,4 +1,4 @@
-"""What takes its time says so: a bar, and lines of a log."""
+"""Progress of slow steps: a bar, and lines of a log."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ def is_asked_for(show_progress: bool) -> bool:
 def stage(
     what: str, *, show_progress: bool = False, count: Count | None = None
 ) -> Iterator[None]:
-    """Tell of the block while it runs; of a block within it nothing is told.
+    """Report the block while it runs, but no block within it.
 
     Args:
-        what: What it does.
+        what: Name of the work.
         show_progress: Whether to draw a bar.
         count: Steps done, from which the time that is left is estimated.
     """
@@ -56,9 +56,9 @@ class News:
     """A bar and a log of one stage, kept up to date by a thread of its own.
 
     Args:
-        what: What is being done.
-        expected: Seconds that it took before; None where it is the first.
-        before: Where that was, such as "trial 3".
+        what: Name of the work.
+        expected: Seconds that it took before; None if it is the first.
+        before: Place where that was, such as "trial 3".
         has_bar: Whether to draw a bar.
         count: Steps done, from which the seconds are estimated in place of that.
     """
@@ -83,7 +83,7 @@ class News:
 
     @contextmanager
     def told(self) -> Iterator[None]:
-        """Tell of the block."""
+        """Report the block."""
         self._begin()
         try:
             yield

@@ -1,6 +1,6 @@
 """Names of packages: imported when they are used, and those of the last version.
 
-The latter still work, and a warning says the new one. So do keywords of that version.
+Former names and keywords still work, and a warning gives the new ones.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ def former_names(
     Args:
         package: Name of the package.
         names: Former name: where it is now, as ``"package:Name"``.
-        stacklevel: Of the warning; 2 where the function is ``__getattr__`` itself.
+        stacklevel: Stack level of the warning; 2 where the function is ``__getattr__``
+            itself.
 
     Returns:
         A function of a name. It raises AttributeError for names that never were.
@@ -73,7 +74,7 @@ def grouped(values: Mapping[str, Any], groups: Mapping[str, Any]) -> dict[str, A
     """Return values by name, with loose ones in the settings that they belong to.
 
     Args:
-        values: Some of which are fields of the settings.
+        values: Values, some of which are fields of the settings.
         groups: The class of each settings, a dataclass, by the name of its value.
 
     Example:
@@ -95,10 +96,11 @@ def grouped(values: Mapping[str, Any], groups: Mapping[str, Any]) -> dict[str, A
 def takes_loose(**groups: Any) -> Callable[[Taking], Taking]:
     """Let a function or a dataclass take fields of its settings as keywords.
 
-    For one version, with a warning. A dataclass has them as attributes as well.
+    They work for one version, with a warning. A dataclass has them as attributes as
+    well.
 
     Args:
-        **groups: As in :func:`grouped`.
+        **groups: Groups of options, as in :func:`grouped`.
     """
     home = {entry.name: g for g, kind in groups.items() for entry in fields(kind)}
 

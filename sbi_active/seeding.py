@@ -6,13 +6,13 @@ a row come from a counter (SplitMix64), which NumPy and torch cannot do for many
 at once. Code that only knows the global generators of torch and NumPy runs under
 :func:`forked_generators`, which restores them.
 
-What takes a seed, or needs none, leaves both global generators as it found them and
-does not depend on them: campaigns, designs, refinements, updates with a seed,
-simulators and their noise, reports, exports. Three kinds of calls draw from torch's, as
-anywhere in torch and sbi: sampling that takes no seed (``belief.sample``, as of any
-distribution, and ``model(theta, action)`` without ``seeds``), a call whose ``seed=`` is
-left at None, and what is sbi's own to the last bit: making a trainer (sbi draws from
-the prior to look at it), ``train``, and sampling an sbi posterior.
+Calls that take a seed, or need none, leave both global generators as they were and do
+not depend on them: campaigns, designs, refinements, updates with a seed, simulators and
+their noise, reports, exports. Three kinds of calls draw from torch's, as anywhere in
+torch and sbi: sampling that takes no seed (``belief.sample``, as of any distribution,
+and ``model(theta, action)`` without ``seeds``), a call whose ``seed=`` is left at None,
+and what is sbi's own to the last bit: making a trainer (sbi draws from the prior to
+look at it), ``train``, and sampling an sbi posterior.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def derive_seed(seed: int, *key: int | str) -> int:
 
     Args:
         seed: The user's seed, a non-negative integer.
-        key: What the seed is for, for example ``("train", 3)``.
+        key: Purpose of the seed, for example ``("train", 3)``.
 
     Returns:
         An integer in [0, 2**63).
@@ -58,7 +58,7 @@ def forked_generators(seed: int | None, *key: int | str) -> Iterator[None]:
 
     Args:
         seed: The user's seed; None leaves the generators as they are.
-        key: As in :func:`derive_seed`.
+        key: Purpose of the seed, as in :func:`derive_seed`.
     """
     if seed is None:
         yield
@@ -112,7 +112,7 @@ def row_uniforms(seeds: Tensor, num: int, *, first: int = 0) -> Tensor:
     """Return uniform numbers within (0, 1), row i a function of ``seeds[i]`` alone.
 
     Args:
-        seeds: Shape (n,), int64.
+        seeds: Seeds, shape (n,), int64.
         num: Numbers a row.
         first: Place of the first of them in the row's stream.
 
@@ -131,7 +131,7 @@ def row_normals(seeds: Tensor, num: int) -> Tensor:
     """Return standard normal numbers, the quantiles of :func:`row_uniforms`.
 
     Args:
-        seeds: Shape (n,), int64.
+        seeds: Seeds, shape (n,), int64.
         num: Numbers a row.
 
     Returns:

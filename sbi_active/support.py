@@ -1,4 +1,4 @@
-"""Where the draws of a distribution lie."""
+"""Support of a distribution's draws."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ Array = NDArray[Any]
 
 
 def support_of(distribution: Distribution) -> Any:
-    """Return where a distribution's draws lie, as a torch constraint.
+    """Return the support of a distribution's draws, as a torch constraint.
 
-    It is what the distribution says, but where torch says too much: a transformed
-    distribution has the image of its base, not all that its last transform can reach;
-    an angle lies between -pi and pi; components of a mixture have bounds each.
+    It is the support that the distribution states, except where torch's is too large: a
+    transformed distribution has the image of its base, not all that its last transform
+    can reach; an angle lies between -pi and pi; components of a mixture have bounds
+    each.
     """
     if isinstance(distribution, Independent):
         base = support_of(distribution.base_dist)
@@ -55,7 +56,7 @@ def support_of(distribution: Distribution) -> Any:
 def within_support(distribution: Any, theta: Tensor) -> Tensor:
     """Return whether rows (n, theta_dim) lie in a distribution's support, shape (n,).
 
-    Where it has none, as a trained network, whether their log density is finite.
+    If it has none, as a trained network, return whether their log density is finite.
     """
     try:
         inside = support_of(distribution).check(theta)

@@ -1,6 +1,6 @@
 """Action spaces: what the robot may do in the next trial, one kind a file.
 
-Here live the spaces alone. Which action is taken lives in ``design``.
+This package contains the spaces alone. The choice of an action is in ``design``.
 """
 
 from sbi_active.actions.box import BoxActions

@@ -22,8 +22,8 @@ class BoxActions(ActionSpace):
     Args:
         low: l, a number or shape (action_dim,), in the units of the action.
         high: h, as ``low``.
-        names: One an entry of the action.
-        units: One an entry of the action.
+        names: Names of the entries of the action.
+        units: Units of the entries of the action.
 
     Raises:
         ValueError: If the limits differ in shape, are not finite, or leave no room.

@@ -24,9 +24,10 @@ class DiscreteActions(ActionSpace):
     r"""A finite set of actions :math:`\mathcal{D} = \{\xi_1, \ldots, \xi_a\}`.
 
     Args:
-        values: Shape (a,) for scalar actions, or (a, action_dim).
-        names: One an entry of the action.
-        units: One an entry of the action.
+        values: Values of the actions, shape (a,) for scalar actions, or (a,
+            action_dim).
+        names: Names of the entries of the action.
+        units: Units of the entries of the action.
 
     Raises:
         ValueError: If the set is empty, not finite, or has another shape.
@@ -92,7 +93,7 @@ def action_space(actions: Any) -> ActionSpace:
 
     Raises:
         TypeError: If it is neither.
-        ValueError: As :class:`DiscreteActions` raises.
+        ValueError: If :class:`DiscreteActions` refuses the list.
     """
     if isinstance(actions, ActionSpace):
         return actions

@@ -92,10 +92,10 @@ class MixedActions(ActionSpace):
         return self._signals()[0].input_times
 
     def inputs(self, action: Tensor) -> dict[str, Tensor]:
-        """Return the signals to play of the one part that has some, by name.
+        """Return the signals of the only part that has signals, by name.
 
         Args:
-            action: Of all parts, shape (n, action_dim) or (action_dim,).
+            action: Action of all parts, shape (n, action_dim) or (action_dim,).
 
         Raises:
             ValueError: If no part or several have signals.

@@ -36,12 +36,13 @@ class SignalActions(BoxActions):
             gives {name: (n, m)}, or (n, m) for one called "input". Ready ones are
             :func:`.chirp`, :func:`.step`, :func:`.multisine` and :func:`.recorded` of
             ``sbi_active.actions.waveforms``.
-        low: Of the parameters, a number or shape (action_dim,).
-        high: As ``low``. Neither is needed where the generator lists its actions.
+        low: Lower limits of the parameters, a number or shape (action_dim,).
+        high: Upper limits, as ``low``. Neither is needed if the generator lists its
+            actions.
         input_times: Uniform grid of the signal in s, shape (m,); None takes that of the
             generator.
-        names: One an entry of the action; None takes those of the generator.
-        units: As ``names``.
+        names: Names of the entries of the action; None takes those of the generator.
+        units: Units of the entries, as ``names``.
         amplitude: Limits of each value, a number for its size or (lowest, highest), for
             all inputs or by name; None for none.
         rate: Largest change of an input in a second, between points of the grid, a
@@ -123,7 +124,8 @@ class SignalActions(BoxActions):
         """Return the signals to play on the grid ``input_times``, by name.
 
         Args:
-            action: Shape (n, action_dim) for series (n, m), or (action_dim,) for (m,).
+            action: Actions, shape (n, action_dim) for series (n, m), or (action_dim,)
+                for (m,).
 
         Raises:
             ValueError: If the generator gives another shape, or no numbers.
@@ -218,7 +220,7 @@ class SignalActions(BoxActions):
         return ((last - first).clamp(min=0) * self._step).double()
 
     def _require_names(self) -> None:
-        """Raise where limits name inputs that the generator does not have."""
+        """Raise if limits name inputs that the generator does not have."""
         some = self.low if self._values is None else self._values[0]
         known = {*self.inputs(some[None])}
         for limits in (self._amplitude, self._rate):

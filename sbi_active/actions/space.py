@@ -1,4 +1,4 @@
-"""What every action space offers."""
+"""The interface of every action space."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ class ActionSpace(ABC):
     """A set of actions that can be sampled and tested for membership.
 
     Attributes:
-        names: One an entry of the action.
-        units: One an entry of the action; empty where unknown.
+        names: Names of the entries of the action.
+        units: Units of the entries of the action; empty if unknown.
     """
 
     names: list[str]
@@ -30,8 +30,8 @@ class ActionSpace(ABC):
         """Return uniform draws.
 
         Args:
-            sample_shape: Any shape, as in torch's distributions.
-            seed: None uses torch's global generator.
+            sample_shape: Shape of the draws, any, as in torch's distributions.
+            seed: Seed of the draws; None uses torch's global generator.
 
         Returns:
             Shape (*sample_shape, action_dim).
@@ -42,7 +42,7 @@ class ActionSpace(ABC):
         """Return which actions belong to the space.
 
         Args:
-            action: Shape (..., action_dim).
+            action: Actions, shape (..., action_dim).
 
         Returns:
             Shape (...), bool.
@@ -52,7 +52,7 @@ class ActionSpace(ABC):
         """Return which actions keep limits beyond those of their entries.
 
         Args:
-            action: Within the limits of each entry, shape (n, action_dim).
+            action: Actions within the limits of each entry, shape (n, action_dim).
 
         Returns:
             Shape (n,), bool.
@@ -60,7 +60,7 @@ class ActionSpace(ABC):
         return torch.ones(len(action)).bool()
 
     def listed(self) -> Tensor | None:
-        """Return all actions, shape (a, action_dim); None where there is no end."""
+        """Return all actions, shape (a, action_dim); None if there is no end."""
         return None
 
     def parts(self) -> list[ActionSpace]:

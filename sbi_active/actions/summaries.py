@@ -1,4 +1,4 @@
-"""Which summary of an outcome is looked at, as a part of the action."""
+"""The choice of an outcome's summary as a part of the action."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sbi_active.actions.space import ActionSpace
 class SummaryAction(DiscreteActions):
     r"""A choice :math:`\delta \in \{1, \ldots, K\}` among summaries of one outcome.
 
-    To be joined with what the robot does, ``MixedActions(BoxActions(...),
+    It is joined with what the robot does, ``MixedActions(BoxActions(...),
     SummaryAction(...))``. The simulator returns the raw outcome, shape (n, k), whatever
     :math:`\delta` is; a campaign calls it with :math:`\delta` = 0, once for all
     summaries, so that the choice costs nothing and gains are compared on the same
@@ -24,19 +24,19 @@ class SummaryAction(DiscreteActions):
     them otherwise.
 
     Args:
-        summaries: By name, a function of raw outcomes (n, k), a torch tensor, that
-            returns (n, d); or an object with ``fit`` and ``transform`` of NumPy arrays,
-            such as ``sklearn.decomposition.PCA``, of which copies are fitted to the
-            simulations of a round.
-        use: Which summary a belief rests on: at each trial the "best", that of which
-            the outcome is expected to tell most at the executed action, since all of
-            them are at hand; or the "chosen" one, as in Kim & Matsubara (2025).
-        name: Of the entry.
+        summaries: Summaries by name. Each is a function of raw outcomes (n, k), a torch
+            tensor, that returns (n, d); or an object with ``fit`` and ``transform`` of
+            NumPy arrays, such as ``sklearn.decomposition.PCA``, of which copies are
+            fitted to the simulations of a round.
+        use: Summary that a belief rests on: at each trial the "best", which is expected
+            to be most informative at the executed action, since all of them are at
+            hand; or the "chosen" one, as in Kim & Matsubara (2025).
+        name: Name of the entry.
 
     Attributes:
-        summaries: As given.
-        labels: Their names, in the order of :math:`\delta`.
-        use: As given.
+        summaries: Summaries by name, as given.
+        labels: Names of the summaries, in the order of :math:`\delta`.
+        use: Summary that a belief rests on, "best" or "chosen".
 
     Raises:
         ValueError: If there is no summary, or ``use`` is another word.

@@ -23,11 +23,11 @@ class Waveform:
     """A signal whose parameters are the action, but for those that are fixed.
 
     Attributes:
-        shape: Of "chirp", "step" or "multisine".
+        shape: Shape of the signal, "chirp", "step" or "multisine".
         input: Name of the input.
         every: Names of all parameters, each with its unit.
         fixed: Values of some.
-        frequencies: Of a multisine, Hz.
+        frequencies: Frequencies of a multisine, Hz.
     """
 
     shape: str
@@ -43,15 +43,15 @@ class Waveform:
 
     @property
     def units(self) -> list[str]:
-        """Their units."""
+        """Units of the parameters."""
         return [unit for name, unit in self.every if name not in self.fixed]
 
     def __call__(self, action: Tensor, input_times: Tensor) -> dict[str, Tensor]:
         """Return the signal, {name: (n, m)}.
 
         Args:
-            action: Shape (n, action_dim).
-            input_times: Shape (m,).
+            action: Actions, shape (n, action_dim).
+            input_times: Times of the inputs, shape (m,).
         """
         if action.shape[1] != len(self.names):
             raise ValueError(
@@ -114,7 +114,7 @@ class Together:
     """Signals of several inputs at once, the entries of one behind those of another.
 
     Attributes:
-        parts: One an input.
+        parts: Waveforms, one an input.
     """
 
     parts: tuple[Waveform, ...]
@@ -126,15 +126,15 @@ class Together:
 
     @property
     def units(self) -> list[str]:
-        """Their units."""
+        """Units of the parameters."""
         return [unit for part in self.parts for unit in part.units]
 
     def __call__(self, action: Tensor, input_times: Tensor) -> dict[str, Tensor]:
         """Return the signals, {name: (n, m)}.
 
         Args:
-            action: Shape (n, action_dim).
-            input_times: Shape (m,).
+            action: Actions, shape (n, action_dim).
+            input_times: Times of the inputs, shape (m,).
         """
         found: dict[str, Tensor] = {}
         sizes = [len(part.names) for part in self.parts]
@@ -147,7 +147,7 @@ def together(*waveforms: Waveform) -> Together:
     """Return the signals of several inputs, such as the joints of an arm, as one.
 
     Args:
-        *waveforms: One an input.
+        *waveforms: Waveforms, one an input.
 
     Raises:
         ValueError: If there is none, or two are of the same input.
@@ -171,8 +171,8 @@ class Recorded:
     """Inputs that were recorded; the action is their number.
 
     Attributes:
-        inputs: By name, shape (t, m).
-        input_times: Shape (m,).
+        inputs: Inputs by name, shape (t, m).
+        input_times: Times of the inputs, shape (m,).
         values: The actions, shape (t, 1).
     """
 
@@ -190,7 +190,7 @@ class Recorded:
         """Return the inputs of some trials, {name: (n, m)}.
 
         Args:
-            action: Their numbers, shape (n, 1).
+            action: Numbers of the recordings, shape (n, 1).
             input_times: The grid of the recordings, shape (m,).
         """
         number = action[:, 0].round().long()

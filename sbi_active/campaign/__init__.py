@@ -1,8 +1,8 @@
 """The loop around a real experiment: ask for an action, tell the outcome, go on.
 
-Here lives the course of a campaign: its state, its rules and its checks. What learns,
-designs or criticizes lives in the packages it calls. A name is imported when it is
-used: the log of the trials needs no torch.
+This package contains the course of a campaign: its state, its rules and its checks. The
+code that learns, designs or criticizes is in the packages it calls. Names are imported
+when they are used, so that reading the log of the trials needs no torch.
 """
 
 from __future__ import annotations

@@ -46,31 +46,31 @@ class Campaign(CampaignTrials):
     A round: :meth:`ask` for an action, execute it, :meth:`tell` the outcome.
     ``tell`` only records; inference runs in the next ``ask`` or in :meth:`update`.
 
-    Each round trains a network, :attr:`posterior`; what asked it is in
-    ``Trial.network_used_by``. With declared noise neither action nor refined belief
-    rest on it: notes and diagnostics compare it with them, and refinement also looks
-    where it points. With the option ``network="on demand"`` it is trained only when
-    something asks.
+    Each round trains a network, :attr:`posterior`; ``Trial.network_used_by`` lists its
+    users. With declared noise neither the action nor the refined belief depends on it:
+    notes and diagnostics compare it with them, and the refinement also searches where
+    it points. With the option ``network="on demand"`` it is trained only when needed.
 
     Args:
         simulator: ``simulator(theta, action)``, shapes (n, theta_dim) and
             (n, action_dim), giving x of shape (n, *x_shape).
-        prior: Over the parameters, with a support.
-        actions: What the robot may do: a space, or a list of actions.
+        prior: Prior of the parameters, with a support.
+        actions: Actions that the robot may take: a space, or a list of actions.
         method: "asbi", "alhi" (a surrogate likelihood) and "seqbed" (ratios) design
             actions; "nsbi" and "nlhi" are the first two with actions drawn at random.
-        effects: What the simulator may lack, see :class:`.Effect`.
-            With them, actions are also chosen to tell whether it does.
-        cost: Of actions (n, action_dim), shape (n,), positive; or one number an action
-            of a list. Actions are then chosen for their information by cost.
-        constraint: Which of actions (n, action_dim) the robot may execute now, shape
-            (n,), bool. The network learns about the others as well.
-        seed: Of everything random; the same seed and outcomes give the same campaign.
+        effects: Effects that the simulator may lack, see :class:`.Effect`. With them,
+            actions are also chosen to test for these effects.
+        cost: Cost of actions (n, action_dim), shape (n,), positive; or one number an
+            action of a list. Actions are then chosen for their information by cost.
+        constraint: Function of actions (n, action_dim) that says which may be executed
+            now, shape (n,), bool. The network learns about the others as well.
+        seed: Seed of all draws; the same seed and outcomes give the same campaign.
         options: Sizes and estimators; or fields of them in a dict.
-        directory: New or empty folder to keep the campaign in, as it happens: whatever
-            ends the process, :meth:`load` goes on. None keeps it in memory alone.
-        show_progress: Draw a bar of what is being done, and of the rounds of
-            :meth:`run`. The logger "sbi_active" says it of all that takes 2 s anyway.
+        directory: New or empty folder, to which the campaign is written as it runs, so
+            that :meth:`load` can resume it after a crash. None keeps it in memory
+            alone.
+        show_progress: Whether to draw a bar of what is being done, and of the rounds of
+            :meth:`run`. The logger "sbi_active" reports all that takes 2 s anyway.
 
     Raises:
         ValueError: If the method is unknown, the prior has no support, or no width that
@@ -163,28 +163,31 @@ class Campaign(CampaignTrials):
     ) -> Campaign:
         """Return the campaign in a directory, where it was left or killed.
 
-        It goes on as if nothing had happened: with the same actions, outcomes and
-        beliefs, to the last bit. Nothing in the directory is executed.
+        It continues with the same actions, outcomes and beliefs, to the last bit.
+        Nothing in the directory is executed.
 
         Args:
-            directory: As given to the constructor.
-            simulator: As given there. Without it the campaign can be read, told and
-                corrected, and neither :meth:`ask` nor :meth:`update` compute.
-            prior: Needed where it is a class of your own; else None takes the
-                directory's.
-            actions: Likewise; a space, or a list of actions, as there.
-            effects: As given to the constructor, and those that were adopted since:
-                functions are not stored.
-            cost: As given to the constructor.
-            constraint: As given to the constructor.
-            options: None takes the directory's; needed where an estimator is of your
-                own. Others than before hold for this process, with a warning. A dict
-                gives all that are not default, as in the constructor.
-            show_progress: As in the constructor.
-            simulator_changed: Take another simulator than the campaign was made with,
-                and compute everything again with it.
-            repair: Give up what is damaged. The files before are kept beside, and a
-                warning names each trial that has to be told again.
+            directory: Directory of the campaign, as given to the constructor.
+            simulator: Simulator that the campaign was made with. Without it the
+                campaign can be read, told and corrected, and neither :meth:`ask` nor
+                :meth:`update` compute.
+            prior: Prior of the parameters. It is needed if it is of your own class;
+                else None takes the directory's.
+            actions: Action space or list of actions, needed if it is of your own class;
+                else None takes the directory's.
+            effects: Effects given to the constructor, and those that were adopted
+                since: functions are not stored.
+            cost: Cost of actions, as given to the constructor.
+            constraint: Constraint of actions, as given to the constructor.
+            options: Options of the campaign; None takes the directory's. They are
+                needed if an estimator is of your own class. Changed options hold for
+                this process, with a warning. A dict gives all that are not default, as
+                in the constructor.
+            show_progress: Whether to draw a progress bar, as in the constructor.
+            simulator_changed: Whether to take another simulator than the campaign was
+                made with, and compute everything again with it.
+            repair: Whether to drop damaged records. The former files are kept beside,
+                and a warning names each trial that has to be told again.
 
         Raises:
             ValueError: If there is no campaign, or one of another simulator or schema.
@@ -236,10 +239,9 @@ class Campaign(CampaignTrials):
     def posterior(self) -> ActionPosterior:
         r"""The amortized posterior :math:`q(\theta | x, \xi)` under the current belief.
 
-        For any outcome at any action in milliseconds: what a trial would tell, before
-        it is run. It is this round's network, trained here where it was not yet; ahead
-        of :meth:`ask` that is on no trial's account. The methods "asbi" and "nsbi" have
-        one; for others this is a ValueError.
+        It gives the posterior of any outcome at any action in milliseconds, before a
+        trial is run. It is this round's network, which is trained here if it was not
+        yet. Only the methods "asbi" and "nsbi" have one; others raise a ValueError.
         """
         index = len(self.state.trials) if self.pending is None else self.pending.index
         return self._learner.posterior(index)
@@ -249,10 +251,10 @@ class Campaign(CampaignTrials):
         """Return the pending trial, or design the next one.
 
         Args:
-            target: What it should tell most about: "theta", names of parameters, or
-                "model", whether the simulator lacks one of the campaign's effects and
-                which. "auto" is "theta" without effects; with them it is the one of
-                which the best action tells more, in nats, and under an alarm "model".
+            target: Target of the design: "theta", names of parameters, or "model",
+                whether the simulator lacks one of the campaign's effects and which.
+                "auto" is "theta" without effects; with them it is the one of which the
+                best action tells more, in nats, and under an alarm "model".
 
         Returns:
             The trial; execute ``trial.action``.
@@ -314,15 +316,17 @@ class Campaign(CampaignTrials):
     ) -> Distribution:
         """Run rounds on a real system that can be called.
 
-        It ends early where :attr:`stop_reason` gives one; a trial that was designed by
+        It ends early if there is a :attr:`stop_reason`; a trial that was designed by
         then stays pending.
 
         An exception of the real system passes through; the trial stays pending.
 
         Args:
-            real_system: Takes an action, shape (action_dim,), and gives x.
+            real_system: Function that takes an action, shape (action_dim,), and gives
+                x.
             num_rounds: Trials to run.
-            on_round: Called with each trial once the belief contains it.
+            on_round: Function that is called with each trial once the belief contains
+                it.
 
         Returns:
             The belief after the last trial.
@@ -347,10 +351,12 @@ class Campaign(CampaignTrials):
         """Compare the current simulator with all trials so far.
 
         Args:
-            effects: What the simulator may lack, None takes the campaign's; those
-                already adopted are left out. The first library of a model counts as
-                frozen: with another one, or other priors, the report is "exploratory".
-            evaluate: As in :func:`.close_loop`.
+            effects: Effects that the simulator may lack; None takes the campaign's;
+                those already adopted are left out. The first library of a model counts
+                as frozen: with another one, or other priors, the report is
+                "exploratory".
+            evaluate: Whether to report the error before and after, see
+                :func:`.close_loop`.
 
         Returns:
             The report; :meth:`adopt` takes it.
@@ -378,7 +384,7 @@ class Campaign(CampaignTrials):
         effects. A pending trial stays; surprises and health start anew.
 
         Args:
-            report: Of :meth:`criticize`, whose verdict names effects.
+            report: Report of :meth:`criticize`, whose verdict names effects.
 
         Returns:
             The belief over (theta, phi).

@@ -19,16 +19,17 @@ from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignDetails:
-    """What few campaigns set otherwise; the papers' experiments do.
+    """Options that few campaigns change; the papers' experiments do.
 
     Attributes:
-        posterior: How a belief of "alhi", "nlhi" or "seqbed" is sampled, see
+        posterior: Sampling method for beliefs of "alhi", "nlhi" and "seqbed", see
             :class:`.ALHI`.
         eliminate: Whether candidates far behind the leader get no further samples.
-        design_on: "fresh" simulations, or those of the "training", which costs none
-            further; the estimates are then too high, the more so the fewer rows.
-        min_probability_valid: Actions that give a measurement less often are chosen
-            neither for the parameters nor at random.
+        design_on: Simulations to design on: "fresh" ones, or those of the "training" at
+            no further cost. The estimates are then too high, the more so the fewer
+            rows.
+        min_probability_valid: Smallest probability of a measurement. Actions below it
+            are chosen neither for the parameters nor at random.
         repeat: Whether an action may be chosen again.
         num_scored: Simulations of each executed action, from the belief before the
             trial, that its outcome is compared with.
@@ -66,43 +67,42 @@ class CampaignOptions:
     """Sizes and estimators of a campaign.
 
     Attributes:
-        num_simulations: Rows a round to train on.
-        num_samples: Simulations a candidate action for the expected information gain,
-            half to choose and half to report.
-        density_estimator: What is learned: as in :class:`.ASBI` and
-            :class:`.ALHI`; for "seqbed" a classifier as in
-            :class:`.SeqBED`, or :class:`.LFIRE`.
-        estimator: Of the expected information gain, as in
+        num_simulations: Number of training rows in each round.
+        num_samples: Number of simulations of each candidate action for the expected
+            information gain, half to choose and half to report.
+        density_estimator: Density estimator that is trained, as in :class:`.ASBI` and
+            :class:`.ALHI`; for "seqbed" a classifier as in :class:`.SeqBED`, or
+            :class:`.LFIRE`.
+        estimator: Estimator of the expected information gain, as in
             :class:`.InformationGainDesigner`; "posterior" is the paper's.
         refine: Whether a belief is refined with the simulator after each trial; without
             it, beliefs are chained as in the paper.
-        network: When a round's network is trained: "each round", so that the amortized
-            posterior is at hand and refined beliefs are compared with it; or "on
-            demand", when something asks: :attr:`.Campaign.posterior`, an estimator of
-            the information gain that rests on it, a belief that is not refined. With
-            declared noise nothing in a round does, which then takes a fraction of the
-            time (``benchmarks/cost/network.json``). Beliefs are refined without the
-            network whoever asked for it, so that asking changes nothing.
+        network: Time when a round's network is trained: "each round", so that the
+            amortized posterior is available and refined beliefs are compared with it;
+            or "on demand", when it is needed: :attr:`.Campaign.posterior`, an
+            estimator of the information gain that rests on it, a belief that is not
+            refined. With declared noise nothing in a round does, which then takes a
+            fraction of the time (``benchmarks/cost/network.json``). Beliefs are refined
+            without the network whoever asked for it, so that asking changes nothing.
         refinement: Settings of the refinement, whose simulations run as all others.
-        check_every: Every so many-th trial goes where none was, instead of where most
-            is to be learned about the parameters: at as many settings as parameters
-            any simulator fits, and nothing tells that it is wrong. None never checks.
-            A campaign that is given effects turns to the model by itself.
-        stop: When :meth:`.Campaign.run` ends before its last round.
-        max_simulations: Of the whole campaign, which never simulates more: belief,
-            designs and scores then share one pool of rows
+        check_every: Interval of trials that check the simulator at an action far from
+            all others, instead of the most informative one: any simulator fits as many
+            settings as it has parameters. None never checks. A campaign with effects
+            designs for the model by itself.
+        stop: Rules by which :meth:`.Campaign.run` ends before its last round.
+        max_simulations: Simulations of the whole campaign, which never simulates more:
+            belief, designs and scores then share one pool of rows
             (:mod:`sbi_active.inference.emulation`), and no network is trained. When
             they are used up, :meth:`.Campaign.run` ends, :meth:`.Campaign.ask` says so
             and the last belief stands. ``Campaign.state.meter`` has what was spent.
         planned_trials: Trials that ``max_simulations`` is to last for; each further one
             gets half of what is left.
-        workers: Where all simulations run and what a row may cost, or the number of
-            calls at a time.
-        bank: Folder of simulations, which campaigns on the same simulator may share one
-            after another: what one has simulated the next reads, and its first round
-            begins with the rows of others, weighted by :func:`.reuse`. None keeps them
-            in the campaign's directory, if it has one.
-        details: What few campaigns set otherwise.
+        workers: Workers that run all simulations, or the number of calls at a time.
+        bank: Folder of simulations that campaigns on the same simulator share one after
+            another. The first round of a campaign begins with the rows of earlier ones,
+            weighted by :func:`.reuse`. None keeps them in the campaign's directory, if
+            it has one.
+        details: Further options that few campaigns change.
     """
 
     num_simulations: int = 5_000

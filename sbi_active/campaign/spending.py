@@ -1,4 +1,4 @@
-"""What a campaign does with the last of its simulations, and without any."""
+"""The end of a campaign's simulations: its last ones, and trials without any."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def used_up(state: CampaignState) -> str | None:
 
 
 def require_left(state: CampaignState) -> None:
-    """Raise where no further trial can be designed.
+    """Raise if no further trial can be designed.
 
     Raises:
         SimulationBudgetError: If the simulations are used up.
@@ -36,7 +36,7 @@ def require_left(state: CampaignState) -> None:
 
 
 def learned(learner: Any, state: CampaignState, trial: Trial) -> bool:
-    """Score a trial and learn from it; False where simulations did not suffice.
+    """Score a trial and learn from it; False if simulations did not suffice.
 
     The trial stays recorded and the belief as it is.
     """

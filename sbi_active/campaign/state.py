@@ -34,39 +34,40 @@ class Trial:
         status: "pending"; "ok"; "invalid" where the trial ran and gave no measurement,
             which is information; "missing" where a fault unrelated to the parameters
             hit it, and "withdrawn" where it was taken back, which are ignored.
-        design: The design behind the action; None where the trial was not asked for.
-        target: What the action was chosen for: "theta" or names of parameters, "model",
-            "check" for one where no trial was, "random"; None where it was not asked
-            for.
-        information_gained: Realized, KL(belief after || before) in nats.
+        design: The design behind the action; None if the trial was not asked for.
+        target: Target of the action: "theta" or names of parameters, "model", "check"
+            for an action far from all others, "random"; None for an action that was not
+            asked for.
+        information_gained: Realized information gain, KL(belief after || before) in
+            nats.
         surprise: Tail probability of x under the posterior predictive of the belief
             before the trial; uniform where the simulator is right.
-        belief_error: Nats that the belief before the trial is off for want of
+        belief_error: Error in nats of the belief before the trial due to few
             simulations, by its own estimate; above 0.2 the surprise says nothing about
             the simulator.
         log_score: Log density of x under it, nats.
         misfit: Tail probability of all trials so far under the belief after this one,
             which was fitted to them; None for a belief that was not refined, or that is
             off by more than 0.2 nats.
-        outlyingness: How far x lies beyond all simulations from the prior at this
-            action, in their range, by its farthest number; inf where none of them had
-            such a number, None where it is as others from the belief before are. Above
+        outlyingness: Distance of x beyond all simulations from the prior at this
+            action, in their range, by its farthest number; inf if none of them had
+            such a number, None if it is as others from the belief before are. Above
             5 nothing in the prior explains the trial, and the belief leaves it out.
-        network_used_by: What asked the network of this round: the "design", whose
-            estimate rests on it, or the design's "notes", which compare the estimate
-            with it; the "belief", where it is the network's word; where the belief is
-            refined, its "start", which adds simulations there and no weight, and its
+        network_used_by: Users of this round's network: the "design", whose estimate
+            rests on it, or the design's "notes", which compare the estimate with it;
+            the "belief", where it is the network's word; where the belief is refined,
+            its "start", which adds simulations there and no weight, and its
             "diagnostics", which compare the two; and :attr:`.Campaign.posterior`, as
             "posterior".
         summary: The summary of the outcome that the belief rests on, where the action
             chooses among several.
-        reason: Why it was withdrawn.
+        reason: Reason for which it was withdrawn.
         version: Number of the model that scored the trial.
         seconds: Wall time by stage; this and what follows add up where the campaign is
             computed again.
         cpu_seconds: CPU time by stage.
         num_simulations: Simulations spent on this trial.
-        num_missing: Those of them lost to faults of the simulator.
+        num_missing: Number of those simulations lost to faults of the simulator.
     """
 
     index: int
@@ -109,11 +110,11 @@ class ModelVersion:
     """A simulator that a campaign used, and how it came to it.
 
     Attributes:
-        number: From 0, the simulator that the campaign started with.
-        effects: All that were adopted so far, in the order of their parameters.
+        number: Number of the version; 0 is the simulator that the campaign began with.
+        effects: Effects that were adopted so far, in the order of their parameters.
         digest: Hash of noise, library and priors behind the adoption; "" at first.
-        num_trials: Told before it was adopted.
-        misfit: As in :class:`Trial`, of the trials that the version was given.
+        num_trials: Number of trials told before it was adopted.
+        misfit: Misfit of the trials that the version was given, as in :class:`Trial`.
         examined: Digests of the comparisons of this version with trials, in order.
         trials: Indices of those told before it was adopted, which it was given at once.
     """
@@ -127,7 +128,7 @@ class ModelVersion:
     trials: tuple[int, ...] = ()
 
 
-#: Of a trial that was not scored.
+#: Fields of a trial that was not scored.
 UNSCORED: dict[str, Any] = {
     "information_gained": None,
     "surprise": None,
@@ -153,20 +154,21 @@ class CampaignState:
 
     Attributes:
         method: Name of the method.
-        seed: Of everything random.
+        seed: Seed of all draws.
         options: Sizes and estimators.
-        trials: In the order in which they were asked for or told.
+        trials: Trials in the order in which they were asked for or told.
         processed: Indices of trials that the belief contains, in order of use.
         versions: Lineage of the simulator, the current one last.
         is_stale: Whether a trial that the belief contains was corrected since.
         num_earlier: Rows that were in ``options.bank`` before the campaign.
-        draws: Some of the belief after each trial, for pictures, by the trial's index,
+        draws: Draws of the belief after each trial, for pictures, by the trial's index,
             shape (n, theta_dim); of the parameters that the model had then.
-        batches: What was simulated for the current model where belief, designs and
-            scores share their simulations.
-        meter: Counts the campaign's simulations.
-        watch: Entered around whatever may take long, with the state, the index of the
-            trial that it is for (of the next one where it is for none) and its name.
+        batches: Simulations made for the current model where belief, designs and scores
+            share their simulations.
+        meter: Counter of the campaign's simulations.
+        watch: Context that is entered around whatever may take long, with the state,
+            the index of the trial that it is for (of the next one where it is for none)
+            and its name.
     """
 
     method: str
@@ -212,7 +214,7 @@ class CampaignState:
         """Note that the current model was compared with the trials.
 
         Args:
-            digest: Of the comparison.
+            digest: Digest of the comparison.
         """
         examined = (*self.version.examined, digest)
         self.versions[-1] = replace(self.version, examined=examined)
@@ -243,7 +245,7 @@ class CampaignState:
     def stage(self, index: int, name: str) -> Iterator[None]:
         """Add the time spent in the block to a trial's account, less stages within.
 
-        Work ahead of a trial that was not asked for yet is on no account.
+        Work before a trial is asked for is not added to any account.
         """
         with self.watch(self, index, name):
             if index == len(self.trials):

@@ -19,19 +19,21 @@ NUM_DRAWS = 2_000  # of the belief; 1.6 % error of a standard deviation
 class StopRules:
     """Rules by which :meth:`.Campaign.run` ends before its last round.
 
-    Any one ends it, but the first two not while the campaign's health is not "ok": a
-    simulator that lacks something makes a belief narrow at a wrong place, which is what
-    both wait for.
+    Any one ends it, but the first two only while the campaign's health is "ok": with a
+    simulator that lacks something, a belief becomes narrow at a wrong place, and both
+    would stop.
 
     Attributes:
-        min_information_gain: The next trial is expected to tell less than this, nats.
-        max_sd: All parameters' standard deviations under the belief are below this:
-            one number, or one a parameter, in the parameters' units.
-        calibration_lost: The verdict of :mod:`sbi_active.diagnostics` is "stop":
-            inferred twice again, the refined belief excludes what these hold; or, where
-            beliefs are the network's word, the network excludes the truth too often at
-            some action. It ends a campaign whatever its health, at the cost of two
-            inferences, or of 1,000 simulations, a trial.
+        min_information_gain: Smallest expected information gain of the next trial,
+            nats.
+        max_sd: Largest standard deviation of any parameter under the belief: one
+            number, or one a parameter, in the parameters' units.
+        calibration_lost: Whether to stop if the verdict of
+            :mod:`sbi_active.diagnostics` is "stop": the refined belief excludes what
+            two new inferences contain; or, if beliefs are the network's posterior, the
+            network excludes the truth too often at some action. This ends a campaign
+            whatever its health, at the cost of two inferences, or of 1,000 simulations,
+            a trial.
 
     Example:
         >>> StopRules(min_information_gain=0.1, max_sd=[0.05, 0.2])
@@ -59,9 +61,9 @@ class StopRules:
         """Return why to stop, or None.
 
         Args:
-            belief: After all trials.
-            design: Of the next trial, if there is one.
-            seed: Of the belief's draws.
+            belief: Belief after all trials.
+            design: Design of the next trial, if there is one.
+            seed: Seed of the belief's draws.
 
         Raises:
             ValueError: If ``max_sd`` has neither one number nor one a parameter.

@@ -1,4 +1,4 @@
-"""What is told of a trial, checked before it is recorded."""
+"""Checks of a told trial before it is recorded."""
 
 from __future__ import annotations
 
@@ -35,13 +35,14 @@ def told_trial(
     """Return the record of a trial as told; the recorded one where nothing is new.
 
     Args:
-        state: Of the campaign.
+        state: State of the campaign.
         x: The outcome.
         trial: The trial, its index, or None for the pending one.
         action: The executed one; None is the one asked for.
-        status: As told.
-        x_shape: Of an outcome.
-        actions: Of the campaign; one executed outside of it is warned of.
+        status: Status of the trial, as told.
+        x_shape: Shape of an outcome.
+        actions: Action space of the campaign; an action executed outside of it is
+            warned of.
 
     Raises:
         ValueError: If there is no such trial, or numbers or shapes do not fit.
@@ -99,10 +100,10 @@ def new_trial(state: CampaignState) -> Trial:
 def recorded(state: CampaignState, facts: Mapping[str, Any]) -> Trial:
     """Return the record of a trial as the log has it.
 
-    What was found about it stays where it is the same trial as before.
+    Earlier findings stay if the trial is the same as before.
 
     Args:
-        state: Of the campaign.
+        state: State of the campaign.
         facts: Fields of :class:`.Trial`, its index among them.
 
     """
@@ -124,7 +125,7 @@ def recorded(state: CampaignState, facts: Mapping[str, Any]) -> Trial:
 def outcome_told(x: Any, status: Status, x_shape: torch.Size) -> Tensor | None:
     """Return the outcome, NaN where not measured, shape x_shape.
 
-    None for a missing trial. A number that is infinite was not measured either.
+    It is None for a missing trial. Infinite numbers count as not measured.
 
     Raises:
         ValueError: If there is no outcome, or one of another shape, or what was told

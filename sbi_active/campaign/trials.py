@@ -1,4 +1,4 @@
-"""What is told of trials, corrected and taken back."""
+"""Telling, correcting and withdrawing trials."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ class CampaignTrials(CampaignView):
     """The half of a :class:`.Campaign` that takes what happened, and computes nothing.
 
     Attributes:
-        on_trial: Called with each trial that was told, once it is recorded; set it.
-        on_update: Called with each trial, once the belief contains it; set it.
+        on_trial: Function that is called with each trial that was told, once it is
+            recorded; set it.
+        on_update: Function that is called with each trial, once the belief contains it;
+            set it.
     """
 
     on_trial: Callable[[Trial], None] | None = None
@@ -83,12 +85,12 @@ class CampaignTrials(CampaignView):
         A pending trial stays pending.
 
         Args:
-            action: The executed one, shape (action_dim,).
-            x: As in :meth:`tell`.
-            status: As in :meth:`tell`.
+            action: Executed action, shape (action_dim,).
+            x: Outcome, as in :meth:`tell`.
+            status: Status of the trial, as in :meth:`tell`.
 
         Raises:
-            ValueError: As in :meth:`tell`.
+            ValueError: If :meth:`tell` would refuse the trial.
         """
         new = new_trial(self.state)
         told = self._checked(x, trial=new, action=action, status=status)
@@ -106,18 +108,18 @@ class CampaignTrials(CampaignView):
     ) -> Trial:
         """Replace what was told of a trial; the log keeps what was told before.
 
-        The next :meth:`update` computes everything that rests on it again, as if it had
-        been told so at once. :meth:`tell` with ``trial=`` is the same without a reason.
+        The next :meth:`update` recomputes everything that depends on it, as if this had
+        been told at once. :meth:`tell` with ``trial=`` is the same without a reason.
 
         Args:
             trial: The trial or its index.
-            x: As in :meth:`tell`; None keeps the outcome where there is one.
-            action: As in :meth:`tell`.
-            status: As in :meth:`tell`.
-            reason: Kept with the trial.
+            x: Outcome, as in :meth:`tell`; None keeps the outcome where there is one.
+            action: Executed action, as in :meth:`tell`.
+            status: Status of the trial, as in :meth:`tell`.
+            reason: Reason that is kept with the trial.
 
         Raises:
-            ValueError: As in :meth:`tell`, or if the trial was not told yet.
+            ValueError: If :meth:`tell` would refuse the trial, or it was not told yet.
         """
         found = find_trial(self.state, trial)
         if found.status == "pending":
@@ -154,12 +156,12 @@ class CampaignTrials(CampaignView):
     def withdraw(self, trial: Trial | int, *, reason: str = "") -> Trial:
         """Take a trial out; it stays in the history, with the status "withdrawn".
 
-        The next :meth:`update` computes everything again without it, as if it had been
+        The next :meth:`update` recomputes everything without it, as if it had been
         "missing". :meth:`tell` with ``trial=`` brings it back.
 
         Args:
             trial: The trial or its index, a pending one too.
-            reason: Kept with the trial.
+            reason: Reason that is kept with the trial.
 
         Returns:
             The recorded trial.

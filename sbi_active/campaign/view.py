@@ -1,4 +1,4 @@
-"""What can be read of a campaign at any time, without changing anything."""
+"""The readable side of a campaign, which changes nothing."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class CampaignView:
     """The readable half of a :class:`.Campaign`.
 
     Attributes:
-        actions: What the robot may do.
-        state: All that happened.
+        actions: Actions that the robot may take.
+        state: State of the campaign.
     """
 
     actions: ActionSpace
@@ -56,7 +56,7 @@ class CampaignView:
         return campaign_html(self)
 
     def _known_together(self) -> str:
-        """Return what the belief knows of parameters that it does not know alone.
+        """Return the combinations that the belief knows of parameters not known alone.
 
         A belief that was not read from the directory yet is not read for this.
         """
@@ -69,11 +69,11 @@ class CampaignView:
     def belief(self) -> Distribution:
         """The belief after the trials in ``state.processed``; the prior before any.
 
-        A trial that nothing in the prior explains, as after a slip of the unit, is left
-        out of it: five times the range of all simulations from the prior beyond them,
-        the model's word would be an extrapolation that pushes the belief to an edge.
-        ``belief.diagnostics.trustworthy`` is then False and ``warnings`` names
-        the trial, until it is told again or withdrawn. Trials that are beyond all
+        A trial that nothing in the prior explains, as after an error of the unit, is
+        left out of it: at five times the range of all simulations beyond them, the
+        model would extrapolate and push the belief to an edge.
+        ``belief.diagnostics.trustworthy`` is then False and ``warnings`` names the
+        trial, until it is told again or withdrawn. Trials that are beyond all
         simulations but nearer stay in the belief and are named as well.
         """
         return self._learner.stated_belief
@@ -94,7 +94,7 @@ class CampaignView:
 
     @property
     def effects(self) -> Sequence[Effect]:
-        """What the simulator may lack, as the campaign was told."""
+        """Effects that the simulator may lack, as the campaign was told."""
         return self._planner.effects
 
     @property
@@ -105,7 +105,7 @@ class CampaignView:
 
     @property
     def directory(self) -> Path | None:
-        """Where the campaign is kept; None for in memory alone."""
+        """Folder of the campaign; None if it is kept in memory alone."""
         return self._storage.path
 
     @property
@@ -212,10 +212,10 @@ class CampaignView:
     ) -> Figure:
         """Draw the campaign so far, in one figure.
 
-        The belief of each parameter by round; what each action was expected to tell,
-        the last map where actions have several entries; each outcome with what the
-        belief before it predicted; what each trial was expected to tell and told, under
-        a watch or an alarm in another color.
+        It shows the belief of each parameter by round; the expected information gain of
+        actions, as the last map if actions have several entries; each outcome with its
+        prediction; and the expected and realized information gain of each trial, in
+        another color under a watch or an alarm.
 
         Args:
             theta_true: The truth where it is known, shape (theta_dim,).

@@ -1,8 +1,8 @@
 """The command line ``sbi-active``.
 
-Here live the commands with their options, and one module for those alike, which takes
-options, calls the library and prints. Nothing that a user of Python might want lives
-here.
+This package contains the commands with their options, and one module for each kind of
+them, which takes options, calls the library and prints. It contains nothing that a user
+of Python might need.
 """
 
 from __future__ import annotations

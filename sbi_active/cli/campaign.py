@@ -159,16 +159,16 @@ def open_campaign(
     """Return the campaign of a folder.
 
     Args:
-        folder: Of the campaign.
+        folder: Folder of the campaign.
         simulates: Whether its simulator is needed; else nothing of the folder is
             imported without --trust.
-        simulator: Where that is; None where the folder says.
+        simulator: Place of the simulator; None if the folder says it.
         trust: Whether to import what the folder names.
-        simulator_changed: Take another simulator than before.
-        repair: Give up what is damaged.
+        simulator_changed: Whether to take another simulator than before.
+        repair: Whether to give up what is damaged.
 
     Raises:
-        ValueError: If there is no campaign, or nobody knows where its simulator is, or
+        ValueError: If there is no campaign, or its simulator is not known, or
             only the folder says so.
     """
     declared = Declared(folder, trusts=trust)
@@ -215,8 +215,8 @@ def library_of(campaign: Campaign, own: Sequence[Effect] = ()) -> list[Effect]:
     """Return the effects to compare, once each.
 
     Args:
-        campaign: Whose own follow, and then those that are usual.
-        own: They come first.
+        campaign: Campaign whose own effects follow, and then the usual ones.
+        own: Effects that come first.
     """
     taken = {effect.name for effect in own}
     known = [effect for effect in campaign.effects if effect.name not in taken]

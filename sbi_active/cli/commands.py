@@ -1,7 +1,7 @@
 """The commands of ``sbi-active`` and their options, each option declared once.
 
-Nothing here imports torch, so that help, the version and a slip of the pen are answered
-at once. A command's module is imported when the command is called.
+Nothing here imports torch, so that help, the version and typing errors are answered at
+once. A command's module is imported when the command is called.
 """
 
 from __future__ import annotations
@@ -210,10 +210,10 @@ def _add(
     """Add a command; one without a place is on a campaign, and answers programs too.
 
     Args:
-        name: What is written.
-        help: What it does.
-        *params: Its arguments and options.
-        place: Of its function, as ``module.name``.
+        name: Name of the command.
+        help: Text that says what it does.
+        *params: Arguments and options of the command.
+        place: Place of its function, as ``module.name``.
         to: The commands that it belongs to.
     """
     call = partial(_call, place) if place else partial(_call_on_campaign, name)

@@ -195,7 +195,7 @@ def _with_times(model: SimulatorModel, trials: Trials, path: Path) -> SimulatorM
 
 
 def _require_units(actions: ActionSpace, trials: Trials, path: Path) -> None:
-    """Raise where the file states another unit of the action than the simulator."""
+    """Raise if the file states another unit of the action than the simulator."""
     for unit, label in zip(actions.units, trials.action_labels or (), strict=False):
         given = label.partition(" [")[2].removesuffix("]")
         if unit and given and unit != given:

@@ -1,8 +1,8 @@
-"""Where a campaign's programs are, as its folder says, and who may believe it.
+"""The programs that a campaign's folder names, and whether to trust it.
 
-A folder may have come from anybody. What its ``command.json`` names is imported where
-this account wrote that file, or was told once by ``--trust`` to follow it; both are
-remembered outside of the folder. Nothing here imports torch.
+A folder may come from an untrusted source. Programs that its ``command.json`` names are
+imported if this account wrote that file, or was told once by ``--trust`` to follow it;
+both are remembered outside of the folder. Nothing here imports torch.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def declare(
     effects: str | None,
     **_: Any,
 ) -> dict[str, Any]:
-    """Return where everything is that a program wrote, as other commands need it."""
+    """Return the places of all that a program wrote, as other commands need them."""
     if simulator is None:
         raise ValueError(
             "expected --simulator; got none; name it, as in --simulator my_robot.py:fn"
@@ -62,17 +62,17 @@ def declare(
 
 
 def declared_of_task(name: str, options: Sequence[str]) -> dict[str, Any]:
-    """Return the same for a campaign on a task.
+    """Return the declaration of a campaign on a task.
 
     Args:
-        name: Of the task.
-        options: Of the task, each NAME=VALUE.
+        name: Name of the task.
+        options: Options of the task, each NAME=VALUE.
     """
     return {"task": name, "options": [*options], "noise": None, "folder": os.getcwd()}
 
 
 def read_declared(folder: Path) -> dict[str, Any]:
-    """Return what a campaign's folder says; nothing for a campaign of a program.
+    """Return the declaration in a campaign's folder; empty for a campaign of a program.
 
     Raises:
         ValueError: If the file does not hold what the command line writes.
@@ -105,16 +105,16 @@ def write_declared(folder: Path, declared: Mapping[str, Any]) -> None:
 
 
 class Declared:
-    """What the folder of a campaign names, where that may be imported.
+    """Programs that the folder of a campaign names, where they may be imported.
 
     Args:
-        folder: Of the campaign.
+        folder: Folder of the campaign.
         trusts: Whether the command line says to import it, whoever wrote it.
 
     Attributes:
-        task: Its name, for a campaign on a task.
-        noise: As --noise had it.
-        place: Where names of files begin.
+        task: Name of the task, for a campaign on a task.
+        noise: Noise as --noise had it.
+        place: Folder where names of files begin.
     """
 
     def __init__(self, folder: Path, *, trusts: bool) -> None:
@@ -124,7 +124,7 @@ class Declared:
         self.task, self.noise, self.place = texts
 
     def names(self, what: str) -> list[str]:
-        """Return what the folder names under a key, each MODULE:NAME.
+        """Return the names under a key of the folder, each MODULE:NAME.
 
         Raises:
             ValueError: If it names something that may be anybody's program.
@@ -139,10 +139,10 @@ class Declared:
 
     @property
     def options(self) -> list[str]:
-        """Those of the task, of which some name files.
+        """Return the options of the task, of which some name files.
 
         Raises:
-            ValueError: As :meth:`names` raises.
+            ValueError: If one names something that may be anybody's program.
         """
         options = self._content["options"]
         if options:
@@ -150,7 +150,7 @@ class Declared:
         return options
 
     def _require_trust(self, what: str, place: Path | None) -> None:
-        """Raise where nobody here said that what comes from a place may be executed.
+        """Raise if nobody here said that what comes from a place may be executed.
 
         None is this library. A relative place, or one within the folder, holds whatever
         somebody put there.

@@ -1,4 +1,4 @@
-"""What options name: objects, simulators, priors, spaces of actions, tasks, effects."""
+"""Objects that options name: simulators, priors, action spaces, tasks, effects."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def load_object(name: str, folder: str | None = None) -> Any:
 
     Args:
         name: ``module:attribute``, or ``path/file.py:attribute``.
-        folder: Where paths begin and modules are looked for first; None is the current
-            one, in which no modules are looked for where it is a campaign's.
+        folder: Folder where paths begin and modules are looked for first; None is the
+            current one, in which no modules are looked for where it is a campaign's.
 
     Raises:
         ValueError: If there is no such module or attribute, or it cannot be imported.
@@ -86,8 +86,8 @@ def make_task(name: str, options: Sequence[str]) -> Task:
     """Return a task with the options of a command line.
 
     Args:
-        name: One of ``TASKS``.
-        options: Each ``NAME=VALUE``.
+        name: Name among ``TASKS``.
+        options: Options, each ``NAME=VALUE``.
 
     Raises:
         ValueError: If an option has no value, the task has none of that name, or what
@@ -125,13 +125,13 @@ def _parse(option: str) -> tuple[str, Any]:
 
 
 class Problem(NamedTuple):
-    """What options declare.
+    """The problem that options declare.
 
     Attributes:
-        simulator: With its noise.
-        prior: Over its parameters.
-        actions: Permitted ones; None where none were needed.
-        effects: What a task's simulator may lack.
+        simulator: Simulator with its noise.
+        prior: Prior of its parameters.
+        actions: Permitted actions; None if none were needed.
+        effects: Effects that a task's simulator may lack.
     """
 
     simulator: Any
@@ -155,14 +155,14 @@ def problem_of(
     """Return the simulator, prior and actions that options of these names give.
 
     Args:
-        simulator: MODULE:NAME; None for a task's.
+        simulator: Simulator as MODULE:NAME; None for a task's.
         task: Name of a task, which has all but other actions and noise.
-        option: Of the task, each NAME=VALUE.
-        prior: MODULE:NAME.
-        theta_low: Bounds in its place.
-        theta_high: Bounds in its place.
-        actions: As :func:`actions_of` takes them.
-        noise: As :func:`with_noise` takes it.
+        option: Options of the task, each NAME=VALUE.
+        prior: Prior as MODULE:NAME.
+        theta_low: Lower bounds of a uniform prior in its place.
+        theta_high: Upper bounds of a uniform prior in its place.
+        actions: Actions, as :func:`actions_of` takes them.
+        noise: Noise, as :func:`with_noise` takes it.
         needs_actions: Whether nothing can be done without them.
 
     Raises:
@@ -193,9 +193,9 @@ def simulator_of(name: str, noise: str | None, folder: str | None = None) -> Any
     """Return a simulator with the noise of --noise.
 
     Args:
-        name: As :func:`load_object` takes it.
-        noise: As written; None for the simulator's own.
-        folder: As there.
+        name: Name of the simulator, as :func:`load_object` takes it.
+        noise: Noise as written; None for the simulator's own.
+        folder: Folder where paths begin, see :func:`load_object`.
 
     Raises:
         ValueError: If it is not there, or no function.
@@ -311,8 +311,9 @@ def effects_of(names: Iterable[str | None], folder: str | None = None) -> list[E
     """Return effects, each name that of a list or of a function that returns one.
 
     Args:
-        names: As :func:`load_object` takes them; None is left out.
-        folder: As there.
+        names: Names of the effects, as :func:`load_object` takes them; None is left
+            out.
+        folder: Folder where paths begin, see :func:`load_object`.
 
     Raises:
         ValueError: If there are none under a name.
@@ -339,10 +340,10 @@ def with_generic(
     """Return effects and the generic ones of other names.
 
     Args:
-        own: Declared ones.
-        simulator: As it was before any was adopted.
+        own: Effects that are declared.
+        simulator: Simulator as it was before any effect was adopted.
         space: Actions, or trials with inputs.
-        prior: Of the simulator's parameters.
+        prior: Prior of the simulator's parameters.
     """
     if not isinstance(simulator, SimulatorModel):
         simulator = SimulatorModel(simulator)

@@ -1,4 +1,4 @@
-"""How words become values: numbers, options of several words, files of options."""
+"""Values from words: numbers, options of several words, files of options."""
 
 from __future__ import annotations
 
@@ -116,9 +116,9 @@ def as_written(
     """Return plain data as the command line writes it, by the names of parameters.
 
     Args:
-        params: That may be set.
-        values: From TOML or JSON; names with dashes or without.
-        place: Where they stand, for the error.
+        params: Parameters that may be set.
+        values: Values from TOML or JSON; names with dashes or without.
+        place: Place where they stand, for the error.
 
     Raises:
         ValueError: If a name is none of a parameter.
@@ -166,7 +166,7 @@ def number_of(cell: str, place: str = "", *, is_outcome: bool = False) -> float:
 
     Args:
         cell: The number; nan in an outcome.
-        place: Where it stands, for the error.
+        place: Place where it stands, for the error.
         is_outcome: Whether it may be one that was not measured.
 
     Raises:

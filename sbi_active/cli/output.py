@@ -1,4 +1,4 @@
-"""What a command prints, and where: answers, notes, errors."""
+"""Output of a command: answers, notes, errors."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ TRACEBACK = re.compile(
 
 
 class Answer(NamedTuple):
-    """What a command found.
+    """The answer of a command.
 
     Attributes:
-        data: For programs; numbers that are not finite become null.
-        text: For people.
+        data: Data for programs; numbers that are not finite become null.
+        text: Text for people.
     """
 
     data: dict[str, Any]

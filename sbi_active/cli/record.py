@@ -39,8 +39,8 @@ def sum_up(folder: Path, known: Mapping[str, Any]) -> None:
     """Leave a summary for the commands to come; call it while nobody else writes.
 
     Args:
-        folder: Of the campaign.
-        known: What :class:`Record` needs.
+        folder: Folder of the campaign.
+        known: Facts that :class:`Record` needs.
     """
     with _stored(folder) as store:
         content = {**known, "of": _mark(store, store.length(EVENTS, LOG))}
@@ -52,10 +52,10 @@ def sum_up(folder: Path, known: Mapping[str, Any]) -> None:
 
 
 def digest(folder: Path) -> str:
-    """Return what changes whenever anybody writes to a campaign.
+    """Return a text that changes whenever anybody writes to a campaign.
 
     Args:
-        folder: Of the campaign.
+        folder: Folder of the campaign.
     """
     with contextlib.suppress(OSError, ValueError, Unsure), _stored(folder) as store:
         return str(_mark(store, store.length(EVENTS, LOG)))
@@ -63,7 +63,7 @@ def digest(folder: Path) -> str:
 
 
 def _mark(store: Store, num: int) -> list[Any]:
-    """Return how long the log is, and a checksum of its end and of the state."""
+    """Return the length of the log, and a checksum of its end and of the state."""
     last = store.get(EVENTS, LOG, num) if num else None
     content = (last or b"") + (store.get(OBJECTS, STATE) or b"")
     return [num, hashlib.sha256(content).hexdigest()]
@@ -78,15 +78,15 @@ def _stored(folder: Path) -> Iterator[Store]:
 
 
 class Record:
-    """What is known of a campaign without computing: a part of its interface.
+    """A campaign's record, known without computing: a part of its interface.
 
     Args:
-        folder: Of the campaign.
+        folder: Folder of the campaign.
 
     Attributes:
-        directory: As given.
-        x_shape: Of an outcome.
-        state: Has the trials.
+        directory: Folder of the campaign.
+        x_shape: Shape of an outcome.
+        state: State of the campaign, with its trials.
 
     Raises:
         Unsure: If there is no summary, or more was done since than told.
@@ -119,7 +119,7 @@ class Record:
 
     @property
     def status(self) -> dict[str, Any]:
-        """What the command of this name answers.
+        """Answer of the command of this name.
 
         Raises:
             Unsure: If a trial that the belief has used is another one now.

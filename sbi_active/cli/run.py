@@ -33,7 +33,7 @@ from sbi_active.simulation import simulate
 from sbi_active.tasks import Task  # pyright: ignore
 
 SETTINGS = {"default": lambda _: CampaignOptions(), "faithful": faithful_options}
-#: Of the table: what is written for a round, and how.
+#: Columns of the table: what is written for a round, and how.
 COLUMNS = {
     "round": ("round", "{}"),
     "action": ("action", "{}"),

@@ -31,7 +31,7 @@ class Session:
     """Calls commands on one campaign, which is loaded again only where it has to be.
 
     Args:
-        folder: Of the campaign.
+        folder: Folder of the campaign.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -61,11 +61,11 @@ class Session:
         """Return the answer of a command.
 
         Args:
-            name: Of the command.
+            name: Name of the command.
             trust: Whether to import what the folder names.
-            simulator: Where that is; None where the folder says.
-            simulator_changed: Take another simulator than before.
-            **options: Of the command.
+            simulator: Place of the simulator; None if the folder says it.
+            simulator_changed: Whether to take another simulator than before.
+            **options: Options of the command.
         """
         wants = {"trust": trust, "simulator": simulator, "files": digest(self.folder)}
         exports = name == "export" and (trust or simulator is not None)

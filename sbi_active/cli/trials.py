@@ -1,4 +1,4 @@
-"""What is asked and told of trials, as text and as JSON, without importing torch."""
+"""Trials that are asked for and told, as text and as JSON, without importing torch."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """``sbi-active watch DIR``: a campaign in a browser, while another process runs it.
 
 The page is made of the folder alone, which is only read; nothing that it names is
-imported. Who asks from elsewhere than this machine, or for anything else, gets nothing.
+imported. Requests from other machines, or for anything else, are refused.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Watched:
     """The page of a campaign, drawn again where the folder's store has changed.
 
     Args:
-        folder: Of the campaign.
+        folder: Folder of the campaign.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -53,7 +53,7 @@ class Watched:
 
     @property
     def version(self) -> str:
-        """What changes when the store does, or somebody begins or ends to write."""
+        """Text that changes with the store and with whoever begins or ends to write."""
         with contextlib.suppress(ValueError, OSError):  # of a lock that is none
             return f"{digest(self._folder)}-{is_locked(self._folder):d}"
         return "unknown"
@@ -99,8 +99,8 @@ def served(watched: Watched, port: int) -> ThreadingHTTPServer:
     """Return a server of a page, for this machine alone.
 
     Args:
-        watched: Has the page.
-        port: Where it listens; 0 is any that is free.
+        watched: Object that has the page.
+        port: Port where it listens; 0 is any that is free.
 
     Raises:
         ValueError: If another program listens there, or only others may.

@@ -2,6 +2,6 @@
 
 Outcomes may pin down some directions of the parameters and leave others open
 (Gutenkunst et al., PLoS Comput. Biol. 2007; Transtrum et al., J. Chem. Phys. 2015).
-Here such directions become short formulas. What they are found from, a belief's draws
-or a simulator's derivatives, does not live here.
+This package turns such directions into short formulas. Their sources, a belief's draws
+or a simulator's derivatives, are elsewhere.
 """

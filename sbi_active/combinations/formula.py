@@ -20,10 +20,10 @@ class Term:
     """One parameter in a combination: weight times theta, or log(theta + shift).
 
     Attributes:
-        index: Of the parameter.
-        weight: Of the term, or exponent of the factor.
+        index: Index of the parameter.
+        weight: Weight of the term, or exponent of the factor.
         log: Whether it is a factor of a product.
-        shift: Added to the parameter before the logarithm.
+        shift: Shift that is added to the parameter before the logarithm.
     """
 
     index: int
@@ -47,19 +47,19 @@ class Combination:
     """A sum of terms; with a logarithm among them, the product that it stands for.
 
     Attributes:
-        terms: One a parameter.
+        terms: Terms, one a parameter.
     """
 
     terms: tuple[Term, ...]
 
     @property
     def index(self) -> tuple[int, ...]:
-        """Its parameters."""
+        """Indices of its parameters."""
         return tuple(term.index for term in self.terms)
 
     @property
     def weight(self) -> Array:
-        """Of the terms."""
+        """Weights of the terms."""
         return np.array([term.weight for term in self.terms])
 
     @property
@@ -72,7 +72,7 @@ class Combination:
         return sum(t.weight * t.coordinate(theta) for t in self.terms)  # pyright: ignore
 
     def value(self, theta: Array) -> Array:
-        """Return what the formula says, (n, d) -> (n,)."""
+        """Return the value of the formula, (n, d) -> (n,)."""
         sums = self.coordinate(theta)
         return np.exp(sums) if self.is_product else sums
 

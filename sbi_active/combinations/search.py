@@ -19,7 +19,7 @@ Array = NDArray[Any]
 #: than each of its parameters: a tenth, so that three decimals of sampling error or a
 #: strong correlation (.99) are not taken for it.
 KNOWN = 0.1
-#: The same of formulas of different kinds, each of which was rounded before.
+#: Factor of the smallest width within which formulas of different kinds are as good.
 ABOUT_AS_GOOD = 1.3
 #: Width of the best pair from which a shift, as in a * (b + 0.5), is looked for.
 WORTH_A_SHIFT = 0.5
@@ -43,14 +43,15 @@ def search(
 ) -> list[tuple[Combination, float]]:
     r"""Return combinations that are known though their parameters are not.
 
-    Of all sums :math:`g = \sum_i w_i t_i(\theta_i)`, t the identity or a logarithm, the
-    one with the smallest :math:`\sqrt{w^T C w / w^T S w}`, C the covariance and S that
-    of the prior, is the last eigenvector of a generalized eigenproblem. Pairs come
-    first, then triples, then all parameters at once, each independent of those before.
-    Of the formulas that are about as narrow as the best the simplest is taken.
+    Combinations are sums :math:`g = \sum_i w_i t_i(\theta_i)`, t the identity or a
+    logarithm. The one with the smallest :math:`\sqrt{w^T C w / w^T S w}`, C the
+    covariance and S that of the prior, is the last eigenvector of a generalized
+    eigenproblem. Pairs come first, then triples, then all parameters at once, each
+    independent of those before. Of the formulas that are about as narrow as the best
+    the simplest is taken.
 
     Args:
-        moments: Of any terms.
+        moments: Function that returns the covariance C and the prior's S of any terms.
         open_parameters: Indices of those that are not known by themselves.
         low: Smallest value of each parameter under the prior, shape (d,).
         span: Range of each under the prior, shape (d,).
@@ -59,7 +60,7 @@ def search(
             all of twelve parameters. Each takes some 50 ms.
 
     Returns:
-        Each with its width; empty where there are none.
+        Each with its width; empty if there are none.
     """
     found: list[tuple[Combination, float]] = []
     rows: list[Array] = []  # directions that are known, in prior deviations

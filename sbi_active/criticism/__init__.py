@@ -1,7 +1,7 @@
 """The closed loop: find the residual, trace it to an effect, add it, report.
 
-Here lives what a user calls and declares; the parts of it live in the packages below.
-No campaign is known here.
+This package contains what a user calls and declares; its parts are in the packages
+below. It does not depend on campaigns.
 """
 
 from sbi_active.criticism.criticism import Criticism

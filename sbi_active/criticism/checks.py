@@ -1,4 +1,4 @@
-"""What must hold before models are compared with trials."""
+"""Checks before models are compared with trials."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def require_fitting(
     effects: Sequence[Effect],
     actions: ActionSpace | None,
 ) -> None:
-    """Raise where the parts of a loop do not fit together."""
+    """Raise if the parts of a loop do not fit together."""
     if Enumeration.of(prior) is not None:
         raise ValueError(
             "expected a prior of continuous parameters; got one with parameters of a "
@@ -135,7 +135,7 @@ def require_fitting(
 
 
 def _require_no_labels_changed(trials: Trials, effects: Sequence[Effect]) -> None:
-    """Raise where an effect would change an action that is only a trial's number."""
+    """Raise if an effect would change an action that is only a trial's number."""
     for effect in effects:
         if effect.hook == "action" and trials.action_is_label:
             raise ValueError(

@@ -1,4 +1,4 @@
-"""What speaks against a verdict, or would: trials, bounds of the prior, actions."""
+"""Evidence against a verdict, or its tests: trials, bounds of the prior, actions."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ class MissedTrial:
 
     Attributes:
         position: Place among the held-out trials.
-        name: What the trial is called.
-        size: Root mean square error; inf where the model is sure of no measurement.
-        unit: Of ``size``: sensor deviations, or the simulator's where it is the draw.
+        name: Name of the trial in reports.
+        size: Root mean square error; inf if the model is sure of no measurement.
+        unit: Unit of ``size``: sensor deviations, or the simulator's where it is the
+            draw.
         p_value: Probability of an error as large, if the model holds.
         by_both: Whether it is as far outside what the bare model predicts.
     """
@@ -37,9 +38,9 @@ class OutlyingTrial:
 
     Attributes:
         position: Place among the fitted trials.
-        name: What the trial is called.
-        times: Its error on the fit to the others, in medians of theirs.
-        size: The same, root mean square in sensor deviations.
+        name: Name of the trial in reports.
+        times: Error on the fit to the others, in medians of theirs.
+        size: Root mean square of that error, in sensor deviations.
     """
 
     position: int
@@ -53,10 +54,10 @@ class BoundParameter:
     """A parameter that the trials press against a bound of its prior.
 
     Attributes:
-        name: What the parameter is called.
-        model: In which model: "none", or effects joined by " + ".
+        name: Name of the parameter.
+        model: Model in which it is: "none", or effects joined by " + ".
         side: "lower" or "upper".
-        bound: Where the prior ends.
+        bound: Value at which the prior ends.
         beyond: Best fit with the bound moved; NaN where the simulator gives nothing
             beyond it.
     """
@@ -73,7 +74,7 @@ class Bounds:
     """Parameters at bounds of the prior, and whether they make up for effects.
 
     Attributes:
-        parameters: Those of the bare model, then of the model of the verdict.
+        parameters: Parameters of the bare model, then of the model of the verdict.
         p_value: Tail probability of the chi-square of the bare model with its bounds
             moved; NaN where none of its parameters is at one.
         replaces: Effects that the verdict named, and that the bare model does without
@@ -90,11 +91,11 @@ class SevereTest:
     """An action at which a verdict that names effects would be put to the test.
 
     Attributes:
-        action: Shape (action_dim,).
+        action: Action, shape (action_dim,).
         is_permitted: Whether it is among the permitted actions.
-        difference: Between the verdict's prediction and that of a free residual, root
-            mean square over the numbers of x, in standard deviations of the verdict's
-            prediction, noise included.
+        difference: Difference between the verdict's prediction and that of a free
+            residual, root mean square over the numbers of x, in standard deviations of
+            the verdict's prediction, noise included.
     """
 
     action: Array

@@ -74,18 +74,18 @@ class Criticism:
         prior: Prior of its parameters.
         trials: Measured trials.
         effects: Effects that the simulator may lack. Those of the order of the trials
-            are left out where the order is unknown.
+            are left out if the order is unknown.
         actions: Permitted actions; None takes those of the trials.
-        summaries: Compare at most this many summaries of x in place of all its numbers,
-            0 for none; None takes 20 where a trial has more than 500 numbers without a
-            time axis, with independent noise.
+        summaries: Number of summaries of x to compare instead of all its numbers, at
+            most; 0 for none. None takes 20 if a trial has more than 500 numbers without
+            a time axis, with independent noise.
         warm_up: Time from its first sample, in the unit of the sample times, in which a
             held-out or left-out trial tells of its nuisances (effects of scope
             "trial"), and is not scored; 0 draws them from their priors.
-        thin: Leave out samples of trajectories that say again what others say, as the
-            bare model's fit shows, where the sensor's error is declared by
-            ``measurement_sd``.
-        rule: Thresholds of what helps and what is named where every model misses.
+        thin: Whether to thin trajectories to a rate at which innovations of the bare
+            model's fit are uncorrelated, if ``measurement_sd`` declares the sensor's
+            error.
+        rule: Rule of what helps and what is named if every model misses.
         seed: Seed of all draws.
         show_progress: Whether to draw a progress bar.
 
@@ -139,7 +139,7 @@ class Criticism:
         if actions is not None:
             actions = with_known_inputs(model, trials.fit, actions)
         self.actions = actions
-        #: Sampling of the trajectories; None where nobody looked.
+        #: Sampling of the trajectories; None if not looked for.
         self.sampling: Sampling | None = None
         if thin:
             with stage("rate of sampling", show_progress=show_progress):
@@ -151,7 +151,7 @@ class Criticism:
         if summaries is None:
             many = trials.x[0].numel() > MANY and not obstacle(*self._parts)
             summaries = MOST if many else 0
-        #: Of x, that are compared in its place; 0 for all of its numbers.
+        #: Number of summaries that are compared in place of x; 0 for all its numbers.
         self.num_summaries = summaries
         if summaries:
             short = summarize(
@@ -191,7 +191,7 @@ class Criticism:
     def misfit(self) -> Misfit | None:
         """Return the models where none explains the trials to the sensor's error.
 
-        None where one does, or where the size of that error is not declared, x has no
+        None if one does, or where the size of that error is not declared, x has no
         time axis, or the simulator is random or jumps.
         """
         if not self._is_searched:
@@ -245,7 +245,7 @@ class Criticism:
         return self._detection
 
     def trace(self) -> Tracing:
-        """Return which effect the data point to."""
+        """Return the tracing: the effect that the data point to."""
         misfit = self.misfit()
         if self._tracing is not None:
             return self._tracing
@@ -299,7 +299,7 @@ class Criticism:
         """Return the action whose outcome tells most about which rival is right.
 
         Args:
-            actions: None takes those of the constructor.
+            actions: Permitted actions; None takes those of the constructor.
             beyond: Whether to name one that is not permitted where rivals are
                 separated by no other.
         """
@@ -334,20 +334,20 @@ class Criticism:
         )
 
     def judged(self, evaluation: Evaluation | None) -> Tracing:
-        """Return what was traced, unless trials that had no part in it speak against.
+        """Return the tracing, unless trials that had no part in it speak against it.
 
-        Effects with which these are predicted worse are withdrawn, and forces of the
+        Effects that predict these trials worse are withdrawn, and forces of the
         dictionary that leave more than the sensor's error are called stand-ins.
 
         Args:
-            evaluation: The error before and after; None where nobody asked.
+            evaluation: The error before and after; None if not requested.
         """
         return judged(self.rivals, self.trace(), evaluation)
 
     def _fitting(
         self, what: str, total: int | None = None
     ) -> AbstractContextManager[None]:
-        """Tell of a block that fits models, and of how many."""
+        """Show progress of a block that fits models."""
         fits, before = self.rivals.fits, len(self.rivals.fits)
         return stage(
             what,
@@ -379,14 +379,14 @@ class Criticism:
         """Return the report of all steps.
 
         Args:
-            evaluate: Without held-out trials the error costs one verdict a trial; False
-                leaves it out.
-            plan: Name the next action, and those that would test the verdict most,
+            evaluate: Whether to report the error before and after. Without held-out
+                trials it costs one verdict a trial.
+            plan: Whether to name the next action and the severest tests of the verdict,
                 which takes about as long as the verdict.
-            designed: The trials' actions were chosen for their information, of which
-                the report then warns.
-            exploratory: Library or priors were changed after the data were seen, of
-                which it warns too.
+            designed: Whether the trials' actions were chosen for their information; the
+                report then warns of it.
+            exploratory: Whether library or priors were changed after the data were
+                seen; the report then warns of it.
         """
         from sbi_active.criticism.reporting import report_of
 

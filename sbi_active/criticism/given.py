@@ -1,4 +1,4 @@
-"""What a comparison was made given, in sentences."""
+"""The conditions of a comparison, in sentences."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ def made_given(
     nuisances: Sequence[str],
     warm_up: float,
 ) -> Iterator[str]:
-    """Yield what was not looked at, and why, a sentence each.
+    """Yield the limits of a comparison and their reasons, a sentence each.
 
     Args:
-        trials: That were compared.
-        num_summaries: That stand for x; 0 for none.
-        sampling: What was found of it; None where nobody looked.
+        trials: Trials that were compared.
+        num_summaries: Number of summaries that stand for x; 0 for none.
+        sampling: Sampling that was found; None if not looked for.
         left_out: Names of effects of an order that is unknown.
-        screening: What linear evidence set aside; None where all were fitted.
-        nuisances: Names of those that each trial has anew.
-        warm_up: In which trials that were not fitted tell of theirs.
+        screening: Screening by linear evidence; None if all were fitted.
+        nuisances: Names of the effects that each trial has anew.
+        warm_up: Time in which trials that were not fitted tell of theirs.
     """
     if num_summaries:
         yield (

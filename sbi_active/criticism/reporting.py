@@ -72,9 +72,9 @@ def report_of(
         loop: The steps.
         evaluation: Error before and after; None leaves it out.
         held_out: Trials that had no part in them.
-        plan: As in :meth:`.Criticism.report`.
-        designed: The same.
-        exploratory: The same.
+        plan: Whether to plan the next action, as in :meth:`.Criticism.report`.
+        designed: Whether actions were chosen for their information.
+        exploratory: Whether what was frozen was changed after the data were seen.
     """
     tracing = loop.judged(evaluation)
     is_withdrawn = tracing.refuted is not None or bool(tracing.bounds.replaces)
@@ -119,7 +119,7 @@ def report_of(
 
 
 def _outlying(loop: Steps, tracing: Tracing) -> list[str]:
-    """Return which fitted trials err far more than the others, a sentence each."""
+    """Return the fitted trials that err far more than the others, a sentence each."""
     misfit = tracing.misfit
     trials = loop.rivals.trials
     if misfit is None or misfit.left_out != "trials":

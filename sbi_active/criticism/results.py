@@ -1,4 +1,4 @@
-"""What each step of the closed loop finds, as plain data."""
+"""Results of each step of the closed loop, as plain data."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ CATCH_ALLS = (UNEXPLAINED, SCATTER, OUTLIER)
 
 @dataclass(frozen=True)
 class ModelKey:
-    """Which model of the trials, as ``rivals.fit(key)`` takes it.
+    """Key of a model of the trials, as ``rivals.fit(key)`` takes it.
 
-    ``str(key)`` is what reports and results call it.
+    ``str(key)`` is its name in reports and results.
 
     Attributes:
-        effects: Their names, in the order of the library.
+        effects: Names of the effects, in the order of the library.
         error: A catch-all; None for the noise alone.
 
     Example:
@@ -48,7 +48,7 @@ class ModelKey:
         return cls(() if name == NONE else (name,))
 
     def without(self, name: str) -> ModelKey:
-        """Return the same without one effect."""
+        """Return the key without one effect."""
         return ModelKey(tuple(n for n in self.effects if n != name), self.error)
 
     @property
@@ -66,25 +66,25 @@ class Residuals:
     r"""Standardized residuals, :math:`(x - \mu) / s` under a posterior predictive.
 
     Attributes:
-        action: Shape (t, action_dim).
+        action: Actions, shape (t, action_dim).
         index: Place of each trial, shape (t,).
         times: Sample times, shape (k,) or (t, k); None without a time axis.
         x: Observations, shape (t, *x_shape), NaN where masked.
         mean: Posterior predictive mean of the model refitted to all trials, shape of x.
-        sd: Its standard deviation, noise included, shape of x.
+        sd: Predictive standard deviation, noise included, shape of x.
         refitted: (x - mean) / sd, shape of x.
-        prequential: The same with trial t predicted from the trials before it, the
-            first from the prior, shape of x.
-        correlation: Of neighboring noise errors along the time axis, posterior mean; 0
-            without a time axis.
+        prequential: Residuals of trial t predicted from the trials before it, the first
+            from the prior, shape of x.
+        correlation: Correlation of neighboring noise errors along the time axis,
+            posterior mean; 0 without a time axis.
         noise: "declared", "estimated" (from repeats or the trajectories themselves), or
             "stochastic" (the simulator is the draw).
-        probability_valid: That each trial has a measurement, shape (t,); None where it
-            was not computed.
+        probability_valid: Probability that each trial has a measurement, shape (t,);
+            None if it was not computed.
         roughness: Deviation of the simulator, which jumps, from any smooth function of
-            its parameters, shape of x; it counts as noise here. None where it is
+            its parameters, shape of x; it counts as noise here. None if it is
             smooth.
-        names: What each trial is called; empty for positions from 0.
+        names: Names of the trials; empty for positions from 0.
     """
 
     action: Array
@@ -107,17 +107,17 @@ class Evidence:
     r"""Marginal likelihood of one model, :math:`\log Z = \log \int p(x|z) p(z) dz`.
 
     Attributes:
-        key: Of the model.
+        key: Key of the model.
         log_evidence: log Z, nats.
-        standard_error: Of log Z, Monte Carlo, nats.
+        standard_error: Standard error of log Z, Monte Carlo, nats.
         effective_sample_size: Number of draws that count.
-        engine: What gave the evidence: "importance" sampling around least squares,
-            "smc" (sequential Monte Carlo), or of a model far behind "laplace" or
-            "linear".
+        engine: Method that gave the evidence: "importance" sampling around least
+            squares, "smc" (sequential Monte Carlo), or of a model far behind "laplace"
+            or "linear".
         num_simulations: Trials simulated.
-        names: Of the coordinates (theta, phi).
+        names: Names of the coordinates (theta, phi).
         draws: Posterior draws of (theta, phi), shape (m, dim).
-        narrow: Likewise by this model alone, where ``draws`` were widened; or None.
+        narrow: Draws by this model alone, where ``draws`` were widened; or None.
         best_chi_square: Smallest whitened residual sum of squares among the draws.
         best: Theta and phi, (dim,), that predict other trials; None for the draws.
     """
@@ -136,7 +136,7 @@ class Evidence:
 
     @property
     def name(self) -> str:
-        """What reports call the model."""
+        """Name of the model in reports."""
         return str(self.key)
 
 
@@ -145,18 +145,19 @@ class Detection:
     r"""Whether the bare model, refitted, still misses the data.
 
     Attributes:
-        log_bayes_factor: Of the mixture of effects and catch-alls
+        log_bayes_factor: Log Bayes factor of the mixture of effects and catch-alls
             against the bare model, nats.
-        standard_error: Monte Carlo, nats.
+        standard_error: Monte Carlo standard error, nats.
         lower: log_bayes_factor minus twice its standard error.
         threshold: log 20.
         chi_square: Smallest whitened residual sum of squares of the bare model.
         degrees_of_freedom: Measurements less the parameters that they determine.
-        p_value: Of that chi-square; anti-conservative where noise is estimated.
-        level: Below which it is an alarm; 0 where something is unknown of the noise.
-        null_log_evidence: By least squares, nats.
-        null_cross_check: The same from other starts; None where no alarm was near or
-            these ended in the same place.
+        p_value: p-value of that chi-square; anti-conservative where noise is estimated.
+        level: Level below which it is an alarm; 0 where something is unknown of the
+            noise.
+        null_log_evidence: Log evidence by least squares, nats.
+        null_cross_check: Log evidence from other starts; None if no alarm was near
+            or these ended in the same place.
         least_chi_square: The smallest of any parameters that were tried; NaN where the
             size of the noise is not declared.
         lower_p_value: Probability of one as small, all parameters taken as determined;
@@ -197,7 +198,7 @@ class Detection:
         Degrees of freedom are those of the bare model, a few too many.
 
         Args:
-            evidence: Of the model.
+            evidence: Evidence of the model.
             level: Tail probability below which there is none.
         """
         left = chi2.sf(evidence.best_chi_square, self.degrees_of_freedom)
@@ -209,16 +210,17 @@ class Estimate:
     """One effect as the data leave it.
 
     Attributes:
-        name: Of the effect.
-        family: Of the effect.
-        units: Of phi.
-        describe: Its sentence, or "".
-        probability: Of the effect being the one that is missing, alone or with others.
-        log_bayes_factor: Of the effect alone against the bare model, nats.
-        mean: Of phi given the effect alone, shape (phi_dim,).
-        sd: Of phi given the effect alone, shape (phi_dim,).
-        effective_sample_size: Of its evidence.
-        engine: Of its evidence.
+        name: Name of the effect.
+        family: Family of the effect.
+        units: Units of phi.
+        describe: Sentence of the effect, or "".
+        probability: Probability that the simulator lacks the effect, alone or with
+            others.
+        log_bayes_factor: Log Bayes factor of the effect alone against the bare model.
+        mean: Mean of phi given the effect alone, shape (phi_dim,).
+        sd: Standard deviation of phi given the effect alone, shape (phi_dim,).
+        effective_sample_size: Effective number of draws behind its evidence.
+        engine: Engine that gave its evidence.
     """
 
     name: str
@@ -235,7 +237,7 @@ class Estimate:
 
 @dataclass(frozen=True, kw_only=True)
 class Tracing:
-    """Which effect the data point to.
+    """Attribution: the effect that the data point to.
 
     Attributes:
         verdict: "none", "unexplained", "scatter", "outlier", or effects joined by
@@ -249,35 +251,36 @@ class Tracing:
             probable first.
         equivalent: Groups of names that no permitted action separates ("none" for an
             effect that shows nowhere).
-        near: The same for the trials at hand alone; another action may separate them.
+        near: Groups for the trials at hand alone; another action may separate them.
         aliases: After an alarm, pairs of effects that explain the data about as well
             (log evidence within log 20 of the best) with predictions closer than the
             noise over the permitted actions; repeated trials may separate them.
-        estimates: One an effect, most probable first.
-        evidences: Of every model tried, by name, effects with priors of unknown scale.
+        estimates: Estimates, one an effect, most probable first.
+        evidences: Evidence of every model tried, by name. Priors of effects have
+            unknown scale.
         robust: Whether effect priors a third and three times as wide agree.
         guesses: Formula effects, best first: (formula, log evidence above
             "unexplained"), which is empty unless nothing declared explains the data.
         beside: Effects that explain most of what is "unexplained", the residual process
-            taking the rest; empty where it takes all, and for any other verdict.
-        outliers: Probability that each trial is the one, if one has a gross error, by
-            its index, most probable first; empty without an alarm.
+            taking the rest; empty if it takes all, and for any other verdict.
+        outliers: Probability that each trial has a gross error, if one has, by its
+            index, most probable first; empty without an alarm.
         needed: Indices of the trials without any one of which the data do not point to
             the effects that explain them best.
-        instead_of: Effects that the evidence is for and the verdict does not name,
+        instead_of: Effects that the evidence favors and the verdict does not name,
             since a trial that may have a gross error alone speaks for them, or further
             trials speak against them; "" for none.
         refuted: The RMSE of these further trials, or of left-out ones, before and
-            after, which is why; None where it is not.
-        refuted_on: Which trials these are; "" for all that had no part in the verdict.
-        misfit: Why, where every model misses by more than the sensor's error. Effects
-            that help are then ``chosen``, those that are probably the cause are the
-            verdict, and the rest stand in ``beside``.
-        trial_names: What each trial is called, by its index; others by their index.
-        stand_in: Why forces of the dictionary that are chosen only stand in for
-            something that nobody declared, a clause each; empty where they may be it.
+            after, which is why; None if it is not.
+        refuted_on: Name of these trials; "" for all that had no part in the verdict.
+        misfit: Account of the misfit if every model misses by more than the sensor's
+            error. Effects that help are then ``chosen``, those that are probably the
+            cause are the verdict, and the rest stand in ``beside``.
+        trial_names: Names of the trials by index; others are called by their index.
+        stand_in: Reasons why forces of the dictionary that are chosen only stand in for
+            something that was not declared, a clause each; empty if they may be it.
         p_value: Tail probability of the chi-square of the verdict's model, its
-            parameters all taken as determined; NaN where nobody asked.
+            parameters all taken as determined; NaN if not requested.
         log_process: Log Bayes factor of a residual process beside that model, nats.
         bounds: Parameters at bounds of the prior, and what a wider one would give.
         set_aside: Trials that every model misses by far more than the others, and that
@@ -320,7 +323,7 @@ class Tracing:
 
     @property
     def model(self) -> str:
-        """What reports call the model of the verdict."""
+        """Name of the verdict's model in reports."""
         return self.verdict if self.misfit is None else str(self.key)
 
     def has_several(self, name: str) -> bool:
@@ -335,15 +338,16 @@ class Evaluation:
     Attributes:
         scheme: "held out" or "leave one out".
         trials: Positions of the scored trials, shape (s,).
-        before: By metric, one value a scored trial, shape (s,): "rmse", "energy score",
-            "log predictive density", "coverage" (share of entries in the central 90 %).
-        after: The same with the effects added.
+        before: Values by metric, one value a scored trial, shape (s,): "rmse", "energy
+            score", "log predictive density", "coverage" (share of entries in the
+            central 90 %).
+        after: Values with the effects added, likewise.
         table: Columns metric, before, after, ratio, low, high: RMSE over all scored
             trials, means of the others, ratio after / before (difference for the log
             density and the coverage), and its 90 % bootstrap interval, paired over
             trials; NaN below 8 trials.
         selected: Verdict of each fold, shape (s,).
-        names: What each scored trial is called; empty for its position.
+        names: Names of the scored trials; empty for their positions.
         p_value: Tail probability of the chi-square of all scored trials under what the
             model with the effects predicts; NaN where the noise is not declared.
         missed: Held-out trials far outside what that model predicts, farthest first.
@@ -365,21 +369,21 @@ class NextAction:
     """The action whose outcome tells most about which model is right.
 
     Attributes:
-        action: Shape (action_dim,); None where nothing is to be gained.
-        candidates: Shape (a, action_dim).
+        action: Action, shape (action_dim,); None if nothing is to be gained.
+        candidates: Candidates, shape (a, action_dim).
         information_gain: Lower bound on I(model; x | action) a candidate, nats.
         separates: Names that remain in question.
         inseparable: Groups of them that no permitted action separates.
         outside: An action that is not permitted and separates such a group, shape
-            (action_dim,); None where none was found, or none was looked for.
+            (action_dim,); None if none was found, or none was looked for.
         outside_separates: The group that it separates; empty without.
         outside_gain: Lower bound on the information about which of the group is right,
             all taken as equally likely, nats; 0 without.
-        within: Where several forms of a force are left, the action within the range of
-            the trials that tells most about which, shape (action_dim,).
+        within: Action, where several forms of a force are left, within the range of the
+            trials that tells most about which, shape (action_dim,).
         within_gain: Lower bound on that information, nats.
-        beyond: The same beyond that range, permitted or not.
-        beyond_gain: Likewise.
+        beyond: Action that tells most beyond that range, permitted or not.
+        beyond_gain: Lower bound on that information, nats.
     """
 
     action: Array | None

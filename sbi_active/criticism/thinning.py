@@ -26,19 +26,19 @@ def thinned_to_need(
 ) -> tuple[Trials, Sampling | None]:
     """Return trials without samples that the bare model's fit shows to be redundant.
 
-    Only where the sensor's error is declared by ``measurement_sd``: errors beyond it
-    are the simulator's, and smooth.
+    Trials are thinned only if ``measurement_sd`` declares the sensor's error: errors
+    beyond it are the simulator's, and smooth.
 
     Args:
         model: The bare simulator.
-        prior: Of its parameters.
-        trials: All of them; those that may be fitted are.
-        effects: Of which those of scope "trial" belong to the bare model.
-        seed: Of the fit.
+        prior: Prior of its parameters.
+        trials: All trials; those that may be fitted are.
+        effects: Effects, of which those of scope "trial" belong to the bare model.
+        seed: Seed of the fit.
 
     Returns:
         The trials, as they are where nothing is to be left out; and what was found of
-        their sampling, None where it was not looked at.
+        their sampling, None if it was not looked at.
     """
     fit = trials.fit
     own = fit.sample_times is not None
@@ -60,7 +60,7 @@ def thinned_to_need(
 
 
 def in_words(found: Sampling) -> str:
-    """Return what was left out and why."""
+    """Return a text on the samples that were left out, and why."""
     return (
         f"SA525 of {1 / found.step:.3g} samples a second every "
         f"{_ordinal(found.every)} is used ({1 / found.suggested_step:.3g} a second; "

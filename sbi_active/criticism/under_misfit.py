@@ -1,4 +1,4 @@
-"""What is found where every model misses by more than the sensor's error."""
+"""Results if every model misses by more than the sensor's error."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class OddsSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class Odds:
-    r"""That an effect is a cause, and does not imitate what nobody declared.
+    r"""Odds that an effect is a cause, and does not imitate an undeclared one.
 
     .. math::
         o = \left(6 \min(n, 9) \; .7^{k - 1} \; .6^b \; g
@@ -67,7 +67,7 @@ class Odds:
     The more effects are declared, the less is left out, up to nine of them. What gains
     little and what leaves much may be an imitation, and little is a few nats more where
     a trial is a few numbers without a time axis; there elementary formulas, which stand
-    for what nobody declared, compete with it. Several effects imitate more easily than
+    for what was not declared, compete with it. Several effects imitate more easily than
     one, and so does one that drives parameters of the simulator to their bounds; and a
     simulator that still misses by tens of the sensor's deviations lacks something
     large. These factors share what they know, so that their product is tempered. All of
@@ -123,7 +123,7 @@ class Odds:
 
     @property
     def probability(self) -> float:
-        """Of a cause, o / (1 + o)."""
+        """Probability of a cause, o / (1 + o)."""
         return self.value / (1 + self.value)
 
 
@@ -133,12 +133,13 @@ class ModelError:
 
     Attributes:
         name: Effects joined by " + ", or "none".
-        probability: Among the admitted models; 0 for one that was not admitted.
+        probability: Probability among the admitted models; 0 for one that was not
+            admitted.
         left_out: Root mean square on left-out trials by channel, units of x, (c,).
-        held_out: The same on held-out trials; None without any.
+        held_out: Root mean square on held-out trials, likewise; None without any.
         remains: Share of the bare model's excess error on left-out trials.
         parts: Mean squared error of each left-out trial, or part of one, in sensor
-            variances, (f,); empty where nobody asked.
+            variances, (f,); empty if not requested.
     """
 
     name: str
@@ -160,18 +161,19 @@ class Misfit:
         cause: Probability that each of them is the cause: of being there, times that of
             its odds.
         better: Probability that each lowers the error on a new trial.
-        odds: That each of them is no imitation.
-        sensor: Its standard deviation by channel, units of x, (c,).
+        odds: Odds that each of them is no imitation.
+        sensor: Standard deviation of the sensor by channel, units of x, (c,).
         passes: Whether the chi-square of the verdict passes against the sensor.
-        size: Of the residual process beside the verdict's model, in sensor deviations.
-        time_scale: Of that process, in the unit of the sample times; NaN where x has
-            no time axis, and each number an error of its own.
-        left_out: What was left out: "trials" or "parts of trials".
-        weights: Of models by their errors on left-out parts, where probabilities are
-            too sure; by name, largest first, without those that hardly count. A next
-            action is to tell these apart.
-        instead: What may stand in the place of an effect that helps: left-out trials
-            are not surely predicted worse with it there.
+        size: Size of the residual process beside the verdict's model, in sensor
+            deviations.
+        time_scale: Time scale of that process, in the unit of the sample times; NaN
+            where x has no time axis, and each number an error of its own.
+        left_out: Units that were left out: "trials" or "parts of trials".
+        weights: Weights of models by their errors on left-out parts, where
+            probabilities are too sure; by name, largest first, without those that
+            hardly count. A next action is to tell these apart.
+        instead: Effects that may stand in the place of an effect that helps: left-out
+            trials are not surely predicted worse with it there.
         least: Probability of being the cause from which an effect is named.
     """
 

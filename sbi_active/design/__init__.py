@@ -1,8 +1,8 @@
 """Design: which action to take next.
 
-Here live the designers and the steps between a belief and a choice. How an information
-gain is estimated lives in ``information_gain``, how candidates are searched in
-``search``.
+This package contains the designers and the steps between a belief and a choice. The
+estimators of an information gain are in ``information_gain``, and the searches for
+candidates in ``search``.
 """
 
 from sbi_active.design.design import Design

@@ -1,4 +1,4 @@
-"""From estimates of the candidates to a design."""
+"""The choice of a design from estimates of the candidates."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def pricing(
 ) -> Callable[[Tensor], Tensor] | None:
     """Return the cost as a function of actions (n, action_dim) -> (n,), float64.
 
-    It may be given as one number an action of a list, shape (a,).
+    The cost may be given as one number for each action of a list, shape (a,).
 
     Raises:
         ValueError: If the shape is another, or when called if a cost is not positive.

@@ -1,4 +1,4 @@
-"""What a designer returns."""
+"""The design that a designer returns."""
 
 from __future__ import annotations
 
@@ -33,30 +33,31 @@ class Design:
             the others: what it tells beyond them.
         expected_information_gain: Estimates on simulations that had no part in the
             choice, nats, shape (a,); NaN for a random choice.
-        standard_error: Of each estimate, shape (a,).
-        difference_standard_error: Of each estimate's difference to the chosen
-            candidate's, on common random numbers, shape (a,); zero at the chosen one.
+        standard_error: Standard error of each estimate, shape (a,).
+        difference_standard_error: Standard error of each estimate's difference to the
+            chosen candidate's, on common random numbers, shape (a,); zero at the chosen
+            one.
         probability_best: Probability that a candidate has the largest expectation of
             the estimate, by its cost if there is one, given the simulations, shape
-            (a,); zero where a candidate is excluded.
+            (a,); zero if a candidate is excluded.
         probability_valid: Share of the simulations of each candidate that gave a
             measurement, partly observed ones included, shape (a,). Rows lost to a fault
             do not count; NaN where nothing else is left.
         bound: Side of the information that the estimates lie on.
-        index: Which candidate was chosen.
+        index: Index of the chosen candidate.
         num_simulations: Simulations spent.
         name: Name of the action, with its unit.
         labels: Names of its entries, with their units.
-        categorical: Which entries are those of a list beside a space without end.
+        categorical: Mask of the entries that are of a list beside a space without end.
         estimator: Class that estimated.
         num_samples: Simulations of each candidate, shape (a,). Candidates that were
             eliminated early have fewer.
-        stopped: Why no further simulations were run: "leader separated", "difference
-            negligible", "budget spent" or "simulations given".
+        stopped: Reason why no further simulations were run: "leader separated",
+            "difference negligible", "budget spent" or "simulations given".
         num_missing: Simulations of them all that were lost to faults of the simulator.
-        notes: What to know: estimators that failed a check or disagree, where an
-            estimate is a bound, candidates that were excluded.
-        cost: Of each candidate, shape (a,); None where there is none.
+        notes: Notes on the estimates: estimators that failed a check or disagree, where
+            an estimate is a bound, candidates that were excluded.
+        cost: Cost of each candidate, shape (a,); None if there is none.
         steps: Designs of the actions of a batch in turn, each given the former and the
             pending ones; empty for a single action.
     """
@@ -91,7 +92,7 @@ class Design:
 
     @property
     def joint_information_gain(self) -> float:
-        """What the action or the batch tells together, nats, beyond pending trials."""
+        """Joint information gain of the action or batch beyond pending trials, nats."""
         steps = self.steps or (self,)
         return sum(float(s.expected_information_gain[s.index]) for s in steps)
 
@@ -134,13 +135,13 @@ class Design:
     def plot(self, ax: Axes | None = None) -> Axes:
         """Plot the expected information gain of the candidates.
 
-        Over one entry of the action with two standard errors; over two as a map with
-        the candidates that were evaluated; over more as the best of them in order.
-        Entries of a list beside a space without end have a panel for each of their
-        values.
+        The plot is over one entry of the action with two standard errors, over two as a
+        map with the candidates that were evaluated, and over more as the best of them
+        in order. Entries of a list beside a space without end have a panel for each of
+        their values.
 
         Args:
-            ax: Where to draw; None makes a figure.
+            ax: Axes to draw on; None makes a figure.
 
         Returns:
             The axes; where there are several panels the ones around them, whose
@@ -167,7 +168,7 @@ def action_labels(actions: ActionSpace) -> tuple[str, ...]:
 
 
 def are_categories(actions: ActionSpace) -> tuple[bool, ...]:
-    """Return which entries of an action are of a list, where others have no end."""
+    """Return a mask of an action's entries that are of a list beside endless ones."""
     listed = [(part.listed() is not None, part.action_dim) for part in actions.parts()]
     mixed = len({is_listed for is_listed, _ in listed}) > 1
     return tuple(mixed and is_listed for is_listed, dim in listed for _ in range(dim))

@@ -56,7 +56,7 @@ class InformationGainDesigner:
             leading ones gets at most four times as many. A search of a box spends as
             many as for four candidates, four more each entry, and four more each
             category after the first; half of them on comparing its finalists.
-        estimator: Of the information gain: an estimator; the name of one (see
+        estimator: Estimator of the information gain; the name of one (see
             :mod:`sbi_active.information_gain`); or "auto". That takes declared noise
             first (entropies by nearest neighbors where x is one number, nested Monte
             Carlo where it is more), then the same with noise from replicates that pass
@@ -65,7 +65,7 @@ class InformationGainDesigner:
             :mod:`sbi_active.search`); or "auto", exhaustive for lists, else gradient.
         eliminate: Start with half of the samples and spend the rest on the candidates
             still in reach of the leader; without it every candidate gets all of them.
-        workers: Of the simulations.
+        workers: Workers that run the simulations.
         most_numbers: Number of an outcome's numbers beyond which a few linear summaries
             stand for them, where the noise is declared and Gaussian; the design's notes
             say what these leave out. A tenth is compared as fast, ten times as many
@@ -135,9 +135,9 @@ class InformationGainDesigner:
         """Return the action that tells most about the target, or a batch of them.
 
         Args:
-            model: What the estimator needs, for :class:`PosteriorGain` anything with
-                ``log_posterior(theta, x, action)``; None where it needs nothing. For
-                the target "model" the rivals, a sequence of
+            model: Model that the estimator needs, for :class:`PosteriorGain` anything
+                with ``log_posterior(theta, x, action)``; None if it needs nothing.
+                For the target "model" the rivals, a sequence of
                 :class:`.RivalPredictive`.
             simulator: ``simulator(theta, action)``; not used for the target "model".
             belief: Distribution of the parameters; None is ``model.belief``.
@@ -149,24 +149,24 @@ class InformationGainDesigner:
             simulations: Rows under the belief, such as those that the model was trained
                 on; then nothing is simulated. Half of them choose and half report, but
                 where the model has seen them, both are too high.
-            cost: Of actions (n, action_dim), shape (n,), positive; or one number an
-                action of a list, shape (a,). The utility is information by cost.
-            constraint: Which of actions (n, action_dim) are permitted, shape (n,),
-                bool.
+            cost: Cost of actions (n, action_dim), shape (n,), positive; or one number
+                an action of a list, shape (a,). The utility is information by cost.
+            constraint: Function of actions (n, action_dim) that says which are
+                permitted, shape (n,), bool.
             exclude: Actions not to repeat, shape (t, action_dim); in a box nor others
                 within a hundredth of its width.
             pending: Actions under way, shape (p, action_dim), whose outcomes will be
                 known: what counts is the information beyond them.
             min_probability_valid: Candidates that give a measurement less often, by
                 the share of the first simulations, are not chosen; 0 excludes none.
-            num_actions: Of a batch, chosen one after the other by joint information
-                with those before, each with the budget of one.
-                This and ``pending`` take joint outcomes, which estimators by the noise
-                ("entropy", "nested"), a likelihood, or named parameters have; a
+            num_actions: Number of actions of a batch. They are chosen one after the
+                other by joint information with those before, each with the budget of
+                one. This and ``pending`` take joint outcomes, which estimators by the
+                noise ("entropy", "nested"), a likelihood, or named parameters have; a
                 posterior or a ratio of single outcomes has not.
             budget: Simulations of an action in all; None is ``num_samples`` a
                 candidate.
-            seed: Of the simulations; None draws one from torch's global generator.
+            seed: Seed of the simulations; None draws one from torch's global generator.
 
         Returns:
             The design.

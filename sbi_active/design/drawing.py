@@ -24,7 +24,7 @@ def draw(design: Any, ax: Axes | None = None) -> Axes:
 
     Args:
         design: A :class:`.Design`.
-        ax: Where to draw; None makes a figure.
+        ax: Axes to draw on; None makes a figure.
     """
     import matplotlib.pyplot as plt
 

@@ -1,4 +1,4 @@
-"""Which candidates a designer may choose."""
+"""Candidates that a designer may choose."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ SAME = 0.01  # of the width of a box, within which two actions are the same
 
 @dataclass(frozen=True)
 class DesignLimits:
-    """Which actions may be chosen, and what they cost.
+    """Limits and costs of the actions that may be chosen.
 
     Attributes:
         actions: The space.
-        constraint: Of actions (n, action_dim), which are permitted, shape (n,), bool;
-            None permits all.
+        constraint: Function of actions (n, action_dim) that says which are permitted,
+            shape (n,), bool; None permits all.
         exclude: Actions that are not to be repeated, shape (t, action_dim); in a box
             nor others within a hundredth of its width in every entry.
         price: Cost of actions (n, action_dim), shape (n,); None for none.
@@ -37,7 +37,7 @@ class DesignLimits:
     least: float = 0.0
 
     def __call__(self, action: Tensor) -> Tensor:
-        """Return which of actions (n, action_dim) are permitted, shape (n,), bool."""
+        """Return a mask of permitted actions (n, action_dim), shape (n,), bool."""
         inside = self.actions.permits(action)
         if self.constraint is not None:
             answer = torch.as_tensor(self.constraint(action))
@@ -94,7 +94,7 @@ class DesignLimits:
         return self.price(action)
 
     def reached_by(self, valid: Tensor) -> Tensor:
-        """Return which shares of measurements suffice, shape (a,).
+        """Return a mask of sufficient shares of measurements, shape (a,).
 
         They are NaN where every simulation was lost.
 
@@ -116,7 +116,7 @@ class DesignLimits:
         )
 
     def excluded_note(self, eligible: Tensor) -> tuple[str, ...]:
-        """Say how many candidates are excluded; nothing where none is."""
+        """Return a note on the number of excluded candidates; empty if none is."""
         num = int((~eligible).sum())
         if num == 0:
             return ()

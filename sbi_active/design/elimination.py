@@ -21,14 +21,16 @@ class Estimates:
 
     Attributes:
         action: Candidates, shape (a, action_dim).
-        choosing: Of the simulations that chose, one tensor (n,) a candidate.
-        reporting: Of those that report.
+        choosing: Contributions of the simulations that chose, one tensor (n,) a
+            candidate.
+        reporting: Contributions of the simulations that report, one tensor (n,) a
+            candidate.
         num_samples: Simulations of each candidate, shape (a,).
         probability_valid: Share of them with a measurement, shape (a,).
-        eligible: Which may be chosen, shape (a,), bool.
+        eligible: Mask of those that may be chosen, shape (a,), bool.
         leader: The candidate of the largest utility.
-        stopped: Why no further simulations were run.
-        notes: What to know of the estimates.
+        stopped: Reason why no further simulations were run.
+        notes: Notes on the estimates.
     """
 
     action: Tensor
@@ -55,13 +57,13 @@ def eliminate(
     """Simulate candidates until one leads, in ever smaller groups.
 
     Args:
-        evaluator: Simulates and estimates.
+        evaluator: Evaluator that simulates and estimates.
         action: Candidates, shape (a, action_dim).
         num_samples: Simulations a candidate on average.
         early: Whether to begin with half of them.
         budget: Simulations in all, those of the sampler so far included.
-        limits: Of the choice.
-        seed: Of the draws behind probabilities.
+        limits: Limits of the choice.
+        seed: Seed of the draws behind probabilities.
     """
     num_actions = len(action)
     sampler = evaluator.sampler

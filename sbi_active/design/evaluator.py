@@ -29,12 +29,13 @@ class GainEvaluator:
 
     Args:
         sampler: Draws outcomes.
-        estimator: None chooses one by what the first simulations show.
-        model: What the estimator needs.
-        belief: Of the parameters.
+        estimator: Estimator of the information; None chooses one by what the first
+            simulations show.
+        model: Model that the estimator needs.
+        belief: Belief over the parameters.
 
     Attributes:
-        notes: What speaks against the estimator, or why others were not taken.
+        notes: Notes on failed checks of the estimator, or why others were not taken.
         num_others: Actions whose outcomes will be known as well.
         replicates: Whether every row is simulated twice; None before the first.
     """
@@ -119,7 +120,7 @@ class GainEvaluator:
     def disagreements(
         self, simulations: CandidateSimulations, gain: Tensor
     ) -> Sequence[str]:
-        """Return where other estimators differ, see :func:`disagreements`."""
+        """Return the disagreements of other estimators, see :func:`disagreements`."""
         if self.num_others:
             return self.estimator.cautions(gain)
         with single_thread():

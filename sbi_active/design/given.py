@@ -44,11 +44,11 @@ class GivenGains:
 
     Attributes:
         simulations: The rows.
-        estimator: Of the information.
-        model: What the estimator needs.
-        belief: Of the parameters in the rows.
-        limits: Of the choice.
-        seed: Of the split.
+        estimator: Estimator of the information.
+        model: Model that the estimator needs.
+        belief: Belief over the parameters in the rows.
+        limits: Limits of the choice.
+        seed: Seed of the split.
     """
 
     simulations: Simulations

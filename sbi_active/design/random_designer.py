@@ -27,7 +27,7 @@ class RandomDesigner:
         actions: The action space, or a list of actions.
         num_samples: Simulations a candidate where ``min_probability_valid`` asks for
             its share of measurements; otherwise nothing is simulated.
-        workers: Of these simulations.
+        workers: Workers that run these simulations.
     """
 
     def __init__(
@@ -55,20 +55,20 @@ class RandomDesigner:
         """Return a random action.
 
         Args:
-            model: Only its belief is used, see below.
+            model: Model of which only the belief is used, see below.
             simulator: ``simulator(theta, action)``; only used, and then needed, with
                 ``min_probability_valid``.
-            belief: Of the parameters, at which candidates are simulated; None is
-                ``model.belief``.
-            constraint: Which of actions (n, action_dim) are permitted, shape (n,),
-                bool.
+            belief: Belief over the parameters, at which candidates are simulated; None
+                is ``model.belief``.
+            constraint: Function of actions (n, action_dim) that says which are
+                permitted, shape (n,), bool.
             exclude: Actions not to repeat, shape (t, action_dim); in a box nor others
                 within a hundredth of its width.
             min_probability_valid: Candidates that give a measurement less often are
                 excluded; 0 excludes none. Of a space without end, 32 actions are
                 simulated.
-            seed: Of the choice and the simulations; None draws one from torch's global
-                generator.
+            seed: Seed of the choice and the simulations; None draws one from torch's
+                global generator.
 
         Returns:
             The design. Of a space without end the candidates are those drawn.

@@ -29,16 +29,16 @@ FEW = 256  # given rows by which to choose the estimator
 
 @dataclass(frozen=True)
 class Selection:
-    """What one action is chosen by; see :class:`.InformationGainDesigner`.
+    """The choice of one action; see :class:`.InformationGainDesigner`.
 
     Attributes:
-        target: What to learn about.
-        limits: Of actions.
-        search: For the candidates.
+        target: Target that is learned about.
+        limits: Limits of the actions.
+        search: Search for the candidates.
         num_samples: Simulations a candidate on average.
         early: Whether candidates begin with half of them.
-        workers: Of the simulations.
-        seed: Of everything random.
+        workers: Workers that run the simulations.
+        seed: Seed of all draws.
         most_numbers: Number of an outcome's numbers beyond which summaries stand for
             them.
     """

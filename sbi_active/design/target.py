@@ -1,4 +1,4 @@
-"""What a design is to tell about, and what it takes to estimate that."""
+"""The target of a design, and what it takes to estimate its information."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from sbi_active.simulation.workers.settings import Workers
 
 @dataclass(frozen=True)
 class Target:
-    """What the information is about.
+    """The target of the information.
 
     Attributes:
         name: "theta", names of parameters, or "model".
-        estimator: As the designer was given it.
-        model: What the estimator needs.
+        estimator: Estimator of the information, as the designer was given it.
+        model: Model that the estimator needs.
         simulator: ``simulator(theta, action)``.
         belief: Distribution of the parameters; None for the target "model".
     """
@@ -84,7 +84,7 @@ class Target:
         return Target(name, estimator, model, simulator, belief)
 
     def gain(self) -> InformationGainEstimator | None:
-        """Return the estimator; None where the simulations are to decide.
+        """Return the estimator; None if the simulations are to decide.
 
         Raises:
             ValueError: If it needs a model and there is none, or a name is unknown.
@@ -112,7 +112,7 @@ class Target:
         *,
         most_numbers: float,
     ) -> tuple[CandidateSampler | RivalSampler, InformationGainEstimator | None]:
-        """Return what draws outcomes of candidates (a, action_dim), and the estimator.
+        """Return the sampler of outcomes of candidates (a, action_dim), and estimator.
 
         Outcomes with more than so many numbers are summarized where noise allows.
 

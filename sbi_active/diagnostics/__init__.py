@@ -1,7 +1,7 @@
 """Can a posterior be trusted, given the action and around a belief?
 
-Here lives what judges networks and beliefs by fresh simulations, with sbi's own tools,
-and says so in words. How a belief is made does not, nor what it is used for.
+This package judges networks and beliefs by fresh simulations, with sbi's own tools, and
+reports the result in words. It does not make beliefs, and does not use them further.
 """
 
 from sbi_active.diagnostics.beliefs import BeliefCheck, check_belief

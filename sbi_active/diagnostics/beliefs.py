@@ -1,6 +1,6 @@
 r"""Is a refined belief right? Asked at run time, without any further truth.
 
-Two questions, which find different errors:
+There are two checks, which find different errors:
 
 - Refits. The same trials are inferred again with other seeds. A belief that lost a
   mode, or is too wide or narrow by accident, differs from these in nats.
@@ -10,8 +10,8 @@ Two questions, which find different errors:
   inference makes show here, the more the more the new outcomes tell, which is why each
   action is simulated ``num_copies`` times.
 
-What no check around a belief can find is a mode that each inference loses in the same
-way; :func:`.check_calibration` draws from all of the prior.
+No check around a belief can find a mode that each inference loses in the same way;
+:func:`.check_calibration` draws from all of the prior.
 
 References:
     Saeilynoja, Schmitt, Buerkner & Vehtari 2025, arXiv:2502.03279 (posterior SBC);
@@ -56,16 +56,17 @@ class BeliefCheck:
         verdict: "trust"; "refine" where the belief is not that of a second inference,
             or ranks are not uniform; "stop" where it excludes what others hold or is
             too narrow.
-        reasons: For it, a sentence each.
-        parameter_names: One a parameter; the last of the figures is the joint density.
+        reasons: Reasons for the verdict, a sentence each.
+        parameter_names: Names of the parameters; the last of the figures is the joint
+            density.
         beyond: Nats by which refits, at their own draws, exceed the belief; one a
             refit, the belief is too narrow or elsewhere.
-        within: The same at the belief's draws: it is too wide, or elsewhere.
+        within: Nats at the belief's draws, likewise: it is too wide, or elsewhere.
         spread: Standard deviation of the normal scores of the ranks, one a parameter
             and one for the density: 1 where right, more for too narrow.
-        spread_interval: Of that, 95 %.
-        shift: Mean of the scores, alike.
-        p_value: Of spread and shift together, alike.
+        spread_interval: Interval of each spread, 95 %.
+        shift: Mean of the scores, one as for ``spread``.
+        p_value: p-value of spread and shift together, one as for ``spread``.
         num_repeats: Repeats of posterior SBC.
         num_simulations: Rows of new outcomes.
     """
@@ -127,16 +128,17 @@ def check_belief(
 
     Args:
         inference: A trainer or a campaign after at least one trial.
-        simulator: None takes the campaign's.
+        simulator: Simulator of new outcomes; None takes the campaign's.
         num_repeats: Inferences of simulated trials; 0, or at least 10.
         num_copies: New outcomes of each executed action in a repeat.
         num_refits: Inferences of the same trials with other seeds.
         num_posterior_samples: Draws that a repeat's parameters are ranked among.
-        refinement: None takes the campaign's settings, or the defaults.
-        belief: To be judged; None takes the current one.
+        refinement: Options of the refits; None takes the campaign's settings, or the
+            defaults.
+        belief: Belief to be judged; None takes the current one.
         infer: ``infer(action, x, seed)`` gives a belief; None refines.
         level: Probability that ranks alone flag a right belief, at most.
-        seed: Of everything random here.
+        seed: Seed of all draws.
 
     Raises:
         ValueError: If there is no trial, no simulator, or sizes are too small.

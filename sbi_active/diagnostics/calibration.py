@@ -1,4 +1,4 @@
-"""What a calibration check finds, stratum by stratum, and the verdict."""
+"""Results of a calibration check, stratum by stratum, and the verdict."""
 
 from __future__ import annotations
 
@@ -22,22 +22,23 @@ class Stratum:
     Every interval holds at the same time as all others with the check's level.
 
     Attributes:
-        name: Of the action or group; "all".
-        round: Of the network, from 1; 0 for all.
+        name: Name of the action or group; "all".
+        round: Round of the network, from 1; 0 for all.
         num_rows: Simulations behind it.
         coverage: Share of truths in the network's smallest regions, by their level.
-        coverage_interval: Of these shares (Clopper & Pearson).
+        coverage_interval: Interval of each of these shares (Clopper & Pearson).
         rank_distance: Largest distance of the ranks' distribution from uniform, one a
             parameter (Kolmogorov & Smirnov).
-        rank_interval: Of that distance, one a parameter.
-        p_value: That ranks of uniform ones are as far, one a parameter, as sbi gives.
+        rank_interval: Interval of that distance, one a parameter.
+        p_value: Probability that ranks of uniform ones are as far, one a parameter, as
+            sbi gives.
         gap: Log-score gap, a lower bound in nats.
-        gap_interval: Of that bound.
-        information: What outcomes tell beyond the belief, nats: gap and what the
-            network has of it.
+        gap_interval: Interval of that bound.
+        information: Information that outcomes tell beyond the belief, nats: gap and
+            what the network has of it.
         lost: Share of the information that the network loses.
-        verdict: As in :class:`Calibration`.
-        reasons: For it, a clause each.
+        verdict: Verdict on the stratum, as in :class:`Calibration`.
+        reasons: Reasons for the verdict, a clause each.
     """
 
     name: str
@@ -60,27 +61,27 @@ class Stratum:
 class Calibration:
     """Whether an amortized posterior can be trusted, action by action.
 
-    ``print(calibration)`` says it in words, the verdict first.
+    ``print(calibration)`` reports it in words, the verdict first.
 
     Attributes:
-        verdict: "trust" where nothing speaks against the network; "refine" where its
-            regions are off or it loses much of what outcomes tell, so that beliefs need
-            the simulator or the network more training; "stop" where it excludes the
-            truth too often, or tells less than the belief did.
-        reasons: For the verdict, a sentence each; empty for "trust".
-        overall: All rows.
-        strata: By action and round.
-        parameter_names: One a parameter.
+        verdict: Verdict: "trust" if the network passes; "refine" if its regions are off
+            or it loses much of the outcomes' information, so that beliefs need the
+            simulator or the network more training; "stop" if it excludes the truth too
+            often, or is less informative than the belief before.
+        reasons: Reasons for the verdict, a sentence each; empty for "trust".
+        overall: Figures of all rows.
+        strata: Figures by action and round.
+        parameter_names: Names of the parameters.
         gap_method: "likelihood" or "classifier", see :mod:`.log_score`.
         num_invalid: Rows without a measurement that the network cannot take.
         num_simulations: Rows simulated.
-        ranks: Of the truths among ``num_posterior_samples``, shape (n, d + 1); the last
-            by the network's density.
+        ranks: Ranks of the truths among ``num_posterior_samples``, shape (n, d + 1);
+            the last by the network's density.
         num_posterior_samples: Draws of the network a row.
         label: Index of each row's stratum, shape (n,).
         tarp: Expected coverage and credibility by distances to random points (Lemos et
             al. 2023), of all rows.
-        tarp_area: Between these from .5 up; negative for too narrow a posterior.
+        tarp_area: Area between these from .5 up; negative for too narrow a posterior.
         local: p-values that the posterior is right at given outcomes, where asked for.
     """
 

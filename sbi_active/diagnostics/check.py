@@ -87,8 +87,8 @@ def check_calibration(
             the methods "asbi" or "nsbi" (its current network), or a sequence of
             trainers or posteriors, one a round.
         simulator: ``simulator(theta, action)``; None takes the campaign's.
-        actions: Where to check; None takes the campaign's.
-        belief: Where parameters are drawn from; None is each posterior's own.
+        actions: Actions at which to check; None takes the campaign's.
+        belief: Belief that parameters are drawn from; None is each posterior's own.
         num_simulations: Rows a round; at least 100.
         num_posterior_samples: Draws of the network a row.
         num_contrastive: Noise-free runs a row behind the gap are twice as many.
@@ -96,10 +96,10 @@ def check_calibration(
         gap: "likelihood" (declared noise), "classifier", or "auto".
         observations: Pairs (x, action) at which sbi's local classifier test (L-C2ST)
             is run as well, with overall level .05; takes a minute.
-        tolerance: None is ``Tolerance()``.
+        tolerance: Tolerance of the verdict; None is ``Tolerance()``.
         level: Probability that a perfect network is flagged anywhere, at most.
-        parameter_names: None takes the simulator's.
-        seed: Of everything random here.
+        parameter_names: Names of the parameters; None takes the simulator's.
+        seed: Seed of all draws.
 
     Returns:
         Figures and the verdict.

@@ -60,15 +60,15 @@ def gap_by_likelihood(
     r"""Return :math:`\log p(\theta|x,\xi) - \log q`, on average a lower bound.
 
     Args:
-        simulator: With declared noise.
-        belief: Of theta before x.
+        simulator: Simulator with declared noise.
+        belief: Belief over theta before x.
         theta: Truths, shape (n, d).
-        action: Shape (n, action_dim).
-        x: Shape (n, *x_shape).
+        action: Actions, shape (n, action_dim).
+        x: Outcomes, shape (n, *x_shape).
         log_q: Log density of rows of draws, (m, n, d) -> (m, n).
-        draws: Of q, shape (m, n, d).
+        draws: Draws of q, shape (m, n, d).
         num_contrastive: Draws of q and of the belief, as many of each.
-        seed: Of the belief's draws.
+        seed: Seed of the belief's draws.
 
     Returns:
         Shape (n,), nats.
@@ -115,9 +115,9 @@ def gap_by_classifier(
     Args:
         theta: Truths, shape (n, d).
         condition: Packed (x, action), shape (n, c).
-        draws: Of q, shape (m, n, d), at least three.
-        log_q: As in :func:`gap_by_likelihood`.
-        seed: Of the halves and the classifier.
+        draws: Draws of q, shape (m, n, d), at least three.
+        log_q: Log density of rows of draws, (m, n, d) -> (m, n).
+        seed: Seed of the halves and the classifier.
 
     Returns:
         Shape (n,), nats.

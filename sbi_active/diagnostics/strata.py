@@ -24,10 +24,10 @@ def stratified_actions(
     actions, or of a continuum, neighbors are put together.
 
     Args:
-        space: Of actions.
+        space: Space of the actions.
         num_rows: Rows n.
         max_strata: Groups at most.
-        seed: Of draws and groups.
+        seed: Seed of draws and groups.
 
     Returns:
         Actions (n, action_dim), labels (n,) int64, and a name a group.

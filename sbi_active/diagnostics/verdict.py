@@ -1,4 +1,4 @@
-"""From ranks and gaps of a stratum to figures, intervals and a verdict."""
+"""Figures, intervals and a verdict from ranks and gaps of a stratum."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ NUM_TESTS = 4  # kinds of figures beside the ranks of each parameter
 
 @dataclass(frozen=True, kw_only=True)
 class Tolerance:
-    """What a verdict lets pass.
+    """Tolerances of a verdict.
 
     Attributes:
-        coverage: Of the 90 % regions, by which it may be off.
-        excluded: By which that may be too small before it is a "stop".
-        rank_distance: Of ranks from uniform.
+        coverage: Error of the coverage of the 90 % regions.
+        excluded: Shortfall of that coverage beyond which the verdict is "stop".
+        rank_distance: Distance of the ranks' distribution from uniform.
         lost: Share of what outcomes tell.
         gap: Nats below which no share counts.
     """
@@ -52,15 +52,15 @@ def judge(
     r"""Return the figures of a stratum.
 
     Args:
-        name: Of the stratum.
-        round_: Of the network.
-        ranks: Shape (n, d + 1), the last by density.
+        name: Name of the stratum.
+        round_: Round of the network.
+        ranks: Ranks, shape (n, d + 1), the last by density.
         gap: Terms of the log-score gap, shape (n,), nats.
         gained: log q - log b at the truths, shape (n,), nats.
-        num_posterior_samples: L.
-        level: Of error of one stratum, shared among its figures.
-        tolerance: What may pass.
-        names: One a parameter.
+        num_posterior_samples: Number of posterior draws L.
+        level: Level of error of one stratum, shared among its figures.
+        tolerance: Tolerance of the figures.
+        names: Names of the parameters.
     """
     n, dim = len(ranks), ranks.shape[1] - 1
     each = level / (NUM_TESTS + dim)

@@ -1,7 +1,7 @@
-"""How things are shown: tables, pages that travel, cards of a notebook, figures.
+"""Display: tables, pages in one file, cards of a notebook, figures.
 
-Here lives how text, Markdown and HTML are set. What is said in them lives with what it
-is about: in ``campaign.display``, ``criticism.report``, and with beliefs and designs.
+This package sets text, Markdown and HTML. The texts themselves are with their subjects:
+in ``campaign.display``, ``criticism.report``, and with beliefs and designs.
 """
 
 from sbi_active.display.figures import legible, svg

@@ -22,9 +22,9 @@ class Picture:
     """The place of a figure.
 
     Attributes:
-        name: Of the figure.
-        words: What it shows, for who does not see it.
-        caption: Below it.
+        name: Name of the figure.
+        words: Text that says what it shows, for those who do not see it.
+        caption: Caption below it.
     """
 
     name: str
@@ -37,11 +37,11 @@ class Section:
     """A part of a page.
 
     Attributes:
-        title: Its heading.
+        title: Heading of the section.
         text: Paragraphs.
         items: A list of points.
-        table: Below them; one without rows is left out.
-        picture: At its end.
+        table: Table below them; one without rows is left out.
+        picture: Picture at its end.
         warns: Whether the points limit what the page says.
     """
 
@@ -59,10 +59,10 @@ class Page:
 
     Attributes:
         title: The headline.
-        sections: In order.
+        sections: Sections in order.
         lead: Paragraphs before them.
         badge: A word and its kind, "good", "fair" or "bad", before the lead.
-        footer: Where it comes from.
+        footer: Line that says where it comes from.
     """
 
     title: str
@@ -103,7 +103,7 @@ class Page:
         All text is escaped.
 
         Args:
-            figures: By their names, one for each picture.
+            figures: Figures by their names, one for each picture.
         """
         template = templates().get_template("page.html.jinja")
         return UNSEEN.sub("\ufffd", template.render(page=self, figures=figures))

@@ -18,7 +18,7 @@ class Table:
     r"""A table; the first column holds words, all others numbers.
 
     Attributes:
-        header: One a column.
+        header: Headings of the columns.
         rows: Cells, shown by :func:`str`.
 
     Example:
@@ -50,8 +50,8 @@ class Table:
         """Return mean, standard deviation and central 90 % of each parameter.
 
         Args:
-            names: One a parameter.
-            draws: Of a belief, shape (n, theta_dim).
+            names: Names of the parameters.
+            draws: Draws of a belief, shape (n, theta_dim).
         """
         values = draws.double().numpy()
         low, high = np.quantile(values, [0.05, 0.95], axis=0)

@@ -1,7 +1,7 @@
 """Inference of parameters from trials with actions.
 
-Here lives what goes from simulations and trials to beliefs; each package below says
-which part. Which action comes next lives in ``design``.
+This package leads from simulations and trials to beliefs; each package below says which
+part it does. The choice of the next action is in ``design``.
 """
 
 from sbi_active.inference.beliefs.belief import Belief

@@ -1,7 +1,7 @@
 """Estimators of the expected information gain, one a file.
 
-Here lives what a trial of an action is worth, in nats. Which actions are compared lives
-in ``search`` and ``design``.
+This package estimates the worth of a trial of an action, in nats. The choice of the
+actions to compare is in ``search`` and ``design``.
 """
 
 from sbi_active.information_gain.base import (

@@ -1,4 +1,4 @@
-"""What an estimator of the expected information gain gets and gives."""
+"""Interface of an estimator of the expected information gain."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class CandidateSimulations:
         theta: Draws from the belief, shape (n, theta_dim), common to all candidates.
         action: Candidates, shape (a, action_dim).
         x: Outcomes, shape (a, n, *x_shape); NaN where there was no measurement.
-        mean: Noise-free outcomes, as x; None where the noise is not declared.
+        mean: Noise-free outcomes, as x; None if the noise is not declared.
         noise: The declared noise around the mean.
         replicate: Second outcomes at the same parameters, as x; None for none.
         missing: Rows lost to a fault that has nothing to do with the parameters, shape
@@ -66,7 +66,7 @@ class CandidateSimulations:
         return torch.stack(partly).any(0) & self.counted
 
     def num_valid(self) -> tuple[Tensor, Tensor]:
-        """Return how many outcomes have a measurement, and of how many, both (a,).
+        """Return the numbers of outcomes with a measurement, and of all, both (a,).
 
         A partly observed outcome has one; missing rows are not counted.
         """
@@ -115,8 +115,8 @@ class InformationGainEstimator(ABC):
     r"""Estimator of :math:`I(\theta; x | \xi)` in nats for a set of candidates.
 
     Attributes:
-        bound: Which side of the information the estimate's expectation lies on,
-            whatever the model.
+        bound: Side of the information that the estimate's expectation lies on, whatever
+            the model.
         needs_noise: Whether it uses the declared noise, or else replicates.
         needs_model: Whether it uses something learned.
         rowwise: Whether a contribution depends on its own row alone, as given by
@@ -137,9 +137,9 @@ class InformationGainEstimator(ABC):
         """Return the contribution of every simulation; their mean is the estimate.
 
         Args:
-            model: What was learned, see the estimator.
+            model: Model that was learned, see the estimator.
             simulations: Fresh simulations, not those the model was trained on.
-            belief: Density of theta in the simulations; None where an estimator has no
+            belief: Density of theta in the simulations; None if an estimator has no
                 use for it.
 
         Returns:
@@ -168,7 +168,7 @@ class InformationGainEstimator(ABC):
         return gain.masked_fill(~simulations.counted, torch.nan)
 
     def bound_on(self, model: Any) -> Bound:
-        """Return which side of the information the estimate's expectation lies on.
+        """Return the side of the information that the estimate's expectation lies on.
 
         A model with ``exact_likelihood = True`` has an exact likelihood, others a
         learned one.
@@ -176,7 +176,7 @@ class InformationGainEstimator(ABC):
         return self.bound
 
     def cautions(self, gain: Tensor) -> list[str]:
-        """Say what contributions (a, n) give to know, as a limit that is near."""
+        """Return cautions about contributions (a, n), as a limit that is near."""
         return []
 
     def problems(self, simulations: CandidateSimulations) -> list[str]:
@@ -184,7 +184,7 @@ class InformationGainEstimator(ABC):
         return []
 
     def remarks(self, simulations: CandidateSimulations) -> list[str]:
-        """Return what to know of an estimate from simulations."""
+        """Return remarks on an estimate from simulations."""
         return []
 
     @abstractmethod

@@ -37,8 +37,8 @@ class CandidateSampler:
         simulator: ``simulator(theta, action)``.
         belief: Distribution of the parameters.
         action: Candidates, shape (a, action_dim).
-        seed: Of everything drawn.
-        workers: Of the simulations.
+        seed: Seed of all draws.
+        workers: Workers that run the simulations.
         others: Actions whose outcomes will be known as well, shape (p, action_dim);
             every draw then holds joint outcomes
             (:func:`.join_outcomes`). None for none.
@@ -51,8 +51,8 @@ class CandidateSampler:
         declared: Whether the simulator declares its noise around an output that does
             not change from run to run.
         num_drawn: Simulations so far.
-        num_missing: Those of them lost to faults of the simulator.
-        summaries: What stands for the numbers of an outcome; None keeps all.
+        num_missing: Number of those simulations lost to faults of the simulator.
+        summaries: Summaries that stand for the numbers of an outcome; None keeps all.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class CandidateSampler:
 
     @property
     def notes(self) -> list[str]:
-        """What stands for an outcome, where not all of its numbers do."""
+        """Notes on the summaries that stand for an outcome."""
         if self.summaries is None:
             return []
         return [self.summaries.note(self._num_numbers)]
@@ -117,7 +117,7 @@ class CandidateSampler:
     ) -> CandidateSimulations | None:
         """Simulate actions (a, action_dim) at parameters (n, theta_dim).
 
-        Twice where paired; None where the declared mean turns out to change from run to
+        Twice where paired; None if the declared mean turns out to change from run to
         run. The label is the seeds': outcomes that are joined have noise of their own.
         """
         num = len(theta)
@@ -138,7 +138,7 @@ class CandidateSampler:
             noise, short = self.simulator.noise, self.summaries
             assert noise is not None
             means, lost = [], []
-            # Of many numbers, those of one action at a time are in memory.
+            # Many numbers are kept in memory for one action at a time.
             for some in action.split(len(action) if short is None else 1):
                 mean, missing = run(self.simulator.mean, some, "x")
                 rows = _rows(theta, some)

@@ -1,4 +1,4 @@
-"""What a model says of outcomes and parameters, where it can say it."""
+"""Values of a model at outcomes and parameters, where it has any."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ from torch import Tensor
 class LikelihoodModel(Protocol):
     """Anything with a conditional density of outcomes.
 
-    Where its likelihood is exact rather than learned, ``exact_likelihood = True`` says
-    so. It may have ``log_likelihood_table(x, theta, action)`` as well: outcomes
-    (n, *x_shape), parameters (m, theta_dim) and one action (action_dim,), all pairs of
-    them, -> (n, m). A network whose condition is (theta, action) then runs m times, not
-    n m times.
+    An exact likelihood, rather than a learned one, has ``exact_likelihood = True``. It
+    may have ``log_likelihood_table(x, theta, action)`` as well: outcomes (n, *x_shape),
+    parameters (m, theta_dim) and one action (action_dim,), all pairs of them, -> (n,
+    m). A network whose condition is (theta, action) then runs m times, not n m times.
     """
 
     def log_likelihood(self, x: Tensor, theta: Tensor, action: Tensor) -> Tensor:
@@ -44,9 +43,9 @@ class Critic:
     r"""A function :math:`f(x, \theta | \xi)` of the model, evaluated in batches.
 
     Attributes:
-        model: What was learned.
-        method: Its method.
-        user: Who asks, for errors.
+        model: Model that was learned.
+        method: Method of the model that is the function f.
+        user: Name of the caller, for errors.
         batch_size: Rows in one pass.
     """
 
@@ -69,7 +68,7 @@ class Critic:
         Args:
             x: Outcomes, shape (n, *x_shape).
             theta: Parameters, shape (n, theta_dim).
-            action: Shape (n, action_dim).
+            action: Actions, shape (n, action_dim).
 
         Raises:
             ValueError: If the model cannot say of a row.

@@ -33,7 +33,8 @@ def join_outcomes(
 
     Args:
         candidates: x of shape (a, n, *x_shape).
-        others: Of p actions at the same parameters, with noise of their own.
+        others: Simulations of p actions at the same parameters, with noise of their
+            own.
 
     Returns:
         x of shape (a, n, 1 + p, *x_shape), the candidate's first; actions of shape

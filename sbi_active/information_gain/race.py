@@ -1,4 +1,4 @@
-"""Which candidate leads, how surely, and which are still in reach."""
+"""The leading candidate, its probability, and those still in reach."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ REACH = 3.0  # standard errors within which candidates stay
 
 @dataclass(frozen=True)
 class Race:
-    r"""Which candidate leads, and how surely, under the central limit.
+    r"""The leading candidate and its probability, under the central limit.
 
     The means of the candidates are jointly Gaussian with the covariance of the paired
     contributions over n. It is applied through the contributions themselves,
@@ -27,9 +27,10 @@ class Race:
 
     Attributes:
         leader: Index of the largest mean.
-        probability_best: Shape (a,).
+        probability_best: Probability of being the best, shape (a,).
         regret: Expected loss by choosing the leader, nats.
-        in_reach: Within some standard errors of the leader, shape (a,), bool.
+        in_reach: Mask of those within some standard errors of the leader, shape (a,),
+            bool.
     """
 
     leader: int
@@ -61,7 +62,7 @@ class Race:
         return Race(leader, best.double() / DRAWS, regret, in_reach)
 
     def reason(self) -> str | None:
-        """Why no further simulations are needed; None where they are."""
+        """Why no further simulations are needed; None if they are."""
         if float(self.probability_best[self.leader]) > SURE:
             return "leader separated"
         if self.regret < NEGLIGIBLE:

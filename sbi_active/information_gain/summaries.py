@@ -92,7 +92,7 @@ class LinearSummaries:
         return _Directions(center, rows[: self._num_kept])
 
     def note(self, num_numbers: int) -> str:
-        """Return what is compared in place of how many numbers."""
+        """Return a note on what is compared in place of how many numbers."""
         return (
             f"{self._num_kept} linear summaries stand for the {num_numbers} numbers of "
             f"an outcome, and leave out at most {self.left_out:.2g} nats"

@@ -1,7 +1,7 @@
 """Folders of earlier releases, brought up to date once.
 
-Here live the readers of what earlier releases wrote: folders of HDF5 and logs of JSON
-lines. Nothing here is used by a campaign or a bank of today.
+This package contains the readers of files that earlier releases wrote: folders of HDF5
+and logs of JSON lines. Current campaigns and banks do not use it.
 """
 
 from sbi_active.migration.folders import migrate

@@ -34,11 +34,11 @@ ADDED = {"draws": {}, "batches": [], "num_simulated": 0}
 def migrate(folder: Path) -> dict[str, int]:
     """Bring a bank, several in a folder, or a campaign of release 0.1 up to date.
 
-    The files of before are kept, in a folder "version-1" within. A migration that was
-    cut short is done again.
+    The former files are kept in a subfolder "version-1". An interrupted migration is
+    done again.
 
     Args:
-        folder: Of the campaign or bank, or that of ``CampaignOptions(bank=)``.
+        folder: Folder of the campaign or bank, or that of ``CampaignOptions(bank=)``.
 
     Returns:
         Number of rows by bank; of a campaign also the number of its events, as "log".
@@ -149,7 +149,7 @@ def _entries(path: Path) -> list[Mapping[str, Any]]:
 
 
 def _content(path: Path) -> bytes | None:
-    """Return what a file holds after its checksum; None where it is not that."""
+    """Return what a file holds after its checksum; None if it is not that."""
     if not path.exists():
         return None
     digest, _, content = path.read_bytes().partition(b"\n")

@@ -24,9 +24,9 @@ def copy_bank(folder: Path, store: Store, name: str) -> int:
     """Write a bank of earlier into a store, its rows in the same order.
 
     Args:
-        folder: Of the bank.
-        store: That gets the rows.
-        name: Of the bank in the store.
+        folder: Folder of the bank.
+        store: Store that gets the rows.
+        name: Name of the bank in the store.
 
     Returns:
         Number of rows.

@@ -1,9 +1,8 @@
 """Robots: MuJoCo models as simulators, and what a plain model lacks as effects.
 
-Here lives what reads an MJCF or the data of ``mujoco.sysid`` and gives the library's
-own simulator, prior, actions and trials, and what gives a belief back to MuJoCo's
-tools. No inference, and no criticism of models, is done here. Needs
-``sbi-active[mujoco]``.
+This package reads an MJCF or the data of ``mujoco.sysid`` and returns the library's own
+simulator, prior, actions and trials. It also converts a belief for MuJoCo's tools. It
+does not infer, and does not criticize models. It needs ``sbi-active[mujoco]``.
 """
 
 from sbi_active.criticism.forces.library import force_effects

@@ -35,15 +35,15 @@ def belief_to_parameters(
     reads the file, in the order of the parameters, which ``save_to_disk`` would sort.
 
     Args:
-        belief: Over the free parameters in the order of ``params.as_vector()``, with
-            ``sample``.
+        belief: Belief over the free parameters in the order of
+            ``params.as_vector()``, with ``sample``.
         params: The ``ParameterDict`` that the belief began with, whose shapes, frozen
             parameters and modifiers are kept; None makes one of single numbers.
-        names: One a parameter where there are no ``params``; None takes those of the
-            belief.
-        level: Of the intervals.
-        seed: Of the draws.
-        path: Of a YAML file to write.
+        names: Names of the parameters where there are no ``params``; None takes those
+            of the belief.
+        level: Probability of the intervals.
+        seed: Seed of the draws.
+        path: Path of a YAML file to write.
 
     Raises:
         ValueError: If their number of parameters differs, or there are no names.
@@ -91,8 +91,9 @@ class Randomization(NamedTuple):
     """Ranges and joint draws for domain randomization.
 
     Attributes:
-        names: One a parameter.
-        ranges: By level, {name: (low, high)}, central intervals of single parameters.
+        names: Names of the parameters.
+        ranges: Ranges by level, {name: (low, high)}, central intervals of single
+            parameters.
         samples: Joint draws, shape (n, d), which keep what ranges lose: the
             correlations between parameters.
     """
@@ -110,14 +111,14 @@ def randomization(
     num_samples: int = 1_000,
     seed: int = 0,
 ) -> Randomization:
-    """Return what to randomize a simulation by, as wide as a belief is.
+    """Return a randomization of a simulation, as wide as a belief is.
 
     Args:
-        belief: With ``sample``; a prior's box will do.
+        belief: Belief with ``sample``; a prior's box will do.
         levels: Probabilities of the ranges, each in (0, 1).
-        names: One a parameter; None takes those of the belief.
+        names: Names of the parameters; None takes those of the belief.
         num_samples: Joint draws to return.
-        seed: Of the draws.
+        seed: Seed of the draws.
 
     Raises:
         ValueError: If a level is no probability, or there are no names.

@@ -21,17 +21,17 @@ def identify_robot(
     beside: Sequence[Effect] | None = None,
     seed: int = 0,
 ) -> IdentifiedBelief:
-    """Return what recordings tell of a robot's parameters, with intervals that hold.
+    """Return the belief of recordings over a robot's parameters, with intervals.
 
     It is :func:`sbi_active.criticism.identification.identify` with what the MJCF may
     lack beside the parameters.
 
     Args:
-        robot: Of :func:`.from_mjcf` or :func:`.from_sysid`.
-        trials: In place of the robot's recordings.
+        robot: Robot of :func:`.from_mjcf` or :func:`.from_sysid`.
+        trials: Trials in place of the robot's recordings.
         beside: Effects that may be there; None takes friction loss, quadratic damping
             and stiffness of each joint, and a lag of each drive.
-        seed: Of all draws.
+        seed: Seed of all draws.
 
     Raises:
         ValueError: If there are no recordings.

@@ -26,13 +26,13 @@ def warn_of_idle(
     """Warn of parameters that change nothing from one bound to the other.
 
     They are tried one by one at the middle of all others, in a few recorded trials, or
-    actions where there are none; where neither says how a trial is run, nothing is.
+    actions if there are none. Nothing is tried if neither says how a trial is run.
 
     Args:
-        simulator: Of :class:`.MujocoFunction`.
-        prior: A box.
-        actions: Permitted ones.
-        trials: Recorded ones.
+        simulator: Simulator of a :class:`.MujocoFunction`.
+        prior: Prior, a box.
+        actions: Permitted actions.
+        trials: Recorded trials.
     """
     run: dict[str, Any] = {}
     if trials is not None:

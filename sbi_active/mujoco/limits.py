@@ -1,4 +1,4 @@
-"""Which actions keep a robot within its limits: they are played in simulation first."""
+"""Actions that keep a robot within its limits, by simulating them first."""
 
 from __future__ import annotations
 
@@ -36,21 +36,22 @@ NUMBERS = 20_000_000
 class MotionLimits:
     """A constraint on actions: joints and actuators stay within limits when played.
 
-    As ``constraint=`` of a :class:`.Campaign` or a designer it lets through actions
+    Passed as ``constraint=`` to a :class:`.Campaign` or a designer, it permits actions
     whose motion, simulated at draws from the belief, stays within every limit at each
     step, and in which no state diverges. The draws are few and the model is not the
     robot: leave a margin, and keep the robot's own guards.
 
     Args:
-        robot: Of :func:`.from_mjcf` or :func:`.from_sysid`.
+        robot: Robot of :func:`.from_mjcf` or :func:`.from_sysid`.
         position: Limits (low, high) by joint, rad or m; None takes the ranges of those
             joints that are limited in the MJCF. ``{}`` for none.
         velocity: Largest speed by joint, rad/s or m/s.
         torque: Largest force by actuator, N m or N, of the actuator's own; None takes
             the ``forcerange`` of the MJCF where it has one.
-        belief: Of the parameters; None takes the prior.
-        num_draws: Of the parameters. The first alone refuses most.
-        seed: Of the draws.
+        belief: Belief over the parameters; None takes the prior.
+        num_draws: Number of draws of the parameters. The first one already refuses
+            most.
+        seed: Seed of the draws.
 
     Raises:
         ValueError: If a name does not exist, a limit is not positive or empty, or there
@@ -120,7 +121,7 @@ class MotionLimits:
         self._theta = drawn.double()
 
     def __call__(self, action: Tensor) -> Tensor:
-        """Return which of actions (n, action_dim) stay within all limits, bool (n,)."""
+        """Return a mask of actions (n, action_dim) within all limits, bool (n,)."""
         action = torch.as_tensor(action).double()
         inside = np.ones(len(action), dtype=bool)
         # Most that leave their limits do so at any parameters.
@@ -137,7 +138,7 @@ class MotionLimits:
         """Return the lowest and highest value of what is limited, over all draws.
 
         Args:
-            action: Shape (n, action_dim).
+            action: Actions, shape (n, action_dim).
 
         Returns:
             By name of a joint, of one with " velocity", or of an actuator with

@@ -16,7 +16,7 @@ ON_TIME = 1e-3
 
 
 def num_steps(times: Array, start: float, step: float) -> int:
-    """Return how many readings, one a step from the start, reach the last time."""
+    """Return the number of readings, one a step from the start, up to the last time."""
     last = float(np.nanmax(times)) - start
     return max(int(np.ceil(last / step - ON_TIME)), 0) + 1
 
@@ -25,10 +25,10 @@ def held(series: Array, own: Array, num: int, step: float) -> Array:
     """Return a series (n, m), held between the points of its grid, at every step.
 
     Args:
-        series: Shape (n, m).
-        own: Its grid, shape (m,).
-        num: Of steps from the grid's first point.
-        step: Of the simulation.
+        series: Series, shape (n, m).
+        own: Grid of the series, shape (m,).
+        num: Number of steps from the grid's first point.
+        step: Time step of the simulation.
     """
     times = own[0] + step * np.arange(num)
     slack = ON_TIME * min(step, own[1] - own[0])
@@ -46,11 +46,11 @@ def sampled(
     """Return readings at times, a line between those of two steps.
 
     Args:
-        readings: Shape (n, steps, c), from the start on.
-        times: Shape (n, k).
+        readings: Readings, shape (n, steps, c), from the start on.
+        times: Times, shape (n, k).
         start: Time of the first reading.
-        step: Between readings.
-        late: By how much each channel reads what was there before, (n, c); None is 0.
+        step: Time between readings.
+        late: Delay of each channel, (n, c); None is 0.
 
     Returns:
         Shape (n, k, c).

@@ -49,16 +49,16 @@ def trials_of(
 ) -> Trials:
     """Return logs as trials.
 
-    Each has a column "time", s from the start of the trial, one of each input and one
-    of each sensor, and may have "start hinge" or "start hinge velocity", of which the
-    first row counts. Where a sensor is called as an input, the input's column is
+    Each log has a column "time", s from the start of the trial, one for each input and
+    one for each sensor, and may have "start hinge" or "start hinge velocity", of which
+    the first row counts. If a sensor has the name of an input, the input's column is
     "hinge control". A sensor may have NaN where it was not read; an input is held.
 
     Args:
-        model: Compiled.
+        model: Compiled model.
         recordings: A list of data frames, of dicts of arrays, or of paths of CSV files;
             or one of these for a single trial.
-        channels: What the simulator returns.
+        channels: Channels that the simulator returns.
         inputs: Actuators that are driven.
 
     Raises:
@@ -101,15 +101,15 @@ def trials_of(
 
 
 def require_in_range(model: Any, name: str, values: Array, what: str) -> None:
-    """Raise where a control is outside the range that its actuator has.
+    """Raise if a control is outside the range that its actuator has.
 
-    MuJoCo would clip it without a word.
+    MuJoCo would clip it without a warning.
 
     Args:
-        model: Compiled.
-        name: Of the actuator.
-        values: Of any shape.
-        what: Where they come from.
+        model: Compiled model.
+        name: Name of the actuator.
+        values: Values of the control, of any shape.
+        what: Source of the values, for the error.
     """
     i = names_of(model, "actuator").index(name)
     if not model.actuator_ctrllimited[i]:
@@ -224,7 +224,7 @@ def _note_angles(model: Any, channel: Channel, x: Array, what: str) -> None:
 
     Args:
         model: Compiled model.
-        channel: What was read; angles are those in rad.
+        channel: Channel that was read; angles are those in rad.
         x: Readings, shape (k,).
         what: Name of the log in messages.
     """

@@ -47,12 +47,12 @@ def free_parameters(params: Any) -> tuple[Bounded, ...]:
 def from_residuals(residual_fn: Any, params: Any, *, noise: Any) -> Robot:
     """Return a robot whose outcome is minus the residual of each sequence.
 
-    It runs in this process: a spec does not go to others.
+    It runs in this process, since a spec is not sent to others.
 
     Args:
         residual_fn: ``residual_fn(x, params)`` of ``build_residual_fn``.
         params: A ``ParameterDict``.
-        noise: Of the residuals.
+        noise: Noise of the residuals.
 
     Raises:
         ValueError: If there is no noise.
@@ -93,7 +93,7 @@ class _Residuals:
         """Return minus the residuals, shape (n, length), NaN where there is none.
 
         Args:
-            theta: Shape (n, d).
+            theta: Parameters, shape (n, d).
             action: Numbers of sequences, shape (n, 1).
         """
         rows = theta.detach().cpu().double().numpy()

@@ -39,10 +39,10 @@ __all__ = ["Robot", "from_mjcf", "from_spec", "named_box", "require_alike"]
 def named_box(parameters: Sequence[Bounded]) -> BoxUniform:
     """Return a uniform prior whose sides have ``names`` and ``units``.
 
-    It is sbi's own class, which a campaign's folder keeps and makes again.
+    It is sbi's own class, which a campaign's folder can store.
 
     Args:
-        parameters: With bounds, names and units.
+        parameters: Parameters with bounds, names and units.
     """
     box = BoxUniform(
         torch.tensor([p.low for p in parameters]),
@@ -59,14 +59,15 @@ MOST_STEPS = 1e7
 
 
 class Robot(NamedTuple):
-    """What a campaign or the closed loop needs of a robot.
+    """The parts of a robot that a campaign or the closed loop needs.
 
     Attributes:
-        simulator: Runs MuJoCo; ``simulator.fn`` is a :class:`.MujocoFunction`.
-        prior: Uniform within the bounds of the parameters, with ``names`` and
+        simulator: Simulator that runs MuJoCo; ``simulator.fn`` is a
+            :class:`.MujocoFunction`.
+        prior: Prior, uniform within the bounds of the parameters, with ``names`` and
             ``units``.
-        actions: What the robot may do; None where only recordings say that.
-        trials: The recordings; None where there are none.
+        actions: Actions that the robot may take; None if only recordings say that.
+        trials: The recordings; None if there are none.
     """
 
     simulator: SimulatorModel
@@ -94,27 +95,28 @@ def from_mjcf(
         spec_or_path: An ``MjSpec``, the path of an MJCF, or its text; or a list of such
             that share all parameters, as with and without a payload, of which the entry
             "model" of an action is the number.
-        parameters: What is unknown, by name: ``{"hinge.damping": (low, high)}`` for a
+        parameters: Unknown parameters by name: ``{"hinge.damping": (low, high)}`` for a
             quantity of :mod:`.quantities`; ``{"friction": (low, high,
             "hinge.frictionloss")}`` under a name of one's own; ``{"length": (low, high,
             edit)}`` with ``edit(spec, value)`` for what only the spec can say. The
             prior is uniform within these bounds.
         inputs: Actuators that recordings drive, None for all; or a space of signals
-            named by actuators, which are then the actions.
+            named by actuators. These signals are then the actions.
         sensors: Sensors of the MJCF that are read, None for all; also joints, as in
             "hinge" or "hinge velocity", for which it has no sensor.
-        actions: What is chosen in each trial, beside a signal too: its names are
-            joints (start positions), joints with ``" velocity"`` behind, actuators
+        actions: Actions that are chosen in each trial, beside a signal too: its names
+            are joints (start positions), joints with ``" velocity"`` behind, actuators
             (a control that is held), or "model". A name that a joint and an actuator
             share is the actuator's; the joint's start is then "hinge position".
-        times: At which sensors are read, s from the start of a trial, shape (k,); None
+        times: Times of the readings, s from the start of a trial, shape (k,); None
             takes those of the inputs, of the recordings, or they come with the trials.
-        noise: Of the sensors, as ``SimulatorModel`` takes it, or standard deviations by
-            sensor; None takes ``noise`` of the sensors in the MJCF, where it is given.
-        start: Start of every trial whose action or recording does not say: positions,
-            velocities, controls that are held ("motor control") and poses of mocap
-            bodies ("target mocap[0]") by name, or the name of a keyframe, which gives
-            all of these. None is the model's.
+        noise: Noise of the sensors, as ``SimulatorModel`` takes it, or standard
+            deviations by sensor; None takes ``noise`` of the sensors in the MJCF, where
+            it is given.
+        start: Start state of trials whose action or recording does not give it:
+            positions, velocities, controls that are held ("motor control") and poses of
+            mocap bodies ("target mocap[0]") by name, or the name of a keyframe, which
+            gives all of these. None is the model's.
         recordings: Logs, one a trial, as in :func:`.trials_of`.
         threads: Number of threads of MuJoCo's rollout, in each process. Results do
             not depend on it.
@@ -185,7 +187,7 @@ def _read(given: Any, sensors: Sequence[str] | None) -> Source:
 
 
 def require_alike(machines: Sequence[Machine]) -> None:
-    """Raise where models differ in what trials say of them by name."""
+    """Raise if models differ in what trials say of them by name."""
     for kind in ("joint", "actuator", "sensor"):
         names = [names_of(machine.model, kind) for machine in machines]
         for k, own in enumerate(names):
@@ -278,7 +280,7 @@ def _start(
 
 
 def _require_times(times: NDArray[Any], step: float) -> None:
-    """Raise where times are not seconds from the start of a trial."""
+    """Raise if times are not seconds from the start of a trial."""
     increase = times.ndim == 1 and len(times) > 0 and (np.diff(times) > 0).all()
     if not (increase and np.isfinite(times).all() and times[0] >= 0):
         raise ValueError(

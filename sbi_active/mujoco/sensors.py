@@ -1,4 +1,4 @@
-"""What is read: sensors of the MJCF, and those of joints that it does not have."""
+"""Sensors of the MJCF, and those of joints that it does not have."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ def added_sensors(source: Source, model: Any, sensors: Sequence[str] | None) -> 
     """Return a source with sensors of those joints that are named in their place.
 
     Args:
-        source: Of the model.
-        model: Compiled.
+        source: Source of the model.
+        model: Compiled model.
         sensors: Names; None for those that the model has.
 
     Raises:
@@ -94,7 +94,7 @@ def channels_of(model: Any, sensors: Sequence[str] | None) -> tuple[Channel, ...
     """Return the numbers that sensors read, in the order of their names.
 
     Args:
-        model: Compiled, with all of them.
+        model: Compiled model, with all of them.
         sensors: Names; None for all.
     """
     own = names_of(model, "sensor")

@@ -48,9 +48,9 @@ class Channel:
     """A number that a sensor reads.
 
     Attributes:
-        name: What reports call it.
-        place: In the model's ``sensordata``.
-        unit: In SI, as far as the model tells it.
+        name: Name in reports.
+        place: Place in the model's ``sensordata``.
+        unit: Unit in SI, as far as the model tells it.
     """
 
     name: str
@@ -69,22 +69,22 @@ class MujocoFunction:
 
     Args:
         machines: Models of one set of parameters.
-        channels: What is returned.
+        channels: Channels that are returned.
         roles: Meaning of each entry of an action; "" for one that only names a trial.
-        times: At which it is returned where trials do not say, shape (k,).
+        times: Times of the readings where trials do not say, shape (k,).
         start: Start states of all trials that do not say, by name: positions,
             velocities, controls that are held ("motor control"), poses of mocap bodies
             ("target mocap[0]" to "target mocap[6]").
         threads: Number of threads of MuJoCo's rollout.
-        readout: What lies between the model's sensors and what is returned, with
+        readout: Readout between the model's sensors and what is returned, with
             ``readout.late(theta)``, by how much each channel reads what was there
             before, s, and ``readout.read(x, theta)``, shapes (n, c) and (n, k, c).
         recorded: Model and start states of each recording, where the entry "recording"
             of an action is its number.
 
     Attributes:
-        machines: As given.
-        channels: As given.
+        machines: Models of one set of parameters.
+        channels: Channels that are returned.
     """
 
     def __init__(
@@ -136,18 +136,19 @@ class MujocoFunction:
         force: Any = None,
         watch: Watch | None = None,
     ) -> Tensor:
-        """Return what the sensors read.
+        """Return the sensors' readings.
 
         Args:
-            theta: Shape (n, d).
-            action: Shape (n, action_dim).
+            theta: Parameters, shape (n, d).
+            action: Actions, shape (n, action_dim).
             inputs: Controls by actuator, shape (n, m), held between their times.
-            input_times: Shape (m,); the simulation starts at the first.
-            times: Of the readings, shape (n, k).
-            start: By name of a joint, or with " velocity", shape (n,).
+            input_times: Times of the inputs, shape (m,); the simulation starts at the
+                first.
+            times: Times of the readings, shape (n, k).
+            start: Start state by name of a joint, or with " velocity", shape (n,).
             model: Changes of the model, {:class:`.ModelChange`: (n, k)}.
             force: Generalized forces, {:class:`.Force`: (n, k)}.
-            watch: Called with the rows that run, before they do.
+            watch: Function that is called with the rows that run, before they do.
 
         Returns:
             Shape (n, k, channels), or (n, k) of a single one; NaN in a row that
@@ -294,7 +295,7 @@ def _alike(
 
     Args:
         which: Model of each row, (n,).
-        times: Of its readings since the start, (n, k).
+        times: Times of its readings since the start, (n, k).
         fewest: Rows of one length, on average, from which lengths run apart.
     """
     last = np.nanmax(times, 1, initial=0.0)

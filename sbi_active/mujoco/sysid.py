@@ -1,8 +1,8 @@
 r"""Data and parameters of ``mujoco.sysid`` as simulator, prior, actions and trials.
 
-What is simulated is what it simulates: controls are lines between their samples, taken
-at the model's steps and held over each; a sensor's reading is stamped with the end of
-the step at whose begin it was taken, and a state with its own time. Signals are
+The simulation is that of ``mujoco.sysid``: controls are lines between their samples,
+taken at the model's steps and held over each; a sensor's reading is stamped with the
+end of the step at whose begin it was taken, and a state with its own time. Signals are
 compared at the measured times that its window keeps. A transform's delays, gains and
 biases act on the prediction, those of the measured signals the other way round, so that
 outcomes are in the units in which they were measured.
@@ -65,16 +65,16 @@ def from_sysid(
         model_sequences: One ``ModelSequences`` or several; or a ``residual_fn`` of
             ``build_residual_fn``, which is taken as a simulator as it is: an outcome is
             then minus its residual, whose measured value is 0.
-        params: A ``ParameterDict``. A uniform prior within ``get_bounds()``.
-        transform: A ``SignalTransform``; of its weights and its normalization nothing
-            is needed where noise is declared.
-        actions: What the robot may do; None takes the recorded sequences, of which the
-            action is the number. Entries are those of :class:`.MujocoFunction`; "model"
-            is the number of a ``ModelSequences``.
-        noise: Of the signals, one or one a signal; None takes autocorrelated errors of
-            unknown size, one a signal, and unknown correlation time. Of a
-            ``residual_fn`` it is needed.
-        threads: Of MuJoCo's rollout.
+        params: A ``ParameterDict``; the prior is uniform within its ``get_bounds()``.
+        transform: A ``SignalTransform``. Its weights and normalization are not needed
+            if noise is declared.
+        actions: Actions that the robot may take; None takes the recorded sequences, of
+            which the action is the number. Entries are those of
+            :class:`.MujocoFunction`; "model" is the number of a ``ModelSequences``.
+        noise: Noise of the signals, one or one a signal; None takes autocorrelated
+            errors of unknown size, one a signal, and unknown correlation time. A
+            ``residual_fn`` needs it.
+        threads: Threads of MuJoCo's rollout.
 
     Raises:
         ValueError: If signals differ between sequences, a signal is not one of the

@@ -1,4 +1,4 @@
-"""What a ``SignalTransform`` of ``mujoco.sysid`` does to predicted signals."""
+"""The action of a ``SignalTransform`` of ``mujoco.sysid`` on predicted signals."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ class Signal:
 
 @dataclass
 class SignalReadout:
-    """What a transform does to predicted signals, by channel.
+    """The action of a transform on predicted signals, by channel.
 
     Attributes:
-        names: Of the channels' signals.
-        stamp: By how much a reading is stamped late, (c,), s.
+        names: Names of the channels' signals.
+        stamp: Time by which a reading is stamped late, (c,), s.
         delays: Place in (theta, fixed values) of each channel's delay, -1 for none.
         scales: Pairs of a place and whether it divides, a list a channel.
         shifts: Pairs of a place and a sign, those that are divided too, a list each.

@@ -1,8 +1,8 @@
 """Pyro: robust updates by error models, and Pyro models as simulators.
 
-Here live Pyro programs of what lies between a simulator and a measurement, the trainer
-that averages over denoised outcomes, and what reads a Pyro model. Needs the extra
-``pyro``. Effects that a simulator lacks live in ``criticism``.
+This package contains Pyro programs of the error between a simulator and a measurement,
+the trainer that averages over denoised outcomes, and the reader of a Pyro model. It
+needs the extra ``pyro``. Effects that a simulator lacks are in ``criticism``.
 """
 
 from sbi_active.pyro.denoising import Denoised, denoise

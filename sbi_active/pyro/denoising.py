@@ -33,12 +33,12 @@ class Denoised:
     Attributes:
         x: Draws, shape (n, q), in the units of the outcome. Channels that were not
             observed are as the others leave them.
-        probability: Of misspecification, a channel, shape (q,); NaN where it was not
-            observed.
+        probability: Probability of misspecification, a channel, shape (q,); NaN where
+            it was not observed.
         r_hat: Largest over channels (split, two chains), of x and of the coordinates
             that NUTS runs over; 1 where nothing was observed.
         effective_sample_size: Smallest over the same.
-        num_divergences: Of both chains.
+        num_divergences: Divergences of both chains.
     """
 
     x: Tensor
@@ -76,7 +76,7 @@ def denoise(
         x_o: Outcome, shape (q,); NaN where a channel was not observed.
         predictive: Simulations at the executed action, shape (n, q).
         error_model: p(x_o | x) by its deviations.
-        seed: Of everything random.
+        seed: Seed of all draws.
 
     Raises:
         ValueError: If shapes do not fit, a number is infinite, or a simulation has NaN.

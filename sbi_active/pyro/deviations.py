@@ -39,10 +39,10 @@ class Coordinates:
     """Log deviations as functions of coordinates that are about standard normal.
 
     Args:
-        fit: Of the channels that were seen.
-        target: Their outcome, shape (q,).
-        error_model: Of the deviations.
-        rng: Of the Gibbs sweeps.
+        fit: Predictive of the channels that were seen.
+        target: Outcome of these channels, shape (q,).
+        error_model: Error model of the deviations.
+        rng: Random generator of the Gibbs sweeps.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ def _swept(
             pulled = np.einsum("kij,kj->ki", precision, residual)
             own = precision[:, c, c]
             off, spread = pulled[:, c] / own, 1 / own
-            # Of all other channels: the whole without this one given them.
+            # Density of all other channels: the whole without this one given them.
             square = (residual * pulled).sum(1) - off**2 * own
             rest = log_weight - 0.5 * (square + log_volume - np.log(spread))
             v = np.maximum(spread - variance[c], SMALLEST)[:, None] + variances

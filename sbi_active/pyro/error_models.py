@@ -44,7 +44,7 @@ class SpikeAndSlab:
         x_o - x \sim (1 - \rho)\, N(0, s^2) + \rho\, t_3(0, S^2)
 
     Attributes:
-        probability: Of misspecification of a channel, :math:`\rho`.
+        probability: Probability of misspecification of a channel, :math:`\rho`.
         spike: s; small beside the noise, which the predictive has already.
         slab: S.
     """
@@ -108,13 +108,13 @@ class StudentError:
 class ChannelBias:
     r"""Each channel is right or has a bias: :math:`x_o = x + m b`, b summed out.
 
-    As :class:`SpikeAndSlab` with a normal slab, for sensors whose zero has moved:
+    It is :class:`SpikeAndSlab` with a normal slab, for sensors whose zero has moved:
     :math:`m \sim \mathrm{Bernoulli}(\rho)`, :math:`b \sim N(0, B^2)`.
 
     Attributes:
         probability: :math:`\rho`.
         bias: B.
-        spike: What is left without a bias.
+        spike: Deviation that is left without a bias.
     """
 
     probability: float = 0.1

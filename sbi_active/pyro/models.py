@@ -65,12 +65,12 @@ class SitesPrior(Distribution):
 
 @dataclass(frozen=True)
 class PyroProblem:
-    """What a Pyro model gives a campaign.
+    """Simulator and prior that a Pyro model gives a campaign.
 
     Attributes:
-        simulator: With a noise where the outcome is a known likelihood.
-        prior: Over all latent sites.
-        parameter_names: Of its entries.
+        simulator: Simulator, with a noise where the outcome has a known likelihood.
+        prior: Prior of all latent sites.
+        parameter_names: Names of the prior's entries.
     """
 
     simulator: SimulatorModel
@@ -90,7 +90,7 @@ def from_pyro(
 
     Args:
         model: ``model(action)``.
-        action: One to try it at, shape (action_dim,).
+        action: Action to try it at, shape (action_dim,).
         outcome: Name of the outcome's site.
 
     Raises:

@@ -1,4 +1,4 @@
-"""What simulations can give, as a normal mixture."""
+"""The predictive of simulations as a normal mixture."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Predictive:
     """A normal mixture.
 
     Attributes:
-        log_weight: Shape (k,).
-        mean: Shape (k, q).
-        cov: Shape (k, q, q).
+        log_weight: Log weights, shape (k,).
+        mean: Means, shape (k, q).
+        cov: Covariances, shape (k, q, q).
     """
 
     log_weight: Tensor
@@ -38,7 +38,7 @@ class Predictive:
         return Predictive(log_weight, mean, factor @ factor.mT)
 
     def marginal(self, seen: Tensor) -> Predictive:
-        """Return that of some channels, a boolean of shape (q,)."""
+        """Return the predictive of some channels, a boolean of shape (q,)."""
         cov = self.cov[:, seen][:, :, seen]
         return Predictive(self.log_weight, self.mean[:, seen], cov)
 

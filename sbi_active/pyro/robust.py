@@ -33,10 +33,10 @@ class RobustBelief(Belief):
         1[\theta \in \mathrm{supp}\, p] / Z, \qquad x_i \sim p(x | x_o)
 
     Args:
-        estimator: q over packed conditions.
-        condition: (x_i, action), shape (n, condition_dim).
+        estimator: Estimator q over packed conditions.
+        condition: Conditions (x_i, action), shape (n, condition_dim).
         prior: The original prior.
-        denoised: What the outcomes were drawn with.
+        denoised: Denoised outcomes that it was drawn with.
     """
 
     label = "robust, chained approximation"
@@ -91,19 +91,20 @@ class RobustBelief(Belief):
 
 
 class RobustASBI(ASBI):
-    r"""ASBI that does not take an outcome at its word.
+    r"""ASBI that is robust to errors of an outcome.
 
     A trial's outcome is denoised with the error model and the predictive under the
     belief before it, and the belief becomes the network's posterior averaged over
-    denoised outcomes. The simulator serves the predictive alone, and nothing is
+    denoised outcomes. The simulator is only used for the predictive, and nothing is
     refined: the result is a chained approximation as that of :class:`ASBI` without one.
 
     Args:
-        prior: As of :class:`ASBI`, with all that follows.
+        prior: Prior of the parameters; it and all that follows are those of
+            :class:`ASBI`.
         error_model: p(x_o | x); None is :class:`SpikeAndSlab`.
 
     Attributes:
-        denoised: Of each update.
+        denoised: Denoised outcome of each update.
     """
 
     def __init__(
@@ -129,9 +130,9 @@ class RobustASBI(ASBI):
                 those numbers too; else their sensor failed, and they are drawn from
                 what the predictive says given the others.
             action: The executed action.
-            simulator: For the predictive; required.
-            refinement: Not used; anything but None is an error.
-            seed: Of everything random; None draws one from torch's global generator.
+            simulator: Simulator of the predictive; required.
+            refinement: Refinement, which must be None.
+            seed: Seed of all draws; None draws one from torch's global generator.
 
         Raises:
             ValueError: If there is no simulator, a refinement is asked for, or fewer

@@ -1,7 +1,7 @@
 """Searches of an action space, one a file.
 
-Here lives how candidates are proposed for any objective. What the objective is lives in
-``information_gain``, who calls both in ``design``.
+This package proposes candidates for any objective. The objectives are in
+``information_gain``, and the callers of both in ``design``.
 """
 
 from sbi_active.search.base import Evaluations, Objective, Search

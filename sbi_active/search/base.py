@@ -1,4 +1,4 @@
-"""What a search gets and gives."""
+"""Interface of a search."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class Evaluations:
     """Estimates of the utility.
 
     Attributes:
-        action: Shape (n, action_dim).
+        action: Actions, shape (n, action_dim).
         utility: Expected information gain, by its cost where there is one, shape (n,).
-        standard_error: Shape (n,).
+        standard_error: Standard errors, shape (n,).
         probability_valid: Share of simulations with a measurement, shape (n,).
     """
 
@@ -35,7 +35,7 @@ class Evaluations:
         )
 
     def known(self) -> Evaluations:
-        """Return those that are numbers."""
+        """Return the evaluations that are numbers."""
         keep = self.utility.isfinite() & self.standard_error.isfinite()
         return Evaluations(*(part[keep] for part in self._all()))
 
@@ -49,11 +49,12 @@ class Objective:
 
     Attributes:
         actions: The space.
-        permitted: Which of actions (n, action_dim) may be chosen, shape (n,), bool.
-        evaluate: Simulate actions (k, action_dim), all at the same parameters, also
-            from call to call.
+        permitted: Function of actions (n, action_dim) that says which may be chosen,
+            shape (n,), bool.
+        evaluate: Function that simulates actions (k, action_dim), all at the same
+            parameters, also from call to call.
         num_evaluations: Actions that may be evaluated.
-        seed: Of what is random in the search.
+        seed: Seed of the search's draws.
         min_probability_valid: Share of measurements that a choice needs.
         known: Evaluations to begin with; None for none.
     """
@@ -80,7 +81,7 @@ class Search(ABC):
 
     @abstractmethod
     def num_evaluations(self, budget: int, num_samples: int) -> int:
-        """Return how many actions to evaluate on the way.
+        """Return the number of actions to evaluate on the way.
 
         Args:
             budget: Simulations of the design.

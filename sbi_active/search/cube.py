@@ -23,7 +23,7 @@ class Coordinates:
     Attributes:
         num_continuous: c.
         sizes: Number of actions of each listed part.
-        dim: Of a point.
+        dim: Dimension of a point.
 
     Raises:
         TypeError: If a part is neither a box nor listed.

@@ -12,8 +12,7 @@ from sbi_active.search.base import Objective, Search
 class ExhaustiveSearch(Search):
     """Compare all actions of a list.
 
-    They meet in :func:`.eliminate`, on common random
-    numbers.
+    They are compared by :func:`.eliminate`, on common random numbers.
     """
 
     @override

@@ -18,7 +18,7 @@ from sbi_active.search.sequential import (
 NUM_STEPS = 50  # of the ascent
 STEP = 0.03  # in the unit cube
 RANGE = 0.1  # of the penalty on being close, in the unit cube
-#: Of the penalty at its largest, in standard deviations of the utility between actions.
+#: Largest penalty, in standard deviations of the utility between actions.
 REPULSION = 0.3
 OPTIMISM = 2.0  # standard deviations of the regression that a proposal may hope for
 APART = 0.02  # least distance of actions chosen together, in the unit cube
@@ -53,7 +53,7 @@ class GradientSearch(SequentialSearch):
     Args:
         num_rounds: Rounds after the first.
         num_finalists: Actions to compare in the end.
-        num_starts: Of an ascent.
+        num_starts: Number of starts of an ascent.
 
     References:
         Klein et al., arXiv 2602.06900 (design by gradients of neural estimates);
@@ -124,10 +124,12 @@ def ascend(
     """Return points that rose from permitted starts (s, dim), shape (s, dim).
 
     Args:
-        score: Of points (s, dim), differentiable in the first entries, shape (s,).
-        start: Shape (s, dim).
+        score: Score of points (s, dim), differentiable in the first entries, shape
+            (s,).
+        start: Starts, shape (s, dim).
         num_continuous: Entries that move, in a unit cube.
-        permitted: Of points (s, dim), shape (s,), bool.
+        permitted: Function of points (s, dim) that says which are permitted, shape
+            (s,), bool.
         repulsion: The penalty on two points that coincide, in units of the score.
     """
     c = num_continuous
@@ -176,7 +178,7 @@ def regression(
 def _score(
     progress: Progress, optimism: float
 ) -> tuple[Callable[[Tensor], Tensor], GaussianProcess]:
-    """Return what to ascend, and the regression of the utility in it."""
+    """Return the score to ascend, and the regression of the utility in it."""
     objective, coordinates, found = progress
     point = coordinates.points(found.action)
     c = coordinates.num_continuous

@@ -22,11 +22,11 @@ MANY = 32  # draws for a permitted point
 
 
 class Progress(NamedTuple):
-    """What a search knows so far.
+    """State of a search.
 
     Attributes:
-        objective: What it maximizes.
-        coordinates: Of the actions.
+        objective: Objective that it maximizes.
+        coordinates: Coordinates of the actions.
         found: Evaluations that are numbers.
     """
 

@@ -1,7 +1,7 @@
 """Simulators, their noise, and the engine that runs them.
 
-Here lives what turns parameters and an action into outcomes. What is learned from
-outcomes does not. A name is imported when it is used.
+This package turns parameters and an action into outcomes. It does not learn from
+outcomes. Names are imported when they are used.
 """
 
 from __future__ import annotations

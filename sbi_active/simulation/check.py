@@ -47,7 +47,7 @@ def check_simulator(
     workers: Workers | int | None = None,
     seed: int = 0,
 ) -> SimulatorReport:
-    """Run a simulator over draws of the prior and say what a campaign would meet.
+    """Run a simulator over draws of the prior and report its defects before a campaign.
 
     A defect keeps a campaign from working: the simulator raises, gives rows of another
     number or shape, is deterministic, has no measurement at all, mixes its rows, or
@@ -57,13 +57,16 @@ def check_simulator(
     Args:
         simulator: ``simulator(theta, action)``, see
             :class:`.Simulator`.
-        prior: Over the parameters.
-        actions: What the robot may do; the values of a discrete space are all run.
+        prior: Prior of the parameters.
+        actions: Actions that the robot may take; the values of a discrete space are all
+            run.
         num_rows: Rows a check, at least 16.
-        max_seconds: Of simulation time; a slow simulator gets fewer rows, 16 at least.
-        num_simulations: That the campaign needs, for :attr:`SimulatorReport.minutes`.
-        workers: Where they will run, or the number of calls at a time.
-        seed: Of the draws.
+        max_seconds: Seconds of simulation time; a slow simulator gets fewer rows, 16 at
+            least.
+        num_simulations: Simulations that the campaign needs, for
+            :attr:`SimulatorReport.minutes`.
+        workers: Workers of the campaign, or the number of calls at a time.
+        seed: Seed of the draws.
 
     Example:
         >>> from sbi.utils import BoxUniform

@@ -1,4 +1,4 @@
-"""How a trial was run, beyond its action: keyword arguments of a simulator's function.
+"""Conditions of a trial beyond its action: keyword arguments of a simulator.
 
 A function ``fn(theta, action)`` may take any of ``times``, shape (n, k), at which x is
 measured; ``inputs``, {name: (n, m)}, over time; ``input_times``, (m,), their uniform
@@ -32,9 +32,9 @@ SOURCES = {
 def conditions_of(
     fn: Callable[..., Any], keywords: Sequence[str]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return which of them a function takes, and which it cannot do without.
+    """Return the conditions that a function takes, and those that it requires.
 
-    A ``functools.partial`` that binds one has decided it.
+    A condition that a ``functools.partial`` binds does not count.
 
     Args:
         fn: The function.
@@ -50,7 +50,7 @@ def conditions_of(
 
 
 def require_conditions(needed: tuple[str, ...], given: Mapping[str, Any]) -> None:
-    """Raise where a function lacks what it cannot do without."""
+    """Raise if a function lacks a condition that it requires."""
     for name in needed:
         if name not in given:
             raise ValueError(
@@ -62,7 +62,7 @@ def require_conditions(needed: tuple[str, ...], given: Mapping[str, Any]) -> Non
 def require_taken(
     inputs: SignalActions | MixedActions | None, conditions: tuple[str, ...]
 ) -> None:
-    """Raise where signals are given that a function does not take."""
+    """Raise if signals are given that a function does not take."""
     if inputs is not None and "inputs" not in conditions:
         raise ValueError(
             "expected a function that takes the signals of its actions; got one "
@@ -76,9 +76,9 @@ def played(
     """Return the signals of actions as inputs and input_times.
 
     Args:
-        space: Of the actions.
-        action: Shape (n, action_dim); equal ones are generated once.
-        dtype: Of the series.
+        space: Space of the actions.
+        action: Actions, shape (n, action_dim); equal ones are generated once.
+        dtype: Type of the series.
     """
     each, place = torch.unique(action, dim=0, return_inverse=True)
     return {
@@ -90,7 +90,7 @@ def played(
 
 
 def require_rows_each(name: str, value: Any, num: int) -> None:
-    """Raise where a keyword argument is neither a number nor one a row."""
+    """Raise if a keyword argument is neither a number nor one a row."""
     if isinstance(value, Mapping):
         for key, part in value.items():
             require_rows_each(f"{name}[{key!r}]", part, num)
@@ -133,8 +133,8 @@ def one_row(arrays: Mapping[str, Any], i: int) -> dict[str, Any]:
     """Return the keyword arguments of a row, from those of all, as copies of its own.
 
     Args:
-        arrays: From :func:`as_arrays`.
-        i: Of the row.
+        arrays: Arrays from :func:`as_arrays`.
+        i: Index of the row.
     """
     return {
         name: value.copy() if name == "input_times" else _row(value, i)

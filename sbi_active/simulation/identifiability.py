@@ -1,4 +1,4 @@
-"""Which parameters of a simulator no permitted action tells apart."""
+"""Parameters of a simulator that no permitted action tells apart."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ class Undetermined:
     """Parameters that no permitted action determines, as far as was tried.
 
     Attributes:
-        parameters: Their names.
-        known: The combinations through which the outcome depends on them; empty where
+        parameters: Names of the parameters.
+        known: The combinations through which the outcome depends on them; empty if
             it does not, or where there is no short formula.
         is_exact: Whether the outcome is the same, rather than within a tenth of the
             noise.
-        text: In words, with what to do.
+        text: Text in words, with what to do.
     """
 
     parameters: tuple[str, ...]
@@ -85,26 +85,26 @@ def find_undetermined(
     where noise is added to the outcome). Its mean over the sets gives formulas by
     :func:`.search`.
 
-    Each formula is then put to the test: parameters are moved along it, most of a prior
-    deviation where the support allows that, and where x moves by more than a tenth of
-    the noise nothing is said. The same outcome under the same random numbers is the
-    same distribution, so that what is said holds at the places that were tried,
-    whatever the noise; the reverse is not true, and more may be undetermined.
+    Each formula is then tested: parameters are moved along it, by most of a prior
+    deviation if the support allows it, and if x moves by more than a tenth of the noise
+    the formula is dropped. The same outcome under the same random numbers is the same
+    distribution, so that the result holds at the places that were tried, whatever the
+    noise; the reverse is not true, and more may be undetermined.
 
     Args:
         simulate: The simulator.
-        prior: Over its parameters.
-        actions: To try, shape (a, action_dim); the first 16 are.
-        names: One a parameter.
-        skip: Parameters that are left alone, since they change nothing anyhow.
+        prior: Prior of its parameters.
+        actions: Actions to try, shape (a, action_dim); the first 16 are.
+        names: Names of the parameters.
+        skip: Parameters that are skipped since they change nothing.
         num_rows: Rows a call of the simulator; it is called 2 d + 2 times, and twice
             for what is found.
-        num_numbers: Of an outcome; many of them get fewer rows.
+        num_numbers: Number of an outcome's numbers; many of them get fewer rows.
         num_permitted: Actions that are permitted; None is endless.
-        seed: Of the draws.
+        seed: Seed of the draws.
 
     Returns:
-        One a group of parameters; empty where all are told apart.
+        One a group of parameters; empty if all are told apart.
 
     References:
         Rothenberg, Identification in parametric models, Econometrica 1971; Raue et al.,
@@ -130,7 +130,7 @@ def find_undetermined(
 def _formulas(
     probe: Sensitivities, names: Sequence[str], where: str, practical: bool
 ) -> tuple[Undetermined, ...]:
-    """Return what has a formula that holds where it was tried."""
+    """Return groups with a formula that holds where it was tried."""
     covariances = probe.covariances(practical)
     place = {i: k for k, i in enumerate(probe.free)}
     theta = probe.theta.double().numpy()
@@ -184,7 +184,7 @@ def _holds(
 def _local(
     probe: Sensitivities, names: Sequence[str], where: str
 ) -> tuple[Undetermined, ...]:
-    """Return what changes nothing at each of the parameters, without a formula."""
+    """Return groups that change nothing at each parameter set, without a formula."""
     size, vectors = probe.singular()
     if not (size == 0).any(1).all():
         return ()

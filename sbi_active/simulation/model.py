@@ -62,26 +62,26 @@ class SimulatorModel:
             ``fn(theta, action, rng)`` of one row: float64 NumPy arrays of shapes
             (theta_dim,) and (action_dim,), and a NumPy generator from the row's seed,
             which a ``fn`` without random numbers may leave out.
-        noise: Added to the output of ``fn``; None where ``fn`` is itself the draw. A
-            number is the standard deviation of Gaussian noise.
+        noise: Noise added to the output of ``fn``; None if ``fn`` is itself the
+            draw. A number is the standard deviation of Gaussian noise.
         batched: Whether ``fn`` takes all rows at once.
-        setup: Called without arguments once a process, before the first run; ``fn``
-            receives what it returns as keyword argument ``context``. It is neither
+        setup: Function called without arguments once a process, before the first run;
+            ``fn`` receives its result as keyword argument ``context``. It is neither
             pickled nor freed before the process ends.
-        parameter_names: One a parameter.
-        channel_names: One an entry of x's last axis; a single one where x is a
+        parameter_names: Names of the parameters.
+        channel_names: Names of the entries of x's last axis; a single one where x is a
             trajectory of one channel, which has no axis of its own.
         sample_times: Time stamps of x's first axis in seconds, shape (T,), for the
             noise.
-        inputs: Where actions are parameters of a signal, alone or beside others, their
-            space: ``fn`` receives its signals as ``inputs``, unless trials bring those
-            that were recorded.
+        inputs: Space of the actions if they are parameters of signals, alone or beside
+            others: ``fn`` receives the signals as ``inputs``, unless trials have
+            recorded ones.
 
     Attributes:
-        noise: With the time stamps, where there are any.
+        noise: Noise with the time stamps, where there are any.
         effect_names: Names of the effects that ``fn`` declares.
-        conditions: Which of ``times``, ``inputs``, ``input_times`` and ``start`` ``fn``
-            takes as keyword arguments.
+        conditions: Keyword arguments of ``fn`` among ``times``, ``inputs``,
+            ``input_times`` and ``start``.
         is_batched: Whether ``fn`` takes all rows at once.
         fn_takes_seeds: Whether each row of ``fn`` is a function of its seed.
 
@@ -155,10 +155,10 @@ class SimulatorModel:
         """Return one draw a row.
 
         Args:
-            theta: Shape (n, theta_dim).
-            action: Shape (n, action_dim).
-            seeds: One a row, shape (n,); None uses torch's global generator.
-            effects: By name, a number or one a row.
+            theta: Parameters, shape (n, theta_dim).
+            action: Actions, shape (n, action_dim).
+            seeds: Seeds, one a row, shape (n,); None uses torch's global generator.
+            effects: Effects by name, a number or one a row.
 
         Returns:
             Shape (n, *x_shape).
@@ -179,9 +179,9 @@ class SimulatorModel:
         """Return the noise-free output, shape (n, *x_shape).
 
         Args:
-            theta: Shape (n, theta_dim).
-            action: Shape (n, action_dim).
-            effects: By name, a number or one a row.
+            theta: Parameters, shape (n, theta_dim).
+            action: Actions, shape (n, action_dim).
+            effects: Effects by name, a number or one a row.
 
         Raises:
             ValueError: If the model was built without a noise model, or ``fn`` is
@@ -209,9 +209,9 @@ class SimulatorModel:
 
         Args:
             x: Observations, shape (n, *x_shape).
-            theta: Shape (n, theta_dim).
-            action: Shape (n, action_dim).
-            effects: By name, a number or one a row.
+            theta: Parameters, shape (n, theta_dim).
+            action: Actions, shape (n, action_dim).
+            effects: Effects by name, a number or one a row.
 
         Returns:
             Shape (n,), float64, nats.
@@ -243,9 +243,9 @@ class SimulatorModel:
         The first call runs ``fn`` twice on at most 8 rows; its answer is kept.
 
         Args:
-            theta: Shape (n, theta_dim).
-            action: Shape (n, action_dim).
-            effects: By name, a number or one a row.
+            theta: Parameters, shape (n, theta_dim).
+            action: Actions, shape (n, action_dim).
+            effects: Effects by name, a number or one a row.
         """
         if self._is_deterministic is None:
             few = at_rows(effects, slice(FEW))
@@ -318,7 +318,7 @@ class SimulatorModel:
     def _own_conditions(
         self, theta: Tensor, action: Tensor, given: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """Return what the model itself knows of how its trials are run."""
+        """Return the conditions of trials that the model itself knows."""
         found = {}
         if "times" in self.conditions and self.sample_times is not None:
             times = self.sample_times.to(theta.dtype)

@@ -1,4 +1,4 @@
-"""What became of each simulated row: a measurement, none, or a fault."""
+"""Outcomes of simulated rows: a measurement, none, or a fault."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sbi_active.messages import Explained, SimulationWarning
 
 
 class Outcome(IntEnum):
-    """What became of a row.
+    """Outcome of a row.
 
     Attributes:
         OK: A measurement; some of its numbers may be NaN, which masks them.
@@ -37,7 +37,7 @@ class Simulations:
         x: Outcomes, shape (n, *x_shape), float32; NaN where there is no measurement.
         status: An :class:`Outcome` a row, shape (n,), int8; None reads it from x, NaN
             throughout being invalid.
-        tracebacks: Of the rows that failed, by index.
+        tracebacks: Tracebacks of the rows that failed, by index.
     """
 
     theta: Tensor
@@ -84,7 +84,7 @@ class SimulationInterrupted(Explained, KeyboardInterrupt):
     """The user interrupted a simulation.
 
     Attributes:
-        simulations: What is finished; the other rows are missing.
+        simulations: Simulations that are finished; the other rows are missing.
     """
 
     code = "SA308"

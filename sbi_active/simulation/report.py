@@ -1,4 +1,4 @@
-"""What was seen of a simulator before a campaign."""
+"""Report on a simulator before a campaign."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ LINES = 10  # of actions without a measurement
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatorReport:
-    """What was seen of a simulator; print it.
+    """Findings about a simulator; ``print`` shows them.
 
     Attributes:
         num_rows: Rows that each check simulated.
-        x_shape: Of one outcome; None where there was none.
+        x_shape: Shape of one outcome; None if there was none.
         output: Type of the simulator's output, "torch.float32".
         takes_seeds: Whether it is given one seed a row.
         is_deterministic: Whether two seeds gave identical x.
@@ -32,14 +32,14 @@ class SimulatorReport:
             tried, and the combinations of them that actions do determine.
         seconds_batch: Time of ``num_rows`` rows at once.
         seconds_row: Time of a call with one row.
-        seconds_round: Measured wall time of a campaign's round; None where it was not.
-        num_rounds: Of that campaign.
-        num_simulations: That a campaign needs.
-        num_workers: That share them.
+        seconds_round: Measured wall time of a campaign's round; None if it was not.
+        num_rounds: Rounds of that campaign.
+        num_simulations: Simulations that a campaign needs.
+        num_workers: Workers that share them.
         noiseless: Numbers of x, flattened, that two seeds leave as they are while
             others change.
-        defects: What keeps a campaign from working.
-        warnings: What deserves a look.
+        defects: Defects that keep a campaign from working.
+        warnings: Warnings of what deserves a look.
     """
 
     num_rows: int = 0
@@ -77,7 +77,7 @@ class SimulatorReport:
     def minutes(self) -> float | None:
         """Time of a campaign, as the round that was measured, or of its simulations.
 
-        The latter, shared evenly by the workers, where no round was measured.
+        If no round was measured, simulations are shared evenly by the workers.
         """
         if self.seconds_round is not None:
             return self.num_rounds * self.seconds_round / 60

@@ -1,4 +1,4 @@
-"""How x answers to parameters at a few places: derivatives, noise, rounding."""
+"""Sensitivity of x to parameters at a few places: derivatives, noise, rounding."""
 
 from __future__ import annotations
 
@@ -22,8 +22,9 @@ Array = NDArray[Any]
 Simulate = Callable[[Tensor, Tensor, str], Tensor]
 
 STEP = 0.01  # of a derivative, in prior deviations
-#: Of the largest singular value, below which one is an error of the differences: they
-#: are cut off at STEP**2 / 6 of what turns within a deviation, and rounded in float32.
+#: Share of the largest singular value below which one is an error of the differences:
+#: these are cut off at STEP**2 / 6 of what turns within a deviation, and rounded in
+#: float32.
 NUMERIC = 5e-4
 #: Trials of each action with which a parameter that is not known is hardly determined.
 TRIALS = 100.0
@@ -72,7 +73,7 @@ class Sensitivities:
         return np.where(np.isfinite(x), x, np.nan)
 
     def _noise(self) -> Array:
-        """Return what counts as large in x, by action and number, (1, a, numbers)."""
+        """Return sizes that count as large, by action and number, (1, a, numbers)."""
         gap = self.base - self.x(self.theta, "noise")
         with np.errstate(invalid="ignore"):
             noise = np.sqrt(0.5 * _mean(gap**2, 0))
@@ -106,7 +107,7 @@ class Sensitivities:
         return np.where(size > limit[:, None], size, 0.0), vectors.swapaxes(1, 2)
 
     def covariances(self, practical: bool) -> Array:
-        """Return what many trials leave, in prior deviations, shape (k, d, d)."""
+        """Return covariances that many trials leave, in prior deviations, (k, d, d)."""
         size, vectors = self.singular()
         largest = np.maximum(size.max(1, keepdims=True), 1e-300)
         known = (size / (NUMERIC * largest)) ** 2

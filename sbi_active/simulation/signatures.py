@@ -1,4 +1,4 @@
-"""What a simulator's function takes, read from its signature."""
+"""Arguments of a simulator's function, read from its signature."""
 
 from __future__ import annotations
 

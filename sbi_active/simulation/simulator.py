@@ -1,4 +1,4 @@
-"""What users bring as a simulator, and what its output must look like."""
+"""Interface of a user's simulator, and checks of its output."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FEW_VALUES = 4  # outcomes for each whole number among them, at least: they are 
 
 
 class Simulator(Protocol):
-    """What users bring: a draw from p(x | theta, action), one row a parameter set.
+    """A user's simulator: draws from p(x | theta, action), one row a parameter set.
 
     A plain function will do. It may also accept ``seeds`` (shape (n,), int64), and then
     row i depends on ``seeds[i]`` alone.
@@ -24,8 +24,8 @@ class Simulator(Protocol):
         """Return x of shape (n, *x_shape), torch or NumPy.
 
         Args:
-            theta: Shape (n, theta_dim), float32.
-            action: Shape (n, action_dim), float32.
+            theta: Parameters, shape (n, theta_dim), float32.
+            action: Actions, shape (n, action_dim), float32.
         """
         ...
 
@@ -38,7 +38,7 @@ def outcome_tensor(
     It has memory of its own: a simulator may return the buffer that it works in.
 
     Args:
-        x: What the simulator returned.
+        x: Outcomes that the simulator returned.
         num_rows: Rows that it was given.
         dtype: Floating type to return; None keeps that of x.
 
@@ -78,7 +78,7 @@ def outcome_array(x: Any) -> np.ndarray:
 
 
 def _require_outcome(x: Any) -> None:
-    """Raise where there is none; it counts as an exception of the simulator."""
+    """Raise if there is none; it counts as an exception of the simulator."""
     if x is None:
         raise RuntimeError(
             "expected an outcome from the simulator; got None; return x, with NaN "
@@ -87,10 +87,10 @@ def _require_outcome(x: Any) -> None:
 
 
 def require_rows(theta: Tensor, action: Tensor) -> None:
-    """Raise where parameters and actions are no finite rows (n, ...) of each other.
+    """Raise if parameters and actions are no finite rows (n, ...) of each other.
 
     Raises:
-        ValueError: With the first row that is not finite.
+        ValueError: If a row is not finite; it names the first.
     """
     if theta.ndim != 2 or action.ndim != 2 or len(theta) != len(action):
         raise ValueError(
@@ -112,7 +112,7 @@ def square_of(x: Tensor, before: int | None) -> int | None:
 
     Args:
         x: Outcomes, shape (n, *x_shape).
-        before: What this returned for earlier ones; None for none.
+        before: Value that this returned for earlier ones; None for none.
 
     Raises:
         ValueError: If that was so for two numbers of rows: each outcome has a number
@@ -131,10 +131,10 @@ def square_of(x: Tensor, before: int | None) -> int | None:
 
 
 def require_noise(x: Tensor, again: Tensor) -> None:
-    """Raise where two seeds gave identical outcomes.
+    """Raise if two seeds gave identical outcomes.
 
-    Of counts, and of what is or is not, many are equal by chance: a few whole numbers
-    among many outcomes prove nothing.
+    Many counts and yes-or-no outcomes are equal by chance: a few whole numbers among
+    many outcomes prove nothing.
 
     Args:
         x: Outcomes under one seed, shape (n, *x_shape).

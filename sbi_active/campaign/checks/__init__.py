@@ -1,7 +1,7 @@
 """Checks of a campaign's trials against what was believed before them.
 
-Here live scores, surprises and the health they add up to. What a campaign does about
-them does not.
+This package contains the scores, the surprises and the health computed from them. It
+does not contain what a campaign does about them.
 """
 
 from sbi_active.campaign.checks.health import assess, log_e_value

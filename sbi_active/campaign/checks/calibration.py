@@ -12,11 +12,11 @@ from sbi_active.seeding import derive_seed
 def calibration_lost(campaign: Any) -> str | None:
     """Return why not to go on, or None.
 
-    A refined belief is inferred twice again from the same trials; of a chained one the
-    network is checked that has the next word.
+    A refined belief is inferred twice again from the same trials; for a chained one the
+    network that gives the next belief is checked.
 
     Args:
-        campaign: Of a method with a posterior, or with refined beliefs.
+        campaign: Campaign of a method with a posterior, or with refined beliefs.
     """
     state = campaign.state
     if not state.explained:

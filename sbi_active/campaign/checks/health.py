@@ -33,10 +33,10 @@ def assess(state: CampaignState) -> Health:
     levels add up to :math:`\alpha`. Alarms stay until another model is adopted.
 
     Args:
-        state: Of the campaign. Trials count that the current model scored, under a
-            belief that is off by no more than 0.2 nats for want of simulations
-            (``error_nats_if_explained`` of its diagnostics): another predicts wrongly
-            though the simulator be right.
+        state: State of the campaign. Only trials count that the current model
+            scored under a belief with at most 0.2 nats of simulation error
+            (``error_nats_if_explained`` of its diagnostics); a worse belief predicts
+            wrongly even if the simulator is right.
 
     References:
         Vovk & Wang, Annals of Statistics 2021 (e-values from p-values); Ville, Etude

@@ -1,4 +1,4 @@
-"""What a belief says of the trials that it was fitted to."""
+"""The misfit of a belief to the trials that it was fitted to."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ def misfit(diagnostics: Diagnostics) -> float | None:
     """Return a belief's tail probability, of all trials or the worst, both counted.
 
     Args:
-        diagnostics: Of the belief; without tail probabilities there is none, nor where
-            it is off by more than a test of the simulator can bear.
+        diagnostics: Diagnostics of the belief. The result is None without tail
+            probabilities, and where the belief is off by more than a test of the
+            simulator can bear.
     """
     each, joint = diagnostics.tail_probability_of_trial, diagnostics.tail_probability
     if joint is None or error_nats(diagnostics) > LARGE:

@@ -1,4 +1,4 @@
-"""How well a trial was predicted, before it is used."""
+"""Scores of a trial's prediction, made before the trial is used."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ TIE = 1e-9  # of a distance, by which rounding may part equal ones
 
 @dataclass(frozen=True)
 class Score:
-    """How well an outcome was predicted.
+    """Scores of the prediction of an outcome.
 
     Attributes:
         surprise: Tail probability, in (0, 1].
         log_score: Log density, nats.
-        num_simulations: Spent.
-        num_missing: Of them lost to faults of the simulator.
+        num_simulations: Number of simulations spent.
+        num_missing: Number of those simulations lost to faults of the simulator.
     """
 
     surprise: float
@@ -62,10 +62,10 @@ def score_outcome(
     numbers, and independent of the trials before it. It is at least 1 / (n + 1),
     however far the outcome lies: what no draw reaches is no evidence beyond that.
 
-    Outcomes without a measurement, or those with one, lie further out where they are
-    rarer. Of a trial that was partly measured only what was measured is compared, with
-    the same numbers of the simulations, so that a sensor that drops out is no surprise.
-    A simulator that itself leaves numbers out may be the cause as well; p is then the
+    Outcomes without a measurement, or those with one, lie further out the rarer they
+    are. Of a trial that was partly measured only the measured numbers are compared with
+    those of the simulations, so that a sensor that drops out is no surprise. A
+    simulator that itself leaves numbers out may be the cause as well; p is then the
     larger of the two tail probabilities. Numbers that are there where simulations
     seldom have them do count.
 
@@ -77,11 +77,11 @@ def score_outcome(
         x: The outcome, shape x_shape; NaN where nothing was measured.
         action: The executed one, shape (action_dim,).
         simulator: ``simulator(theta, action)``.
-        belief: Before the trial.
+        belief: Belief before the trial.
         num_samples: n, fewer of outcomes with more than 2,000 numbers: as many as have
             4 million together, and at least 400.
-        seed: Of the simulations.
-        workers: Of the simulations.
+        seed: Seed of the simulations.
+        workers: Workers that run the simulations.
 
     References:
         Dawid, J. R. Stat. Soc. A 1984 (prequential assessment); Vovk, Gammerman &

@@ -20,15 +20,15 @@ class Spread:
     .. math::
         C = (1 - \lambda) \hat C + \lambda \operatorname{diag} \hat C,
 
-    with the :math:`\lambda` of the largest leave-one-out Gaussian likelihood: C serves
-    with more numbers than rows. What was not measured counts as at the mean. All
-    are the same functions of the rows in any order.
+    with the :math:`\lambda` of the largest leave-one-out Gaussian likelihood, so that C
+    can be used with more numbers than rows. Missing numbers count as the mean. No
+    result depends on the order of the rows.
 
     Attributes:
-        mean: Shape (q,).
+        mean: Means, shape (q,).
         scale: Standard deviations, shape (q,).
         share: :math:`\lambda`.
-        z: Standardized rows, zero where not measured, shape (n, q).
+        z: Standardized rows, zero if not measured, shape (n, q).
         distance: Squared Mahalanobis distance of each row, shape (n,).
 
     References:

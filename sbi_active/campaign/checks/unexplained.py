@@ -40,12 +40,12 @@ def simulate_prior(
     """Return simulations of a trial's action from the prior.
 
     Args:
-        trial: Gives the action.
+        trial: Trial whose action is simulated.
         simulator: ``simulator(theta, action)``.
-        prior: Of theta.
-        num_samples: Rows.
-        seed: Of the simulations.
-        workers: Of the simulations.
+        prior: Prior of theta.
+        num_samples: Number of rows.
+        seed: Seed of the simulations.
+        workers: Workers that run the simulations.
     """
     with forked_generators(seed, "theta"):
         theta = prior.sample(torch.Size([num_samples]))
@@ -62,12 +62,12 @@ def outlyingness(x: Tensor, drawn: Tensor) -> float:
         \max_j \frac{\max(x_j - \max_i x_{ij},\; \min_i x_{ij} - x_j,\; 0)}
         {\max_i x_{ij} - \min_i x_{ij}}
 
-    over the numbers j that were measured; infinite where no simulation had one of them.
+    over the numbers j that were measured; infinite if no simulation had one of them.
     The range of a number that never varies is its size.
 
     Args:
         x: The outcome, shape x_shape; NaN where nothing was measured.
-        drawn: Simulated ones, shape (n, *x_shape).
+        drawn: Simulated outcomes, shape (n, *x_shape).
 
     Example:
         >>> outlyingness(torch.tensor([3.0]), torch.tensor([[0.0], [0.5], [1.0]]))
@@ -92,7 +92,7 @@ def outlyingness(x: Tensor, drawn: Tensor) -> float:
 
 
 def doubts(trials: Sequence[Trial]) -> list[str]:
-    """Return what is wrong with trials beyond all simulations, and what to do."""
+    """Return the doubts about trials beyond all simulations, with advice."""
     return [
         _doubt(t) for t in trials if t.is_measured and (t.outlyingness or 0.0) > NOTABLE
     ]
@@ -104,9 +104,9 @@ def in_doubt(
     """Return the same belief, marked untrustworthy for reasons; itself without any.
 
     Args:
-        belief: Of the trials that are explained; the prior before any.
+        belief: Belief from the trials that are explained; the prior before any.
         prior: The original prior.
-        texts: From :func:`doubts`.
+        texts: Reasons from :func:`doubts`.
     """
     if not texts:
         return belief

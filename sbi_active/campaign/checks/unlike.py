@@ -21,7 +21,7 @@ def most_unlike(actions: ActionSpace, executed: Tensor) -> ActionSpace:
 
     Args:
         actions: The permitted ones.
-        executed: Shape (t, action_dim), t >= 0.
+        executed: Executed actions, shape (t, action_dim), t >= 0.
 
     References:
         Johnson, Moore & Ylvisaker, J. Stat. Plan. Inference 1990 (maximin distance).

@@ -1,5 +1,5 @@
 """A campaign as a person sees it: a table, figures, a page of a notebook, a bar.
 
-Here lives what reads a campaign and shows it. Nothing here changes one, or decides
-anything that a campaign does.
+This package reads a campaign and shows it. It never changes a campaign and decides
+nothing for it.
 """

@@ -44,11 +44,11 @@ def plot_campaign(
     """Return the figure of :meth:`.CampaignView.plot`.
 
     Args:
-        state: Of the campaign.
-        simulator: That of a trial, by its index; None where there is none.
-        prior: Over the current parameters.
-        parameter_names: One a parameter.
-        theta_true: Shape (theta_dim,), where known.
+        state: State of the campaign.
+        simulator: Simulator of a trial, by its index; None if there is none.
+        prior: Prior of the current parameters.
+        parameter_names: Names of the parameters.
+        theta_true: True parameters, shape (theta_dim,), where known.
         num_predicted: Simulations of each trial.
 
     Raises:

@@ -40,10 +40,10 @@ def to_dataframe(
     """Return the trials as a table, see :meth:`.CampaignView.to_dataframe`.
 
     Args:
-        state: Of the campaign.
-        actions: Of the campaign.
-        parameter_names: One a parameter.
-        channel_names: One an entry of x's last axis, where known.
+        state: State of the campaign.
+        actions: Action space of the campaign.
+        parameter_names: Names of the parameters.
+        channel_names: Names of the entries of x's last axis, where known.
     """
     import pandas as pd
 
@@ -107,8 +107,8 @@ def outcome_labels(
     """Return a name for each number of an outcome, none where they are many.
 
     Args:
-        shape: Of the outcome.
-        channel_names: One an entry of the last axis, where known.
+        shape: Shape of the outcome.
+        channel_names: Names of the entries of the last axis, where known.
 
     Example:
         >>> outcome_labels((2,)), outcome_labels((2,), ["angle", "speed"])
@@ -131,9 +131,9 @@ def outcome_labels(
 
 
 def expected_gain(design: Design | None) -> tuple[float, float]:
-    """Return what an action was expected to tell and the standard error, nats.
+    """Return the expected information gain of an action and its standard error, nats.
 
-    NaN where it was not designed.
+    They are NaN for a trial that was not designed.
     """
     if design is None:
         return float("nan"), float("nan")
@@ -147,7 +147,7 @@ def expected_gain(design: Design | None) -> tuple[float, float]:
 def health_after(state: CampaignState, trial: Trial) -> str | None:
     """Return the campaign's health when a trial had been used.
 
-    None for one that was not used, or not scored.
+    It is None for a trial that was not used, or not scored.
     """
     if trial.index not in state.processed:
         return None

@@ -20,8 +20,8 @@ def page(campaign: Any) -> str:
     """Return a campaign as a page of HTML that refers to no other file.
 
     Args:
-        campaign: With or without its simulator; without it, outcomes are not compared
-            with predictions, and their surprises are shown instead.
+        campaign: Campaign with or without its simulator; without it, outcomes are not
+            compared with predictions, and their surprises are shown instead.
     """
     import matplotlib.pyplot as plt
 

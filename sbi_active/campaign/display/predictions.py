@@ -1,4 +1,4 @@
-"""What each outcome was compared with: simulations from the belief before it."""
+"""Simulations from the belief before a trial, with which its outcome is compared."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ def predict(
 ) -> dict[int, Array]:
     """Return simulations of each executed action, by the index of its trial, (n, q).
 
-    Of the belief before the trial as its draws were kept. Where these are of other
-    parameters, those of a model before the current one, there is no prediction.
+    They use the kept draws of the belief before the trial. Where these draws are of
+    other parameters, those of an earlier model, there is no prediction.
 
     Args:
-        state: Of the campaign.
-        simulator: That of a trial, by its index; None for no predictions.
-        prior: Over the current parameters.
-        num_simulations: Of each trial; 0 for no predictions.
+        state: State of the campaign.
+        simulator: Simulator of a trial, by its index; None for no predictions.
+        prior: Prior of the current parameters.
+        num_simulations: Simulations of each trial; 0 for no predictions.
     """
     if simulator is None or num_simulations == 0:
         return {}

@@ -1,4 +1,4 @@
-"""What a campaign is doing and how long it will take: a bar and a log."""
+"""Progress of a campaign: a bar and a log say what it does and how long it takes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sbi_active.progress import News, is_asked_for
 class StageWatch:
     """Tells of each stage of a campaign while it runs.
 
-    How long one takes is known from the same stage of the trial before.
+    The duration of a stage is estimated from the same stage of the trial before.
 
     Args:
         show_progress: Whether to draw a bar.
@@ -23,12 +23,13 @@ class StageWatch:
 
     @contextmanager
     def __call__(self, state: CampaignState, index: int, name: str) -> Iterator[None]:
-        """Tell of the block.
+        """Show progress while the block runs.
 
         Args:
-            state: Of the campaign.
-            index: Of the trial that it is for; of the next one where it is for none.
-            name: What it does.
+            state: State of the campaign.
+            index: Index of the trial that the work is for; of the next one where it is
+                for none.
+            name: Name of the work.
         """
         if not is_asked_for(self.show_progress):
             yield

@@ -1,4 +1,5 @@
 """A round of a campaign: what trains, designs, scores, updates, compares and adopts.
 
-Here lives what a campaign calls the packages below with. Its course is one floor up.
+This package contains the calls of a campaign to the packages below. The course of a
+campaign is in the package above.
 """

@@ -17,8 +17,8 @@ def keep_draws(state: CampaignState, belief: Distribution) -> None:
     Nothing is computed from them, and no other random number depends on them.
 
     Args:
-        state: Of the campaign.
-        belief: After ``state.processed``.
+        state: State of the campaign.
+        belief: Belief after ``state.processed``.
     """
     if not state.processed:
         return

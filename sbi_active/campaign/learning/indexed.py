@@ -19,8 +19,8 @@ def at_index(simulator: Any, index: int) -> Any:
     """Return the simulator of one trial.
 
     Args:
-        simulator: One with a ``next_index``; any other is returned as it is.
-        index: Of the trial.
+        simulator: Simulator with a ``next_index``; any other is returned as it is.
+        index: Index of the trial.
     """
     if getattr(simulator, "next_index", index) == index:
         return simulator
@@ -50,7 +50,7 @@ class IndexedSimulator:
     """A simulator whose action carries the index of the trial as a last entry.
 
     Args:
-        simulator: One with a ``next_index``.
+        simulator: Simulator with a ``next_index``.
     """
 
     def __init__(self, simulator: Any) -> None:

@@ -51,15 +51,15 @@ class Learner:
     Args:
         simulator: ``simulator(theta, action)``. One with a ``next_index`` that matters
             is simulated at the index of each trial.
-        prior: Over its parameters.
-        actions: Of the campaign.
-        state: Of the campaign.
-        x_shape: Of an outcome; None finds it by a few simulations.
+        prior: Prior of its parameters.
+        actions: Action space of the campaign.
+        state: State of the campaign.
+        x_shape: Shape of an outcome; None finds it by a few simulations.
 
     Attributes:
-        x_shape: Of an outcome.
-        simulations: Those that the last training was on, where the design is to rest on
-            them; else None.
+        x_shape: Shape of an outcome.
+        simulations: Simulations that the last training was on, where the design is to
+            rest on them; else None.
 
     Raises:
         ValueError: If the prior has no support or no width, the simulator is
@@ -116,7 +116,8 @@ class Learner:
         """Go on where ``state.processed`` ends.
 
         Args:
-            belief: Returns the belief of then, read when it is first asked for.
+            belief: Function that returns the belief of that time, read when it is first
+                asked for.
         """
         self._saved = belief
 
@@ -216,7 +217,7 @@ class Learner:
     def learn(self, trial: Trial) -> None:
         """Bring the belief up to date with one more trial.
 
-        One that nothing in the prior explains leaves it as it is.
+        A trial that nothing in the prior explains leaves the belief as it is.
         """
         if trial.is_explained:
             try:
@@ -302,10 +303,10 @@ class Learner:
             self._state.change(index, network_used_by=asked)
 
     def model(self, index: int) -> RoundModel:
-        """Return what a design asks, trained now or on demand.
+        """Return the model that a design asks, trained now or on demand.
 
         Args:
-            index: Of the trial that is designed.
+            index: Index of the trial that is designed.
         """
         if Enumeration.of(self.prior) is not None:
             return RoundModel(None)
@@ -320,7 +321,7 @@ class Learner:
         """Return the model of this round where it is a posterior.
 
         Args:
-            index: Of the trial that the round is for.
+            index: Index of the trial that the round is for.
 
         Raises:
             ValueError: If it is another one.
@@ -338,7 +339,7 @@ class Learner:
         """Return the posterior trained under the current belief, training if needed.
 
         Args:
-            index: Of the trial that the work is for.
+            index: Index of the trial that the work is for.
         """
         state = self._state
         if not self._round_ready:

@@ -1,4 +1,4 @@
-"""What the robot may do in a campaign, and what it costs."""
+"""Limits and costs of the robot's actions in a campaign."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class Limits:
 
     Attributes:
         actions: The action space.
-        constraint: Of actions (n, action_dim), which are permitted, shape (n,), bool;
-            None permits all.
-        cost: Of actions (n, action_dim), shape (n,), or one number an action of a list;
-            None for none.
+        constraint: Function of actions (n, action_dim) that says which are permitted,
+            shape (n,), bool; None permits all.
+        cost: Cost of actions (n, action_dim), shape (n,), or one number an action of a
+            list; None for none.
     """
 
     actions: ActionSpace

@@ -27,8 +27,8 @@ class Method:
 
     Attributes:
         designs: Whether actions are chosen for information, or drawn at random.
-        build: Makes the trainer of a prior and a campaign's options.
-        estimator: What is trained by default.
+        build: Function that makes the trainer of a prior and a campaign's options.
+        estimator: Estimator that is trained by default.
         faithful: Options of the setting of the method's authors that differ from those
             of :meth:`.CampaignOptions.faithful`.
         refines: Whether its beliefs are refined, where the options ask for it.
@@ -79,7 +79,7 @@ _ALHI = {
     "estimator": "likelihood",
     "details": CampaignDetails(posterior="kde", eliminate=False),
 }
-#: Of 52,000 simulations a round, as the others: LFIRE needs those to learn from.
+#: Options for 52,000 simulations a round, as the others: LFIRE learns from those.
 _SEQBED = {
     "estimator": "ratio",
     "density_estimator": LFIRE(),
@@ -114,12 +114,11 @@ def find_method(name: str) -> Method:
 def faithful_options(name: str) -> CampaignOptions:
     """Return the setting of a method's authors, for the numerical experiment.
 
-    That is :meth:`.CampaignOptions.faithful` for ASBI and NSBI; ALHI and
-    NLHI have the same network on x given (theta, action), beliefs by kernel density
-    estimation and nested Monte Carlo for the gain; SeqBED has LFIRE, at the same total
-    of simulations.
+    This is :meth:`.CampaignOptions.faithful` for ASBI and NSBI; ALHI and NLHI have the
+    same network on x given (theta, action), beliefs by kernel density estimation and
+    nested Monte Carlo for the gain; SeqBED has LFIRE, at the same total of simulations.
 
     Args:
-        name: Of the method.
+        name: Name of the method.
     """
     return replace(CampaignOptions.faithful(), **find_method(name).faithful)

@@ -1,4 +1,4 @@
-"""Which trial comes next: for the parameters, or for which model is right."""
+"""The choice of the next trial, for the parameters or for the right model."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ class Planner:
 
     Args:
         limits: The action space, what of it is permitted, and its cost.
-        state: Of the campaign.
-        effects: What its simulator may lack.
+        state: State of the campaign.
+        effects: Effects that its simulator may lack.
 
     Attributes:
-        effects: As given.
+        effects: Effects that the simulator may lack.
     """
 
     def __init__(
@@ -92,9 +92,9 @@ class Planner:
         """Return the comparison of the current simulator with trials.
 
         Args:
-            learner: Of the current simulator.
-            trials: That gave a measurement, or none.
-            effects: What it may lack; None takes the campaign's.
+            learner: Learner of the current simulator.
+            trials: Trials that gave a measurement, or none.
+            effects: Effects that it may lack; None takes the campaign's.
         """
         return compare(
             self._state,
@@ -116,9 +116,9 @@ class Planner:
         """Return the design of a trial and what it is for.
 
         Args:
-            index: Of the trial.
-            target: As in :meth:`.Campaign.ask`.
-            learner: Of the current simulator.
+            index: Index of the trial.
+            target: Target of the design, see :meth:`.Campaign.ask`.
+            learner: Learner of the current simulator.
             alarmed: Whether the simulator no longer explains the trials; then what is
                 to be learned about its parameters does not count.
         """
@@ -201,12 +201,12 @@ def _model_design(
     """Return the design that tells most about which rival is right.
 
     Args:
-        criticism: Of all trials so far.
-        limits: What is permitted, and its cost.
+        criticism: Comparison of the model with all trials so far.
+        limits: Limits of the actions, and their cost.
         exclude: Actions not to repeat, shape (t, action_dim).
 
     Returns:
-        None where no permitted action tells anything: one rival is left, or those left
+        None if no permitted action tells anything: one rival is left, or those left
         predict the same.
     """
     spent = criticism.rivals.simulator.num_simulations

@@ -96,7 +96,7 @@ class PooledLearner(Learner):
 
     @cached_property
     def noise(self) -> NoiseModel | None:
-        """The declared noise; None where the simulator itself is random."""
+        """The declared noise; None if the simulator itself is random."""
         model = self.simulator
         if self._choice is not None or not isinstance(model, SimulatorModel):
             return None

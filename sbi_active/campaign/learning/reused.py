@@ -42,14 +42,14 @@ def first_round(
 
     Args:
         simulator: The current one.
-        prior: That theta was drawn from.
-        theta: Of the round, shape (n, theta_dim).
-        action: Shape (n, action_dim).
+        prior: Prior that theta was drawn from.
+        theta: Parameters of the round, shape (n, theta_dim).
+        action: Actions of the round, shape (n, action_dim).
         actions: Rows of other actions are not taken.
         num_earlier: Rows of the bank that were there before this campaign; what it
             stored itself must not count when it begins again.
-        seed: Of the new simulations, and of the choice of earlier ones.
-        workers: Of the simulations.
+        seed: Seed of the new simulations, and of the choice of earlier ones.
+        workers: Workers that run the simulations.
 
     Returns:
         At most n rows without the missing, how many were simulated, and how many of
@@ -87,7 +87,7 @@ def _earlier(
     num_rows: int,
     seed: int,
 ) -> Simulations | None:
-    """Return as many earlier rows as they are worth; None where that is too few."""
+    """Return as many earlier rows as they are worth; None if that is too few."""
     if not num_earlier:
         return None
     try:

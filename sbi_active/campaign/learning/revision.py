@@ -34,12 +34,12 @@ def compare(
     """Return the comparison of a campaign's simulator with its trials.
 
     Args:
-        state: Of the campaign.
+        state: State of the campaign.
         simulator: The current one; a plain callable is the draw.
-        prior: Of its parameters.
+        prior: Prior of its parameters.
         actions: The permitted ones.
-        trials: To compare it with.
-        effects: What it may lack; those already adopted are left out.
+        trials: Trials to compare it with.
+        effects: Effects that it may lack; those already adopted are left out.
     """
     # Criticism reads results of everything below, so it is imported where it is used.
     from sbi_active.criticism import Criticism, Trials
@@ -73,8 +73,8 @@ def criticize(
     """Return the report of a comparison, and note it in the campaign's state.
 
     Args:
-        state: Of the campaign.
-        criticism: From :func:`compare`.
+        state: State of the campaign.
+        criticism: Comparison from :func:`compare`.
         evaluate: Whether to report the error before and after.
         designed: Whether the actions were chosen for information.
     """
@@ -95,9 +95,9 @@ def revise(state: CampaignState, actions: ActionSpace, report: Report) -> Learne
     The state gains a version; nothing changes where this raises.
 
     Args:
-        state: Of the campaign.
-        actions: Of the campaign.
-        report: Whose verdict names effects.
+        state: State of the campaign.
+        actions: Action space of the campaign.
+        report: Report whose verdict names effects.
     """
     if not hasattr(report, "tracing"):
         raise TypeError(
@@ -151,11 +151,11 @@ def rebuilt(
     """Return the simulator and the prior of the current version, made anew.
 
     Args:
-        state: Of the campaign.
-        simulator: That it began with.
-        prior: That it began with.
+        state: State of the campaign.
+        simulator: Simulator that it began with.
+        prior: Prior that it began with.
         actions: The permitted ones.
-        effects: Among them those that were adopted.
+        effects: Effects, among them those that were adopted.
 
     Raises:
         ValueError: If an adopted effect is not among them.
@@ -185,8 +185,9 @@ def recompute(state: CampaignState, learner: Learner) -> None:
     adoption; all others are left to be scored and learned one after another.
 
     Args:
-        state: Of the campaign; its trials lose their scores.
-        learner: Of the current model; its belief is that of the adoption, or the prior.
+        state: State of the campaign; its trials lose their scores.
+        learner: Learner of the current model; its belief is that of the adoption, or
+            the prior.
     """
     version = state.version
     state.processed.clear()

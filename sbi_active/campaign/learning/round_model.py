@@ -1,4 +1,4 @@
-"""What a round's network learned, trained once something asks."""
+"""The network of a round, trained once something asks for it."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ class RoundModel:
     """The model of a round, as a designer takes it.
 
     Args:
-        train: Returns the model, trained in this call if needed; None where none can
-            be, as of discrete parameters.
+        train: Function that returns the model, trained in this call if needed; None
+            if none can be, as of discrete parameters.
         model: The trained model; None leaves it untrained until something asks for one
             of its densities.
 

@@ -1,6 +1,7 @@
 """A campaign on disk: what it is, what happened, and what was computed from it.
 
-Here live files, their checks, and the way back. Nothing here infers or designs.
+This package contains the files, their checks, and the way to read them. It does not
+infer or design.
 """
 
 from sbi_active.campaign.storage.damage import DamagedCampaignError

@@ -68,9 +68,9 @@ def encode(value: Any, *, known: Mapping[str, Any]) -> bytes:
     Args:
         value: Numbers, texts, arrays, tensors, containers, and objects of this library,
             sbi's utilities and networks, torch's distributions and modules.
-        known: What the reader has too, by name, such as the simulator and the prior.
-            It is stored by its name, and what hangs from it, where it is of a class
-            that is not stored, by its place.
+        known: Objects that the reader has too, by name, such as the simulator and the
+            prior. It is stored by its name, and what hangs from it, where it is of a
+            class that is not stored, by its place.
 
     Raises:
         NotStorableError: If there is anything else in it.
@@ -90,7 +90,7 @@ def decode(content: bytes, *, known: Mapping[str, Any]) -> Any:
 
     Args:
         content: The bytes.
-        known: As given to :func:`encode`, by the same names.
+        known: Objects that were given to :func:`encode`, by the same names.
 
     Raises:
         ValueError: If the content is nothing that :func:`encode` writes.
@@ -199,7 +199,7 @@ class _Reader:
         self._seen: list[Any] = []
 
     def value(self, node: Any) -> Any:
-        """Return what a node stands for."""
+        """Return the value that a node stands for."""
         if not isinstance(node, dict):
             return node
         kind = node[TAG]

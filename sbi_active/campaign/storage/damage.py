@@ -15,7 +15,7 @@ class DamagedCampaignError(Explained, OSError):
 
     Attributes:
         path: The file.
-        reason: What is wrong with it, and what is whole.
+        reason: Text that says what is damaged, and what is whole.
     """
 
     code = "SA606"
@@ -52,7 +52,7 @@ def naming() -> Iterator[None]:
     """Turn damage of the store into damage of the campaign.
 
     Raises:
-        DamagedCampaignError: In place of the error of a bank.
+        DamagedCampaignError: If a bank raises an error.
     """
     try:
         yield
@@ -68,7 +68,7 @@ def reading(path: Path) -> Iterator[None]:
         path: The file.
 
     Raises:
-        DamagedCampaignError: In place of any other error, which names no file.
+        DamagedCampaignError: If any other error is raised, which names no file.
     """
     try:
         with naming():

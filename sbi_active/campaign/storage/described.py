@@ -129,7 +129,7 @@ def describe_options(options: Any) -> Any:
 def options_from(described: Any) -> Any:
     """Return the settings of :func:`describe_options`.
 
-    Those of an earlier version that are no more are left out.
+    Settings of an earlier version that no longer exist are left out.
     """
     if isinstance(described, list):
         return tuple(options_from(item) for item in described)

@@ -43,13 +43,13 @@ class CampaignDirectory:
 
     Args:
         path: Folder with a campaign.
-        repair: Give up what is damaged.
+        repair: Whether to give up what is damaged.
 
     Attributes:
         path: The folder.
-        store: Its file.
-        manifest: What the campaign is.
-        notes: What was given up, a sentence each.
+        store: Store of the campaign's records.
+        manifest: Description of the campaign.
+        notes: Notes on what was given up, a sentence each.
 
     Raises:
         ValueError: If the folder holds no campaign, or one of another schema.
@@ -85,7 +85,7 @@ class CampaignDirectory:
         """Add to the log; it is on the disk when this returns.
 
         Args:
-            event: What happened.
+            event: Event that is written.
             trial: The trial as it is afterwards.
             **entries: JSON data.
         """
@@ -106,7 +106,7 @@ class CampaignDirectory:
 
     @property
     def num_changes(self) -> int:
-        """How often another simulator took the place of the one before."""
+        """Number of times that another simulator took the place of the one before."""
         return len(self._changes)
 
     def save(self, state: CampaignState, belief: Any, known: Mapping[str, Any]) -> None:
@@ -115,9 +115,9 @@ class CampaignDirectory:
         A belief that cannot be stored is computed again after :meth:`restore`.
 
         Args:
-            state: Of the campaign.
-            belief: After ``state.processed``; None where that is the prior.
-            known: What the reader has too, see :func:`.encode`.
+            state: State of the campaign.
+            belief: Belief after ``state.processed``; None if that is the prior.
+            known: Objects that the reader has too, see :func:`.encode`.
         """
         content = None
         name = self._belief_written[1] if belief is not None else None
@@ -154,10 +154,11 @@ class CampaignDirectory:
         """Bring a new state to where the log ends.
 
         Args:
-            state: Changed in place; ``is_stale`` where beliefs must be computed again.
+            state: State that is changed in place; ``is_stale`` where beliefs must be
+                computed again.
 
         Returns:
-            The name of the belief; None where it is the prior, or to be computed.
+            The name of the belief; None if it is the prior, or to be computed.
         """
         saved, self._saved = self._saved, None
         name, lines = None, 0
@@ -267,7 +268,7 @@ class CampaignDirectory:
             return None
 
     def _require_whole(self, *, repair: bool) -> None:
-        """Raise where the log lacks lines that the saved state has counted.
+        """Raise if the log lacks lines that the saved state has counted.
 
         A repair takes their trials from the state, and has all else computed again.
         """
@@ -323,7 +324,7 @@ def _has(state: CampaignState, trial: Trial) -> bool:
 
 
 def _facts(trial: Trial) -> dict[str, Any]:
-    """Return of a trial what cannot be computed again, NaN as null."""
+    """Return the facts of a trial that cannot be computed again, NaN as null."""
     x = None if trial.x is None else _listed(trial.x.tolist())
     return {
         "index": trial.index,

@@ -1,4 +1,4 @@
-"""What stands for a prior and actions that are programs, for readers without these.
+"""Draws that stand for a prior and actions that readers cannot load.
 
 A class of a user's own is not stored with a campaign. Draws of it are, by which a
 campaign can be shown, told and corrected where nobody runs the user's programs.
@@ -29,8 +29,8 @@ def draws_of(thing: Distribution | ActionSpace, *, seed: int) -> dict[str, Any]:
     """Return as JSON what readers need of a prior or of an action space.
 
     Args:
-        thing: Either.
-        seed: Of the draws.
+        thing: Prior or action space.
+        seed: Seed of the draws.
     """
     if isinstance(thing, ActionSpace):
         draws = thing.sample((NUM_DRAWS,), seed=seed)
@@ -59,9 +59,9 @@ class DrawnPrior(ParticleDraws):
     """Stands for a prior, by its draws; it has no density.
 
     Args:
-        draws: Shape (n, theta_dim).
-        mean: Shape (theta_dim,).
-        variance: Shape (theta_dim,).
+        draws: Draws, shape (n, theta_dim).
+        mean: Mean, shape (theta_dim,).
+        variance: Variance, shape (theta_dim,).
     """
 
     support = constraints.real_vector  # pyright: ignore
@@ -92,9 +92,9 @@ class DrawnBelief(Belief):
     """Stands for a belief under such a prior, by the draws that a campaign keeps.
 
     Args:
-        belief: As it was read.
+        belief: Belief as it was read.
         prior: The prior.
-        draws: Of the belief, shape (n, theta_dim).
+        draws: Draws of the belief, shape (n, theta_dim).
     """
 
     def __init__(self, belief: Any, prior: DrawnPrior, draws: Tensor) -> None:
@@ -116,9 +116,9 @@ class DrawnActions(ActionSpace):
     """Stands for an action space, by its draws; nobody knows what it contains.
 
     Args:
-        draws: Shape (n, action_dim).
-        names: One an entry of the action.
-        units: One an entry of the action.
+        draws: Draws, shape (n, action_dim).
+        names: Names of the entries of the action.
+        units: Units of the entries of the action.
     """
 
     def __init__(
@@ -149,9 +149,9 @@ def stood_for(
     """Return a belief that was read; its draws where there is no density of the prior.
 
     Args:
-        belief: As it was read.
-        prior: That the campaign began with.
-        state: Of the campaign.
+        belief: Belief as it was read.
+        prior: Prior that the campaign began with.
+        state: State of the campaign.
     """
     kept = [state.draws[i] for i in state.processed if i in state.draws]
     if not isinstance(prior, DrawnPrior) or not kept:

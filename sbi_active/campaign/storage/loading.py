@@ -48,18 +48,19 @@ class Loaded:
 
 
 class StoredLearner:
-    """What is known of a campaign without its simulator.
+    """A campaign's learner as far as it is known without the simulator.
 
     Args:
-        prior: That the campaign began with.
-        x_shape: Of an outcome.
-        state: Of the campaign.
-        belief: Returns the belief, read when it is first asked for; None for none.
-        parameter_names: Of the parameters, if they have names.
+        prior: Prior that the campaign began with.
+        x_shape: Shape of an outcome.
+        state: State of the campaign.
+        belief: Function that returns the belief, read when it is first asked for; None
+            for none.
+        parameter_names: Names of the parameters, if they have any.
 
     Attributes:
-        first_prior: As given.
-        x_shape: As given.
+        first_prior: Prior that the campaign began with.
+        x_shape: Shape of an outcome.
     """
 
     simulator = None

@@ -1,4 +1,4 @@
-"""What a campaign is: written once, with a copy, and in words for people."""
+"""The description of a campaign: written once, with a copy, and in words for people."""
 
 from __future__ import annotations
 
@@ -51,14 +51,15 @@ def new_manifest(
     """Return the description of a new campaign.
 
     Args:
-        state: Of the campaign.
-        simulator: As given.
-        prior: As given.
-        actions: As given.
-        x_shape: Of an outcome.
+        state: State of the campaign.
+        simulator: Simulator of the campaign.
+        prior: Prior of the campaign.
+        actions: Action space of the campaign.
+        x_shape: Shape of an outcome.
         effects: Names of those that the simulator may lack.
         has_cost: Whether actions have a cost, which the reader must give again.
-        has_constraint: Likewise.
+        has_constraint: Whether actions have a constraint, which the reader must give
+            again.
     """
     names = getattr(simulator, "parameter_names", None)
     channels = getattr(simulator, "channel_names", None)
@@ -128,8 +129,9 @@ def read_manifest(store: Store, *, repair: bool = False) -> dict[str, Any]:
     """Return a manifest.
 
     Args:
-        store: Of the campaign.
-        repair: Take the copy where the manifest is damaged, and write it again.
+        store: Store of the campaign.
+        repair: Whether to take the copy where the manifest is damaged, and write it
+            again.
 
     Raises:
         ValueError: If there is none, or one of another schema.
@@ -163,10 +165,10 @@ def read_manifest(store: Store, *, repair: bool = False) -> dict[str, Any]:
 def require_same_simulator(
     manifest: Mapping[str, Any], simulator: Callable[..., Any]
 ) -> None:
-    """Raise where a simulator is not the one that the campaign was made with.
+    """Raise if a simulator is not the one that the campaign was made with.
 
     Raises:
-        ValueError: It says where they differ.
+        ValueError: If they differ; it says where.
     """
     lines = differences(manifest["simulator"], fingerprint(simulator))
     if lines:

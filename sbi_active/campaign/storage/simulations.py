@@ -21,7 +21,7 @@ def num_rows(folder: str | None) -> int:
     """Return how many rows of the simulator itself a bank of campaigns has.
 
     Args:
-        folder: None for none.
+        folder: Folder of the bank; None for none.
     """
     if folder is None or not Path(folder, NAME).exists():
         return 0
@@ -38,7 +38,8 @@ class CampaignBanks:
 
     Args:
         place: The file that they are in, or its folder, made when it is needed.
-        suffix: Of their names, after another simulator took the place of the first.
+        suffix: Suffix of the banks' names, after another simulator took the place of
+            the first.
     """
 
     def __init__(self, place: Store | Path, suffix: str = "") -> None:
@@ -52,12 +53,12 @@ class CampaignBanks:
 
         Args:
             simulator: The current one.
-            model: Its number in the campaign.
+            model: Number of the model in the campaign.
         """
         self._own, self._model = simulator, model
 
     def find(self, simulator: Callable[..., Any]) -> RowStore | None:
-        """Return the store of a simulator's rows; None where they are not stored."""
+        """Return the store of a simulator's rows; None if they are not stored."""
         form = self._form(simulator)
         return None if form is None else self.bank(simulator, form)
 

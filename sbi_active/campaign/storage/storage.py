@@ -1,4 +1,4 @@
-"""What a campaign keeps: nothing, simulations, or all of it in a folder."""
+"""Storage of a campaign: nothing, simulations, or all of it in a folder."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Storage:
     Args:
         disk: The folder; None keeps the campaign in memory alone.
         bank: Folder of the simulations; None keeps them in the campaign's file.
-        prior: That the campaign began with.
+        prior: Prior that the campaign began with.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class Storage:
 
         Args:
             simulator: The current one.
-            version: Its number.
+            version: Number of the version.
         """
         if self.disk is not None:
             self.disk.acquire()

@@ -1,7 +1,7 @@
 """Measured trials, and the tables they are read from.
 
-Here lives what is known before any simulator: numbers, masks, roles and units. Nothing
-here simulates.
+This package contains what is known before any simulator: numbers, masks, roles and
+units. It does not simulate.
 """
 
 from sbi_active.criticism.data.arrays import Role

@@ -45,8 +45,8 @@ def kept(mask: Any, x: Tensor) -> Tensor:
     """Return where x is a measurement, of its shape; what pads a ragged mask is none.
 
     Args:
-        mask: As given, one an entry of x.
-        x: Shape (n, ...).
+        mask: Mask as given, one an entry of x.
+        x: Observations, shape (n, ...).
     """
     keep = padded(mask)
     if keep.ndim == 1 and x.shape[1:] == (1,):
@@ -93,7 +93,7 @@ def root(repeat_of: Tensor) -> Tensor:
             own for none.
 
     Returns:
-        The same with positions that repeat nothing themselves, -1 for none.
+        Positions that repeat nothing themselves, -1 for none.
 
     Raises:
         ValueError: If a position is no trial, or trials repeat each other in a circle.
@@ -126,7 +126,7 @@ def require_names(names: Sequence[object] | None, num: int) -> tuple[str, ...] |
     """Return names of trials as text, or raise where they are not one each.
 
     Args:
-        names: None for none.
+        names: Names of the trials; None for none.
         num: Number of trials.
     """
     if names is None:
@@ -146,9 +146,9 @@ def require_labels(
     """Return labels as a tuple, or raise where they are not one text an entry.
 
     Args:
-        name: Of the argument.
-        labels: None for none.
-        sizes: How many there may be.
+        name: Name of the argument.
+        labels: Labels to check; None for none.
+        sizes: Numbers of labels that are allowed.
     """
     if labels is None:
         return None
@@ -165,9 +165,9 @@ def sample_times_of(times: Any, x: Tensor, names: Sequence[str]) -> Tensor | Non
     """Return sample times, shape (k,) or (n, k), or raise where they are no such.
 
     Args:
-        times: As given; None for none.
-        x: Shape (n, k, ...), NaN where nothing was measured.
-        names: Of the n trials.
+        times: Sample times as given; None for none.
+        x: Observations, shape (n, k, ...), NaN where nothing was measured.
+        names: Names of the n trials.
     """
     if times is None:
         return None
@@ -202,7 +202,7 @@ def start_states(start: Any, num: int) -> Tensor | dict[str, Tensor] | None:
     """Return measured start states, shape (num, d) or {name: (num,)}.
 
     Args:
-        start: As given; None for none.
+        start: Start states as given; None for none.
         num: Number of trials.
 
     Raises:

@@ -38,15 +38,15 @@ def inputs_of(
     """Return the inputs of trials by name, shape (t, m), and their grid, shape (m,).
 
     Args:
-        inputs: As in :func:`named_series`; None for none.
-        times: Of the values, shape (m,), (t, m), or a list of t, or a dict of such by
-            name; None takes those of x where there are as many.
-        x: What was measured, shape (t, k, ...).
-        x_times: Its times, shape (k,) or (t, k).
-        hold: As in :func:`on_one_grid`.
+        inputs: Inputs, as :func:`named_series` takes them; None for none.
+        times: Times of the values, shape (m,), (t, m), or a list of t, or a dict of
+            such by name; None takes those of x where there are as many.
+        x: Observations that were measured, shape (t, k, ...).
+        x_times: Times of x, shape (k,) or (t, k).
+        hold: Value between two times, as in :func:`on_one_grid`.
 
     Raises:
-        ValueError: As those raise, and :func:`require_covered`.
+        ValueError: If those functions or :func:`require_covered` raise it.
     """
     if inputs is None:
         if times is not None:
@@ -106,11 +106,11 @@ def on_one_grid(
     """Return series on one uniform grid, and the grid.
 
     Its step is the smallest median step of an input in a trial, and it reaches from the
-    earliest to the latest time. What is on one uniform grid already stays as it is.
-    Beyond a trial's end its last value is held, before its begin its first.
+    earliest to the latest time. Series on one uniform grid stay as they are. After a
+    trial's end its last value is held, and before its start its first.
 
     Args:
-        series: By name, shape (t, m), NaN after the last value of a trial.
+        series: Series by name, shape (t, m), NaN after the last value of a trial.
         stamps: Times of the values, by name, shape (t, m), NaN where there are none.
         hold: "previous" holds each value until the next one, as a command is held;
             "linear" draws lines between them.
@@ -152,8 +152,8 @@ def held_at(
     """Return series, each held until its next value, at the times of another grid.
 
     Args:
-        series: By name, shape (t, m).
-        own: Their grid, shape (m,).
+        series: Series by name, shape (t, m).
+        own: Grid of the series, shape (m,).
         times: The other, shape (n,).
     """
     slack = ON_TIME * (own[1] - own[0])
@@ -163,10 +163,10 @@ def held_at(
 
 
 def require_covered(x_times: Tensor, stamps: Mapping[str, Tensor]) -> None:
-    """Raise where x was measured long before or after an input of its trial.
+    """Raise if x was measured long before or after an input of its trial.
 
     Args:
-        x_times: Of what was measured, shape (t, k), NaN for none.
+        x_times: Times of what was measured, shape (t, k), NaN for none.
         stamps: Times of the inputs, by name, shape (t, m).
     """
     for name, times in stamps.items():
@@ -272,7 +272,7 @@ def _length(what: str, values: Tensor, times: Tensor) -> int:
 def _grid(
     stamps: Mapping[str, Tensor], lengths: Mapping[str, list[int]]
 ) -> Array | None:
-    """Return the grid, None where all are on one that is uniform already."""
+    """Return the grid, None if all are on one that is uniform already."""
     every = [*stamps.values()]
     first = every[0][0]
     whole = all(k == len(first) for each in lengths.values() for k in each)

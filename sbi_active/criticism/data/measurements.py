@@ -18,12 +18,13 @@ class Measurements:
     """The measured numbers of some trials, in the order trial, channel, time.
 
     Attributes:
-        x: Shape (N,).
-        position: Of each in the flattened x of shape (t, *x_shape), shape (N,).
+        x: Measured numbers, shape (N,).
+        position: Position of each number in the flattened x of shape (t, *x_shape),
+            shape (N,).
         trial: Row of its trial, shape (N,).
-        channel: Its channel, shape (N,).
-        time: Its sample time; its place along x's first axis where no times are
-            given, shape (N,).
+        channel: Channel of each number, shape (N,).
+        time: Sample time of each number; its place along x's first axis where no times
+            are given, shape (N,).
         gap: Time since the measured number before it in the same trial and channel;
             inf for the first, shape (N,).
         has_time: Whether x has a time axis.
@@ -52,7 +53,8 @@ class Measurements:
         """Return the measurements of some trials.
 
         Args:
-            trials: Their x has a time axis where they, or the model, have sample times.
+            trials: Trials. Their x has a time axis where they, or the model, have
+                sample times.
             model_times: The simulator's sample times.
             is_sequence: The first axis of x is a time axis whose samples are counted.
         """
@@ -98,15 +100,15 @@ class Measurements:
         )
 
     def bounded(self, center: Array, reach: Array) -> Measurements:
-        """Return the same with numbers that are beyond all reason within a reach.
+        """Return the measurements with implausible numbers moved within a reach.
 
-        What is so far off is wrong whatever its digits are, and in double precision its
-        residual would hold nothing of the simulator any more. Where most trials are, it
-        is the model that is elsewhere, and nothing is changed.
+        Such a number is wrong whatever its digits are, and in double precision its
+        residual would no longer depend on the simulator. If most trials are so far off,
+        the model is wrong instead, and nothing is changed.
 
         Args:
-            center: Of what can be expected, shape (N,).
-            reach: How far numbers may be from it, shape (N,).
+            center: Center of what can be expected, shape (N,).
+            reach: Distance from it that numbers may have, shape (N,).
         """
         x = np.clip(self.x, center - reach, center + reach)
         beyond = np.unique(self.trial[x != self.x])

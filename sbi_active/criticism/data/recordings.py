@@ -30,17 +30,18 @@ def read_trials(
 
     A folder's trials are those of its ``trials.csv``, or else of all its files
     ``*.csv``, by name with numbers in their order. A file with times and without a
-    column "trial" is one trial, called as the file; trials in another file with times
-    have its name in front; where a row is a trial, rows go on from file to file.
+    column "trial" is one trial, named after the file; trials in another file with times
+    have its name as a prefix; if a row is a trial, rows are numbered on from file to
+    file.
 
     Args:
-        path: Of the file or folder.
-        columns: As in :func:`.find_columns`.
-        units: As there.
-        inputs: As :func:`.read_table` takes them.
+        path: Path of the file or folder.
+        columns: Columns, as in :func:`.find_columns`.
+        units: Units by column, as in :func:`.find_columns`.
+        inputs: Table of inputs, as :func:`.read_table` takes it.
 
     Raises:
-        ValueError: As :func:`.read_table` raises; if there is no file in the folder, or
+        ValueError: If :func:`.read_table` raises it, there is no file in the folder, or
             files have different columns.
     """
     path = Path(path)

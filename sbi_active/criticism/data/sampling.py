@@ -1,8 +1,8 @@
-r"""Which samples of a trajectory tell something of their own.
+r"""Thinning of trajectories to samples that carry information of their own.
 
-What a simulator gets wrong is smooth, and at a rate that is high beside it each sample
-says again what the one before said. An autocorrelated error takes up some of that, and
-its innovations
+Errors of a simulator are smooth, and at a high sampling rate each sample repeats the
+error of the one before. An autocorrelated error takes up some of that, and its
+innovations
 
 .. math::
     e_k = \frac{r_k - \rho_k r_{k-1}}{\sqrt{1 - \rho_k^2}}, \qquad
@@ -36,14 +36,15 @@ NUM_TIMES, SHORTEST, LONGEST = 40, 0.2, 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class Sampling:
-    """How densely trials are sampled, and how densely they need to be.
+    """The sampling of trials, and the sampling that they need.
 
     Attributes:
         step: Median time between samples, s.
-        every: Which samples to keep: every 1st, 2nd, ...
+        every: Interval of the samples to keep: every 1st, 2nd,
         before: Largest correlation of neighboring innovations at the higher rates that
             were looked at, of all samples where they are all kept.
-        after: The same of those that are kept.
+        after: Largest correlation of neighboring innovations of the samples that are
+            kept.
     """
 
     step: float
@@ -58,17 +59,18 @@ class Sampling:
 
 
 def suggested_sampling(trials: Trials, residuals: Any, times: Any = None) -> Sampling:
-    """Return how densely trials are sampled, and how densely they need to be.
+    """Return the sampling of trials, and the sampling that they need.
 
-    It is the highest rate at which neighboring innovations are correlated by no more
-    than .2, or three standard errors, and below which they are not for want of motion:
-    at a very high rate the sensor's error is larger than what the simulator gets wrong
-    from sample to sample, and hides it. At least 8 samples of a trial are left.
+    The needed rate is the first one, from high to low, at which neighboring innovations
+    are correlated by no more than .2, or three standard errors, after a rate at which
+    they are: at a very high rate the sensor's error hides the simulator's. All samples
+    are kept if no rate has correlated innovations. At least 8 samples of a trial are
+    left.
 
     Args:
-        trials: With sample times.
-        residuals: What a fitted model leaves of x, of the shape of x (n, k, ...), NaN
-            where nothing was measured.
+        trials: Trials with sample times.
+        residuals: Residuals that a fitted model leaves, of the shape of x (n, k, ...),
+            NaN where nothing was measured.
         times: Sample times, shape (k,) or (n, k), where the trials have none.
 
     Raises:
@@ -126,14 +128,14 @@ def suggested_sampling(trials: Trials, residuals: Any, times: Any = None) -> Sam
 def thinned(trials: Trials, sampling: Sampling, times: Any = None) -> Trials:
     """Return trials of which only samples as far apart as suggested count as measured.
 
-    The others are masked, in each trial and channel by itself: times, and what else the
-    simulator is given, stay as they are. The first samples, often the start that the
-    simulator is given, go; of a trial that is shorter the last one stays.
+    The others are masked, in each trial and channel by itself: times and other inputs
+    of the simulator stay as they are. The first samples, often the start that the
+    simulator is given, are masked too; a shorter trial keeps its last one.
 
     Args:
-        trials: With x of shape (n, k, ...).
-        sampling: What was found of them.
-        times: As in :func:`suggested_sampling`.
+        trials: Trials with x of shape (n, k, ...).
+        sampling: Sampling that was found.
+        times: Sample times, as in :func:`suggested_sampling`.
     """
     found = trials.select(slice(None))
     if sampling.every == 1:
@@ -177,8 +179,8 @@ def _innovations(series: Array, stamps: Array, every: int) -> tuple[float, int]:
 
     Args:
         series: Residuals, one a trial and channel, shape (s, k), NaN where missing.
-        stamps: Their times, alike.
-        every: Which of them are kept.
+        stamps: Times of the samples, of the same shape.
+        every: Interval of the samples that are kept: every 1st, 2nd, ...
     """
     r, t = series[:, every - 1 :: every], stamps[:, every - 1 :: every]
     gaps = np.diff(t, axis=1)

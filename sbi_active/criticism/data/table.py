@@ -36,8 +36,8 @@ class TrialTable:
     """A table of trials.
 
     Attributes:
-        arguments: Of :class:`.Trials`, by name.
-        columns: What its columns are.
+        arguments: Arguments of :class:`.Trials`, by name.
+        columns: Columns of the table, by their role.
     """
 
     arguments: dict[str, Any]
@@ -59,12 +59,12 @@ def read_table(
 
     Args:
         table: Path of a CSV file, or a data frame.
-        columns: As in :func:`.find_columns`.
-        units: As there.
+        columns: Names of columns, as in :func:`.find_columns`.
+        units: Units by column, as in :func:`.find_columns`.
         inputs: A table of their inputs at times of their own, with columns "time",
             "input_*", and "trial" unless all trials share them. What is said of
             columns and units holds for it too.
-        source: What messages call the table; "" takes its path.
+        source: Name of the table in messages; "" takes its path.
 
     Raises:
         ValueError: If a column is missing or unknown, a cell is no number, an action,
@@ -211,7 +211,7 @@ class _TrialRows(Rows):
         return found
 
     def _require_distinct(self, action: Array, samples: list[Array]) -> None:
-        """Raise where two trials are the same number for number."""
+        """Raise if two trials are the same number for number."""
         is_long, seen = self.columns.time is not None, {}
         what = "trials" if is_long else "rows"
         for t, own in enumerate(samples):

@@ -1,4 +1,4 @@
-"""What the columns of a table of trials are, and their units."""
+"""Roles and units of the columns of a table of trials."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 
 @dataclass(frozen=True, kw_only=True)
 class Columns:
-    """Which column of a table is what.
+    """Roles of the columns of a table.
 
     Attributes:
         action: Columns of the action.
@@ -26,10 +26,10 @@ class Columns:
         input: Columns of the inputs over time.
         start: Columns of the measured start state.
         trial: Columns that name the trial together, in a table with one row a sample;
-            empty where a row is a trial.
-        time: Column of the time stamps; None where a row is a trial.
+            empty if a row is a trial.
+        time: Column of the time stamps; None if a row is a trial.
         optional: Columns of "role", "index" and "repeat_of", where there are such.
-        units: By column, "" where none is known.
+        units: Units by column, "" if none is known.
     """
 
     action: tuple[str, ...]
@@ -42,7 +42,7 @@ class Columns:
     units: dict[str, str]
 
     def label(self, column: str) -> str:
-        """Return what a column is called, with its unit, as in "speed [m/s]"."""
+        """Return the label of a column, with its unit, as in "speed [m/s]"."""
         unit = self.units.get(column, "")
         name = self.short(column)
         return f"{name} [{unit}]" if unit else name
@@ -69,15 +69,15 @@ def find_columns(
     of_inputs: bool = False,
     has_inputs: bool = False,
 ) -> Columns:
-    """Return what the columns are, by their names or as the user says.
+    """Return the roles of the columns, by their names or as the user says.
 
     Args:
-        names: Of all columns.
+        names: Names of all columns.
         columns: Names of those that are "trial", "time", "action", "x", "input",
             "start", "role", "index" or "repeat_of"; others are then ignored. None goes
             by the names.
-        units: By column, with or without what stands in its brackets.
-        source: What messages call the table.
+        units: Units by column, with or without what stands in its brackets.
+        source: Name of the table in messages.
         of_inputs: The table holds times and inputs alone, and those of all trials
             where no column names the trial.
         has_inputs: Inputs stand in another table, so that no action is needed.
@@ -147,7 +147,7 @@ def find_columns(
 def _require_inputs(
     found: Mapping[str, tuple[str, ...]], names: Sequence[str], source: str
 ) -> None:
-    """Raise where a table of inputs lacks them or their times, or holds more."""
+    """Raise if a table of inputs lacks them or their times, or holds more."""
     for key, column in ((TIME, TIME), ("input", "input_*")):
         if not found[key]:
             raise ValueError(

@@ -21,13 +21,13 @@ class InputRows:
     """The rows of a table that hold inputs.
 
     Attributes:
-        names: Of the inputs, each with its label.
-        values: Shape (n, c), NaN where a cell is empty.
-        time: In s, shape (n,).
+        names: Names of the inputs, each with its label.
+        values: Values of the inputs, shape (n, c), NaN where a cell is empty.
+        time: Times in s, shape (n,).
         members: Rows of each trial.
-        trials: Their names; one empty name where all share the series.
-        place: Returns what a message calls a row.
-        source: What it calls the table.
+        trials: Names of the trials; one empty name where all share the series.
+        place: Function that returns the name of a row in messages.
+        source: Name of the table in messages.
     """
 
     names: dict[str, str]
@@ -39,7 +39,7 @@ class InputRows:
     source: str
 
     def arguments(self) -> dict[str, Any]:
-        """Return them as arguments of ``Trials``.
+        """Return the inputs as arguments of ``Trials``.
 
         Raises:
             ValueError: If a trial has fewer than two values of an input, which has a
@@ -64,7 +64,7 @@ class InputRows:
         """Warn of rows with a measurement in which no input stands.
 
         Args:
-            measured: Which rows have one, shape (n,), bool.
+            measured: Mask of the rows that have one, shape (n,), bool.
         """
         lost = np.flatnonzero(measured & ~np.isfinite(self.values).any(1))
         if len(lost):
@@ -95,13 +95,13 @@ class InputRows:
         return replace(self, members=members, trials=[*trials])
 
     def require_covered(self, row: Array, time: Array, place: Any, source: str) -> None:
-        """Raise where x was measured long before or after the inputs of its trial.
+        """Raise if x was measured long before or after the inputs of its trial.
 
         Args:
             row: Number of the trial in each row of x, shape (k,).
-            time: Of x in s, shape (k,).
-            place: Returns what a message calls a row of x.
-            source: What it calls the table of x.
+            time: Times of x in s, shape (k,).
+            place: Function that returns the name of a row of x in messages.
+            source: Name of the table of x in messages.
         """
         for t, at in enumerate(self.members):
             own = self.time[at]
@@ -117,7 +117,7 @@ class InputRows:
                 )
 
     def _require_one_origin(self, rows: Sequence[Array]) -> None:
-        """Raise where a trial begins after another of its length has ended."""
+        """Raise if a trial begins after another of its length has ended."""
         earliest = min(self.time[at[0]] for at in rows)
         for at in rows:
             begin, end = self.time[at[0]], self.time[at[-1]]

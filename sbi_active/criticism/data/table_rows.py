@@ -32,12 +32,12 @@ class Rows:
 
     Args:
         frame: The table.
-        columns: What its columns are.
-        source: What messages call it.
+        columns: Columns of the table, by their role.
+        source: Name of the table in messages.
 
     Attributes:
         code: Number of each row's trial, shape (n,).
-        names: Of the trials.
+        names: Names of the trials.
         members: Rows of each trial.
         first: The first row of each.
     """
@@ -79,7 +79,7 @@ class Rows:
         """Return the rows of inputs.
 
         Args:
-            time: Of each row.
+            time: Time of each row.
         """
         columns = self.columns
         return InputRows(
@@ -93,12 +93,12 @@ class Rows:
         )
 
     def place(self, i: Any) -> str:
-        """Return what a message calls a row."""
+        """Return the name of a row in messages."""
         trial = f" (trial {self.names[self.code[i]]})" if self.columns.trial else ""
         return f"row {i + 1}{trial}"
 
     def words(self, column: str) -> Array:
-        """Return a column as text, shape (n,), "" where it is empty."""
+        """Return a column as text, shape (n,), "" if it is empty."""
         cells = self.frame[column]
         if pd.api.types.is_float_dtype(cells):  # 1.0 and 1 name one trial
             text = [_digits(value) for value in cells]
@@ -133,7 +133,7 @@ class Rows:
         return values
 
     def constant(self, column: str, values: Array | None = None) -> Array:
-        """Return what each trial has in a column, which must not vary within it."""
+        """Return the value of each trial in a column, which must not vary within it."""
         values = self.numbers(column) if values is None else values
         own = values[self.first]
         for i in np.flatnonzero(values != own[self.code]):
@@ -146,7 +146,7 @@ class Rows:
         return own
 
     def _require_order(self, time: Array, column: str) -> None:
-        """Raise where a sample is there twice, or time runs backward in a trial."""
+        """Raise if a sample is there twice, or time runs backward in a trial."""
         for at, name in zip(self.members, self.names, strict=True):
             order = at[np.argsort(time[at], kind="stable")]
             for k in np.flatnonzero(np.diff(time[order]) == 0):
@@ -187,7 +187,7 @@ def seconds(cells: pd.Series, source: str) -> Array:
 
 
 def require_real(cells: pd.Series, column: str, source: str) -> None:
-    """Raise where numbers have an imaginary part, which nothing here could keep."""
+    """Raise if numbers have an imaginary part, which nothing here could keep."""
     if pd.api.types.is_complex_dtype(cells) or any(
         isinstance(cell, complex) for cell in cells
     ):
@@ -218,7 +218,7 @@ def _if_it_varies(column: str) -> str:
 
 
 def _remedy(column: str, text: str) -> str:
-    """Return what to do about a cell that is no number; "" where it says nothing."""
+    """Return what to do about a cell that is no number; "" if it says nothing."""
     if re.fullmatch(r"[-+]?[\d.]+([eE][-+]?\d+)?\s*[^\d\s,;].*", text):
         name = f"{column.split('[')[0]}[unit]"
         return f"write the unit once, in the header as {name}, with all numbers in it"
@@ -260,7 +260,7 @@ def read_csv(path: Path) -> pd.DataFrame:
 
 
 def _require_commas(path: Path) -> None:
-    """Raise where the header's cells are parted by something else."""
+    """Raise if the header's cells are parted by something else."""
     with path.open(encoding="utf-8-sig") as file:
         lines = (line.strip() for line in file)
         header = next((line for line in lines if line and line[0] != "#"), "")

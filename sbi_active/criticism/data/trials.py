@@ -37,43 +37,42 @@ class Trials:
 
     Ragged observations are padded with NaN. NaN is masked, and so is inf, with a
     warning; a trial of NaN alone is *invalid*: the system ran and gave no measurement.
-    What is given is copied, and may change afterwards.
+    All arguments are copied, and may change afterwards.
 
     Args:
-        action: As commanded, shape (n, action_dim), or (n,) for scalar actions. None
-            where the inputs say what was commanded: the action is then the trial's
+        action: Actions as commanded, shape (n, action_dim), or (n,) for scalar ones.
+            None if the inputs say what was commanded: the action is then the trial's
             number, a label that no effect changes.
         x: Shape (n, \*x_shape), or a list of n arrays of shape (k_i, \*channels).
         role: "fit", or "held out" of everything that is fitted or chosen; one a
             trial, or None for all "fit".
-        mask: True where x is a measurement, of its shape; None takes what is not NaN.
+        mask: Mask of x, true where it is a measurement; None takes all that is not NaN.
         index: Place of each trial in the order of execution, shape (n,); None counts
             from 0.
         order: "known", or "unknown" where the index does not say when a trial was
             executed: nothing is then traced to wear or drift from trial to trial.
         sample_times: Times of x's first axis, shape (k,), (n, k), or a list of n.
-        names: What reports, warnings and figures call each trial; None takes its index.
-            A selection keeps them.
-        repeat_of: Position of the trial that each one repeats, shape (n,), -1 for
-            none; None takes trials of equal actions as repeats of the first. A repeat
-            of a repeat is one of the first.
-        action_labels: What reports call each entry of the action, with its unit.
-        channel_labels: The same of each entry of x's last axis.
-        inputs: What varies in time, {name: series}, each of shape (n, m), (m,) where
-            all trials share it, or a list of n arrays. An array (n, m) or a list
-            without a name is "input"; (n, m, c) is "input 1" to "input c".
-        input_times: Of the inputs, shape (m,), (n, m), or a list of n, or such by name,
-            from the same origin as ``sample_times``, which they are where there are as
-            many.
-        input_hold: Between two of its times an input has the "previous" value, as a
-            command is held, or is "linear".
-        input_labels: What reports call each input, with its unit.
+        names: Names of the trials in reports; None takes their indices. A selection
+            keeps them.
+        repeat_of: Position of the trial that each one repeats, (n,), -1 for none; None
+            takes trials of equal actions. A repeat of a repeat is one of the first.
+        action_labels: Labels of the action's entries in reports, with units.
+        channel_labels: Labels of the entries of x's last axis, likewise.
+        inputs: Signals over time, {name: series}, each of shape (n, m), (m,) where all
+            trials share it, or a list of n arrays. An array (n, m) or a list without a
+            name is "input"; (n, m, c) is "input 1" to "input c".
+        input_times: Times of the inputs, shape (m,), (n, m), a list of n, or such by
+            name, from the same origin as ``sample_times``, which they are where there
+            are as many.
+        input_hold: Value of an input between its times: the "previous" one, as commands
+            are held, or "linear".
+        input_labels: Labels of the inputs in reports, with units.
         start: Measured start state, shape (n, d), or {name: (n,)}.
 
     Attributes:
-        inputs: By name, shape (n, m), on one uniform grid for all trials: its step is
-            the smallest median step of a trial, and before and after a trial's own
-            times its first and last value are held. None where there are none.
+        inputs: Inputs by name, shape (n, m), on one uniform grid for all trials: its
+            step is the smallest median step of a trial, and before and after a trial's
+            own times its first and last value are held. None if there are none.
         input_times: The grid, shape (m,).
         action_is_label: Whether the action is only the trial's number.
 
@@ -217,7 +216,7 @@ class Trials:
         A row is a sample where there are columns "trial" and "time" (in s, or as in
         "time_ms"). Either way "action_\*" is the action, which like all else that
         belongs to a trial stands in each of its rows, and "x_\*" the observation.
-        What stands in "trial" is what reports call it.
+        Reports name a trial by its entry in "trial".
         Optional are "role", "index" (the place in the order of execution; without it
         that of the first row) and "repeat_of" (the index of the trial that is
         repeated). An empty cell of x is what was not measured. A unit stands in
@@ -226,17 +225,18 @@ class Trials:
         which then needs no action; rows may have an input and no x.
 
         Args:
-            path: Of the file; lines that begin with # are comments. Or of a folder with
+            path: Path of a file, in which lines after # are comments, or a folder with
                 ``trials.csv`` or such files: one with times and no "trial" is a trial.
-            columns: Which columns are "trial", "time", "action", "x", "input", "start",
-                "role", "index" and "repeat_of", where they have other names; those left
-                out are then ignored. Several columns may name a trial together.
-            units: By column, where the header has none. Numbers are taken as they are,
-                but for the time, which is converted to seconds.
-            order: As in the constructor; "unknown" where rows are in any order.
+            columns: Names of the columns that are "trial", "time", "action", "x",
+                "input", "start", "role", "index" and "repeat_of", where they have other
+                names; those left out are then ignored. Several columns may name a trial
+                together.
+            units: Units by column, where the header has none. Numbers are taken as they
+                are, but for the time, which is converted to seconds.
+            order: Order of execution; "unknown" where rows are in any order.
             inputs: Another file, or a data frame, with the inputs at times of their
                 own: "time", "input_\*", and "trial" unless all trials share them.
-            input_hold: As in the constructor.
+            input_hold: Value of an input between two times, as in the constructor.
 
         Raises:
             ValueError: If the table is not understood; the text says where.
@@ -286,7 +286,7 @@ class Trials:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What each trial is called, as given, or its index."""
+        """Names of the trials, as given, or their indices."""
         return self._names or tuple(f"{value:.15g}" for value in self.index.tolist())
 
     def called(self, positions: Sequence[int]) -> str:
@@ -296,7 +296,7 @@ class Trials:
 
     @property
     def mask(self) -> Tensor:
-        """True where x is a measurement, of the shape of x."""
+        """True if x is a measurement, of the shape of x."""
         return self.x.isfinite()
 
     @property
@@ -316,7 +316,7 @@ class Trials:
 
     @property
     def held_out(self) -> Trials | None:
-        """The held-out trials; None where there are none."""
+        """The held-out trials; None if there are none."""
         return self._of("held out") if self.held_out_positions else None
 
     def template(self) -> tuple[Tensor, Tensor | None]:

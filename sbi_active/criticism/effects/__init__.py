@@ -1,6 +1,7 @@
-"""What a simulator may lack: declared effects, and the simulator that has them.
+"""Declared effects that a simulator may lack, and the simulator that has them.
 
-Here live effects, their checks and priors. How well one explains trials does not.
+This package contains effects, their checks and priors. The comparison of effects with
+trials is elsewhere.
 """
 
 from sbi_active.criticism.effects.declarations import require_nested

@@ -14,17 +14,17 @@ from sbi_active.criticism.effects.effect import Context, Effect
 def applied(
     effect: Effect, value: Any, phi: Tensor, action: Tensor, context: Context
 ) -> Any:
-    """Return what an effect makes of a value.
+    """Return a value as an effect changes it.
 
-    It gets copies, so that it may change them in place, and what it gives back is
-    copied, so that it may be a view of what it keeps.
+    The effect gets copies, so that it may change them in place, and its result is
+    copied, so that it may be a view of a buffer.
 
     Args:
-        effect: Of any hook.
-        value: As the hook says; a dict for "dynamics" and "input".
-        phi: Shape (n, phi_dim).
-        action: As commanded, shape (n, action_dim).
-        context: Of the rows.
+        effect: Effect of any hook.
+        value: Value that the hook changes; a dict for "dynamics" and "input".
+        phi: Parameters of the effect, shape (n, phi_dim).
+        action: Actions as commanded, shape (n, action_dim).
+        context: Context of the rows.
 
     Raises:
         ValueError: If ``apply`` gives back another type, shape or kind of number, or a

@@ -55,7 +55,7 @@ class AugmentedSimulator(SimulatorModel):
 
     Attributes:
         base: The simulator without any effect.
-        effects: All effects.
+        effects: Effects, all of them.
         takes_times: Whether the simulator's function has an argument ``times``, shape
             (n, k), for the times at which each row is measured.
     """
@@ -123,20 +123,20 @@ class AugmentedSimulator(SimulatorModel):
     ) -> Tensor:
         """Return the output of the simulator's function with some effects switched on.
 
-        It is noise-free where the model declares its noise, else a draw.
+        It is noise-free if the model declares its noise, else a draw.
 
         Args:
             theta: Parameters of the base simulator, shape (n, theta_dim).
-            phi: By effect, shape (n, phi_dim); effects that are left out vanish.
-            action: As commanded, shape (n, action_dim).
+            phi: Parameters by effect, (n, phi_dim); effects that are left out vanish.
+            action: Actions as commanded, shape (n, action_dim).
             index: Place of each row's trial, shape (n,); None is ``next_index``.
             times: Sample times, shape (k,) or (n, k); None takes the model's.
-            context: All that is known of how each row's trial was run, in place of
-                index and times.
-            seeds: One a row, for a simulator that takes them; None gives each row 0
-                where the noise is declared.
-            merge: Simulate rows once that the simulator would be asked for twice, as
-                where an action was repeated.
+            context: Conditions under which each row's trial was run, in place of index
+                and times.
+            seeds: Seeds, one a row, for a simulator that takes them; None gives each
+                row 0 where the noise is declared.
+            merge: Whether to simulate equal rows only once, as where an action was
+                repeated.
 
         Returns:
             Shape (n, *x_shape).
@@ -159,12 +159,12 @@ class AugmentedSimulator(SimulatorModel):
         """Return the noise's standard deviation with effects, of the shape of ``sd``.
 
         Args:
-            phi: As in :meth:`evaluate`.
+            phi: Parameters by effect, as in :meth:`evaluate`.
             action: Shape (n, action_dim).
-            sd: Without effects, shape (n, *x_shape).
-            index: As in :meth:`evaluate`.
-            times: As in :meth:`evaluate`.
-            context: As in :meth:`evaluate`.
+            sd: Standard deviation without effects, shape (n, *x_shape).
+            index: Place of each row's trial, as in :meth:`evaluate`.
+            times: Sample times, as in :meth:`evaluate`.
+            context: Context of the rows, as in :meth:`evaluate`.
         """
         context = self._row_context(action, index, times, context)
         for effect in self._active("noise", phi):
@@ -344,7 +344,7 @@ class AugmentedSimulator(SimulatorModel):
         return x[place]
 
     def _check_null(self, theta: Tensor, action: Tensor, context: Context) -> None:
-        """Raise where an effect at its null changes x."""
+        """Raise if an effect at its null changes x."""
         x = self._seeded(theta, {}, action, context)
         shapes = [x.shape, *(u.shape for u in (context.inputs or {}).values())]
         if any(len(x) in shape[1:] for shape in shapes) and len(x) > 1:

@@ -1,4 +1,4 @@
-"""What a declared effect must be before anything is computed with it."""
+"""Checks of declared effects before anything is computed with them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ STEP = 1e-6
 
 
 def require_nested(effects: Sequence[Effect]) -> None:
-    """Raise where a prior excludes the null, so that no phi is close to no effect.
+    """Raise if a prior excludes the null, so that no phi is close to no effect.
 
     The edge of a support counts as within, and so does an infinite null. Nuisances of
     each trial are always there and need none.
@@ -28,11 +28,11 @@ def require_nested(effects: Sequence[Effect]) -> None:
 
 
 def require_distinct(effects: Sequence[Effect], parameters: Sequence[str] = ()) -> None:
-    """Raise where two numbers would have one name in tables and records.
+    """Raise if two numbers would have one name in tables and records.
 
     Args:
-        effects: By their own names, whose parts between " + " must not come again
-            either, since that joins names, and those of the entries of their phi.
+        effects: Effects by their own names, whose parts between " + " must not come
+            again either, since that joins names, and those of the entries of their phi.
         parameters: Names of the simulator's own.
     """
     parts = [part for effect in effects for part in effect.name.split(" + ")]

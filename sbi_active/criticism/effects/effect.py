@@ -25,13 +25,13 @@ NUM_DRAWS = 64
 
 @dataclass(frozen=True)
 class Context:
-    """What an effect may know of the rows that it changes.
+    """Conditions of the rows that an effect changes.
 
     Attributes:
         index: Place of each row's trial in the order of the trials, shape (n,).
         times: Sample times, shape (k,) or (n, k); None for x without a time axis.
-        inputs: As commanded, {name: (n, m)}; None for trials without.
-        input_times: Their uniform grid, shape (m,).
+        inputs: Inputs as commanded, {name: (n, m)}; None for trials without.
+        input_times: Uniform grid of the inputs, shape (m,).
         start: Measured start states, shape (n, d) or {name: (n,)}; None for none.
     """
 
@@ -42,7 +42,7 @@ class Context:
     start: Tensor | dict[str, Tensor] | None = None
 
     def at(self, rows: slice) -> Context:
-        """Return what is known of some rows."""
+        """Return the context of some rows."""
         times = self.times
         return Context(
             self.index[rows],
@@ -58,10 +58,11 @@ class Effect:
     r"""A nested extension of a simulator that vanishes at :math:`\phi = \phi_0`.
 
     Args:
-        name: What reports call it; unique among the effects of a loop.
-        hook: What it changes: the "action" that is executed, the "input" series, the
-            "parameter" vector theta, the keyword arguments of the simulator's function
-            ("dynamics"), the "observation" x, or the standard deviation of the "noise".
+        name: Name in reports; unique among the effects of a loop.
+        hook: Part that it changes: the "action" that is executed, the "input" series,
+            the "parameter" vector theta, the keyword arguments of the simulator's
+            function ("dynamics"), the "observation" x, or the standard deviation of the
+            "noise".
         prior: Distribution of phi, with event or batch shape (phi_dim,) or ().
         null: Value of phi, a number or shape (phi_dim,), at which the effect vanishes;
             may be infinite.
@@ -70,14 +71,14 @@ class Effect:
             :class:`Context`. For "input", value is {name: (n, m)}, on the grid
             ``context.input_times``. For "dynamics", it is a dict of keyword arguments.
             For "noise", it is the standard deviation, of the shape of x.
-        units: Of phi.
-        family: Effects of one family share a prior probability, so that variants of an
-            idea dilute nobody; None takes the hook.
+        units: Units of phi.
+        family: Name of the family. Effects of one family share a prior probability, so
+            that variants of an idea do not dilute others; None takes the hook.
         scope: "campaign" for one phi in all trials; "trial" for a nuisance that every
             trial draws afresh and every rival model marginalizes.
         describe: A sentence for the report.
         needs_order: Whether it acts by ``context.index``, the order of the trials; it
-            is then left out where that is unknown.
+            is then left out if that is unknown.
 
     Raises:
         ValueError: If the hook or scope is unknown, a part is of another type, null and
@@ -127,11 +128,11 @@ class Effect:
         """Return an effect that the simulator's function already has.
 
         Args:
-            name: Of the effect.
+            name: Name of the effect.
             *keywords: Arguments of the simulator's function, one an entry of phi, each
                 of shape (n,); without any the name, its spaces underscored.
-            prior: Of phi.
-            **options: As in the constructor; the null is 0 unless given.
+            prior: Prior of phi.
+            **options: Options of the constructor; the null is 0 unless given.
 
         Raises:
             ValueError: If there is not one keyword for each entry of phi.
@@ -214,7 +215,7 @@ class _Keywords:
 
 
 def _require_parts(effect: Effect) -> None:
-    """Raise where a part of an effect is of another type than it should be."""
+    """Raise if a part of an effect is of another type than it should be."""
     texts = {"name": effect.name, "units": effect.units}
     texts |= {
         name: value
@@ -268,7 +269,7 @@ def _sound_null(effect: Effect) -> Any:
 
 
 def _require_finite_draws(effect: Effect) -> None:
-    """Raise where the prior gives phi that is no number."""
+    """Raise if the prior gives phi that is no number."""
     lost = ~effect.declared_draws().isfinite()
     if bool(lost.any()):
         raise ValueError(
@@ -283,8 +284,8 @@ class UnderKey:
     """Adds phi to a dictionary that the simulator takes as a keyword, under a key.
 
     Attributes:
-        keyword: Of the simulator's function.
-        key: What phi belongs to, such as a force.
+        keyword: Keyword of the simulator's function.
+        key: Key that phi belongs to, such as a force.
         order: Center and half span of the trials' order; with it the place of the
             trial, from -1 to 1, is the last column of phi.
     """

@@ -57,16 +57,17 @@ def start_from_first_samples(
     does one that was measured.
 
     Args:
-        trials: With sample times. Held-out trials start from their own first samples.
-        start: By name, an entry of x's last axis, or this and the order of the
-            derivative: {"angle": 0, "speed": (0, 1)}. The polynomial has the largest
-            of these orders, and at least one.
+        trials: Trials with sample times. Held-out trials start from their own
+            first samples.
+        start: Start state by name: an entry of x's last axis, or this and the order of
+            the derivative: {"angle": 0, "speed": (0, 1)}. The polynomial has the
+            largest of these orders, and at least one.
         within: Time from its first sample in which a trial's motion is such a
             polynomial, in the unit of the sample times.
         sd: Standard deviation of the sensor, one for all entries of x or one each.
         at: Time at which the simulator starts; None for each trial's first sample.
         width: Standard errors in a deviation of the nuisance.
-        name: Of the nuisance.
+        name: Name of the nuisance.
 
     Returns:
         A copy of the trials with ``start``, beside what was measured of it, and an
@@ -152,24 +153,24 @@ def zero_from_first_samples(
 ) -> tuple[Trials, Effect]:
     """Return the trials less the mean of their first samples, and what is left of it.
 
-    For a sensor whose zero is another one in each trial and shows before anything
+    Use it for a sensor whose zero differs from trial to trial and shows before anything
     moves, as that of a load cell.
 
     Args:
-        trials: With sample times.
+        trials: Trials with sample times.
         within: Time from its first sample in which a trial is at rest, in the unit of
             the sample times.
         sd: Standard deviation of the sensor, one for all entries of x or one each.
         channels: Entries of x's last axis that have such a zero.
         width: Standard errors in a deviation of the nuisance.
-        name: Of the nuisance.
+        name: Name of the nuisance.
 
     Returns:
         A copy of the trials with other x, and an effect of scope "trial" with an entry
         of phi for each channel.
 
     Raises:
-        ValueError: As :func:`start_from_first_samples`.
+        ValueError: If :func:`start_from_first_samples` would raise it.
 
     Example:
         >>> force = torch.tensor([[125.0, 125.0, 131.0], [90.0, 90.0, 97.0]])

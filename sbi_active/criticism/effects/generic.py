@@ -57,27 +57,27 @@ def generic_effects(
 ) -> list[Effect]:
     r"""Return effects that wrap the inputs and outputs of a simulator.
 
-    Of the action: gain, offset, saturation and, where actions have both signs, a dead
-    zone. Of the observation: bias, gain, drift with the trial's index, an offset of
-    the clock where x has sample times, and saturation where the prior is given. Scales
-    come from the range of the actions, the noise, and the prior predictive. Noise
-    inflation needs no effect: it is always among the rivals. The drift is left out of a
-    comparison with trials whose order is unknown.
+    Effects on the action are gain, offset, saturation and, where actions have both
+    signs, a dead zone. Effects on the observation are bias, gain, drift with the
+    trial's index, an offset of the clock where x has sample times, and saturation where
+    the prior is given. Scales come from the range of the actions, the noise, and the
+    prior predictive. Noise inflation needs no effect: it is always among the rivals.
+    The drift is left out of a comparison with trials whose order is unknown.
 
-    Trials in place of the actions say more, and so do the signals of a model that has
-    some. An action that is a label, or stands for a signal, is left as it is. Of each
-    input over time there are gain, offset, saturation, dead zone, delay, first-order
-    lag and backlash of its actuator, with the input's name where there are several.
-    Where x has sample times, a drift along them, delay, first-order lag and quantum of
-    the sensor take the place of the clock's offset; up to four sensors have theirs
-    each, with the channel's name. Delays and lags are a fiftieth of a recording, and
-    ten samples at most.
+    Trials in place of the actions give more effects, and so do the signals of a model.
+    An action that is a label, or stands for a signal, is left as it is. Effects on each
+    input over time are gain, offset, saturation, dead zone, delay, first-order lag and
+    backlash of its actuator, with the input's name where there are several. Where x has
+    sample times, a drift along them, delay, first-order lag and quantum of the sensor
+    take the place of the clock's offset; up to four sensors have theirs each, with the
+    channel's name. Delays and lags are a fiftieth of a recording, and ten samples at
+    most.
 
     Args:
         model: The simulator.
         actions: The permitted actions, or the measured trials.
-        prior: Of the simulator's parameters, for the spread of its predictions; needed
-            where the simulator declares no noise.
+        prior: Prior of the simulator's parameters, for the spread of its predictions;
+            needed if the simulator declares no noise.
 
     Raises:
         ValueError: If neither noise nor prior says how large x and its errors are.

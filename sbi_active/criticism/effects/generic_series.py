@@ -55,7 +55,8 @@ def typical_delay(times: Tensor) -> float:
     """Return one prior deviation of delays and lags, s.
 
     Args:
-        times: Of one recording, or of several, shape (k,) or (t, k), NaN for none.
+        times: Sample times of one recording, or of several, shape (k,) or (t, k), NaN
+            for none.
     """
     rows = times.reshape(-1, times.shape[-1]).double()
     known = [row[row.isfinite()] for row in rows]
@@ -71,9 +72,9 @@ def of_inputs(
     """Return effects of an actuator on each input.
 
     Args:
-        inputs: By name, shape (t, m).
+        inputs: Inputs by name, shape (t, m).
         delay: One prior deviation of delays and lags, s.
-        units: Of the inputs, by name.
+        units: Units of the inputs, by name.
     """
     found = []
     for name, value in inputs.items():
@@ -162,8 +163,8 @@ def of_samples(sd: Tensor, times: Tensor) -> list[Effect]:
     """Return effects of a sensor along its samples.
 
     Args:
-        sd: Of its noise, one or one a channel.
-        times: Of the samples, shape (k,) or (t, k), NaN for none.
+        sd: Standard deviation of its noise, one or one a channel.
+        times: Times of the samples, shape (k,) or (t, k), NaN for none.
     """
     delay = _half(typical_delay(times))
     span = float(times.nan_to_num(-torch.inf).max() - times.nan_to_num(torch.inf).min())
@@ -199,9 +200,9 @@ def on_channel(effect: Effect, channel: int, name: str) -> Effect:
     """Return an effect of one sensor, on its channel alone.
 
     Args:
-        effect: Of an observation of one channel.
+        effect: Effect on an observation of one channel.
         channel: Entry of x's last axis.
-        name: What reports call it.
+        name: Name in reports.
     """
     return replace(
         effect,

@@ -21,8 +21,8 @@ class JointPrior(Distribution):
     :math:`p(\theta, \phi) = p(\theta) \prod_e p_e(\phi_e)`.
 
     Args:
-        prior: Of theta, event shape (theta_dim,); itself a joint prior where effects
-            were added before.
+        prior: Prior of theta, event shape (theta_dim,); itself a joint prior where
+            effects were added before.
         effects: Effects whose phi follow theta, in this order.
     """  # noqa: D205
 
@@ -85,7 +85,7 @@ def joint_prior(prior: Distribution, effects: Sequence[Effect]) -> JointPrior:
     """Return the prior of theta and the effects' phi, never a posterior.
 
     Args:
-        prior: Of theta, event shape (theta_dim,).
+        prior: Prior of theta, event shape (theta_dim,).
         effects: Effects, in the order of their parameters; those of scope "trial" are
             drawn by the simulator and are left out.
 

@@ -13,7 +13,7 @@ from sbi_active.seeding import forked_generators
 
 
 def change_at_null(reference: Tensor, at_null: Any, effect: Effect) -> float:
-    """Return the largest change of x at the null; inf where it turns into NaN."""
+    """Return the largest change of x at the null; inf if it turns into NaN."""
     difference = torch.inf
     is_finite = bool(effect.null_phi(1).isfinite().all())
     for finite in (True,) if is_finite else (False, True):
@@ -29,7 +29,7 @@ def change_at_null(reference: Tensor, at_null: Any, effect: Effect) -> float:
 def require_positive(
     effect: Effect, one: Tensor, action: Tensor, context: Context
 ) -> None:
-    """Raise where an effect on the noise makes a deviation that is none."""
+    """Raise if an effect on the noise makes a deviation that is none."""
     with forked_generators(0, "noise of an effect"):
         phi = effect.sample(len(one)).to(one.dtype)
     sd = applied(effect, one, phi, action, context)

@@ -1,4 +1,4 @@
-r"""What an actuator or a sensor does to a series, exactly between its samples.
+r"""Actuators and sensors acting on a series, exactly between its samples.
 
 An input is held between the points of its grid, and a simulator may read it once a
 step. What a delay :math:`\tau` or a lag makes of it is therefore its mean over the step
@@ -9,7 +9,7 @@ the lagged input at the grid's points alone would be flat,
     \bar y_k = u_k + (y_k - u_k) \frac{\tau}{h} (1 - a), \qquad
     y_{k+1} = u_k + (y_k - u_k)\, a, \qquad a = e^{-h / \tau}.
 
-What is measured, x, is a line between its samples instead: with slope
+The measured x is a line between its samples instead: with slope
 :math:`s_k = (x_{k+1} - x_k) / h_k` the lagged sensor reads
 
 .. math::
@@ -32,9 +32,9 @@ def lagged_input(u: Tensor, tau: Tensor, step: Tensor) -> Tensor:
     """Return a held series behind a first-order lag, its mean over each step.
 
     Args:
-        u: Shape (n, m), at rest before.
+        u: Series, shape (n, m), at rest before.
         tau: Time constant, 0 for none, shape (n, 1).
-        step: Of the grid.
+        step: Step of the grid.
     """
     tau = tau.clamp(min=0)
     keep = torch.exp(-step / tau)
@@ -46,9 +46,9 @@ def delayed_input(u: Tensor, tau: Tensor, step: Tensor) -> Tensor:
     """Return a held series later by tau, its mean over each step.
 
     Args:
-        u: Shape (n, m); its first value held before.
+        u: Series, shape (n, m); its first value held before.
         tau: Delay, shape (n, 1).
-        step: Of the grid.
+        step: Step of the grid.
     """
     place = torch.arange(u.shape[1], dtype=u.dtype) - tau / step
     place = place.clamp(0, u.shape[1] - 1)
@@ -61,7 +61,7 @@ def played(u: Tensor, width: Tensor) -> Tensor:
     r"""Return a series behind a backlash, :math:`|y_k - u_k| \le w / 2`.
 
     Args:
-        u: Shape (n, m); it starts in the middle of the play.
+        u: Series, shape (n, m); it starts in the middle of the play.
         width: w, shape (n, 1).
     """
     half = width.clamp(min=0) / 2
@@ -90,9 +90,10 @@ def lagged_samples(x: Tensor, tau: Tensor, times: Tensor) -> Tensor:
     """Return samples by a sensor with a first-order lag, at rest before the first.
 
     Args:
-        x: Shape (n, k, ...), a line between its samples.
+        x: Observations, shape (n, k, ...), a line between its samples.
         tau: Time constant, 0 for none, shape (n, 1).
-        times: Shape (n, k); what pads a shorter trial has the time of its last sample.
+        times: Times, shape (n, k); what pads a shorter trial has the time of its last
+            sample.
     """
     if x.shape[1] < 2:
         return x
@@ -112,9 +113,9 @@ def delayed_samples(x: Tensor, tau: Tensor, times: Tensor) -> Tensor:
     """Return samples of what was there tau before, the first value before it.
 
     Args:
-        x: As in :func:`lagged_samples`.
+        x: Samples, as in :func:`lagged_samples`.
         tau: Delay, shape (n, 1).
-        times: As there.
+        times: Sample times, as in :func:`lagged_samples`.
     """
     if x.shape[1] < 2:
         return x
@@ -136,8 +137,8 @@ def rounded(x: Tensor, quantum: Tensor) -> Tensor:
     """Return samples to the nearest multiple of a quantum, 0 for as they are.
 
     Args:
-        x: Shape (n, ...).
-        quantum: Of the shape of x, or of one that it broadcasts to.
+        x: Observations, shape (n, ...).
+        quantum: Quantum, of the shape of x or of one that broadcasts to it.
     """
     quantum = quantum.expand_as(x)
     safe = quantum.where(quantum > 0, torch.ones_like(quantum))
@@ -148,9 +149,9 @@ def _affine(factor: Tensor, shift: Tensor, start: Tensor) -> Tensor:
     """Return y with y_0 = start and y_{k+1} = factor_k y_k + shift_k.
 
     Args:
-        factor: Shape (n, k - 1, ...).
-        shift: Of that shape.
-        start: Shape (n, 1, ...).
+        factor: Factors, shape (n, k - 1, ...).
+        shift: Shift of each step, of the same shape.
+        start: Start values, shape (n, 1, ...).
     """
     reach = 1
     while reach < factor.shape[1]:

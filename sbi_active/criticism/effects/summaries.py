@@ -43,9 +43,9 @@ class Summarized:
     """A comparison of models given summaries.
 
     Attributes:
-        model: Simulates the summaries, with noise of unit size.
-        trials: Their summaries.
-        effects: As declared, acting on x before it is summarized.
+        model: Simulator of the summaries, with noise of unit size.
+        trials: Trials, with their summaries as x.
+        effects: Effects as declared, acting on x before it is summarized.
         weight: W / s, shape (k, numbers of x).
     """
 
@@ -75,11 +75,11 @@ def summarize(
 
     Args:
         model: The bare simulator.
-        prior: Of its parameters.
-        trials: With many numbers each, all or none of them measured.
+        prior: Prior of its parameters.
+        trials: Trials with many numbers each, all or none of them measured.
         effects: Declared effects.
         num: Summaries at most.
-        seed: Of the simulations that they are trained on.
+        seed: Seed of the simulations that they are trained on.
 
     Raises:
         ValueError: If the noise is not independent and Gaussian, numbers are masked,
@@ -134,7 +134,7 @@ def summarize(
 
 
 def obstacle(model: SimulatorModel, trials: Trials, effects: Sequence[Effect]) -> str:
-    """Return what stands against summaries, in words; "" for nothing."""
+    """Return the obstacle to summaries, in words; "" for none."""
     reason = ""
     if not isinstance(model.noise, GaussianNoise):
         reason = f"noise {model.noise}"

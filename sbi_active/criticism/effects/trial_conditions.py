@@ -1,4 +1,4 @@
-"""How trials were run, as effects and simulators are told."""
+"""Conditions of trials, as effects and simulators get them."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from sbi_active.simulation.conditions import typed
 def conditions_of_trials(
     trials: Trials, rows: Tensor, model: SimulatorModel
 ) -> Context:
-    """Return how the trial of each row was run.
+    """Return the conditions of each row's trial.
 
     Args:
-        trials: Measured ones.
+        trials: Measured trials.
         rows: Position of each row's trial, shape (n,).
-        model: Where it has sample times of its own and takes no others, x is simulated
-            at its own.
+        model: Simulator. If it has sample times of its own and takes no others, x is
+            simulated at these.
     """
     times = None if has_own_times(model, trials) else trials.sample_times
     if times is not None and times.ndim == 2:
@@ -40,13 +40,13 @@ def conditions_of_trials(
 def conditions_for(
     model: SimulatorModel, trials: Trials, rows: Tensor, dtype: torch.dtype
 ) -> dict[str, Any]:
-    """Return how trials were run as keyword arguments that a model's function takes.
+    """Return conditions of trials as keyword arguments that a model's function takes.
 
     Args:
         model: The simulator.
-        trials: Measured ones.
+        trials: Measured trials.
         rows: Position of each row's trial, shape (n,).
-        dtype: Of the tensors.
+        dtype: Type of the tensors.
     """
     context = vars(conditions_of_trials(trials, rows, model))
     found = {k: context[k] for k in model.conditions if context[k] is not None}

@@ -1,6 +1,7 @@
 """The evidence of each rival: its best fit, its posterior draws and its normalizer.
 
-Here live optimizers and samplers over rivals. What is concluded lives in ``steps``.
+This package contains optimizers and samplers over rivals. The conclusions from them are
+in ``steps``.
 """
 
 from sbi_active.criticism.evidence.outliers import OneOutlier

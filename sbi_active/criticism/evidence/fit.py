@@ -22,10 +22,11 @@ class Fit:
 
     Attributes:
         rival: The model.
-        sample: Of its posterior, weighted.
-        evidence: What is recorded of it.
-        best: Where other trials are predicted from, shape (dim,); None takes the draws.
-        mode: Where it is linear, shape (dim,); None where it was sampled.
+        sample: Sample of its posterior, weighted.
+        evidence: Evidence that is recorded of it.
+        best: Point from which other trials are predicted, shape (dim,); None takes the
+            draws.
+        mode: Point at which it is linear, shape (dim,); None if it was sampled.
     """
 
     rival: Rival

@@ -43,11 +43,11 @@ def look_for_jumps(rival: Rival, *, seed: int) -> tuple[float, bool, Array]:
 
     Args:
         rival: The bare model, with the declared noise.
-        seed: Of all draws.
+        seed: Seed of all draws.
 
     Returns:
         The step, in prior deviations; whether the simulator is smooth; and the
-        deviation of its jumps, shape (N,), zero where it is.
+        deviation of its jumps, shape (N,), zero if it is.
     """
     noise = rival.error
     assert isinstance(noise, NoiseGrid)
@@ -103,7 +103,7 @@ def probe_step(rival: Rival, u: Array) -> tuple[float | None, bool]:
 def local_roughness(rival: Rival, *, step: float, seed: int) -> tuple[Array, Array]:
     r"""Return the standard deviation of what no smooth function follows, shape (N,).
 
-    And the draws around the best fit that tell, shape (n, dim).
+    It also returns the draws around the best fit that show it, shape (n, dim).
 
     A simulator of contact or chaos answers a change of its parameters that is far
     within their posterior by a jump. Beside the error of measurement s, jumps of size r
@@ -118,8 +118,8 @@ def local_roughness(rival: Rival, *, step: float, seed: int) -> tuple[Array, Arr
 
     Args:
         rival: The bare model, with the declared noise.
-        step: Of finite differences.
-        seed: Of the draws.
+        step: Step of finite differences.
+        seed: Seed of the draws.
 
     References:
         Gramacy & Lee, Statistics and Computing 22 (2012), for the nugget of

@@ -57,12 +57,13 @@ class OneOutlier(ErrorModel):
 
     Args:
         noise: The error of all other trials.
-        measurements: What the residuals are of.
+        measurements: Measurements that the residuals belong to.
         largest: Size that an error may need to have, in standard deviations.
 
     Attributes:
-        trials: Those with a measurement, shape (k,).
-        sizes: Of the gross error, in standard deviations of the noise, shape (s,).
+        trials: Trials with a measurement, shape (k,).
+        sizes: Sizes of the gross error, in standard deviations of the noise, shape
+            (s,).
     """
 
     def __init__(
@@ -96,7 +97,7 @@ class OneOutlier(ErrorModel):
         """Return log densities of all trials but each one, shape (n, k).
 
         Args:
-            residual: Shape (n, N).
+            residual: Residuals, shape (n, N).
         """
         parts = []
         for cell, prior in zip(self.noise.cells, self.noise.log_prior, strict=True):
@@ -208,7 +209,7 @@ class OneOutlier(ErrorModel):
 
 
 def _smooth(cell: NoiseCell, measurements: Measurements, at: Array) -> _Smooth | None:
-    """Return the smooth error of a trial; None where it has one number, or t noise."""
+    """Return the smooth error of a trial; None if it has one number, or t noise."""
     if at.sum() < 2 or np.isfinite(cell.df) or not measurements.has_time:
         return None
     own = smooth_features(measurements, at)

@@ -1,4 +1,4 @@
-"""What the simulator predicts before the data."""
+"""The prior predictive of the simulator."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def predicted_before(
     """Return mean and deviation of each number over the prior, shapes (N,).
 
     Args:
-        simulator: Of the trials.
-        coordinates: Of the bare model over these trials.
-        seed: Of the draws.
+        simulator: Simulator of the trials.
+        coordinates: Coordinates of the bare model over these trials.
+        seed: Seed of the draws.
     """
     u = coordinates.sample(NUM_DRAWS, seed=seed)
     mean, _, _ = simulator.predict(*coordinates.split(u))

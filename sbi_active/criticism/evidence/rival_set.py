@@ -63,28 +63,28 @@ class RivalSet:
 
     Args:
         model: The bare simulator.
-        prior: Of its parameters.
-        trials: Those that may be fitted.
+        prior: Prior of its parameters.
+        trials: Trials that may be fitted.
         effects: Declared effects; of scope "trial" ones every rival has.
         actions: The permitted ones, for the length scales of the residual process; None
             takes the range of the trials.
-        seed: Of all draws.
+        seed: Seed of all draws.
 
     Attributes:
         effects: Effects of scope "campaign", by name.
-        library: Those that were declared, of which priors tell.
+        library: Effects that were declared, of which priors tell.
         noise: Distribution of the errors of the bare model.
         center: Mean of the prior predictive, shape (N,).
-        spread: Its deviation, shape (N,).
+        spread: Deviation of the prior predictive, shape (N,).
         can_fail: Whether a trial, or one of the prior predictive, has no outcome.
-        step: Of finite differences.
+        step: Step of finite differences.
         is_smooth: Whether derivatives mean anything.
         roughness: Deviation of what no smooth function of the parameters follows, which
             ``noise`` has on top of the declared one, shape (N,); 0 where it is smooth.
         fits: The rivals that were asked for.
         found: Modes of some that are not fitted yet.
-        best_fits: Where least squares ended, of rivals that were fitted so, by their
-            coordinates; their searches begin there.
+        best_fits: Points where least squares ended, of rivals that were fitted so, by
+            their coordinates; their searches begin there.
         warm_up: Time from its first sample in which a trial that was not fitted tells
             of its nuisances, and is not scored.
     """
@@ -138,7 +138,7 @@ class RivalSet:
         """Let errors be larger than declared, by an unknown factor.
 
         Args:
-            largest: Of the factor, which is log-uniform from one.
+            largest: Largest value of the factor, which is log-uniform from one.
         """
         factors = np.geomspace(1.0, max(largest, 2.0), NUM_FACTORS)
         weights = np.full(NUM_FACTORS, -np.log(NUM_FACTORS))
@@ -205,8 +205,8 @@ class RivalSet:
     def scaled_actions(self, trials: Trials | None = None) -> Array:
         """Return actions in ranges of the action space, those of the fit first.
 
-        Those that are labels are so far from each other that a smooth function of them
-        has another value at each.
+        Actions that are labels are so far from each other that a smooth function of
+        them has another value at each.
 
         Args:
             trials: Further trials.
@@ -225,10 +225,10 @@ class RivalSet:
         return action / np.where(width > 0, width, 1.0)
 
     def scaled_order(self, trials: Trials | None = None) -> Array | None:
-        """Return the order of trials in the span of the fit; None where it has none.
+        """Return the order of trials in the span of the fit; None if it has none.
 
-        Among a few trials it is no structure: any differences of theirs follow it. Nor
-        is one that is not that of execution.
+        The order of a few trials is no structure: any differences between them follow
+        it. Nor is an order that is not that of execution.
 
         Args:
             trials: Further trials.
@@ -258,7 +258,7 @@ class RivalSet:
         near = starts_near_parents(self.fits, rival, seed)
         how = THOROUGH if near is None else NESTED
         if key in self.best_fits:
-            # Of the bare model every mode counts, of others what is beside the best.
+            # Every mode of the bare model counts; of others what is beside the best.
             near = self.best_fits[key][None]
             how = THOROUGH if key == ModelKey() else KNOWN
         how = how if self.is_smooth else ROUGH
@@ -267,8 +267,8 @@ class RivalSet:
     def search_again(self) -> Found:
         """Return the bare model's modes from where other models have its parameters.
 
-        What an effect that is there drew the first search away from, the model that has
-        it shows.
+        A missing effect may have drawn the first search away from a mode that the model
+        with this effect shows.
         """
         rival, seed = self.rival(ModelKey()), derive_seed(self.seed, "again")
         others = [other for key, other in self.fits.items() if key != ModelKey()]
@@ -343,7 +343,7 @@ class RivalSet:
         return Fit(rival, sample, evidence)
 
     def names_of(self, rival: Rival) -> tuple[str, ...]:
-        """Return what the parameters of a rival and its effects are called."""
+        """Return the names of the parameters of a rival and its effects."""
         names = self.model.parameter_names
         if names is None:
             names = [f"theta_{i + 1}" for i in range(self.prior.event_shape[0])]

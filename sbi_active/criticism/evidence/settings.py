@@ -1,4 +1,4 @@
-"""How much is spent on the evidence of a rival."""
+"""Settings of what is spent on the evidence of a rival."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MOST = 3_000
 
 
 def settings_of(num_trials: int, *, is_bare: bool, is_smooth: bool) -> Settings:
-    """Return how much is spent on a model.
+    """Return the settings of what is spent on a model.
 
     The bare model is every comparison's other side, and its posterior is shown; an
     evidence that is off by a seventh of a nat decides as well as a better one.

@@ -1,4 +1,4 @@
-"""Where the search for a rival's posterior starts: at those of smaller rivals."""
+"""Starts of the search for a rival's posterior: posteriors of smaller rivals."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ def starts_near_parents(
 ) -> Array | None:
     """Return points at posteriors of smaller rivals, the rest from the prior.
 
-    Those with one effect less are the parents; without effects, or behind a catch-all,
+    The parents have one effect less; without effects, or behind a catch-all,
     it is the bare model.
 
     Args:
         fits: Rivals whose posterior is known.
-        rival: Whose search starts.
-        seed: Of the draws.
+        rival: Rival whose search starts.
+        seed: Seed of the draws.
 
     Returns:
         Shape (k, dim); None without a parent.

@@ -42,8 +42,8 @@ def log_evidence(
 
     Args:
         rivals: The models.
-        key: Which of them.
-        factor: By which the declared scales are multiplied first.
+        key: Key of the model.
+        factor: Factor by which the declared scales are multiplied first.
 
     Returns:
         Log evidence and its Monte Carlo standard error, nats.

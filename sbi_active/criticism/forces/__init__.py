@@ -1,7 +1,7 @@
-"""Generalized forces that nobody declared: a dictionary of what a joint may lack.
+"""Undeclared generalized forces: a dictionary of what a joint may lack.
 
-Here live the forces, their sizes along nominal trajectories, and the effects made of
-them. Whether one explains trials is found elsewhere.
+This package contains the forces, their sizes along nominal trajectories, and the
+effects made of them. The comparison of forces with trials is elsewhere.
 """
 
 from sbi_active.criticism.forces.force import Force, total_force

@@ -71,14 +71,14 @@ class Joint:
     """One degree of freedom, and how large things are on it.
 
     Attributes:
-        name: What reports call it.
-        place: Among the positions.
-        dof: Among the velocities.
-        unit: Of a force on it, "N" or "N m".
+        name: Name in reports.
+        place: Place among the positions.
+        dof: Place among the velocities.
+        unit: Unit of a force on it, "N" or "N m".
         position: Unit of q.
         velocity: Unit of v.
-        low: Of q and v in their units, along nominal trajectories.
-        high: The same.
+        low: Lowest q and v in their units, along nominal trajectories.
+        high: Highest q and v, likewise.
     """
 
     name: str
@@ -96,7 +96,7 @@ class FormForce:
     """A force of a known form on one joint, phi times its size.
 
     Attributes:
-        joint: On which it acts.
+        joint: Joint on which it acts.
         form: Name in the dictionary, or "free f(...)" of what stands in brackets.
         size: Factor that gives the form a root mean square of one.
         horizon: Unit of t, s.
@@ -113,9 +113,9 @@ class FormForce:
         """Return the force, shape (n, nv).
 
         Args:
-            q: Shape (n, nq).
-            v: Shape (n, nv).
-            t: Since the start of the trial, s.
+            q: Positions, shape (n, nq).
+            v: Velocities, shape (n, nv).
+            t: Time since the start of the trial, s.
             phi: Strengths, and the trial's place from -1 to 1 as the last column.
         """
         force = np.zeros_like(v)

@@ -1,4 +1,4 @@
-"""What a generalized force is to a simulator: a key of its argument ``force``."""
+"""Generalized forces, keys of a simulator's argument ``force``."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Force(Protocol):
             q: Positions, shape (n, nq).
             v: Velocities, shape (n, nv).
             t: Time since the start of the trial, s.
-            phi: Shape (n, k).
+            phi: Parameters of the effect, shape (n, k).
         """
         ...
 
@@ -41,7 +41,7 @@ def total_force(
     on it.
 
     Args:
-        force: As the simulator was given it; None is no force.
+        force: Force as the simulator was given it; None is no force.
         q: Positions, shape (n, nq).
         v: Velocities, shape (n, nv).
         t: Time since the start of the trial, s.

@@ -26,7 +26,7 @@ from sbi_active.simulation import SimulatorModel
 
 #: How families of forces begin: their forms are alternatives of one cause.
 FAMILY = "force in "
-#: The same, of forces that depend on another joint.
+#: Prefix of forces that depend on another joint.
 COUPLING = "coupling with "
 #: Prior deviation of a force, in root mean squares of what the motion takes.
 SHARE = 0.2
@@ -64,18 +64,20 @@ def force_effects(
     step. MuJoCo models of ``sbi_active.mujoco`` do.
 
     Args:
-        simulator: As above; a robot of ``sbi_active.mujoco`` brings prior and trials.
-        prior: Of its parameters, at draws of which nominal trajectories are simulated.
-        trials: Those to be explained, whose actions are taken.
+        simulator: Simulator as above; a robot of ``sbi_active.mujoco`` brings prior and
+            trials.
+        prior: Prior of its parameters, at draws of which nominal trajectories are
+            simulated.
+        trials: Trials to be explained, whose actions are taken.
         joints: Names, one a degree of freedom, in the order of v; None takes those of a
             MuJoCo model, or "joint 1", "joint 2", ...
         slides: Joints that slide, whose forms are in units of their range: a sine of q
             in metres means nothing.
         include: Patterns of names of effects, as in "*of hinge" or "sin*".
-        exclude: The same, taken out.
-        free: Also free shapes f(q), f(v), f(t) and f(q) v, smooth forms that are in no
-            dictionary.
-        seed: Of the draws.
+        exclude: Patterns of names of effects that are taken out.
+        free: Whether to add free shapes f(q), f(v), f(t) and f(q) v, smooth forms that
+            are in no dictionary.
+        seed: Seed of the draws.
 
     Raises:
         ValueError: If prior or trials are missing, the simulator never asks for
@@ -158,7 +160,7 @@ def _forces(
 
 
 def _sized(force: FormForce, nominal: Trajectories, scale: float) -> FormForce | None:
-    """Return the force of size one at phi = 1; None where it does nothing."""
+    """Return the force of size one at phi = 1; None if it does nothing."""
     begin = float(nominal.time[0])
     squares = []
     for k, t in enumerate(nominal.time):

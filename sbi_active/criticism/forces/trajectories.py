@@ -1,4 +1,4 @@
-"""How a simulator's joints move, and what moves them, along nominal trajectories."""
+"""Motion and forces of a simulator's joints along nominal trajectories."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ class Trajectories:
     """Nominal trajectories.
 
     Attributes:
-        time: Shape (k,), s.
-        q: Shape (rows, k, nq).
-        v: Shape (rows, k, nv).
+        time: Times, shape (k,), s.
+        q: Positions, shape (rows, k, nq).
+        v: Velocities, shape (rows, k, nv).
         force: Root mean square of the force that the motion takes, (nv,), N or N m:
             of acceleration, times what a constant force shows of inertia.
     """
@@ -53,7 +53,7 @@ class _Recorder:
         self.dof, self.seen = dof, dict[float, tuple[Array, Array]]()
 
     def __call__(self, q: Array, v: Array, t: float, phi: Array) -> Array:
-        # Of several looks the last counts: the first are those at the effect's null.
+        # The last of several looks counts: the first are those at the effect's null.
         self.seen[float(t)] = q.copy(), v.copy()
         force = np.zeros_like(v)
         if self.dof is not None:
@@ -69,13 +69,13 @@ class _Recorder:
 def trajectories(
     model: SimulatorModel, prior: Distribution, trials: Trials, *, seed: int = 0
 ) -> Trajectories:
-    """Return how joints move in some trials, at draws of the prior.
+    """Return the motion of joints in some trials, at draws of the prior.
 
     Args:
-        model: Takes ``force=``.
-        prior: Of its parameters.
-        trials: Whose actions, inputs and starts are taken.
-        seed: Of the draws.
+        model: Simulator that takes ``force=``.
+        prior: Prior of its parameters.
+        trials: Trials whose actions, inputs and starts are taken.
+        seed: Seed of the draws.
 
     Raises:
         ValueError: If the simulator never asks what the force is.

@@ -40,11 +40,11 @@ class Linear:
     """A simulator with effects that may be there, linear near its best fit.
 
     Attributes:
-        rival: Of theta and the effects beside it.
+        rival: Rival of theta and the effects beside it.
         effect: Number of the effect that a coordinate belongs to, -1 for none, (d,).
-        null: Where effects vanish, shape (d,); NaN for other coordinates.
+        null: Values at which effects vanish, shape (d,); NaN for other coordinates.
         unit: Root mean square residual of each number's channel, shape (N,).
-        model: Linear, in units.
+        model: Linear model, in units.
     """
 
     rival: Rival
@@ -60,12 +60,12 @@ class Linear:
         unit: Array,
         tried: float | None = None,
     ) -> Linear:
-        """Return it around a fit of some of the effects.
+        """Return the linear model around a fit of some of the effects.
 
         Args:
-            model: In units, without the others.
-            free: Its coordinates, shape (d,).
-            unit: Shape (N,).
+            model: Linear model in units, without the others.
+            free: Coordinates of that model, shape (d,).
+            unit: Units of the residuals, shape (N,).
             tried: Deviations of the prior by which the others are tried anew: by a
                 chord, since many are flat at their null.
         """
@@ -80,7 +80,7 @@ class Linear:
 
     @property
     def origin(self) -> Array:
-        """Where the model is linear, with effects at their null, shape (d,)."""
+        """Point of linearization, with effects at their null, shape (d,)."""
         return np.where(self.effect < 0, self.model.u, self.null)
 
     @property
@@ -92,7 +92,7 @@ class Linear:
 
     @property
     def unknowns(self) -> Unknowns:
-        """What is known of u - ``origin`` before the trials."""
+        """Prior knowledge of u - ``origin``."""
         c, at = self.rival.coordinates, self.origin
         is_flat = (self.effect >= 0) & (c.precision == 0)
         precision = np.where(is_flat, 1.0, c.precision)
@@ -105,7 +105,7 @@ class Linear:
 
     @property
     def measurements(self) -> Measurements:
-        """What is fitted."""
+        """Measurements that are fitted."""
         return self.rival.simulator.measurements
 
 
@@ -114,8 +114,8 @@ class Fitted(Linear):
     """A linear model with posterior draws.
 
     Attributes:
-        errors: Hypotheses of them.
-        draws: Of u - ``origin``.
+        errors: Hypotheses of the errors.
+        draws: Draws of u - ``origin``.
         aliases: Effects that are left out since parameters do the same.
     """
 
@@ -127,7 +127,7 @@ class Fitted(Linear):
         """Return rows (N, k) whitened by the likeliest error of each channel.
 
         Args:
-            rows: In units.
+            rows: Rows in units.
             fold: Part of each number, shape (N,), with errors of its own.
         """
         m, draws = self.measurements, self.draws
@@ -153,13 +153,13 @@ def fitted(
     """Return a simulator near its best fit to trajectories.
 
     Args:
-        model: With a noise of any kind, of which nothing is used.
-        prior: Of theta.
-        trials: That are fitted.
+        model: Simulator with a noise of any kind, of which nothing is used.
+        prior: Prior of theta.
+        trials: Trials that are fitted.
         beside: Effects that may be there; those of scope "trial" are.
         known_sd: Deviation of each channel's white errors, shape (c,); None estimates.
-        seed: Of all draws.
-        settings: How much is spent.
+        seed: Seed of all draws.
+        settings: Settings of what is spent.
     """
     own, rng = settings, np.random.default_rng(seed)
     rival = _rivals(model, prior, trials, beside, own, seed)

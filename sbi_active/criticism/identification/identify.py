@@ -34,7 +34,7 @@ class IdentifiedBelief(KernelBelief):
     """A belief by draws of a linearized posterior.
 
     Attributes:
-        draws: Of theta, shape (n, theta_dim).
+        draws: Draws of theta, shape (n, theta_dim).
         sides: Bound of the prior at which each parameter lies, -1 for the lower one, 1
             for the upper one, 0 for none, shape (theta_dim,).
     """
@@ -52,10 +52,11 @@ class IdentifiedBelief(KernelBelief):
     def interval(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Return the central interval of each parameter by its name.
 
-        That of a parameter at a bound of its prior is one-sided, from the bound on.
+        The interval of a parameter at a bound of its prior is one-sided, from the bound
+        on.
 
         Args:
-            level: Its probability.
+            level: Probability of the interval.
         """
         if not 0 < level < 1:
             raise ValueError(
@@ -80,10 +81,10 @@ def identify(
     seed: int = 0,
     settings: IdentifySettings = IdentifySettings(),  # noqa: B008  (frozen)
 ) -> IdentifiedBelief:
-    r"""Return what trajectories tell of the parameters, with intervals that hold.
+    r"""Return the belief of trajectories over the parameters, with valid intervals.
 
     The best fit is found by least squares, and the model is linear around it. Errors
-    of each channel may be white or last, for a time and in a size that nobody knows
+    of each channel may be white or last, for an unknown time and in an unknown size
     (:mod:`..linear.processes`). Effects ``beside`` may be there or not, each with its
     own parameter (:mod:`.posterior`); fits follow where they are. Where single trials
     disagree all the same, the model lacks something else, and the belief is as wide as
@@ -91,15 +92,15 @@ def identify(
     linear model, draws are weighed by the simulator.
 
     Args:
-        model: Deterministic but for the noise. The white part of the errors has the
-            size that a ``GaussianNoise`` declares; any other noise, or none, leaves
-            sizes to the trials, one a channel.
-        prior: Of its parameters.
+        model: Simulator, deterministic but for the noise. The white part of the errors
+            has the size that a ``GaussianNoise`` declares; any other noise, or none,
+            leaves sizes to the trials, one a channel.
+        prior: Prior of its parameters.
         trials: Trajectories, with gaps where nothing was measured.
-        beside: What the model may lack. Those of scope "trial" are there, with a
-            nuisance in each trial.
-        seed: Of all draws.
-        settings: How much is spent, and what decides.
+        beside: Effects that the model may lack. Those of scope "trial" are there, with
+            a nuisance in each trial.
+        seed: Seed of all draws.
+        settings: Settings of what is spent, and of what decides.
 
     Returns:
         A belief with ``interval(level)`` by parameter. Its ``diagnostics`` have
@@ -227,7 +228,7 @@ def _weighed(
 ) -> tuple[Array, float, float | None]:
     """Return draws of u - origin, how many they count for, and the weights' tail.
 
-    Its shape is None where the model is linear. Of effects that were not fitted a chord
+    Its shape is None if the model is linear. Of effects that were not fitted a chord
     is all that is known: draws that have one are not compared with the simulator.
     """
     own, draws = settings, found.draws
@@ -278,7 +279,7 @@ def _beside(found: Fitted) -> dict[str, float]:
 
 
 def _errors(found: Fitted, model: SimulatorModel) -> dict[str, dict[str, float]]:
-    """Return what the errors of each channel are like, posterior medians."""
+    """Return the errors of each channel, as posterior medians."""
     draws, known, said = found.draws, found.errors, {}
     names = model.channel_names
     for c, unit in enumerate(found.sizes.tolist()):
@@ -310,13 +311,13 @@ def _beyond(
 
 
 def _opened(inside: Array, sd: float, half: float) -> Array:
-    """Return how far draws are inside a bound, as half a Gaussian at least, (n,).
+    """Return distances of draws from a bound, as half a Gaussian at least, (n,).
 
     Where trials ask for what is far beyond it, the posterior within has no width, which
     says nothing of the parameter.
 
     Args:
-        inside: How far they are, shape (n,).
+        inside: Distances from the bound, shape (n,).
         sd: Deviation that the parameter has without bounds.
         half: Share of it that is wide enough.
     """
@@ -327,7 +328,7 @@ def _opened(inside: Array, sd: float, half: float) -> Array:
 
 
 def _at_bounds(belief: IdentifiedBelief) -> list[str]:
-    """Return which parameters may be beyond a bound of the prior."""
+    """Return the parameters that may be beyond a bound of the prior."""
     notes, found = [], belief.interval()
     for (name, (low, high)), side in zip(found.items(), belief.sides, strict=True):
         if side:

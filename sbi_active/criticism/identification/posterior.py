@@ -37,13 +37,13 @@ TINY = 1e-300  # keeps logarithms finite
 
 @dataclass(frozen=True)
 class Unknowns:
-    """What is known of u before the logs, d coordinates from where effects vanish.
+    """Prior knowledge of u, d coordinates from where effects vanish.
 
     Attributes:
-        low: Shape (d,).
-        high: Shape (d,).
-        center: Of a Gaussian prior, shape (d,).
-        precision: Of it, 0 for uniform ones, shape (d,).
+        low: Lower bounds, shape (d,).
+        high: Upper bounds, shape (d,).
+        center: Center of a Gaussian prior, shape (d,).
+        precision: Precision of that prior, 0 for uniform ones, shape (d,).
         effect: Number of the effect that a coordinate belongs to, -1 for theta, (d,).
     """
 
@@ -60,7 +60,7 @@ class Unknowns:
 
     @property
     def log_density(self) -> Array:
-        """What the prior's constant adds by each effect that is there, shape (e,)."""
+        """Log constant of the prior for each effect that is there, shape (e,)."""
         own = np.flatnonzero(self.effect >= 0)
         center, precision = self.center[own], self.precision[own]
         log_p = 0.5 * (np.log(np.maximum(precision, TINY)) - precision * center**2)
@@ -71,10 +71,10 @@ class Unknowns:
 
 @dataclass(frozen=True)
 class Draws:
-    """Of the posterior.
+    """Draws of the posterior.
 
     Attributes:
-        u: Shape (n, d).
+        u: Coordinates, shape (n, d).
         present: Whether each effect is there, bool, shape (n, e).
         errors: Hypothesis of each channel, shape (n, c).
         size: Deviation of each channel's errors, shape (n, c).
@@ -99,12 +99,12 @@ def sample(
     """Return posterior draws of all chains.
 
     Args:
-        grams: Of (r_0, J), by channel.
+        grams: Gram matrices of (r_0, J), by channel.
         processes: Hypotheses of the errors, white noise first, of size one.
-        unknowns: Priors.
-        known_size: Deviation of the white part by channel; None where it is unknown.
+        unknowns: Priors of the unknowns.
+        known_size: Deviation of the white part by channel; None if it is unknown.
         rng: Source of the draws.
-        sweeps: Of each chain, after those that are left out.
+        sweeps: Sweeps of each chain, after those that are left out.
         settings: Numbers of draws, and priors.
     """
     p, num, d = unknowns, settings.chains, len(unknowns.low)
@@ -170,7 +170,7 @@ class _Swept:
     Attributes:
         table: Minus the covariance of what is free, its mean in the last column, and
             in the corner :math:`-b^T P^{-1} b`; shape (n, d + 1, d + 1).
-        log_det: Of the precision of what is free, shape (n,).
+        log_det: Log determinant of the precision of what is free, shape (n,).
         free: Shape (n, d).
     """
 
@@ -221,12 +221,12 @@ class _Swept:
 def _present(
     swept: _Swept, p: Unknowns, present: Flags, absent: float, rng: np.random.Generator
 ) -> Flags:
-    """Return which effects are there, one after the other given all others.
+    """Return the effects that are there, one after the other given all others.
 
     Args:
-        swept: Given those that are there; follows.
-        p: Priors.
-        present: Which are there so far, shape (n, e).
+        swept: Gaussians given the effects that are there; changed in place.
+        p: Priors of the unknowns.
+        present: Mask of the effects that are there so far, shape (n, e).
         absent: Prior probability that none is there.
         rng: Source of the draws.
     """

@@ -1,4 +1,4 @@
-"""How much an identification spends, and what decides in it."""
+"""Settings of an identification."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sbi_active.criticism.linear.settings import FitSettings
 
 @dataclass(frozen=True, kw_only=True)
 class SamplerSettings:
-    """How much is drawn, and what is known of doubtful effects and of errors before.
+    """Numbers of draws, and priors of doubtful effects and of errors.
 
     Attributes:
         chains: Independent ones, side by side.
@@ -37,16 +37,17 @@ class SamplerSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class IdentifySettings:
-    """How much is spent, and what is told apart.
+    """Settings of what is spent, and of what is told apart.
 
     Attributes:
         num_screened: Draws of the prior that are looked at, at least.
-        screened_each: The same for each parameter: the more there are, the more optima.
+        screened_each: Draws looked at for each parameter: the more there are, the more
+            optima.
         fit: Searches from these, at least, and how far they go.
         starts_each: Searches for each parameter.
         kept_each: Searches that go on, for each parameter.
         sampler: Draws of the linear model.
-        step: Of finite differences, in deviations of the prior.
+        step: Step of finite differences, in deviations of the prior.
         tried: Deviations of the prior by which an effect that is absent is tried: many
             are flat at their null.
         alias: Share of an effect's column that is no combination of the parameters'
@@ -57,7 +58,7 @@ class IdentifySettings:
         rounds: Times at most that channels are weighed by their residuals.
         worth: Mean fall of the logarithm of these sizes that is worth another time.
         smallest: Residual that a channel is taken to have at least, in its deviations.
-        shares: Of the variance that are white, of errors of unknown size.
+        shares: Shares of the variance that are white, of errors of unknown size.
         least: Smallest share of a declared white error: below it sums of squares lose
             their digits.
         num_compared: Draws at which the linear model is compared with the simulator:
@@ -67,12 +68,12 @@ class IdentifySettings:
         num_weighed: Draws that are weighed where it will not.
         fewest: Effective draws below which a belief whose draws are weighed is not to
             be trusted.
-        fewest_each: The same as a multiple of d (d + 3) for d parameters, as for other
-            beliefs.
+        fewest_each: Effective draws as a multiple of d (d + 3) for d parameters, below
+            which such a belief is not to be trusted, as for other beliefs.
         largest_shape: Shape of the tail of weights above which it is not either, as for
             other beliefs: the linear model lacks places that the simulator explains.
-        fewest_kept: Those that weights leave at least: few would make for a narrow
-            interval.
+        fewest_kept: Effective draws that weights leave at least: few would make for a
+            narrow interval.
         fewest_parts: Parts of the trials at least, for which trials are divided in
             time.
         level: Tail probability below which they disagree.
@@ -119,7 +120,7 @@ class IdentifySettings:
         """Return hypotheses of errors of size one, white noise first.
 
         Args:
-            m: Which say what time scales can be told.
+            m: Measurements, which say what time scales can be told.
             declared: Share of the variance of residuals that a declared white error
                 has at least in all channels; shares go on by tens to a tenth of it.
         """

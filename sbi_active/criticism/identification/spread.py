@@ -1,9 +1,9 @@
-r"""What single parts of the trials say beside all of them.
+r"""The disagreement between single parts of the trials.
 
-Where the model is right, parameters fitted to single trials differ by no more than
-their errors allow. Where it is wrong they follow what it lacks: beside dry friction
-nobody declared, damping falls as the motion grows. The spread between trials is then a
-measure of how far all of them may be off, and it does not average out.
+If the model is right, parameters fitted to single trials differ by no more than their
+errors allow. If it is wrong they follow what it lacks: with undeclared dry friction,
+damping falls as the motion grows. The spread between trials is then a measure of how
+far all of them may be off, and it does not average out.
 
 References:
     DerSimonian & Laird, Controlled Clinical Trials 7 (1986).
@@ -26,13 +26,15 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Spread:
-    """How parts of the trials disagree.
+    """The disagreement between parts of the trials.
 
     Attributes:
-        p_value: Of each parameter being the same in all parts, shape (d,).
-        deviation: Of the parts from their mean, as far as it is none of their errors,
-            shape (f, d), such that normal multiples of them add up to the spread.
-        sd: Of each parameter by all trials if it had no bounds, shape (d,).
+        p_value: p-value of each parameter being the same in all parts, shape (d,).
+        deviation: Deviation of the parts from their mean, as far as it is none of their
+            errors, shape (f, d), such that normal multiples of them add up to the
+            spread.
+        sd: Standard deviation of each parameter by all trials if it had no bounds,
+            shape (d,).
     """
 
     p_value: Array
@@ -46,7 +48,7 @@ class Spread:
 
 
 def spread(found: Fitted, fewest: int) -> Spread:
-    """Return how parts of the trials disagree about theta.
+    """Return the disagreement of parts of the trials about theta.
 
     Args:
         found: The model, linear.
@@ -71,7 +73,7 @@ def spread(found: Fitted, fewest: int) -> Spread:
     square, freedom = (weight * (each - mean) ** 2).sum(0), len(each) - 1
     of_parts = weight.sum(0) - (weight**2).sum(0) / weight.sum(0)
     variance = np.maximum(square - freedom, 0.0) / np.maximum(of_parts, 1e-300)
-    # Of their own deviations, those that are far off by their errors count less.
+    # Deviations that are far off by their errors count less.
     off = np.sqrt(weight) * (each - mean)
     off = off / np.maximum(np.linalg.norm(off, axis=0), 1e-300)
     p_value = chi2.sf(square, max(freedom, 1))

@@ -15,9 +15,9 @@ class Candidate:
 
     Attributes:
         model: Linearized at its best fit.
-        grams: Of its rows.
-        posterior: Under the shared errors.
-        left: Its errors on left-out parts of the trials.
+        grams: Gram matrices of its rows.
+        posterior: Posterior under the shared errors.
+        left: Errors of the model on left-out parts of the trials.
         log_prior: Probability of its set of effects, nats.
     """
 

@@ -55,11 +55,11 @@ class Posterior:
     """The evidence of a linear model, and its posterior.
 
     Attributes:
-        log_sensor: With the sensor's error alone, nats.
-        log_process: With a residual process beside it, or a parameter that differs from
-            trial to trial, nats.
-        mean: Of u given the process, shape (d,).
-        cov: Of u given the process, shape (d, d).
+        log_sensor: Log evidence with the sensor's error alone, nats.
+        log_process: Log evidence with a residual process beside it, or a parameter
+            that differs from trial to trial, nats.
+        mean: Mean of u given the process, shape (d,).
+        cov: Covariance of u given the process, shape (d, d).
         size: s of the process, posterior mean.
         time_scale: tau of it, posterior median.
         variances: Mean square of the process, and of what each parameter does that may
@@ -85,7 +85,7 @@ class Errors:
     """The grid of errors over some measurements.
 
     Args:
-        measurements: With a time axis.
+        measurements: Measurements with a time axis.
         unit: Standard deviation of the sensor, shape (N,).
         cells: The sensor's error, with what is unknown of its correlation.
         largest: Root mean square of the residual of a model that misses, in sensor
@@ -98,12 +98,12 @@ class Errors:
     Attributes:
         fold: Part that each number belongs to, shape (N,): trials, or with fewer than
             six the parts of trials, which are then left out in their place.
-        num_folds: f.
+        num_folds: Number of folds f.
         is_by_trial: Whether the parts are trials.
         cells: The sensor's error in its units, with what is unknown of its correlation.
         log_cells: Log prior probability of each, shape (c,).
         is_scored: Numbers that are predicted where their part is left out, bool, (N,).
-        varying: Derivatives of mean square one, zero where nothing depends on it.
+        varying: Derivatives of mean square one, zero if nothing depends on it.
     """
 
     def __init__(
@@ -198,10 +198,10 @@ class Errors:
         """Return the evidence and the posterior of a model.
 
         Args:
-            model: Linear, with its prior.
-            grams: Of its rows.
+            model: Linear model with its prior.
+            grams: Gram matrices of its rows.
             folds: Parts that count, bool, shape (f,); None takes all.
-            factor: On the scales of the effects' priors.
+            factor: Factor on the scales of the effects' priors.
             process: Whether u is given the process; else the sensor's error alone.
         """
         use = np.ones(self.num_folds, bool) if folds is None else folds
@@ -250,13 +250,13 @@ class Errors:
         )
 
     def weight(self, posterior: Posterior) -> Array:
-        """Return how much the squared errors of a trial count, mean one, shape (N,).
+        """Return weights of the squared errors of trials, mean one, shape (N,).
 
-        By the inverse of their mean variance: where a parameter differs from trial to
-        trial, a trial that depends on it more tells less of everything else.
+        Weights are the inverse of their mean variance: where a parameter differs from
+        trial to trial, a trial that depends on it more tells less of everything else.
 
         Args:
-            posterior: Of a model.
+            posterior: Posterior of a model.
         """
         process, *differ = posterior.variances
         variance = 1 + process + self.varying**2 @ np.array(differ)

@@ -28,7 +28,7 @@ def best_fit(rival: Rival, u: Array, unit: Array, settings: FitSettings) -> Line
         rival: The model.
         u: Draws of its prior, shape (n, d).
         unit: Standard deviation of each number's error, shape (N,).
-        settings: How much is spent.
+        settings: Settings of what is spent.
     """
     own = settings
     r = rival.residual(u)[0] / unit
@@ -49,7 +49,7 @@ def polished(rival: Rival, u: Array, unit: Array, settings: FitSettings) -> Line
         rival: The model.
         u: The start, shape (d,).
         unit: Standard deviation of each number's error, shape (N,).
-        settings: How much is spent.
+        settings: Settings of what is spent.
     """
     model = linearize(rival, u, unit, rival.step)
     for _ in range(settings.rounds - 1):
@@ -77,8 +77,8 @@ def along_secants(
     Args:
         rival: The model.
         u: Starts, shape (n, d).
-        unit: Of residuals, shape (N,).
-        steps: At most.
+        unit: Units of residuals, shape (N,).
+        steps: Number of steps at most.
         known: Residuals in units and derivatives at the starts, (n, N) and (n, N, d).
     """
     return descend(

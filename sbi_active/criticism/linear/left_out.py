@@ -1,7 +1,7 @@
 """Errors on trials that a model was not fitted to, and its intervals.
 
-By linear algebra: a model is refitted without each part of the trials by least squares,
-from its linearization at the best fit to all.
+A model is refitted by least squares without each part of the trials, from its
+linearization at the best fit to all.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Array = NDArray[Any]
 
 #: Factor on the scale of effects' priors in refits, which are to follow the trials.
 WIDTH = 3.0
-#: Of a search within bounds, each of which ends at one or at the best x.
+#: Steps of a search within bounds, each of which ends at one or at the best x.
 STEPS = 30
 
 
@@ -31,12 +31,12 @@ class LeftOut:
     Attributes:
         square: Mean squared error of each part, in sensor variances, shape (f,); NaN
             for parts that do not count.
-        standard: The same in units of what the refit without the part expects of it:
-            a part that it can only extrapolate to counts for less, shape (f,).
-        error: Of each number by the fit without its part, sensor deviations, (N,); NaN
-            where it told of the part's nuisances.
+        standard: Mean squared error in units of what the refit without the part expects
+            of it: a part that it can only extrapolate to counts for less, shape (f,).
+        error: Error of each number by the fit without its part, sensor deviations,
+            (N,); NaN where it told of the part's nuisances.
         refits: Coordinates without each part, shape (f, d).
-        fit: With all of them, shape (d,).
+        fit: Coordinates with all parts, shape (d,).
     """
 
     square: Array
@@ -72,10 +72,10 @@ def leave_out(
     """Return a model's errors on each part of the trials that it was not fitted to.
 
     Args:
-        model: Linear.
-        errors: Which says what the parts are.
+        model: Linear model.
+        errors: Errors, which say what the parts are.
         folds: Parts that count, shape (f,); None takes all.
-        weight: Of each squared error, in refits and in what is returned, (N,).
+        weight: Weight of each squared error, in refits and in what is returned, (N,).
     """
     f = errors.num_folds
     use = np.ones(f, bool) if folds is None else folds
@@ -112,14 +112,14 @@ def leave_out(
 def bounded(system: Array, right: Array, low: Array, high: Array) -> Array:
     r"""Return the x within bounds that minimize :math:`x^T A x / 2 - b^T x`, (n, d).
 
-    Clipped alone, the best x without bounds would leave other coordinates where they
-    are right only with what was clipped.
+    If the best x without bounds were only clipped, other coordinates would keep values
+    that are right only with the clipped ones.
 
     Args:
         system: A, shape (n, d, d), positive definite.
         right: b, shape (n, d).
-        low: Shape (d,).
-        high: Shape (d,).
+        low: Lower bounds, shape (d,).
+        high: Upper bounds, shape (d,).
     """
     free = np.linalg.solve(system, right[..., None])[..., 0]
     x = np.clip(free, low, high)
@@ -158,7 +158,7 @@ def _expected(
     precision: Array,
     is_free: NDArray[np.bool_],
 ) -> Array:
-    r"""Return what of the squared errors of parts the refits were unsure of, (f,).
+    r"""Return the part of squared errors that the refits were unsure about, (f,).
 
     Without a part coordinates have the covariance :math:`P_{-f}`, and by Woodbury's
     identity with :math:`P` of the fit to all
@@ -167,10 +167,10 @@ def _expected(
         e^T (I + S P_{-f} S^T)^{-1} e = e^T e - e^T S P S^T e.
 
     Args:
-        rows: In units of the model's own error, shape (N, 1 + d).
-        error: On left-out parts, shape (N,).
-        errors: Which says what the parts are.
-        precision: Of the fit to all, the inverse of P, shape (d, d).
+        rows: Rows in units of the model's own error, shape (N, 1 + d).
+        error: Errors on left-out parts, shape (N,).
+        errors: Errors, which say what the parts are.
+        precision: Precision of the fit to all, the inverse of P, shape (d, d).
         is_free: Coordinates within their bounds without each part, shape (f, d); at a
             bound a coordinate is as good as known.
     """

@@ -34,7 +34,7 @@ class Fits(Protocol):
 
     @property
     def errors(self) -> Errors:
-        """That all models share."""
+        """Errors that all models share."""
         ...
 
     def model(self, key: ModelKey) -> LinearModel:
@@ -58,9 +58,9 @@ class Library:
     Coordinates of these effects count from where their columns were taken.
 
     Args:
-        search: Has fitted the model.
-        base: Of the model; the bare one unless given.
-        names: Of the effects; all unless given.
+        search: Search that has fitted the model.
+        base: Key of the model; the bare one unless given.
+        names: Names of the effects; all unless given.
     """
 
     def __init__(

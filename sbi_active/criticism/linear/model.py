@@ -27,15 +27,15 @@ class LinearModel:
     r"""A rival near its best fit, :math:`r(u) = r(\hat u) + J (u - \hat u)`.
 
     Attributes:
-        key: Of the rival.
-        u: Where it is linearized, shape (d,).
-        residual: There, in standard deviations of the sensor, shape (N,).
-        jacobian: Its derivatives, shape (N, d).
-        center: Of the prior, shape (d,).
-        sd: Of the prior, shape (d,).
+        key: Key of the rival.
+        u: Point at which it is linearized, shape (d,).
+        residual: Residual there, in standard deviations of the sensor, shape (N,).
+        jacobian: Derivatives of the residual, shape (N, d).
+        center: Center of the prior, shape (d,).
+        sd: Standard deviation of the prior, shape (d,).
         scaled: Coordinates of effects whose prior has an unknown scale, bool, (d,).
-        low: Bounds, shape (d,).
-        high: Bounds, shape (d,).
+        low: Lower bounds, shape (d,).
+        high: Upper bounds, shape (d,).
         own: Coordinates of theta and phi; those of the trials' nuisances follow.
         trial_of: The trial that each coordinate belongs to, -1 for all, shape (d,).
     """
@@ -60,7 +60,7 @@ class LinearModel:
 
     @property
     def rms(self) -> float:
-        """Of the residual, in standard deviations of the sensor."""
+        """Root mean square of the residual, in standard deviations of the sensor."""
         return float(np.sqrt(np.mean(self.residual**2)))
 
     @property
@@ -72,9 +72,9 @@ class LinearModel:
 
     @property
     def promised(self) -> float:
-        """By how much its linear optimum lowers the sum of squares.
+        """Fall of the sum of squares at its linear optimum.
 
-        In sensor variances, with the residual's own size as that of the errors.
+        It is in sensor variances, with the residual's own size as that of the errors.
         """
         scale = max(self.rms, 1.0) ** 2
         bounded = np.isfinite(self.low) & np.isfinite(self.high)
@@ -103,10 +103,10 @@ def linearize(rival: Rival, u: Array, unit: Array, step: float | Array) -> Linea
     """Return a rival linearized at one point.
 
     Args:
-        rival: Of effects that change the prediction.
-        u: Where, shape (d,).
+        rival: Rival with effects that change the prediction.
+        u: Point of linearization, shape (d,).
         unit: Standard deviation of the sensor, shape (N,).
-        step: Of finite differences, one or one a coordinate, shape (d,).
+        step: Step of finite differences, one or one a coordinate, shape (d,).
     """
     r, jacobian = rival.jacobian(u[None], lambda residual: residual / unit, step)
     return with_prior(rival, u, r[0], jacobian[0])
@@ -149,10 +149,10 @@ def enlarged(
     """Return a model with further coordinates.
 
     Args:
-        model: Linear, without them.
-        rival: With them.
-        new: Which of the rival's coordinates they are, bool, shape (d,).
-        values: Of the new ones, shape (k,).
+        model: Linear model without them.
+        rival: Rival with them.
+        new: Mask of these among the rival's coordinates, bool, shape (d,).
+        values: Values of the new ones, shape (k,).
         columns: Derivatives of the residual by them, shape (N, k).
     """
     u, jacobian = np.empty(rival.dim), np.empty((len(model.residual), rival.dim))
@@ -171,15 +171,15 @@ def chords(
 ) -> Array:
     """Return derivatives of the residual by some coordinates, shape (N, k).
 
-    Of a step as long as one tries, within the bounds, and no tangent: many effects are
-    flat at their null.
+    They are difference quotients over a step within the bounds and no tangents: many
+    effects are flat at their null.
 
     Args:
         rival: The model.
-        u: From where, shape (d,).
-        new: Which coordinates, bool, shape (d,).
+        u: Point to start from, shape (d,).
+        new: Mask of the new coordinates, bool, shape (d,).
         tried: Length of the step, one or one each, shape (k,).
-        residual: At u, in units, shape (N,).
+        residual: Residual at u, in units, shape (N,).
         unit: Standard deviation of each number's error, shape (N,).
     """
     where = np.flatnonzero(new)

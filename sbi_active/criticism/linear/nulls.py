@@ -1,4 +1,4 @@
-"""Where an effect vanishes, among the coordinates of a model."""
+"""The null of an effect among the coordinates of a model."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def at_null(rival: Rival, effect: Effect, tried: float) -> tuple[Array, Array]:
     """Return the null of an effect among the coordinates, and a step from it, (k,).
 
     Args:
-        rival: With this effect.
+        rival: Rival with this effect.
         effect: The effect.
         tried: Length of the step.
     """

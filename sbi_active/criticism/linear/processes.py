@@ -30,7 +30,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True, kw_only=True)
 class TimeScales:
-    """Which time scales of a process are told apart.
+    """Time scales of a process that are told apart.
 
     Attributes:
         sample: The shortest, in steps from sample to sample; one half as long is hardly
@@ -69,8 +69,8 @@ class Processes:
         """Return all combinations: kernel, then time scale, then variances.
 
         Args:
-            variances: Of the white part and the process, shape (v, 2).
-            times: Shape (t,).
+            variances: Variances of the white part and the process, shape (v, 2).
+            times: Times, shape (t,).
             kernels: Whether each kernel is the smooth one, the rough one first.
         """
         shape = len(kernels), len(times), len(variances)
@@ -106,8 +106,8 @@ class Grams:
     """Gram matrices of whitened rows, hypothesis by hypothesis and group by group.
 
     Attributes:
-        gram: Shape (h, g, k, k).
-        log_det: Of the covariance, shape (h, g).
+        gram: Gram matrices, shape (h, g, k, k).
+        log_det: Log determinant of the covariance, shape (h, g).
         count: Numbers of each group, shape (g,).
     """
 
@@ -121,10 +121,11 @@ class Filters:
 
     Args:
         processes: Hypotheses of the errors.
-        measurements: In the order trial, channel, time.
+        measurements: Measurements in the order trial, channel, time.
         fold: Part of each number, shape (N,); it starts a new series, as a trial and a
             channel do.
-        group: What each number is counted in, the same along a series, shape (N,).
+        group: Group that each number is counted in, the same along a series, shape
+            (N,).
     """
 
     def __init__(
@@ -163,9 +164,9 @@ def whitened(
     """Return rows (N, k) in the metric of one hypothesis a channel.
 
     Args:
-        rows: Shape (N, k).
+        rows: Rows, shape (N, k).
         processes: Hypotheses of the errors.
-        m: In the order trial, channel, time.
+        m: Measurements in the order trial, channel, time.
         chosen: Hypothesis of each channel, shape (c,).
         fold: Part of each number, shape (N,); it starts a new series.
     """
@@ -234,11 +235,11 @@ class Filter:
 
     Args:
         processes: Hypotheses of the errors.
-        time: Shape (n,).
+        time: Times, shape (n,).
         most: Whitened numbers in memory at once, 16 MB.
 
     Attributes:
-        log_det: Of the covariance, shape (h,), or (h, s).
+        log_det: Log determinant of the covariance, shape (h,), or (h, s).
     """
 
     def __init__(

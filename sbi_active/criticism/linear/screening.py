@@ -1,4 +1,4 @@
-"""Which effects of a large library are worth a fit: linear evidence of one Jacobian.
+"""Screening of a large library of effects by the linear evidence of one Jacobian.
 
 A fit of an effect takes a dozen simulations of the trials, its column one. With the
 bare model's best fit and a column of every effect the evidence of all singles and pairs
@@ -28,7 +28,7 @@ TRIED, PAIRED = 20, 30
 
 @dataclass(frozen=True)
 class Screening:
-    """What linear evidence says of a library.
+    """The result of screening a library by linear evidence.
 
     Attributes:
         kept: Names of the effects that are worth a fit, in the library's order.
@@ -93,7 +93,7 @@ def _with_kin(found: Screening, search: Search) -> Screening:
 
 
 def _best_of(linear: Library, every: Collection[str]) -> Screening | None:
-    """Return which effects of a library are worth a fit; None for all."""
+    """Return the effects of a library that are worth a fit; None for all."""
     singles = {n: linear.score((n,)) for n in linear.names}
     ranked = sorted(singles, key=singles.__getitem__)[::-1]
     best = dict(singles)

@@ -46,11 +46,11 @@ class Search:
         unit: Standard deviation of the sensor, shape (N,).
         prior: Log prior probabilities of "none" and each effect.
         cells: The sensor's error alone.
-        settings: How much is spent on fits.
+        settings: Settings of what is spent on fits.
 
     Attributes:
         found: Fitted models, the bare one first.
-        errors: That all models share; known after the bare fit.
+        errors: Errors that all models share; known after the bare fit.
         names: Effects that change the prediction, of which sets are fitted.
     """
 
@@ -154,7 +154,7 @@ class Search:
         """Fit one set of effects from its parts, once."""
         if key not in self.found:
             known = [p for p in key.parts if p in self.found]
-            # Of a set that sampling found, its effects alone may be what was fitted.
+            # The effects alone of a set that sampling found may be what was fitted.
             alone = [ModelKey((n,)) for n in key.effects]
             alone = [k for k in alone if k in self.found]
             self.keep(self._fit(key, known or alone or [ModelKey()]))
@@ -201,7 +201,7 @@ class Search:
     ) -> tuple[LinearModel, NDArray[np.bool_]]:
         """Return a model with a further effect where it vanishes, and its columns.
 
-        A chord and no tangent: many effects are flat at their null.
+        The column is a chord and no tangent: many effects are flat at their null.
         """
         key = self._joined(base, [name])
         rival, model = self._rival(key), self.found[base].model
@@ -279,7 +279,7 @@ class Search:
 
     def _fit_bare(self) -> LinearModel:
         rival = self._rival(ModelKey())
-        # Those of the prior predictive, which are simulated already.
+        # Draws of the prior predictive, which are simulated already.
         seed = derive_seed(self.rivals.seed, "spread")
         u = rival.coordinates.sample(NUM_DRAWS, seed=seed)
         return best_fit(rival, u, self.unit, self.settings)
@@ -325,7 +325,7 @@ class Search:
         )
 
     def _starts(self, key: ModelKey, parent: ModelKey) -> Array:
-        """Return where a set's fit begins beside its linear optimum, shape (n, d)."""
+        """Return starts of a set's fit beside its linear optimum, shape (n, d)."""
         own, rival, model = self.settings, self._rival(key), self.found[parent].model
         c, shared = rival.coordinates, self.columns(key, parent)
         u = c.sample(own.num_drawn, seed=derive_seed(self._seed, str(key)))

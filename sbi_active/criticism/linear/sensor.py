@@ -1,4 +1,4 @@
-"""What is declared of the sensor's error, where anything is."""
+"""The declared error of the sensor."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def sensor_error(
 ) -> tuple[Array, list[NoiseCell]] | None:
     """Return the sensor's deviation (N,), and its error with what is unknown of it.
 
-    None where the size of the sensor's error is not declared, x has no time axis, or
+    None if the size of the sensor's error is not declared, x has no time axis, or
     the simulator is random or jumps, unless ``measurement_sd`` says so all the same.
 
     Args:

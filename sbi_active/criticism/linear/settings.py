@@ -1,4 +1,4 @@
-"""How much is spent on fits."""
+"""Settings of what is spent on fits."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class FitSettings:
-    """How much is spent on fits.
+    """Settings of what is spent on fits.
 
     Attributes:
         num_starts: Draws of the prior at which the bare model's search begins.

@@ -1,7 +1,8 @@
 """Verdicts when every model is wrong: one evidence, left-out trials, what remains.
 
-Here live linearized models, the errors that all of them share, and the rule that says
-what helps and what is named. What samples a posterior lives in ``evidence``.
+This package contains linearized models, the errors that all of them share, and the rule
+that selects helpful effects and names causes. The samplers of a posterior are in
+``evidence``.
 """
 
 from sbi_active.criticism.misfit.verdict import find_misfit

@@ -58,8 +58,8 @@ class BySensor:
     """Linear models of which one fits to the sensor's error.
 
     Attributes:
-        search: Its models.
-        rivals: They are made of.
+        search: Search with its models.
+        rivals: Rivals that the models are made of.
         equivalent: Groups of effects that no permitted action separates.
     """
 
@@ -115,7 +115,7 @@ class BySensor:
 
     @property
     def catch_alls(self) -> tuple[str, ...]:
-        """Those that are compared after an alarm."""
+        """Catch-alls that are compared after an alarm."""
         if len(self._one_part):
             return CATCH_ALLS
         return tuple(name for name in CATCH_ALLS if name != OUTLIER)
@@ -186,7 +186,7 @@ class BySensor:
         return self.search.found[self._predicting(key)].posterior.log_process
 
     def record(self, key: ModelKey) -> Evidence:
-        """Return what is recorded of a model, and keep its draws."""
+        """Return the record of a model, and keep its draws."""
         log_z, bare = self._log_z[key], ModelKey()
         if key.error is not None:
             return replace(self.record(bare), key=key, log_evidence=log_z)

@@ -1,4 +1,4 @@
-r"""What else may be the matter with the bare model, in closed form.
+r"""Catch-all alternatives to the bare model, in closed form.
 
 Larger noise scales all Gram matrices, a gross error of one trial is a residual process
 in that trial alone, "unexplained" one in all of them.
@@ -24,7 +24,7 @@ def log_scaled(bare: Candidate, errors: Errors, scales: Array) -> Array:
 
     Args:
         bare: The model.
-        errors: With the sensor's error.
+        errors: Errors with the sensor's error.
         scales: Factors on it, one a number, shape (s, N), or one for all, (s, 1).
     """
     scales = np.broadcast_to(scales, (len(scales), len(bare.model.residual)))
@@ -44,7 +44,7 @@ def log_one_part(bare: Candidate, errors: Errors) -> Array:
 
     Args:
         bare: The model.
-        errors: That its Gram matrices are of.
+        errors: Errors that its Gram matrices are of.
     """
     n, grams = len(errors.cells), bare.grams
     some = slice(n, n + errors.num_processes)

@@ -26,12 +26,12 @@ class Fitted(Protocol):
 
     @property
     def search(self) -> Search:
-        """Its models."""
+        """Search with its models."""
         ...
 
     @property
     def rivals(self) -> RivalSet:
-        """What they are models of."""
+        """Rivals that the models are made of."""
         ...
 
     def posterior(self, key: ModelKey, use: NDArray[np.bool_]) -> Posterior:
@@ -47,11 +47,11 @@ def evaluate_linear(misfit: Fitted, trials: Trials) -> Evaluation | None:
     """Return the error on each trial of models chosen and fitted without it.
 
     The linearizations are those of all trials; evidence, left-out errors, the choice
-    and the refits are made again without each. None where parts of trials are left out.
+    and the refits are made again without each. None if parts of trials are left out.
 
     Args:
         misfit: The models.
-        trials: That were fitted.
+        trials: Trials that were fitted.
     """
     errors = misfit.search.errors
     if not errors.is_by_trial:
@@ -71,7 +71,7 @@ def evaluate_linear(misfit: Fitted, trials: Trials) -> Evaluation | None:
 
 
 def _prediction(misfit: Fitted, key: ModelKey, fold: int, place: int) -> Prediction:
-    """Return what a model that was fitted without a trial predicts of it."""
+    """Return the prediction of a trial by a model that was fitted without it."""
     search, m = misfit.search, misfit.rivals.measurements
     candidate, errors = search.found[key], search.errors
     posterior = misfit.posterior(key, np.arange(errors.num_folds) != fold)

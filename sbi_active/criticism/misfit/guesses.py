@@ -1,4 +1,4 @@
-r"""What the residual follows where every model misses.
+r"""Guesses of what the residual follows where every model misses.
 
 Each guess adds :math:`c\, g(v)` to a model's output, with g one elementary function of
 an entry of the action, an input, the output, its slope, or the time in the trial. Where
@@ -68,7 +68,7 @@ def guess_residual(search: Search) -> tuple[tuple[str, float], ...]:
 
     Returns:
         Formulas and their log evidence above that of the bare model with its process,
-        nats; empty where there is none.
+        nats; empty if there is none.
     """
     if not search.rivals.measurements.is_sequence:
         return _guess_of_numbers(search)
@@ -124,13 +124,13 @@ def smooth_evidence(search: Search) -> float:
 def gained_by_guesses(search: Search, key: ModelKey, name: str) -> float:
     """Return the nats that guesses in the place of an effect gain over it.
 
-    As likely beforehand one as the other: their mean evidence counts. Each has one
+    Guesses are equally likely beforehand: their mean evidence counts. Each has one
     coefficient for all numbers of a trial.
 
     Args:
-        search: Has fitted the models; x has no time axis.
+        search: Search that has fitted the models; x has no time axis.
         key: The set with the effect.
-        name: Of the effect.
+        name: Name of the effect.
     """
     without = search.found[key.without(name)].model
     m = search.rivals.measurements
@@ -203,7 +203,7 @@ def _distinct(
 
 
 def _variables(search: Search, own: NDArray[np.bool_]) -> Iterator[tuple[str, Array]]:
-    """Yield what a residual of some numbers may follow, shape (N,)."""
+    """Yield variables that a residual of some numbers may follow, shape (N,)."""
     trials, m = search.rivals.trials, search.rivals.measurements
     predicted = m.x - search.found[ModelKey()].model.residual * search.unit
     action = trials.action.double().numpy()

@@ -55,11 +55,11 @@ def covariance(
     """Return the covariance of a model's coordinates about its best fit, (d, d).
 
     Args:
-        model: Linear.
-        posterior: Given a process that is independent in each trial.
+        model: Linear model.
+        posterior: Posterior given a process that is independent in each trial.
         left: Refits without each part of the trials.
-        errors: Shared by all models.
-        action: Of each trial, shape (t, action_dim).
+        errors: Errors that all models share.
+        action: Action of each trial, shape (t, action_dim).
         between: Variance of the coordinates from model to model, shape (d,).
     """
     found = shared_process(model, errors, action)
@@ -93,12 +93,12 @@ def shared_process(
     summed over c, the length, s, the kernel and its time scale.
 
     Args:
-        model: Linear.
-        errors: Shared by all models.
-        action: Of each trial, shape (t, action_dim).
+        model: Linear model.
+        errors: Errors that all models share.
+        action: Action of each trial, shape (t, action_dim).
 
     Returns:
-        Shapes (d,) and (d, d); None where trials are not sampled at the same times.
+        Shapes (d,) and (d, d); None if trials are not sampled at the same times.
     """
     m, num = errors.measurements, errors.num_folds
     patterns = alike(m, errors.fold)

@@ -39,17 +39,17 @@ def beside_misfit(
     """Return a verdict by models with a residual process, where none explains.
 
     Along a trajectory it takes the place of any other. Of numbers without a time axis
-    it is asked for several effects as well, which fit much that nobody declared; it
+    it is asked for several effects as well, which fit much that was not declared; it
     takes the place where it says more, and else gives the intervals.
 
     Args:
         tracing: The verdict by the sensor's error, or one of unknown size.
-        detection: Which it follows.
+        detection: Detection that it follows.
         rivals: The models.
         equivalent: Groups of effects that nothing separates.
         held_out: Trials on which models are scored; None for none.
-        search: Fits the models; None where the error of the sensor is not known.
-        rule: What decides which effects help.
+        search: Fits the models; None if the error of the sensor is not known.
+        rule: Rule that decides which effects help.
 
     Returns:
         The verdict, and the models if it is theirs.
@@ -74,7 +74,7 @@ def beside_misfit(
 
 
 def _within(rivals: RivalSet) -> Callable[[ModelKey, Array], Array]:
-    """Return what moves draws of a model into the bounds of its prior."""
+    """Return a function that moves draws of a model into the bounds of its prior."""
     return lambda key, z: rivals.rival(key).coordinates.within(z)
 
 

@@ -52,13 +52,13 @@ CLOSE = 1.0
 
 
 def detected(misfit: Misfit) -> Detection:
-    """Return that the bare model misses the trials, by the evidence of the verdict."""
+    """Return the detection of the bare model's misfit, by the verdict's evidence."""
     bare = misfit.search.found[ModelKey()]
     return detection_of(bare, misfit.log_bayes_factor, LEVEL)
 
 
 def detection_of(bare: Candidate, log_b: float, level: float) -> Detection:
-    """Return what a linear bare model says of the trials.
+    """Return the detection by a linear bare model.
 
     Args:
         bare: The model.
@@ -128,8 +128,8 @@ def with_intervals(tracing: Tracing, misfit: Misfit) -> Tracing:
     """Return a verdict of other evidence with the intervals that hold under misfit.
 
     Args:
-        tracing: Of numbers without a time axis, of which no declared effect predicts
-            left-out trials better: larger noise or something undeclared.
+        tracing: Tracing of numbers without a time axis, of which no declared effect
+            predicts left-out trials better: larger noise or something undeclared.
         misfit: The models.
     """
     found = dict(tracing.evidences)
@@ -165,12 +165,13 @@ def keep_draws(
     """Return a linear model's record, and keep its draws as its posterior sample.
 
     Args:
-        rivals: That keep them.
-        model: Fitted.
-        center: Of its posterior, shape (d,).
-        cov: Of its posterior, shape (d, d).
-        log_z: Its evidence, nats.
-        best: Where other trials are predicted from, shape (d,); None takes the draws.
+        rivals: Rivals that keep them.
+        model: Fitted model.
+        center: Center of its posterior, shape (d,).
+        cov: Covariance of its posterior, shape (d, d).
+        log_z: Log evidence of the model, nats.
+        best: Point from which other trials are predicted, shape (d,); None takes the
+            draws.
     """
     key = model.key
     if key in rivals.fits:
@@ -303,8 +304,8 @@ def alike(search: Search, log_z: dict[str, float]) -> tuple[frozenset[str], ...]
     """Return pairs of effects that fit the trials nearly alike and about as well.
 
     Args:
-        search: Has fitted them alone.
-        log_z: Their evidence alone.
+        search: Search that has fitted them alone.
+        log_z: Log evidence of each effect alone, by name.
     """
     best = max(log_z.values(), default=-np.inf)
     likely = [n for n, value in log_z.items() if value > best - THRESHOLD]

@@ -28,8 +28,8 @@ def widened(
     normal n for each draw: the verdict's effects, left out, shift what is left.
 
     Args:
-        tracing: With effects as the verdict.
-        seed: Of the draws.
+        tracing: Tracing with effects as the verdict.
+        seed: Seed of the draws.
         within: Moves draws of a model, shape (n, k), into the bounds of its prior.
 
     References:

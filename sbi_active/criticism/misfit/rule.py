@@ -1,4 +1,4 @@
-r"""What helps, and what is the cause, when every model is wrong.
+r"""Model selection and effect attribution under misspecification.
 
 1. Models are *admitted* whose error on left-out trials is within a tenth of the
    smallest, or is not larger on a new trial with a probability of .9: one trial far
@@ -51,7 +51,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Scored:
-    """What the rule knows of a model.
+    """Scores of a model, as the rule uses them.
 
     Attributes:
         log_p: Unnormalized log posterior probability.
@@ -74,23 +74,23 @@ class Scored:
 
     @property
     def excess(self) -> float:
-        """Of the fit's residual, beyond the sensor's error."""
+        """Excess of the fit's residual beyond the sensor's error."""
         return max(self.fitted - 1, 1e-2)  # so that ratios are finite
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What the rule says.
+    """The choice that the rule makes.
 
     Attributes:
         key: The model whose effects all help; the bare one where none does.
-        probabilities: Of the admitted models, most probable first.
+        probabilities: Probabilities of the admitted models, most probable first.
         inclusion: Probability of each effect among them.
         cause: Probability of each effect that helps of being the cause.
         better: Probability that a left-out trial is predicted better with it.
-        odds: Of being a cause and no imitation, by effect that helps.
-        instead: What may stand in the place of an effect that helps, where anything
-            may (:func:`stand_ins`).
+        odds: Odds of being a cause and no imitation, by effect that helps.
+        instead: Effects that may stand in the place of an effect that helps, if any
+            (:meth:`Rule.stand_ins`).
     """
 
     key: ModelKey
@@ -104,7 +104,7 @@ class Choice:
 
 @dataclass(frozen=True, kw_only=True)
 class Rule:
-    """What decides which effects help, and which is the cause.
+    """The rule that decides which effects help, and which is the cause.
 
     The values are those of ``benchmarks/misfit``, tuned on seeds that do not judge.
 
@@ -112,7 +112,7 @@ class Rule:
         admitted_within: Error of an admitted model on left-out trials, in times the
             smallest. With 1.05 models that are as good are left out, with 1.2 ones that
             imitate by evidence alone are let in.
-        admitted_untimed: The same error where x has no time axis.
+        admitted_untimed: Error of an admitted model if x has no time axis.
         ahead: Nats by which a model must be more probable than all admitted ones to be
             admitted whatever its error.
         included: Inclusion probability from which an effect may help.
@@ -146,11 +146,11 @@ class Rule:
         timed: bool = True,
         guessed: Callable[[ModelKey, str], float] | None = None,
     ) -> Choice:
-        """Return what helps, and the probability that it is the cause.
+        """Return the effects that help, and their probability of being the cause.
 
         Args:
-            models: Fitted ones; with a set of effects, the sets with one effect less.
-            names: Of all effects.
+            models: Fitted models; with a set of effects, the sets with one effect less.
+            names: Names of all effects.
             equivalent: Groups of them that nothing separates, which share their mass.
             timed: Whether x has a time axis.
             guessed: Function that returns the nats that guesses in the place of an
@@ -211,8 +211,8 @@ class Rule:
         """Return the sets that the rule prunes; :func:`choose` needs all their parts.
 
         Args:
-            models: Fitted ones.
-            names: Of all effects.
+            models: Fitted models.
+            names: Names of all effects.
             timed: Whether x has a time axis.
 
         Returns:
@@ -243,7 +243,7 @@ class Rule:
         return {keys[i]: float(p[i]) for i in np.argsort(-p, kind="stable")}
 
     def _cost(self, key: ModelKey, *, timed: bool) -> float:
-        """Return what a set is to gain for being so large, nats."""
+        """Return the gain that a set of this size needs, nats."""
         num = len(key.effects)
         second = 0.0 if timed or num < 2 else np.log(self.second_untimed)
         return second + np.log(self.decisive) * max(num - 2, 0)
@@ -251,15 +251,15 @@ class Rule:
     def stand_ins(
         self, models: Mapping[ModelKey, Scored], key: ModelKey, names: Sequence[str]
     ) -> dict[str, tuple[str, ...]]:
-        """Return what may stand in the place of each effect of a set.
+        """Return the effects that may stand in the place of each effect of a set.
 
         With it there, and the others as they are, a new trial is not surely predicted
         worse.
 
         Args:
-            models: Fitted ones; sets that were not fitted do not count.
+            models: Fitted models; sets that were not fitted do not count.
             key: The set.
-            names: Of all effects, in the order of the sets.
+            names: Names of all effects, in the order of the sets.
         """
         square = models[key].square
         found: dict[str, tuple[str, ...]] = {}
@@ -310,7 +310,7 @@ class Rule:
     ) -> list[ModelKey]:
         """Return the models that predict left-out trials about as well as the best.
 
-        And those that are far more probable than all of them.
+        It also returns those that are far more probable than all of them.
         """
         best = min(models.values(), key=lambda m: m.error)
         smallest = max(best.error, 1.0)  # below the sensor's, by chance
@@ -340,11 +340,11 @@ def _remains(models: Mapping[ModelKey, Scored], key: ModelKey, name: str) -> flo
 def predicts_better(one: Array, other: Array) -> float:
     """Return the probability that a model has the smaller error on a new trial.
 
-    By Student's t over the trials' log ratios of mean squared errors.
+    The test is Student's t over the trials' log ratios of mean squared errors.
 
     Args:
         one: Mean squared errors of the model on left-out trials, shape (f,).
-        other: Those of the other.
+        other: Mean squared errors of the other model.
     """
     some = np.isfinite(one) & np.isfinite(other)
     ratio = np.log(one[some]) - np.log(other[some])

@@ -21,16 +21,16 @@ PROCESS = 1.1
 def judged(
     rivals: RivalSet, tracing: Tracing, evaluation: Evaluation | None
 ) -> Tracing:
-    """Return what was traced, and whether its forces are stand-ins.
+    """Return the tracing, and whether its forces are stand-ins.
 
-    A force is adopted as an explanation only where the chi-square of its model has a
-    tail probability of at least .01, and the error on trials that had no part in it
-    falls. One with which that error rises is withdrawn, and so are effects that a wider
+    A force is adopted as an explanation only if the chi-square of its model has a tail
+    probability of at least .01, and the error on trials that were not used falls. A
+    force with which that error rises is withdrawn, and so are effects that a wider
     prior makes up for.
 
     Args:
         rivals: The models.
-        tracing: Which effects the data point to.
+        tracing: Tracing with the effects that the data point to.
         evaluation: Error before and after on trials that had no part in it.
     """
     tracing = beyond_bounds(rivals, unless_refuted(tracing, evaluation))

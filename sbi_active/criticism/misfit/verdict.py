@@ -1,7 +1,7 @@
 """Whether every model misses the trials by more than the sensor's error, and then what.
 
-Where one fits to the sensor's error, evidence on the simulator itself decides, and
-nothing of this is needed.
+If one fits to the sensor's error, evidence on the simulator itself decides, and this
+module is not needed.
 """
 
 from __future__ import annotations
@@ -47,15 +47,15 @@ class Misfit:
     """The models of trials that none of them explains to the sensor's error.
 
     Attributes:
-        search: Its models.
-        rivals: They are made of.
+        search: Search with its models.
+        rivals: Rivals that the models are made of.
         equivalent: Groups of effects that nothing separates.
-        choice: What helps.
-        standard: Returns a model's squared errors on left-out parts, as the rule takes
-            them.
-        log_bayes_factor: Of anything with a residual process against the bare model
-            with the sensor's error alone, nats.
-        rule: What decides which effects help.
+        choice: Choice of what helps.
+        standard: Function that returns a model's squared errors on left-out parts, as
+            the rule takes them.
+        log_bayes_factor: Log Bayes factor of anything with a residual process against
+            the bare model with the sensor's error alone, nats.
+        rule: Rule that decides which effects help.
     """
 
     search: Search
@@ -111,7 +111,7 @@ class Misfit:
 
     @cached_property
     def weights(self) -> dict[ModelKey, float]:
-        """How much each model counts by its errors on left-out parts."""
+        """Weight of each model by its errors on left-out parts."""
         found = self.search.found
         return weights_by_error(
             {key: candidate.left.square for key, candidate in found.items()},
@@ -152,9 +152,9 @@ class Misfit:
     def outlying(self) -> tuple[OutlyingTrial, ...]:
         """Return the trials that err far more than the others let expect.
 
-        By what the verdict's model leaves of each as it is fitted to the others, in
-        units of what they let expect: a trial that alone shows what an effect does is
-        not one of them.
+        They are found by the residuals of the verdict's model for each trial as fitted
+        to the others, in units of what these let expect: a trial that alone shows what
+        an effect does is not one of them.
         """
         errors, found = self.search.errors, self.search.found[self.choice.key]
         if not errors.is_by_trial:
@@ -190,7 +190,7 @@ class Misfit:
 def standard_errors(
     search: Search, use: NDArray[np.bool_] | None = None
 ) -> Callable[[Candidate], Array]:
-    """Return what gives a model's squared errors on left-out parts, once each, (f,).
+    """Return a function of a model's squared errors on left-out parts, (f,), cached.
 
     Trials count as much as the likeliest model has them vary, the same for all models.
 
@@ -216,13 +216,13 @@ def standard_errors(
 
 
 def scored(search: Search, c: Candidate, log_p: float, square: Array) -> Scored:
-    """Return what the rule is to know of a model.
+    """Return the scores of a model that the rule uses.
 
     Args:
-        search: Has fitted it.
+        search: Search that has fitted it.
         c: The model.
-        log_p: Its unnormalized log posterior probability.
-        square: Its mean squared errors on left-out parts, (f,).
+        log_p: Unnormalized log posterior probability.
+        square: Mean squared errors on left-out parts, (f,).
     """
     model = c.model
     of_all = search.columns(model.key, ModelKey()) & (model.trial_of < 0)
@@ -237,15 +237,16 @@ def find_misfit(
     is_known: bool = False,
     rule: Rule = Rule(),  # noqa: B008  (frozen)
 ) -> Misfit | None:
-    """Return the models and what helps; None where one fits to the sensor's error.
+    """Return the models and what helps; None if one fits to the sensor's error.
 
-    So it is where no model gains a Bayes factor of 20 by a residual process, or where
-    one trial alone asks for it, which may have a gross error. A set of several effects
-    that fits proves little: so many imitate what nobody declared. It is judged as if
-    it missed, and so by what left-out trials say of each of its effects.
+    A model fits if no model is improved by a residual process by a Bayes factor of 20,
+    or if a single trial, which may have a gross error, accounts for the improvement. A
+    set of several effects that fits proves little: so many imitate what was not
+    declared. It is judged as if it missed, and so by what left-out trials say of each
+    of its effects.
 
     Args:
-        search: Fits the models; None where the error of the sensor is not known.
+        search: Fits the models; None if the error of the sensor is not known.
         equivalent: Groups of effects that no permitted action separates.
         is_known: No model fits: what remains was found to be no error of a sensor.
             Without a time axis nothing else tells.
@@ -293,15 +294,15 @@ def settled(
     rule: Rule,
     guessed: Callable[[ModelKey, str], float] | None = None,
 ) -> Choice:
-    """Return what helps, once every part of the top model is fitted.
+    """Return the choice, once every part of the top model is fitted.
 
     Args:
         search: The models so far.
-        score: What the rule is to know of one.
+        score: Function that returns what the rule needs of a model.
         equivalent: Groups of effects that nothing separates.
-        rule: What decides which effects help.
-        guessed: Returns what guesses in the place of an effect gain over it, nats; None
-            asks none.
+        rule: Rule that decides which effects help.
+        guessed: Function that returns the nats that guesses in the place of an effect
+            gain over it; None asks none.
     """
     scored: dict[ModelKey, Scored] = {}
     timed = search.rivals.measurements.is_sequence
@@ -338,7 +339,7 @@ def _misses(
     """Return whether even the best model gains by a residual process.
 
     Args:
-        search: Has fitted the models.
+        search: Search that has fitted the models.
         use: Parts of the trials that count; None for all.
         most: Effects of the models that count; None for all.
     """
@@ -366,7 +367,7 @@ def _is_one_trial(search: Search) -> bool:
     best = max(models, key=lambda c: c.log_prior + c.posterior.log_sensor)
     square = np.bincount(trial, best.model.residual**2)
     for suspect in np.argsort(-square)[:NUM_SUSPECTS]:
-        # Of few trials a part is a piece of one: all pieces of the suspect go.
+        # A part of few trials is a piece of one: all pieces of the suspect go.
         use = np.ones(errors.num_folds, bool)
         use[np.unique(errors.fold[trial == suspect])] = False
         if not _misses(search, use, 1):

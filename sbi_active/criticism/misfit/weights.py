@@ -1,4 +1,4 @@
-r"""How much each model counts where all of them are wrong.
+r"""Weights of models where all of them are wrong.
 
 Probabilities among them are too sure: evidence grows with the samples of a trajectory,
 and what every model misses is no noise. Here each left-out part of the trials counts
@@ -35,13 +35,13 @@ NUM_BOOTSTRAP = 400
 def weights_by_error(
     square: Mapping[ModelKey, Array], log_prior: Mapping[ModelKey, float], seed: int
 ) -> dict[ModelKey, float]:
-    """Return how much each model counts, largest first, adding up to one.
+    """Return the weight of each model, largest first, adding up to one.
 
     Args:
         square: Mean squared errors on left-out parts of the trials, shape (f,); NaN for
             parts that do not count.
-        log_prior: Of each model, nats.
-        seed: Of the bootstrap.
+        log_prior: Log prior probability of each model, nats.
+        seed: Seed of the bootstrap.
 
     Example:
         >>> one, two = ModelKey(("one",)), ModelKey(("two",))

@@ -23,28 +23,29 @@ Array = NDArray[Any]
 
 #: Draws of a posterior that say whether it lies at a bound, and steps of a refit.
 NUM_DRAWS, STEPS = 400, 30
-#: By how much a bound is moved, in widths of the prior. Half of it still reaches what a
-#: prior barely excludes, twice asks of the simulator what nobody meant.
+#: Move of a bound, in widths of the prior. Half of it still reaches what a
+#: prior barely excludes, twice asks too much of the simulator.
 WIDER = 1.0
 #: Share of a positive parameter's bound that a moved one keeps of it: what has a sign
 #: keeps it, since a simulator may not know what a negative friction is.
 KEPT = 0.1
-#: Of the null of an effect to a bound, in deviations of its prior: what rounding is.
+#: Distance of an effect's null to a bound, in prior deviations, that is rounding.
 NEAR = 1e-6
 
 
 def beyond_bounds(rivals: RivalSet, tracing: Tracing) -> Tracing:
-    """Return what was traced, and what a wider prior would give.
+    """Return the tracing with the parameters at bounds, and fits with a wider prior.
 
-    Parameters of the bare model and of that of the verdict that lie at a bound are
-    fitted again with it moved. Where the bare model then explains the trials as well
-    as with the effects of the verdict, which have no Bayes factor of 20 left against
-    it, nothing tells these from a prior that is too narrow: they are not named. Nor is
-    what no permitted action tells from the bare model, whatever its prior is.
+    Parameters of the bare model and of the verdict's model that lie at a bound are
+    fitted again with the bound moved. If the bare model then explains the trials as
+    well as the effects of the verdict, which have no Bayes factor of 20 left against
+    it, these cannot be told from a prior that is too narrow, and are not named. Neither
+    are effects that no permitted action separates from the bare model, whatever its
+    prior is.
 
     Args:
         rivals: The models.
-        tracing: Which effects the data point to.
+        tracing: Tracing with the effects that the data point to.
     """
     keys = [k for k in dict.fromkeys([ModelKey(), tracing.key]) if k in rivals.fits]
     sides = {key: _sides(rivals, key) for key in keys}
@@ -74,7 +75,7 @@ def beyond_bounds(rivals: RivalSet, tracing: Tracing) -> Tracing:
 
 
 def _unless_none(tracing: Tracing, bounds: Bounds) -> Tracing:
-    """Return what was traced without effects that are the bare model's parameters."""
+    """Return the tracing without effects that are the bare model's parameters."""
     as_none = frozenset().union(*[g for g in tracing.equivalent if NONE in g])
     if tracing.chosen and as_none.issuperset(tracing.chosen):
         bounds = replace(bounds, replaces=str(ModelKey(tracing.chosen)))
@@ -107,7 +108,7 @@ def _sides(rivals: RivalSet, key: ModelKey) -> NDArray[np.int64]:
 
 
 def _explained(rivals: RivalSet, key: ModelKey) -> tuple[Whitener, float]:
-    """Return what whitens residuals of a model's best fit, and its chi-square."""
+    """Return the whitener of residuals of a model's best fit, and its chi-square."""
     rival = rivals.rival(ModelKey(key.effects))
     start = _start(rivals, key)
     whiten = rivals.noise.whitener(rival.residual(start[None])[0][0])
@@ -123,7 +124,7 @@ def _start(rivals: RivalSet, key: ModelKey) -> Array:
 
 
 def _starts(rivals: RivalSet, key: ModelKey, other: ModelKey) -> Array:
-    """Return where a refit starts: a model's own best fit, and theta of another's."""
+    """Return starts of a refit: a model's own best fit, and theta of another's."""
     own, dim = _start(rivals, key), rivals.prior.event_shape[0]
     return np.stack([own, np.r_[_start(rivals, other)[:dim], own[dim:]]])
 
@@ -147,7 +148,7 @@ def _moved(rival: Rival, side: NDArray[np.int64]) -> Rival:
 def _best(
     rivals: RivalSet, rival: Rival, whiten: Whitener, starts: Array
 ) -> Array | None:
-    """Return the best fit of a rival, (d,); None where the simulator has none."""
+    """Return the best fit of a rival, (d,); None if the simulator has none."""
     if not rivals.is_smooth:
         return starts[0]
     try:

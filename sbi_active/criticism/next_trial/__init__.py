@@ -1,6 +1,6 @@
-"""What to measure next: the action that tells rivals apart, and the severest test.
+"""The next trial: the action that tells rivals apart, and the severest test.
 
-Here lives what proposes a trial. What concludes from trials lives in ``steps``.
+This package proposes a trial. The conclusions from trials are in ``steps``.
 """
 
 from sbi_active.criticism.next_trial.candidates import following

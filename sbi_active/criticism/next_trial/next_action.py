@@ -49,10 +49,10 @@ class PredictedRival:
 
     Args:
         rivals: The models.
-        key: Of this one.
-        probability: Of this one, those of all rivals adding up to one.
-        candidates: All actions that will be asked for, shape (a, action_dim). They are
-            predicted together, each as the next trial.
+        key: Key of this rival.
+        probability: Probability of this rival, those of all rivals adding up to one.
+        candidates: Candidates, all actions that will be asked for, shape (a,
+            action_dim). They are predicted together, each as the next trial.
     """
 
     def __init__(
@@ -68,8 +68,8 @@ class PredictedRival:
 
         Args:
             action: One of the candidates, shape (action_dim,).
-            num_samples: n.
-            seed: Of the draws.
+            num_samples: Number of draws n.
+            seed: Seed of the draws.
         """
         return self._at(action, num_samples, seed)[0]
 
@@ -79,9 +79,9 @@ class PredictedRival:
         """Return these draws without noise, and its standard deviations, (n, q).
 
         Args:
-            action: As in :meth:`predict`.
-            num_samples: As there.
-            seed: As there.
+            action: One of the candidates, as in :meth:`predict`.
+            num_samples: Number of draws n, as in :meth:`predict`.
+            seed: Seed of the draws, as in :meth:`predict`.
         """
         _, mean, sd = self._at(action, num_samples, seed)
         return mean, sd
@@ -125,12 +125,12 @@ def choose_action(
     .02 nats for every permitted action, or some of the rivals are equivalent, actions
     beyond the permitted range are tried: one that separates them is named.
 
-    Where every model misses, rivals count by their errors on left-out trials: their
-    probabilities are too sure. What they leave is a part of their predictions.
+    If every model misses, rivals are weighted by their errors on left-out trials, since
+    their probabilities are too sure. Their residuals are a part of their predictions.
 
     Args:
         rivals: The models.
-        tracing: Their probabilities.
+        tracing: Tracing with their probabilities.
         actions: The permitted ones.
         beyond: Whether to try others where these separate nothing.
     """
@@ -171,7 +171,7 @@ def _most_telling(
     p: Array,
     candidates: Tensor,
 ) -> tuple[Array | None, Array]:
-    """Return the best candidate, None where it tells nothing, and what each tells."""
+    """Return the best candidate, None if it tells nothing, and what each tells."""
     design = _select(rivals, tracing, names, p, candidates)
     gain = design.expected_information_gain.clamp_min(0.0).numpy()
     told = gain[design.index]

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from sbi_active.actions import ActionSpace
 
-#: By which the range of the actions is widened about its center.
+#: Factors by which the range of the actions is widened about its center.
 WIDER = (1.5, 2.0)
 
 
@@ -22,7 +22,7 @@ def outside_candidates(
 
     Args:
         actions: The permitted ones.
-        candidates: Some or all of them, shape (a, action_dim).
+        candidates: Candidates, some or all actions, shape (a, action_dim).
         limit: Actions at most.
 
     Returns:
@@ -50,7 +50,7 @@ def extrapolated(actions: ActionSpace, candidates: Tensor, *, limit: int) -> Ten
 
     Args:
         actions: The permitted ones.
-        candidates: Some or all of them, shape (a, action_dim).
+        candidates: Candidates, some or all actions, shape (a, action_dim).
         limit: Actions at most.
 
     Returns:

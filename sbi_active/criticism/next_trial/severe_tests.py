@@ -1,6 +1,6 @@
 r"""Actions at which a verdict would be put to the test most.
 
-A verdict may be the alias of an effect that nobody declared: it explains the trials at
+A verdict may be the alias of an effect that was not declared: it explains the trials at
 hand about as well, with other parameters. The data cannot tell, another action can. The
 rival without a cause is a free residual, the bare model and the residual process as
 fitted to the trials. Where it expects an outcome far from the verdict's prediction, the
@@ -107,7 +107,7 @@ def _difference(verdict: Prediction, free: Prediction, num: int) -> Array:
 
 
 def _affordable(rivals: RivalSet) -> int:
-    """Return how many candidates the residual process predicts in passable memory."""
+    """Return the number of candidates that the residual process predicts in memory."""
     m = rivals.measurements
     return max(MAX_ENTRIES // (len(m) * int(np.prod(m.shape[1:]))), 2)
 

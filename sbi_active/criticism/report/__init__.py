@@ -1,6 +1,7 @@
 """The report: its headline, sections, warnings and figures.
 
-Here live words and pictures of finished results. Nothing here simulates or fits.
+This package contains the texts and figures of finished results. It does not simulate or
+fit.
 """
 
 from sbi_active.criticism.report.cautions import find_warnings

@@ -1,4 +1,4 @@
-"""What limits the conclusions of a report, a sentence each."""
+"""Cautions that limit the conclusions of a report, a sentence each."""
 
 from __future__ import annotations
 
@@ -65,17 +65,17 @@ def find_warnings(
     exploratory: bool = False,
     designed: bool = False,
 ) -> tuple[Message, ...]:
-    """Return what limits the conclusions, a sentence each.
+    """Return the cautions that limit the conclusions, a sentence each.
 
     Args:
         trials: The measured trials.
-        residuals: Of the bare model.
-        tracing: Which effect the data point to.
+        residuals: Residuals of the bare model.
+        tracing: Tracing with the effect that the data point to.
         detection: Whether the bare model misses the data.
-        residuals_after: With the effects of the verdict.
+        residuals_after: Residuals with the effects of the verdict.
         evaluation: Error before and after.
-        effects: Those that were added.
-        exploratory: What was frozen was changed after the data were seen.
+        effects: Effects that were added.
+        exploratory: Whether what was frozen was changed after the data were seen.
         designed: Actions were chosen for their information.
     """
     found = (

@@ -1,4 +1,4 @@
-"""What a named verdict is conditional on, and the actions that would test it."""
+"""Conditions of a named verdict, and the actions that would test it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MOST_NAMED = 3
 
 
 def first_paragraph(report: Contents) -> str:
-    """Return what was found, and what a verdict that names effects does not know."""
+    """Return the findings, and the conditions of a verdict that names effects."""
     tracing = report.tracing
     against = [*of_outlying(tracing), *of_missed(report.evaluation)]
     against += of_bounds(tracing.bounds)
@@ -27,9 +27,9 @@ def first_paragraph(report: Contents) -> str:
 
 
 def conditions(report: Contents) -> Iterator[str]:
-    """Yield what a verdict that names effects does not know, a sentence each.
+    """Yield the conditions of a verdict that names effects, a sentence each.
 
-    An effect that nobody declared can pass for declared ones, with parameters that are
+    An effect that was not declared can pass for declared ones, with parameters that are
     wrong and residuals that are as small. The data at hand cannot tell.
     """
     if not report.tracing.chosen:
@@ -57,7 +57,7 @@ def _tests(report: Contents) -> Iterator[str]:
 
 
 def _moved(report: Contents) -> str:
-    """Return how far the parameters moved from the bare fit, the farthest first."""
+    """Return the moves of parameters from the bare fit, the farthest first."""
     table = report.parameters.dropna(subset=["before", "after"])
     shift = (table["after"] - table["before"]).to_numpy()
     sd = np.maximum(table["before_sd"].to_numpy(), np.finfo(float).tiny)
@@ -81,7 +81,7 @@ def _times(far: float) -> str:
 
 
 def _tried(report: Contents) -> str:
-    """Return which actions were executed."""
+    """Return the actions that were executed."""
     if report.action_is_label:
         return "No other inputs were tried than those of these trials."
     action = np.unique(report.residuals.action, axis=0)

@@ -1,4 +1,4 @@
-"""What a report holds, apart from how it is set."""
+"""Contents of a report, apart from its layout."""
 
 from __future__ import annotations
 
@@ -33,28 +33,28 @@ NUM_PRIOR = 2_000  # draws that a width is compared with
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Contents:
-    """What the closed loop found.
+    """Findings of the closed loop.
 
     Attributes:
-        residuals: Of the bare model.
-        residuals_after: Of the augmented one; None where nothing was added.
+        residuals: Residuals of the bare model.
+        residuals_after: Residuals of the augmented one; None if nothing was added.
         detection: Whether the bare model misses the data.
-        tracing: Which effect the data point to.
-        evaluation: Error before and after; None where no trial was scored.
-        next_action: What to do next; its ``action`` is None where nothing is to be
+        tracing: Tracing with the effect that the data point to.
+        evaluation: Error before and after; None if no trial was scored.
+        next_action: Action to take next; its ``action`` is None if nothing is to be
             gained. None without permitted actions.
         simulator: The augmented simulator, or the bare one where nothing was added.
-        prior: Of its parameters (never a posterior).
-        warnings: One sentence each.
+        prior: Prior of its parameters (never a posterior).
+        warnings: Warnings, one sentence each.
         digest: Hash of noise, library and priors as they were before the data.
         exploratory: Library or priors were changed after the data were seen.
         num_trials: Trials that could be fitted.
-        action_labels: One an entry of the action, with its unit.
-        channel_names: One an entry of x's last axis, where known.
-        leave_one_out: Of the bare model and of the one that was chosen, where trials
-            are independent given their parameters.
-        severe_tests: Where a verdict that names effects would be put to the test most:
-            a permitted action, and one beyond.
+        action_labels: Labels of the entries of the action, with their units.
+        channel_names: Names of the entries of x's last axis, where known.
+        leave_one_out: Leave-one-out scores of the bare model and of the one that was
+            chosen, where trials are independent given their parameters.
+        severe_tests: Actions that would put a verdict that names effects to the test
+            most: a permitted action, and one beyond.
         action_is_label: Whether the action is only the trial's number.
     """
 
@@ -125,8 +125,8 @@ class Contents:
     def parameters(self) -> pd.DataFrame:
         """Columns parameter, before, before_sd, after, after_sd; phi has no before.
 
-        Means and deviations of posteriors; of a model that misses the trials the best
-        fit, with a deviation that knows of it.
+        Values are means and deviations of posteriors. A model that misses the trials
+        has its best fit, with a deviation that includes the misfit.
         """
         evidences = self.tracing.evidences
         before, after = evidences[NONE], evidences.get(self.tracing.model)
@@ -144,7 +144,7 @@ class Contents:
 
     @property
     def combinations(self) -> Combinations:
-        """What the model of the verdict knows of parameters together, and what not."""
+        """Combinations of parameters that the verdict's model knows, and does not."""
         evidences = self.tracing.evidences
         evidence = evidences.get(self.tracing.model, evidences[NONE])
         with forked_generators(0, "report"):

@@ -39,12 +39,13 @@ def plot_residuals(
     deviations of the predictive.
 
     Args:
-        before: Of the bare model, the upper row.
-        after: Of the augmented one, the lower row; None where nothing was added.
-        action_labels: One an entry of the action, with its unit; none where the action
-            is only the trial's number.
-        channel_names: One an entry of x without a time axis.
-        added: What the augmented model has more, in words.
+        before: Residuals of the bare model, the upper row.
+        after: Residuals of the augmented one, the lower row; None if nothing was
+            added.
+        action_labels: Labels of the entries of the action, with their units; none where
+            the action is only the trial's number.
+        channel_names: Names of the entries of x without a time axis.
+        added: Name of what the augmented model adds.
 
     Returns:
         The figure.
@@ -80,7 +81,7 @@ def plot_probabilities(tracing: Tracing, *, at_most: int = 14) -> Figure:
     Sets of several effects with less than .01 are left out.
 
     Args:
-        tracing: What the tracing found.
+        tracing: Tracing to draw.
         at_most: Bars, the most probable ones.
 
     Returns:

@@ -1,4 +1,4 @@
-"""What a report says of the models: their probabilities, and what they leave."""
+"""Section of a report on the models: their probabilities and residuals."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def residuals(report: Contents) -> Section:
 
 
 def _beside_the_sensor(report: Contents) -> str:
-    """Return what is left in the unit of x, beside the sensor's error if declared."""
+    """Return the residual in the unit of x, beside the sensor's error if declared."""
     declared = getattr(report.simulator.noise, "measurement_sd", None)
     if declared is None:
         return ""
@@ -239,7 +239,7 @@ def _rms(x: Array) -> float:
 
 
 def leave_one_out(report: Contents) -> Section:
-    """Return how well each trial is predicted from the others."""
+    """Return the scores of each trial's prediction from the others."""
     found = report.leave_one_out
     limit = found[0].largest_k
     titles = ["bare model", f"with {added(report)}"]

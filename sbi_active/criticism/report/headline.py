@@ -1,4 +1,4 @@
-"""What a report says first: the verdict with what limits it, and what was found."""
+"""Headline of a report: the verdict with its limits, and the findings."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def verdict_line(report: Contents) -> str:
 
 
 def _withdrawn_for(tracing: Tracing) -> str:
-    """Return why effects are not named, "" where only the warnings say it."""
+    """Return the reason not to name effects, "" if only the warnings say it."""
     if tracing.bounds.replaces:
         return f", and not {tracing.instead_of}: {narrow_prior(tracing)}"
     if tracing.misfit is not None and tracing.refuted and tracing.verdict != OUTLIER:
@@ -99,7 +99,7 @@ def _by_share(item: tuple[str, float]) -> float:
 
 
 def added(report: Contents) -> str:
-    """Return what was added to the bare model, in words."""
+    """Return the additions to the bare model, in words."""
     tracing, beside = report.tracing, report.tracing.beside
     if tracing.misfit is not None and tracing.chosen:
         return tracing.model
@@ -113,7 +113,7 @@ def added(report: Contents) -> str:
 
 
 def summary_sentence(report: Contents) -> str:
-    """Return what was found, in a few sentences."""
+    """Return the findings, in a few sentences."""
     misfit = report.tracing.misfit
     if misfit is not None and report.verdict != OUTLIER:
         return misfit_sentences(report, misfit)

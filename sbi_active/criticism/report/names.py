@@ -15,7 +15,7 @@ def joined(names: Sequence[str] | frozenset[str]) -> str:
 
 
 def called(names: Sequence[str], position: int) -> str:
-    """Return what a trial is called: its name, or its position without names."""
+    """Return the name of a trial, or its position without names."""
     return names[position] if names else str(position)
 
 

@@ -33,12 +33,12 @@ def number(value: float) -> str:
 def estimated(mean: float, sd: float, draws: float) -> str:
     """Return a mean with its deviation, or alone where few draws are behind them.
 
-    Nothing for NaN.
+    The text is empty for NaN.
 
     Args:
-        mean: Of the draws.
-        sd: Of the draws.
-        draws: Their effective number.
+        mean: Mean of the draws.
+        sd: Standard deviation of the draws.
+        draws: Effective number of the draws.
 
     Example:
         >>> estimated(0.35992, 0.00071, 400), estimated(0.35992, 0.00071, 3)
@@ -52,7 +52,7 @@ def estimated(mean: float, sd: float, draws: float) -> str:
 def with_error(mean: float, sd: float) -> str:
     """Return a mean to the second digit of its deviation; nothing for NaN.
 
-    Of a mean that is known better than that, six digits are enough.
+    A mean that is known better than that has six digits.
 
     Example:
         >>> with_error(0.35992, 0.00071), with_error(1234.5, 56.7)

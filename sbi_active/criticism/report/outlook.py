@@ -1,4 +1,4 @@
-"""What a report says of the error, the parameters, and what to do next."""
+"""Section of a report on the error, the parameters, and the next step."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def next_action(report: Contents) -> Section:
 
 
 def _by_range(report: Contents, chosen: NextAction) -> Iterator[str]:
-    """Yield what separates forms of a force, within the range tried and beyond it."""
+    """Yield actions that separate forms of a force, in the tried range and beyond."""
     for where, action, gain in (
         ("within the range tried", chosen.within, chosen.within_gain),
         ("beyond the range tried", chosen.beyond, chosen.beyond_gain),
@@ -161,7 +161,7 @@ def _by_range(report: Contents, chosen: NextAction) -> Iterator[str]:
 
 
 def _nothing_to_tell(report: Contents, chosen: NextAction, best: float) -> str:
-    """Return why no action is chosen; it is the end only where the bare model holds."""
+    """Return the reason not to choose an action; final only if the bare model holds."""
     found = (
         "no permitted action tells more about which declared model is right than "
         f"{max(best, 0.001):.3f} nats."
@@ -183,7 +183,7 @@ def _nothing_to_tell(report: Contents, chosen: NextAction, best: float) -> str:
 
 
 def _by_error(misfit: Misfit) -> str:
-    """Return how rivals count where all of them are wrong."""
+    """Return the weights of rivals where all of them are wrong."""
     shares = ", ".join(f"{n} {probability(w)}" for n, w in misfit.weights.items())
     return (
         "Every model misses, so that probabilities among them are too sure. Here they "

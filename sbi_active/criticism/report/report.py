@@ -24,7 +24,7 @@ from sbi_active.messages import Message
 
 
 class Report(Contents):
-    """What the closed loop found, see :class:`.Contents`.
+    """Report of the closed loop, see :class:`.Contents`.
 
     ``print(report)`` has the verdict in its first line.
     """
@@ -70,7 +70,7 @@ class Report(Contents):
         """Write report.txt, report.md, report.html and the figures as PNG.
 
         Args:
-            directory: Made where it does not exist.
+            directory: Folder, made where it does not exist.
 
         Returns:
             The page's path.
@@ -103,11 +103,11 @@ def build_report(
 
     Args:
         trials: The measured trials.
-        actions: Permitted ones, for names and units.
+        actions: Permitted actions, for names and units.
         designed: Actions were chosen for their information.
-        exploratory: What was frozen was changed afterwards.
-        warnings: Further ones.
-        **parts: As in :class:`.Contents`.
+        exploratory: Whether what was frozen was changed afterwards.
+        warnings: Further warnings.
+        **parts: Parts of :class:`.Contents`.
     """
     labels = [f"action {i + 1}" for i in range(trials.action.shape[1])]
     if trials.action_labels is not None:

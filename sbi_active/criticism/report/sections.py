@@ -1,4 +1,4 @@
-"""What a report says, section by section."""
+"""Sections of a report."""
 
 from __future__ import annotations
 

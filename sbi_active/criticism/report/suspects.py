@@ -1,4 +1,4 @@
-"""What a report says of trials that may have a gross error, or that decide alone."""
+"""Section of a report on trials that may have a gross error, or decide alone."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def in_words(tracing: Tracing) -> str:
 
 
 def label(tracing: Tracing, name: str) -> str:
-    """Return what a report calls a model: the outlier with its trial."""
+    """Return the name of a model in a report: the outlier with its trial."""
     if name != OUTLIER or not tracing.outliers:
         return name
     return f"{name}: {in_words(tracing)}"
 
 
 def verdict_clause(tracing: Tracing) -> str:
-    """Return which trials a verdict is about or rests on, "" for none."""
+    """Return the trials that a verdict is about or rests on, "" for none."""
     line = ""
     if tracing.verdict == OUTLIER:
         line = f": {in_words(tracing)}"
@@ -55,7 +55,7 @@ def verdict_clause(tracing: Tracing) -> str:
 
 
 def of_trials(tracing: Tracing) -> Iterator[str]:
-    """Yield what limits a verdict that rests on one trial, a sentence each."""
+    """Yield the limits of a verdict that rests on one trial, a sentence each."""
     if tracing.verdict == OUTLIER:
         which = in_words(tracing)
         yield (
@@ -92,7 +92,7 @@ def _why_withdrawn(tracing: Tracing) -> tuple[str, str]:
 
 
 def narrow_prior(tracing: Tracing) -> str:
-    """Return what a wider prior gives the bare model where it needs nothing else."""
+    """Return a clause on the wider prior with which the bare model is as good."""
     bounds = tracing.bounds
     where = [place(p) for p in bounds.parameters if p.model == NONE]
     if not where:
@@ -113,7 +113,7 @@ def place(parameter: BoundParameter) -> str:
 
 
 def of_bounds(bounds: Bounds) -> Iterator[str]:
-    """Yield what each parameter at a bound of its prior would be, a sentence each."""
+    """Yield the best fit beyond each bound that a parameter is at, a sentence each."""
     for p in bounds.parameters:
         where = "in the bare model" if p.model == NONE else f"with {p.model}"
         beyond = ""
@@ -137,7 +137,7 @@ def of_outlying(tracing: Tracing) -> Iterator[str]:
 
 
 def set_aside_clause(tracing: Tracing) -> str:
-    """Return which trials were set aside, "" for none."""
+    """Return the trials that were set aside, "" for none."""
     which = tracing.set_aside
     if not which:
         return ""
@@ -162,7 +162,7 @@ def of_missed(evaluation: Evaluation | None) -> Iterator[str]:
 
 
 def missed_clause(evaluation: Evaluation | None) -> str:
-    """Return which held-out trials a verdict misses, "" for none."""
+    """Return the held-out trials that a verdict misses, "" for none."""
     missed = () if evaluation is None else evaluation.missed
     if not missed:
         return ""

@@ -1,4 +1,4 @@
-"""What a report says where every model misses by more than the sensor's error."""
+"""Section of a report if every model misses by more than the sensor's error."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def misfit_line(verdict: str, misfit: Misfit) -> str:
     causes = joined([f"{n} ({stated(misfit.cause[n])})" for n in named])
     line = f"Verdict: {verdict}, probably the cause"
     line += f" ({stated(misfit.cause[named[0]])})" if len(named) == 1 else f": {causes}"
-    # An effect that imitates one that nobody declared leaves something of it.
+    # An effect that imitates one that was not declared leaves something of it.
     line += "" if misfit.passes else f", beside {UNDECLARED}"
     rest = [n for n in misfit.helps if n not in named]
     verb = "helps" if len(rest) == 1 else "help"
@@ -38,7 +38,7 @@ def misfit_line(verdict: str, misfit: Misfit) -> str:
 
 
 def misfit_sentences(report: Contents, misfit: Misfit) -> str:
-    """Return what was found, what remains of the error, and what to make of it."""
+    """Return the findings, the remaining error, and its meaning."""
     begin = f"The bare model misses the {report.num_trials} trials by more than the "
     begin += f"sensor's error of {_size(report, misfit.sensor)}"
     if not misfit.helps:
@@ -176,7 +176,7 @@ def admitted_models(report: Contents, misfit: Misfit) -> Section:
 
 
 def _outdone(nats: float) -> str:
-    """Return what elementary formulas gain over an effect, where they do."""
+    """Return the gain of elementary formulas over an effect, if any."""
     return f"; guesses in its place gain {nats:.0f} nats over it" if nats > 1 else ""
 
 

@@ -1,7 +1,7 @@
 """A rival: one simulator with some effects and an error, and its density of trials.
 
-Here live its coordinates, outcomes and errors. What compares rivals lives in
-``evidence``.
+This package contains the coordinates, outcomes and errors of a rival. The comparison of
+rivals is in ``evidence``.
 """
 
 from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid

@@ -40,12 +40,12 @@ class ChannelNoise(NoiseGrid):
     """Gaussian noise with an unknown size in each channel.
 
     Args:
-        cells: Of the correlation time; their sd is each channel's middle size.
-        channel: Of each number, shape (N,).
+        cells: Cells of the correlation time; their sd is each channel's middle size.
+        channel: Channel of each number, shape (N,).
         factors: Sizes of each channel in units of its middle one, shape (c, j).
-        log_factor_prior: Their log prior probabilities, shape (c, j).
+        log_factor_prior: Log prior probabilities, shape (c, j).
         scales: Further factors, of all channels alike, shape (k,).
-        log_weights: Their log prior probabilities, shape (k,).
+        log_weights: Log prior probabilities, shape (k,).
     """
 
     def __init__(
@@ -163,8 +163,8 @@ class SettledNoise(NoiseGrid):
     the ratio was chosen, so that models with either can be compared.
 
     Args:
-        noise: That it stands for.
-        residual: Shape (N,).
+        noise: Noise that it stands for.
+        residual: Residuals, shape (N,).
     """
 
     def __init__(self, noise: ChannelNoise, residual: Array) -> None:

@@ -42,7 +42,7 @@ class SearchCoordinates:
     force has one where beyond it it would feed energy without end (:mod:`.energy`).
 
     Args:
-        prior: Of theta.
+        prior: Prior of theta.
         effects: Effects of the rival, of scope "campaign".
         nuisances: Effects of scope "trial": one phi in each of the trials.
         num_trials: t.
@@ -51,8 +51,9 @@ class SearchCoordinates:
         dim: Number of coordinates.
         low: Lower bounds in u, shape (dim,).
         high: Upper bounds in u, shape (dim,).
-        center: Of the Gaussian that stands for the prior in a search, shape (dim,).
-        precision: Its inverse variance, 0 between two bounds, shape (dim,).
+        center: Center of the Gaussian that stands for the prior in a search, shape
+            (dim,).
+        precision: Inverse variance, 0 between two bounds, shape (dim,).
     """
 
     def __init__(

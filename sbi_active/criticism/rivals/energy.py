@@ -28,8 +28,8 @@ def dissipative_bounds(effect: Effect) -> tuple[Array, Array]:
     """Return between which phi a force dissipates, shapes (phi_dim,); else infinite.
 
     Args:
-        effect: One that adds a generalized force has bounds, if its force grows faster
-            than the speed and drives with one sign of phi.
+        effect: Effect. One that adds a generalized force has bounds, if its force grows
+            faster than the speed and drives with one sign of phi.
 
     Example:
         >>> from torch.distributions import Normal

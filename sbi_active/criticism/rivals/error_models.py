@@ -57,7 +57,7 @@ class ErrorModel(ABC):
         """Return a cell and a size of the noise for each residual, at random.
 
         Args:
-            residual: Shape (n, N).
+            residual: Residuals, shape (n, N).
             rng: Source of the draws.
 
         Returns:
@@ -69,7 +69,7 @@ class ErrorModel(ABC):
         """Return whitening transforms under which the posterior has other widths.
 
         Args:
-            residual: At a mode, shape (N,).
+            residual: Residual at a mode, shape (N,).
         """
         return []
 
@@ -129,9 +129,9 @@ class NoiseGrid(ErrorModel):
     """Noise whose correlation and size are known up to a grid.
 
     Args:
-        cells: Of the correlation time and the noise model's own parameters.
+        cells: Cells of the correlation time and the noise model's own parameters.
         scales: Factors on the standard deviation, shape (j,).
-        log_weights: Their log prior probabilities, shape (j,).
+        log_weights: Log prior probabilities, shape (j,).
     """
 
     def __init__(
@@ -227,7 +227,8 @@ class NoiseGrid(ErrorModel):
         """Return this noise with one unknown size, where each channel has its own.
 
         Args:
-            residual: Returns one that tells the ratio of sizes, shape (N,).
+            residual: Function that returns a residual that tells the ratio of sizes,
+                shape (N,).
         """
         return self
 

@@ -22,13 +22,13 @@ def with_known_inputs(
 ) -> ActionSpace:
     """Return the permitted actions that could be simulated.
 
-    Where inputs over time were recorded, and the model knows of no signals, what would
-    be played at another action is not known: those are left that some trial has, with
-    its inputs.
+    If inputs over time were recorded and the model has no signals, the inputs at
+    another action are not known: only actions of recorded trials remain, with their
+    inputs.
 
     Args:
         model: The simulator.
-        trials: Measured ones.
+        trials: Measured trials.
         actions: The permitted ones.
     """
     if trials.inputs is None or model.inputs is not None:
@@ -50,7 +50,7 @@ def are_known(model: SimulatorModel, trials: Trials, action: Tensor) -> Tensor:
 def conditions_at(
     model: SimulatorModel, trials: Trials, action: Tensor
 ) -> dict[str, Any]:
-    """Return how trials at some actions would be run, as arguments of ``Trials``.
+    """Return conditions of trials at some actions, as arguments of ``Trials``.
 
     Inputs and start state are those of the first trial of the action; at an action that
     none has, inputs are the model's signals and the start is the mean of those
@@ -58,8 +58,8 @@ def conditions_at(
 
     Args:
         model: The simulator.
-        trials: Measured ones.
-        action: Shape (a, action_dim).
+        trials: Measured trials.
+        action: Actions, shape (a, action_dim).
 
     Raises:
         ValueError: If inputs were recorded, and none at some of these actions.
@@ -86,11 +86,11 @@ def conditions_at(
 
 
 def together(trials: Trials, further: dict[str, Any]) -> dict[str, Any]:
-    """Return how trials were run, with further ones behind them.
+    """Return the conditions of trials, with further ones behind them.
 
     Args:
-        trials: Measured ones.
-        further: From :func:`conditions_at`.
+        trials: Measured trials.
+        further: Conditions from :func:`conditions_at`.
     """
     own = {"inputs": trials.inputs, "start": trials.start}
     joined = {key: _joined(own[key], further[key]) for key in own if key in further}
@@ -119,7 +119,7 @@ def _signals(
 
 
 def _same(trials: Trials, action: Tensor) -> Tensor:
-    """Return which trials have which actions, shape (a, t)."""
+    """Return a mask of the trials that have each action, shape (a, t)."""
     own, asked = trials.action.double(), action.double()
     return torch.isclose(asked[:, None], own[None], rtol=RTOL, atol=ATOL).all(-1)
 

@@ -37,10 +37,10 @@ def declared_noise(
     represented by draws, or summed if it is a grid of a size and a correlation time.
 
     Args:
-        noise: The simulator's; None where the simulator is the draw, and its own
+        noise: Noise of the simulator; None if the simulator is the draw, and its own
             deviation is the unit.
-        measurements: What is measured.
-        seed: Of the draws of the posterior.
+        measurements: Measured numbers.
+        seed: Seed of the draws of the posterior.
 
     Raises:
         ValueError: If a declared standard deviation is zero.
@@ -119,11 +119,11 @@ def _product(
 
 
 def measurement_sds(noise: NoiseModel | None, measurements: Measurements) -> Any:
-    """Return the declared error of the sensor alone, None where there is none.
+    """Return the declared error of the sensor alone, None if there is none.
 
     Args:
         noise: The simulator's.
-        measurements: What is measured.
+        measurements: Measured numbers.
 
     Returns:
         A number, or where channels have their own one a measured number, shape (N,).
@@ -164,7 +164,7 @@ def _correlated(
 
 
 def _channel_of(measurements: Measurements, num: int) -> NDArray[np.int64]:
-    """Return which of the declared standard deviations each number has."""
+    """Return the index of the declared standard deviation of each number."""
     if num == 1:
         return np.zeros(len(measurements), dtype=np.int64)
     last = measurements.shape[-1]

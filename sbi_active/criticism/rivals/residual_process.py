@@ -70,10 +70,11 @@ class ResidualProcess(ErrorModel):
 
     Args:
         noise: The error without the process.
-        measurements: What the residuals are of.
-        action: Of each trial, in ranges of the action space, shape (t, action_dim).
-        order: Of each trial, in the span of those at hand, shape (t,); None for no
-            process over it.
+        measurements: Measurements that the residuals belong to.
+        action: Action of each trial, in ranges of the action space, shape (t,
+            action_dim).
+        order: Order of each trial, in the span of those at hand, shape (t,); None for
+            no process over it.
         largest: Upper end of the amplitude, in standard deviations of the noise.
         lengths: Length scales, in ranges of the action space.
         spread: Deviation of the prior predictive, shape (N,); None has the noise as the
@@ -176,12 +177,14 @@ class ResidualProcess(ErrorModel):
             V[g_* | r] = K_{**} - K_* (K + R)^{-1} K_*^T
 
         Args:
-            residual: Of the measurements at hand, shape (n, N).
+            residual: Residuals of the measurements at hand, shape (n, N).
             new: Measurements to predict, M.
-            action: Of all trials, those at hand first, in ranges of the action space.
-            order: Of all trials, likewise, in the span of those at hand; needed where
-                there is a process over it.
-            spread: Of the new measurements, shape (M,), where there is one of the old.
+            action: Actions of all trials, those at hand first, in ranges of the action
+                space.
+            order: Order of all trials, likewise, in the span of those at hand; needed
+                if there is a process over it.
+            spread: Spread of the new measurements, shape (M,), where there is one of
+                the old.
 
         Returns:
             Means, shape (n, M), and standard deviations, shape (M,).
@@ -218,7 +221,7 @@ class ResidualProcess(ErrorModel):
         return spread * np.median(sd / spread)
 
     def _inputs(self, action: Array, order: Array | None) -> list[Array]:
-        """Return where trials lie for each process, in its lengths, (t, columns)."""
+        """Return the places of trials for each process, in lengths, (t, columns)."""
         inputs = [action / length for length in self.lengths]
         if order is not None:
             inputs.append(order[:, None] / ORDER_LENGTH)
@@ -239,7 +242,7 @@ class ResidualProcess(ErrorModel):
         return log_p + self._log_constant(basis, num)
 
     def grams(self, rows: Array) -> tuple[Array, Array]:
-        """Return what rows whitened by each process come to, amplitude by amplitude.
+        """Return Gram matrices of rows whitened by each process and amplitude.
 
         Args:
             rows: Residual and its derivatives, shape (N, k).
@@ -287,7 +290,7 @@ def smooth_features(m: Measurements, at: Array) -> Array:
 
     Args:
         m: The measurements of all trials.
-        at: Which of them are the trial's n, bool, shape (N,).
+        at: Mask of the trial's n among them, bool, shape (N,).
     """
     points, channel = _coordinates(m, np.zeros((m.shape[0], 0)), m.span)
     return _features(points[at], channel[at])

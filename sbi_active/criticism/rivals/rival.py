@@ -27,21 +27,21 @@ class Rival:
     r"""A model of the trials, :math:`p(x | z)\, p(z)` with z = (theta, phi).
 
     Args:
-        key: What the rival is.
-        simulator: Of the trials, shared by all rivals.
-        prior: Of theta.
+        key: Key of the rival.
+        simulator: Simulator of the trials, shared by all rivals.
+        prior: Prior of theta.
         effects: Effects that this rival has.
         nuisances: Effects of scope "trial", which every rival has.
         error: Distribution of the residual.
         spread: Deviation of the prior predictive, shape (N,), which is the density of a
             number where the simulator gives none.
-        center: Its mean, shape (N,).
+        center: Mean of the prior predictive, shape (N,).
         step: Step of finite differences, in u.
         disagreement: Probabilities, equally likely, that a trial has no outcome where
             the simulator has one, or vice versa.
 
     Attributes:
-        coordinates: Of z.
+        coordinates: Coordinates of z.
         num_trials: Number of trials.
         num_observed: Number of measured numbers of all trials.
     """
@@ -83,7 +83,7 @@ class Rival:
         return self.dim - phi
 
     def columns(self) -> dict[str, slice]:
-        """Return where each effect's phi stands among the coordinates, by name."""
+        """Return the places of each effect's phi among the coordinates, by name."""
         sizes = [(e.name, e.phi_dim) for e in self.effects]
         num = self.coordinates.num_trials
         sizes += [(e.name, e.phi_dim * num) for e in self.coordinates.nuisances]
@@ -108,7 +108,7 @@ class Rival:
         """Return residuals in units of the declared noise.
 
         Args:
-            u: Shape (n, dim).
+            u: Coordinates, shape (n, dim).
             penalized: Where the simulator gives no number, a search needs a residual
                 that drives it away: the spread of the prior predictive, in units of the
                 noise. False gives what the likelihood has there, the prior predictive
@@ -164,16 +164,16 @@ class Rival:
         return False
 
     def whitener(self, u: Array | None = None) -> Whitener:
-        """Return what whitens residuals, by the likeliest error at u, shape (1, dim).
+        """Return the whitener of residuals by the likeliest error at u, shape (1, dim).
 
-        The same object where the error has nothing unknown, and without u.
+        It is the same object if the error has nothing unknown, and without u.
         """
         if u is None or self.error.is_known:
             return self._white
         return self.error.whitener(self.residual(u)[0][0])
 
     def regimes(self, u: Array) -> list[Whitener]:
-        """Return what whitens residuals where the error leaves other widths."""
+        """Return whiteners of residuals where the error leaves other widths."""
         return self.error.regimes(self.residual(u)[0][0])
 
     def log_likelihood(self, u: Array, *, floor: float = -np.inf) -> Array:
@@ -194,9 +194,9 @@ class Rival:
         """Return whitened residuals and their derivatives by finite differences.
 
         Args:
-            u: Shape (n, dim).
-            whiten: Maps (..., N) to (..., N).
-            step: In u, one or one a coordinate, shape (dim,).
+            u: Coordinates, shape (n, dim).
+            whiten: Whitener, which maps (..., N) to (..., N).
+            step: Step in u, one or one a coordinate, shape (dim,).
 
         Returns:
             Shapes (n, N) and (n, N, dim).

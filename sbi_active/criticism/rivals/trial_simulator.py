@@ -40,12 +40,12 @@ class TrialSimulator:
     parameters wherever the simulator is one of its parameters and seeds.
 
     Args:
-        model: With every effect that any rival has.
+        model: Simulator with every effect that any rival has.
         trials: The trials.
-        seed: Of the replicates.
+        seed: Seed of the replicates.
 
     Attributes:
-        measurements: What is predicted.
+        measurements: Measurements that are predicted.
         num_simulations: Trials predicted so far; a deterministic simulator runs once
             for those with the same inputs.
         failed: Whether any of them had no outcome.
@@ -86,15 +86,16 @@ class TrialSimulator:
     def predict(
         self, theta: Tensor, phi: dict[str, Tensor]
     ) -> tuple[Array, Array | None, Array]:
-        """Return what the simulator predicts for the measured numbers.
+        """Return the simulator's predictions of the measured numbers.
 
         Args:
-            theta: Shape (n, theta_dim).
-            phi: By effect, shape (n, phi_dim), or (n, t, phi_dim) of scope "trial".
+            theta: Parameters, shape (n, theta_dim).
+            phi: Parameters by effect, shape (n, phi_dim), or (n, t, phi_dim) of scope
+                "trial".
 
         Returns:
             The mean, shape (n, N), NaN where the simulator gives no number; the
-            deviation, shape (n, N), None where the noise is declared; the probability
+            deviation, shape (n, N), None if the noise is declared; the probability
             that each trial has an outcome, shape (n, t).
         """
         names = [name for name in phi if name not in self._of_noise]
@@ -129,7 +130,7 @@ class TrialSimulator:
         return np.concatenate(mean), joined, np.concatenate(valid)
 
     def _num_inputs(self) -> int:
-        """Return how many numbers all trials' inputs have."""
+        """Return the count of numbers in all trials' inputs."""
         inputs, source = self.trials.inputs, self.model.base.inputs
         if inputs is None and source is not None:
             inputs = source.inputs(self.trials.action)

@@ -15,7 +15,7 @@ Array = NDArray[Any]
 
 #: Probability that a trial has no outcome where the simulator has one, or vice versa.
 DISAGREEMENT = 0.02
-#: The same where nothing declared explains the outcomes, equally likely.
+#: Rates where nothing declared explains the outcomes, equally likely.
 UNKNOWN_RATES = (DISAGREEMENT, 0.1, 0.3, 0.5)
 #: Probability below which an outcome is named.
 SURPRISING = 0.05
@@ -35,8 +35,8 @@ def log_outcomes(
     0 or 1 from a deterministic simulator, the share of its draws from a random one.
 
     Args:
-        probability: Of an outcome by the simulator, shape (n, t).
-        valid: Which trials have one, shape (t,).
+        probability: Probability of an outcome by the simulator, shape (n, t).
+        valid: Mask of the trials that have one, shape (t,).
         rates: :math:`\epsilon`, the R probabilities of disagreement, equally likely.
 
     Returns:
@@ -52,7 +52,7 @@ def surprising_outcomes(residuals: Residuals) -> tuple[list[int], list[int]]:
     """Return places of trials whose validity the model holds for improbable.
 
     Args:
-        residuals: With the probability of a measurement in each trial.
+        residuals: Residuals with the probability of a measurement in each trial.
 
     Returns:
         Those without a measurement and those with one, of a probability below 1/20.

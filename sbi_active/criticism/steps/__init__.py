@@ -1,7 +1,7 @@
 """The steps of the loop, one a module: detect, trace, combine, predict, evaluate.
 
-Here live functions of rivals and trials that return a result. Text about results lives
-in ``report``, proposals of trials in ``next_trial``.
+This package contains functions of rivals and trials that return a result. The texts
+about results are in ``report``, proposals of trials in ``next_trial``.
 """
 
 from sbi_active.criticism.steps.detection import LEVEL, num_determined

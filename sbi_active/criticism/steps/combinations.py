@@ -76,8 +76,9 @@ def grow(
 def log_prior(names: tuple[str, ...], prior: Mapping[str, float]) -> float:
     r"""Return the log prior probability of a set of k of the n effects.
 
-    In proportion to the mean of its effects' probabilities alone, :math:`p_i`. Over all
-    sets of k these means add up to :math:`\binom{n-1}{k-1} \frac1k \sum_i p_i`.
+    It is proportional to the mean of the probabilities :math:`p_i` of its effects
+    alone. Over all sets of k these means add up to :math:`\binom{n-1}{k-1} \frac1k
+    \sum_i p_i`.
     """
     num, k = sum(name not in (NONE, *CATCH_ALLS) for name in prior), len(names)
     log_mean = log_sum_exp(np.array([prior[name] for name in names])) - np.log(k)

@@ -24,10 +24,10 @@ SURE = 0.3
 NO_MORE = 1.0
 #: Tail probability of the refitted chi-square that is an alarm by itself.
 LEVEL = 0.01
-#: That of a chi-square which is too small for the declared noise; rounds of steps to
-#: the smallest one then.
+#: Tail probability of a chi-square which is too small for the declared noise; rounds of
+#: steps to the smallest one then.
 TOO_SMALL, ROUNDS, MOST_STEPS = 1e-4, 2, 10
-#: That of what a verdict leaves over, below which it is not all that is missing.
+#: Tail probability of a verdict's residual below which something else is missing.
 REFUTED = 0.001
 
 
@@ -106,11 +106,11 @@ def detect(rivals: RivalSet, equivalent: Sequence[frozenset[str]] = ()) -> Detec
 def promise(rivals: RivalSet, key: ModelKey) -> float:
     """Return the largest log posterior density that a search finds of a model.
 
-    It costs a part of a fit, which then goes on from there.
+    It costs a part of a fit, which then continues from there.
 
     Args:
-        rivals: All models.
-        key: Which of them.
+        rivals: Set of all models.
+        key: Key of the model.
     """
     if key in rivals.fits:
         return np.inf
@@ -164,7 +164,7 @@ def _least_chi_square(rivals: RivalSet) -> tuple[float, float]:
 
 
 def num_determined(rivals: RivalSet) -> float:
-    r"""Return how many of the bare model's parameters the data determine.
+    r"""Return the number of the bare model's parameters that the data determine.
 
     .. math::
         \gamma = \sum_i (1 - \lambda_i)_+
@@ -187,11 +187,12 @@ def alternatives(
 ) -> dict[str, float]:
     """Return the weights of the alternatives to the bare model, which sum to one.
 
-    The residual process, noise inflation and each effect count alike, effects that
-    nothing separates as one. What nothing separates from the bare model is none.
+    The residual process, noise inflation and each effect have equal weights; effects
+    that nothing separates count as one, and effects that nothing separates from the
+    bare model do not count.
 
     Args:
-        effects: Their names.
+        effects: Names of the effects.
         equivalent: Groups that nothing separates, with "none" for the bare model.
 
     Example:
@@ -215,7 +216,7 @@ def bayes_factor(
 
     Args:
         others: Log of weight times evidence and its error, of each part.
-        null: The same of the bare model.
+        null: Log evidence of the bare model and its error.
     """
     log_z, errors = np.array(others).T
     total = log_sum_exp(log_z)

@@ -116,7 +116,7 @@ def equivalent_effects(
 
 
 def noise_unit(rivals: RivalSet, simulator: TrialSimulator) -> Array:
-    """Return what counts as large in each number of some trials, shape (N,)."""
+    """Return the size that counts as large in each number of trials, shape (N,)."""
     noise = declared_noise(rivals.model.noise, simulator.measurements)
     unit = noise.typical_sd
     if rivals.model.noise is None:
@@ -173,8 +173,8 @@ class _Neighborhood:
         """Return whether parameters make up for an effect away from its null, too.
 
         Args:
-            effect: Of which nothing is left near the null.
-            size: Of its change there, for a deviation of the prior.
+            effect: Effect of which nothing is left near the null.
+            size: Size of its change there, for a deviation of the prior.
         """
         if self.num_search == 1 and size > 0:  # its direction says enough
             return True
@@ -194,10 +194,11 @@ class _Neighborhood:
         return True
 
     def rest(self, aim: Array, both: NDArray[np.bool_]) -> tuple[Array, bool, bool]:
-        """Return what parameters leave of some predictions, by Gauss-Newton steps.
+        """Return the rest of predictions that parameters leave, by Gauss-Newton steps.
 
-        And whether they were free: at an edge of the prior, the edge may be what stands
-        against them. And whether the search has ended, so that no step promises more.
+        It also returns whether they were free, since at an edge of the prior the edge
+        may be what stands against them; and whether the search has ended, so that no
+        step promises more.
         """
         low, high = self.coordinates.low, self.coordinates.high
         v = self.u
@@ -248,12 +249,12 @@ def _imitates(
     """Return whether an effect and parameters imitate another away from its null.
 
     Args:
-        one: That imitates.
-        other: That is imitated.
-        simulator: Of the permitted actions.
+        one: Effect that imitates.
+        other: Effect that is imitated.
+        simulator: Simulator of the permitted actions.
         rivals: The models.
         theta: Parameters beside the other, shape (1, theta_dim).
-        unit: What counts as large in each number.
+        unit: Size that counts as large in each number.
     """
     own = SearchCoordinates(rivals.prior, (one,), (), len(simulator))
     for far in FAR:
@@ -295,7 +296,7 @@ def _small(effect: Effect, step: float) -> tuple[torch.Tensor, float]:
 
 
 def _alike(left: list[tuple[Array, float]], local: list[bool]) -> Array:
-    """Return which pairs (none first) have the same direction, and which can be told.
+    """Return masks of pairs (none first) that have the same direction, and can be told.
 
     At parameters where nothing is left of an effect, it tells nothing of a pair.
     """

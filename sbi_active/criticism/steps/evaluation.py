@@ -43,9 +43,9 @@ def evaluate_held_out(
 
     Args:
         rivals: The models, fitted to other trials.
-        tracing: What was traced in those.
+        tracing: Tracing of the fitted trials.
         held_out: Trials to score.
-        num_draws: From each posterior.
+        num_draws: Draws from each posterior.
         level: Probability that a right verdict has any trial called far outside.
     """
     before, after = _predictions(rivals, tracing, held_out, num_draws)
@@ -73,12 +73,12 @@ def _is_known(rivals: RivalSet) -> bool:
 def tail(prediction: Prediction, trials: Trials) -> float:
     r"""Return the tail probability of :math:`e^T (S + R)^{-1} e`.
 
-    With S the covariance of the predictions over the posterior, and R the noise, whose
-    errors are taken as independent.
+    S is the covariance of the predictions over the posterior, and R that of the noise,
+    whose errors are taken as independent.
 
     Args:
-        prediction: Of some trials.
-        trials: What was measured in them.
+        prediction: Prediction of some trials.
+        trials: Trials with what was measured.
     """
     x = trials.x.double().numpy().reshape(-1)[prediction.position]
     off = prediction.mean - prediction.mean.mean(0)
@@ -93,9 +93,9 @@ def evaluate_left_out(
     """Return the error on each trial of models chosen and fitted without it.
 
     Args:
-        trials: Those that may be fitted.
+        trials: Trials that may be fitted.
         fold: Fits and traces some trials; called once a trial.
-        show_progress: Draw a bar of the trials.
+        show_progress: Whether to draw a bar of the trials.
     """
     valid = np.flatnonzero(trials.valid.numpy())
     before, after, selected = [], [], []

@@ -1,4 +1,4 @@
-r"""What a verdict rests on: its Bayes factor with each trial left out.
+r"""Influence of trials on a verdict: its Bayes factor with each one left out.
 
 .. math::
     Z(x_{-k}) = Z(x)\, E_{p(z | x)}\left[\frac{p(x_{-k} | z)}{p(x | z)}\right],
@@ -55,7 +55,7 @@ def needed_trials(rivals: RivalSet, key: ModelKey) -> tuple[float, ...]:
 
     Args:
         rivals: The models.
-        key: Of the effects alone.
+        key: Key of the effects alone.
 
     Returns:
         Indices of the trials.
@@ -73,8 +73,8 @@ def needed_trials(rivals: RivalSet, key: ModelKey) -> tuple[float, ...]:
 def is_left_to_chance(tracing: Tracing) -> bool:
     """Return whether the effects of a verdict may be one trial's gross error.
 
-    So it is where the verdict falls without the trial that a gross error would be in,
-    and the odds of declared effects against such an error are below 50.
+    This is the case if the verdict falls without the trial that a gross error would be
+    in, and the odds of declared effects against such an error are below 50.
     """
     if not tracing.chosen or not tracing.outliers:
         return False
@@ -85,7 +85,7 @@ def is_left_to_chance(tracing: Tracing) -> bool:
 
 
 def unless_refuted(tracing: Tracing, evaluation: Evaluation | None) -> Tracing:
-    """Return what was traced, its effects withdrawn where further trials refute them.
+    """Return the tracing, its effects withdrawn where further trials refute them.
 
     Their squared error is then the larger with the effects, and their density the
     smaller by a Bayes factor of 20. Where every model misses, what was said to predict
@@ -93,7 +93,7 @@ def unless_refuted(tracing: Tracing, evaluation: Evaluation | None) -> Tracing:
     ones.
 
     Args:
-        tracing: Which effect the data point to.
+        tracing: Tracing with the effect that the data point to.
         evaluation: Error before and after on trials that had no part in it.
     """
     if not tracing.chosen:
@@ -162,7 +162,7 @@ def _rmse(evaluation: Evaluation, told: NDArray[np.bool_]) -> tuple[float, float
 
 
 def withdrawn(tracing: Tracing) -> Tracing:
-    """Return what was traced with the effects of the verdict not to be added."""
+    """Return the tracing with the effects of the verdict not to be added."""
     p = tracing.probabilities
     outlier, other = p.get(OUTLIER, 0.0), p.get(UNEXPLAINED, 0.0)
     by_chance = is_left_to_chance(tracing) or outlier > other
@@ -184,8 +184,8 @@ def _change(
 
     Args:
         rivals: The models.
-        key: Of one.
-        enough: From here on it need not be precise, shape (k,).
+        key: Key of one model.
+        enough: Value beyond which it need not be precise, shape (k,).
     """
     change, effective = _reweighted(rivals, key)
     least = change - rivals.fit(key).evidence.log_evidence - OVERESTIMATED

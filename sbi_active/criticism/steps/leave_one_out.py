@@ -33,14 +33,14 @@ LARGEST_SHAPE = 0.7
 
 @dataclass(frozen=True, kw_only=True)
 class LeaveOneOut:
-    """How well one model predicts each trial from the others.
+    """Scores of one model's prediction of each trial from the others.
 
     Attributes:
-        name: Of the model.
+        name: Name of the model.
         density: Log predictive density of each trial, shape (t,), nats.
         pareto_k: Shape of the largest weights, (t,).
-        num_draws: From the posterior.
-        names: What each trial is called; empty for its position.
+        num_draws: Number of posterior draws.
+        names: Names of the trials; empty for their positions.
 
     References:
         Vehtari, Gelman & Gabry, Statistics and Computing 27 (2017).
@@ -73,7 +73,8 @@ def leave_one_out(rivals: RivalSet, tracing: Tracing) -> tuple[LeaveOneOut, ...]
 
     Args:
         rivals: The models.
-        tracing: Their verdict. "unexplained" and "outlier" have the bare model alone.
+        tracing: Tracing with their verdict. "unexplained" and "outlier" have the bare
+            model alone.
     """
     found = [_density(rivals, ModelKey())]
     if tracing.verdict not in (NONE, UNEXPLAINED, OUTLIER):

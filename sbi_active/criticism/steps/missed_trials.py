@@ -64,10 +64,10 @@ def missed_trials(
 
     Args:
         rivals: The models.
-        tracing: Their verdict.
+        tracing: Tracing with their verdict.
         trials: Trials that had no part in it.
-        before: Of the bare model, for these trials.
-        after: Of the model of the verdict.
+        before: Prediction of the bare model, for these trials.
+        after: Prediction of the model of the verdict.
         level: Probability that a right one has any trial called so; each has its share
             (Bonferroni).
 
@@ -118,7 +118,7 @@ def outlying_trials(
 ) -> list[tuple[int, float]]:
     """Return fitted trials whose error is far beyond what all others show.
 
-    By Student's t of the logarithms, each trial against the others.
+    The test is Student's t of the logarithms, each trial against the others.
 
     Args:
         squares: Mean squared error of each trial on the fit to the others, in sensor
@@ -143,9 +143,9 @@ def _tails(prediction: Prediction, errors: Array, x: Array) -> Array:
     """Return the tail probability of each trial's T, (t,); 1 where none is scored.
 
     Args:
-        prediction: Of the trials.
+        prediction: Prediction of the trials.
         errors: Draws of the errors beside it, shape (n, N).
-        x: What was measured, shape (N,).
+        x: Measured numbers, shape (N,).
     """
     off = prediction.mean - prediction.middle
     sd = np.sqrt((off**2).mean(0) + (errors**2).mean(0))
@@ -174,9 +174,9 @@ def _beside_others(
     """Return the tail of each trial's error among those of left-out ones, (t,).
 
     Args:
-        error: Of each number, in sensor deviations, shape (N,).
-        trial: Of each number, shape (N,).
-        num: Trials.
+        error: Error of each number, in sensor deviations, shape (N,).
+        trial: Trial of each number, shape (N,).
+        num: Number of trials.
         others: Mean squared errors of left-out trials.
     """
     total = np.bincount(trial, error**2, num)
@@ -199,7 +199,7 @@ def _beside_process(misfit: Misfit, m: Measurements, num: int, seed: int) -> Arr
 
 
 def _sensor(rivals: RivalSet, misfit: Misfit | None, m: Measurements) -> Array | None:
-    """Return the sensor's deviation, (N,); None where the simulator is the draw."""
+    """Return the sensor's deviation, (N,); None if the simulator is the draw."""
     noise = rivals.model.noise
     if misfit is not None:
         return misfit.sensor[m.channel]

@@ -81,7 +81,7 @@ def _prediction(rivals: RivalSet, simulator: TrialSimulator, name: str) -> Array
     """Return the posterior predictive mean with an effect, shape (N,)."""
     fit = rivals.fit(ModelKey((name,)))
     if fit.mode is not None and simulator.trials is rivals.trials:
-        # That of the best fit is simulated already.
+        # The prediction of the best fit is simulated already.
         return rivals.measurements.x - fit.rival.residual(fit.mode[None])[0][0]
     evidence = fit.evidence
     draws = torch.from_numpy(evidence.draws[:NUM_DRAWS])

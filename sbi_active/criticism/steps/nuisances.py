@@ -38,9 +38,9 @@ def conditioned(
 
     Args:
         rivals: The models, which say how long the first part is.
-        key: Of the model.
+        key: Key of the model.
         u: Draws of its coordinates, shape (n, dim).
-        simulator: Of the trials that were not fitted.
+        simulator: Simulator of the trials that were not fitted.
         rng: Source of the draws.
     """
     fit, m = rivals.fit(key), simulator.measurements
@@ -90,7 +90,7 @@ def conditioned(
 
 
 def is_first_part(m: Measurements, warm_up: float) -> NDArray[np.bool_]:
-    """Return which numbers are within a time of their trial's first, shape (N,)."""
+    """Return a mask of numbers within a time of their trial's first, shape (N,)."""
     begin = np.full(m.shape[0], np.inf)
     np.minimum.at(begin, m.trial, m.time)
     return m.time - begin[m.trial] < warm_up
@@ -99,7 +99,7 @@ def is_first_part(m: Measurements, warm_up: float) -> NDArray[np.bool_]:
 def _gain(
     jacobian: Array, precision: Array, columns: Array, rows: Array
 ) -> tuple[Array, Array]:
-    """Return what a residual of the first part moves nuisances by, and their cov."""
+    """Return the response of nuisances to the first part's residual, and their cov."""
     part = jacobian[np.ix_(rows, columns)]
     prior = np.diag(np.maximum(precision[columns], 1e-6))
     cov = np.linalg.inv(part.T @ part + prior)

@@ -27,18 +27,18 @@ NUM_DRAWS = 200
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a rival predicts for measured numbers.
+    """Predictions of a rival for measured numbers.
 
     Attributes:
         mean: Noise-free predictions, one a posterior draw, shape (n, N).
         sd: Standard deviation of the error of each number given a draw, shape (n, N).
         x: Draws with errors, shape (n, N).
-        log_likelihood: Of the measurements of each trial given the draw, noise
-            included, shape (n, t), nats.
+        log_likelihood: Log likelihood of the measurements of each trial given the draw,
+            noise included, shape (n, t), nats.
         trial: Trial of each number, shape (N,).
-        position: Of each number in the flattened x, shape (N,).
+        position: Position of each number in the flattened x, shape (N,).
         valid: Whether each trial has an outcome, one draw each, shape (n, t), bool.
-        probability_valid: That it has one, given the draw, shape (n, t).
+        probability_valid: Probability that it has one, given the draw, shape (n, t).
         at_best: Noise-free prediction by the best fit, shape (N,), where every model
             misses; None otherwise.
     """
@@ -55,12 +55,12 @@ class Prediction:
 
     @property
     def middle(self) -> Array:
-        """By which the error is measured: of the best fit, or the mean, (N,)."""
+        """Prediction that errors refer to: that of the best fit, or the mean, (N,)."""
         return self.mean.mean(0) if self.at_best is None else self.at_best
 
     @property
     def log_density(self) -> Array:
-        """Of the measurements of each trial, shape (t,), nats."""
+        """Log density of the measurements of each trial, shape (t,), nats."""
         each = self.log_likelihood
         return log_sum_exp(each, axis=0) - np.log(len(each))
 
@@ -86,9 +86,9 @@ def predict(
         trials: Trials to predict, taken as unseen but for the first part that their
             nuisances are known from, which is left out; None takes those that were
             fitted, with the residual process of "unexplained" conditioned on them.
-        key: Which of the models.
-        num_draws: From the posterior, n.
-        seed: Of the draws; None is that of the models.
+        key: Key of the model.
+        num_draws: Number n of posterior draws.
+        seed: Seed of the draws; None is that of the models.
         scored: Whether to compute ``log_likelihood``, which is empty without.
     """
     fit = rivals.fit(key)
@@ -182,8 +182,8 @@ def correlated_errors(
     """Return errors along each trial, and their deviations, shape (n, N).
 
     Args:
-        noise: Of the numbers.
-        cells: Of each draw, shape (n,).
+        noise: Noise of the numbers.
+        cells: Cell of each draw, shape (n,).
         sizes: Factors on the cell's deviations, shape (n, N).
         rng: Source of the errors.
     """

@@ -39,7 +39,7 @@ def find_residuals(
 
     Args:
         rivals: The models and their trials.
-        key: Which of them.
+        key: Key of the model.
     """
     trials, m = rivals.trials, rivals.measurements
     prediction = predict(rivals, key=key)
@@ -143,8 +143,8 @@ def _between(
 
     Args:
         rivals: The models.
-        fit: That of one.
-        seen: Which numbers each posterior knows, shape (N,) each.
+        fit: Fit of one model.
+        seen: Mask of the numbers that each posterior knows, shape (N,) each.
     """
     rival, u = fit.rival, fit.likeliest
     c, free = rival.coordinates, rival.searched

@@ -56,7 +56,7 @@ class Sampled:
     Attributes:
         rivals: The models.
         equivalent: Groups of effects that no permitted action separates.
-        linear: Linear models; None where there are none.
+        linear: Linear models; None if there are none.
     """
 
     rivals: RivalSet
@@ -70,7 +70,7 @@ class Sampled:
 
     @property
     def catch_alls(self) -> tuple[str, ...]:
-        """Those that are compared after an alarm."""
+        """Catch-alls that are compared after an alarm."""
         return CATCH_ALLS
 
     def detected(self) -> Detection:
@@ -117,7 +117,7 @@ class Sampled:
         return self.rivals.fit(both).evidence.log_evidence
 
     def record(self, key: ModelKey) -> Evidence:
-        """Return what is recorded of a model, its evidence under unknown scales."""
+        """Return the record of a model, its evidence under unknown scales."""
         value, error = log_evidence(self.rivals, key)
         own = self.rivals.fit(key).evidence
         return replace(own, log_evidence=value, standard_error=error)
@@ -125,7 +125,7 @@ class Sampled:
     def outliers(self) -> dict[float, float]:
         """Return the probability that each trial is the one, if one has a gross error.
 
-        By the trial's index, most probable first.
+        Keys are the trials' indices, most probable first.
         """
         _, weights, residual = self.rivals.fit(ModelKey(error=OUTLIER)).weighted()
         error = self.rivals.one_outlier()

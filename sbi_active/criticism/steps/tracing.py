@@ -1,4 +1,4 @@
-"""Which effect the data point to: probabilities over the rivals."""
+"""Attribution to an effect: probabilities over the rivals."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ from sbi_active.inference.sampling.weights import log_sum_exp
 Array = NDArray[Any]
 
 PROBABILITY_OF_NONE = 0.5  # by convention, neither for nor against
-#: That what is missing, if anything is, is each of the catch-alls.
+#: Probability that what is missing, if anything is, is each of the catch-alls.
 PROBABILITY_OF_CATCH_ALL = 0.1
 MASS = 0.9  # of the credible set
-#: That an effect beyond the first, beside which a set fits to the sensor's error, is
-#: real and imitates nothing; empirical.
+#: Probability that an effect beyond the first, beside which a set fits to the sensor's
+#: error, is real and imitates nothing; empirical.
 REAL = 0.85
 #: Factors on the scale of the effects' priors under which a verdict should stand.
 RESCALED = (1 / 3, 3.0)
@@ -52,7 +52,7 @@ def log_priors(
 
     Args:
         effects: The declared ones.
-        catch_alls: Those that are compared.
+        catch_alls: Catch-alls that are compared.
     """
     members: dict[str, list[str]] = {}
     for effect in effects:
@@ -67,7 +67,7 @@ def log_priors(
 
 
 class Evidences(Protocol):
-    """What the trials say of each model, by samples or by linear algebra."""
+    """Evidence of each model, by samples or by linear algebra."""
 
     @property
     def rivals(self) -> RivalSet:
@@ -81,7 +81,7 @@ class Evidences(Protocol):
 
     @property
     def catch_alls(self) -> tuple[str, ...]:
-        """Those that are compared after an alarm."""
+        """Catch-alls that are compared after an alarm."""
         ...
 
     def detected(self) -> Detection:
@@ -107,8 +107,8 @@ class Evidences(Protocol):
         """Return whether the error leaves no room for what a model leaves over.
 
         Args:
-            key: Of the model.
-            detection: Of the bare model.
+            key: Key of the model.
+            detection: Detection of the bare model.
         """
         ...
 
@@ -117,13 +117,13 @@ class Evidences(Protocol):
         ...
 
     def record(self, key: ModelKey) -> Evidence:
-        """Return what is recorded of a model."""
+        """Return the record of a model."""
         ...
 
     def outliers(self) -> dict[float, float]:
         """Return the probability that each trial is the one, if one has a gross error.
 
-        By the trial's index, most probable first.
+        Keys are the trials' indices, most probable first.
         """
         ...
 
@@ -252,7 +252,7 @@ def probabilities_of(log_p: dict[ModelKey, float]) -> dict[ModelKey, float]:
 def beside_imitations(p: dict[ModelKey, float]) -> dict[ModelKey, float]:
     """Return probabilities where a set may owe its fit to something undeclared.
 
-    Along a trajectory two effects imitate a force that nobody declared to the sensor's
+    Along a trajectory two effects imitate a force that was not declared to the sensor's
     error more often than one: each beyond the first is real with a probability of .85
     (in six such worlds of ``benchmarks/misfit``, none of which judge, 7 of 15 were).
     """
@@ -283,7 +283,7 @@ def verdict_of(probabilities: Mapping[ModelKey, float], found: Evidences) -> Mod
 
 
 def kind_of(key: ModelKey, found: Evidences) -> frozenset[str]:
-    """Return what a set is about: families of forces, groups of what is alike."""
+    """Return the subject of a set: families of forces, or groups of similar effects."""
     effects = [found.rivals.effects[name] for name in key.effects]
     groups = [group for group in found.equivalent if NONE not in group]
 
@@ -328,10 +328,10 @@ def estimate_of(
     """Return an effect's estimate by the draws of the model that has it alone.
 
     Args:
-        effect: Whose phi is the end of the draws.
-        evidence: Of that model.
-        probability: That the effect is there.
-        log_bayes_factor: Of that model against the bare one.
+        effect: Effect whose phi is the end of the draws.
+        evidence: Evidence of that model.
+        probability: Probability that the effect is there.
+        log_bayes_factor: Log Bayes factor of that model against the bare one.
     """
     phi = evidence.draws[:, -effect.phi_dim :]
     return Estimate(

@@ -1,7 +1,7 @@
 """Beliefs: distributions over parameters that trials have shaped.
 
-Here live those that are made of densities or particles alone. Those that simulate live
-in ``refinement``, those of learned factors in ``products``.
+This package contains beliefs that are made of densities or particles alone. Beliefs
+that simulate are in ``refinement``, those of learned factors in ``products``.
 """
 
 from sbi_active.inference.beliefs.belief import ChainedBelief, information_gained

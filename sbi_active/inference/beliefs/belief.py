@@ -31,7 +31,7 @@ NUM_COMPARED = 5_000  # draws behind a realized information gain
 class Belief(Distribution, ABC):
     r"""Distribution over the parameters after zero or more trials.
 
-    A torch distribution in float32 with an empty batch shape, the support of the
+    It is a torch distribution in float32 with an empty batch shape, the support of the
     original prior and a normalized ``log_prob``, so that it can be the prior of the
     next round, and of anything else that takes a prior.
 
@@ -40,9 +40,10 @@ class Belief(Distribution, ABC):
 
     Attributes:
         prior: The original prior.
-        label: How the belief was made, for reports.
-        parameter_names: One a parameter, where the simulator names them; else None.
-        diagnostics: What is known of its quality.
+        label: Label that says how the belief was made, for reports.
+        parameter_names: Names of the parameters, where the simulator names them; else
+            None.
+        diagnostics: Diagnostics of its quality.
     """
 
     arg_constraints = {}  # pyright: ignore
@@ -80,7 +81,7 @@ class Belief(Distribution, ABC):
 
         Args:
             num_samples: Number of draws n.
-            seed: Of the draws.
+            seed: Seed of the draws.
 
         Returns:
             Shape (n, theta_dim), float32.
@@ -99,7 +100,7 @@ class Belief(Distribution, ABC):
     def smooth_log_prob(self, value: Tensor) -> Tensor:
         """Return a log density that costs no simulations, for many places (..., d).
 
-        It is :meth:`log_prob` but for beliefs that simulate that.
+        It is :meth:`log_prob` except for beliefs that simulate it.
         """
         theta = torch.as_tensor(value, dtype=torch.float32)
         rows = theta.reshape(-1, theta.shape[-1])
@@ -269,8 +270,9 @@ def named(belief: Distribution, simulator: Any) -> Distribution:
     """Return a belief that knows the names of a simulator's parameters.
 
     Args:
-        belief: Changed in place, unless it is a distribution of the user's.
-        simulator: One with or without ``parameter_names``.
+        belief: Belief that is changed in place, unless it is a distribution of the
+            user's.
+        simulator: Simulator with or without ``parameter_names``.
     """
     names = getattr(simulator, "parameter_names", None)
     if not isinstance(belief, Belief) or names is None:
@@ -285,7 +287,7 @@ def names_of(belief: Distribution, num: int) -> list[str]:
 
     Args:
         belief: The belief, or a prior.
-        num: Of its parameters.
+        num: Number of its parameters.
 
     Example:
         >>> names_of(torch.distributions.Normal(0.0, 1.0), 2)

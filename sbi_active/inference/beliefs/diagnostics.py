@@ -1,4 +1,4 @@
-"""How far a belief is to be trusted, and the figures behind that."""
+"""Trustworthiness of a belief, and the figures behind it."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 @dataclass(frozen=True)
 class Assumption:
-    """What a method takes for granted, and what was found of it.
+    """An assumption of a method, and how it was checked.
 
     Attributes:
         holds: Whether it may be relied on.
-        figure: What that was judged by.
+        figure: Figure that it was judged by.
     """
 
     holds: bool
@@ -35,27 +35,27 @@ class Assumption:
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnostics:
-    """What is known of a belief's quality.
+    """Diagnostics of a belief's quality.
 
-    ``print(belief.diagnostics)`` says it in words.
+    ``print(belief.diagnostics)`` reports them in words.
 
     Attributes:
-        trustworthy: Whether nothing that was checked speaks against the belief; None
-            where nothing was.
-        warnings: What speaks against it and what to do, a sentence each.
-        network_warnings: Of the amortized network beside a refined belief.
-        assumptions: By name, each with the figure that it was judged by.
+        trustworthy: Whether the belief passed all checks; None if nothing was checked.
+        warnings: Warnings about the belief with advice, a sentence each.
+        network_warnings: Warnings of the amortized network beside a refined belief.
+        assumptions: Assumptions by name, each with the figure that it was judged by.
         num_simulations: Rows that the belief cost.
-        num_missing: Those of them lost to faults of the simulator.
-        effective_sample_size: Of the weighted draws behind it.
+        num_missing: Number of those simulations lost to faults of the simulator.
+        effective_sample_size: Effective number of the weighted draws behind it.
         error_nats: Expected divergence from the belief of endless simulations.
-        error_nats_if_explained: The same, were the observations as simulations are.
-        tail_probability: How often a simulation from the belief lies as far out as all
-            trials together do.
-        tail_probability_of_trial: The same of each trial.
-        combinations: What is known of parameters that are not known one by one, and
-            what is not; says nothing where each is.
-        figures: Further ones, by the method; each is an attribute as well.
+        error_nats_if_explained: Expected divergence if the observations were as
+            simulations are.
+        tail_probability: Probability that a simulation from the belief lies as far out
+            as all trials together do.
+        tail_probability_of_trial: Tail probability of each trial alone.
+        combinations: Combinations that are known of parameters not known one by one,
+            and what is not; says nothing where each is.
+        figures: Further figures, by the method; each is an attribute as well.
     """
 
     trustworthy: bool | None = None

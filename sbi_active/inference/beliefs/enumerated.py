@@ -28,7 +28,7 @@ class Enumeration:
     Attributes:
         places: Columns of theta that are discrete, shape (m,).
         values: Combinations of their values, shape (k, m).
-        log_prob: Their log prior probabilities, shape (k,).
+        log_prob: Log prior probabilities, shape (k,).
         others: Columns of theta that are continuous, shape (d - m,).
         rest: Prior of these, independent of the discrete ones.
     """
@@ -43,7 +43,7 @@ class Enumeration:
     def of(prior: Any) -> Enumeration | None:
         """Return the mixture; None of any other prior than independent parts.
 
-        Some parts must be discrete with finitely many values, and some continuous.
+        Some parts must be discrete with finitely many values, and others continuous.
         """
         if not isinstance(prior, MultipleIndependent):
             return None
@@ -107,7 +107,7 @@ class EnumeratedBelief(Belief):
 
     Attributes:
         values: Combinations of the discrete parameters, shape (k, m).
-        probability: Their posterior probabilities, shape (k,).
+        probability: Posterior probabilities, shape (k,).
     """
 
     label = "enumerated"

@@ -1,4 +1,4 @@
-"""Which combinations of parameters a belief knows, and which it does not."""
+"""Combinations of parameters that a belief knows, and those that it does not."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ class KnownCombination:
 
     Attributes:
         text: The formula.
-        value: Its median.
+        value: Median of the combination.
         low: End of its central 90 % interval.
-        high: The other end.
+        high: Other end of that interval.
         width: Standard deviation of the sum, or of a product's logarithm, in those of
             the prior.
     """
@@ -75,7 +75,8 @@ class UnknownCombination:
 
     Attributes:
         text: The formula, or names.
-        width: As of :class:`KnownCombination`; the smallest of several parameters.
+        width: Width as in :class:`KnownCombination`; the smallest of several
+            parameters.
         several: Whether these are parameters, each by itself.
     """
 
@@ -92,14 +93,14 @@ class UnknownCombination:
 
 @dataclass(frozen=True)
 class Combinations:
-    """What a belief knows of parameters that it does not know one by one.
+    """Knowledge of parameters that a belief does not know one by one.
 
-    False where there is nothing to say: every parameter is known by itself, or nothing
+    False if there is nothing to say: every parameter is known by itself, or nothing
     is known much better than anything else.
 
     Attributes:
         known: Combinations with their intervals.
-        unknown: What is left open.
+        unknown: Combinations that are left open.
     """
 
     known: tuple[KnownCombination, ...] = ()
@@ -120,7 +121,7 @@ class Combinations:
         return "; ".join(parts)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it in a form that JSON can hold."""
+        """Return the combinations in a form that JSON can hold."""
         parts = {"known": self.known, "unknown": self.unknown}
         return {k: [dict(vars(c)) for c in own] for k, own in parts.items() if own}
 
@@ -132,22 +133,23 @@ def combinations_of(
     *,
     seed: int = 0,
 ) -> Combinations:
-    r"""Return which combinations of parameters a belief knows, and which it does not.
+    r"""Return the combinations of parameters that a belief knows, and does not know.
 
-    From 2,000 draws of each: a parameter is open where its standard deviation is above
-    0.3 of the prior's; a combination of open parameters is known where it has, in prior
-    deviations of its own, at most a tenth of the width of any of them. The formulas are
-    sums, products and ratios with weights, products with an exponential, and products
-    of the kind a (b + c), see :func:`.search`. A parameter that is in none of them is
-    not known where it has more than half of the prior's deviation while something else
-    has a tenth of that. It is the belief that speaks: a further trial may determine
-    what this says is open; :func:`.check_simulator` tells whether any action could.
+    They are found from 2,000 draws of each. A parameter is open if its standard
+    deviation is above 0.3 of the prior's; a combination of open parameters is known if
+    it has, in prior deviations of its own, at most a tenth of the width of any of them.
+    The formulas are sums, products and ratios with weights, products with an
+    exponential, and products of the kind a (b + c), see :func:`.search`. A parameter
+    that is in none of them is not known where it has more than half of the prior's
+    deviation while something else has a tenth of that. It is the belief that speaks: a
+    further trial may determine what this says is open; :func:`.check_simulator` tells
+    whether any action could.
 
     Args:
-        belief: After some trials.
-        prior: Before any.
-        names: One a parameter; None is theta_1, theta_2, ...
-        seed: Of the draws.
+        belief: Belief after some trials.
+        prior: Prior before any trial.
+        names: Names of the parameters; None is theta_1, theta_2, ...
+        seed: Seed of the draws.
 
     References:
         Gutenkunst et al., Universally sloppy parameter sensitivities in systems biology
@@ -162,7 +164,7 @@ def combinations_of(
 def combinations_of_draws(
     after: Array, before: Array, names: Sequence[str] | None = None
 ) -> Combinations:
-    """Return the same from draws of a belief and of the prior, (m, d) and (n, d)."""
+    """Return combinations by draws of a belief and of the prior, (m, d) and (n, d)."""
     dim = before.shape[1]
     if dim < 2 or not (np.isfinite(before).all() and np.isfinite(after).all()):
         return Combinations()
@@ -202,8 +204,8 @@ def note_combinations(belief: Any, names: Sequence[str] | None, *, seed: int) ->
 
     Args:
         belief: A :class:`.Belief`.
-        names: One a parameter, or None.
-        seed: Of the draws.
+        names: Names of the parameters, or None.
+        seed: Seed of the draws.
     """
     try:
         found = combinations_of(belief, belief.prior, names, seed=seed)
@@ -218,7 +220,7 @@ def _draws(distribution: Distribution, seed: int, key: str) -> Array:
 
 
 def _effective(draws: Array) -> float:
-    """Return how many different draws there are, repetitions weighed."""
+    """Return the number of different draws, repetitions weighed."""
     count = np.unique(draws, axis=0, return_counts=True)[1]
     return float(count.sum() ** 2 / (count**2).sum())
 
@@ -254,7 +256,7 @@ def _known(
 def _left(
     group: Sequence[Combination], moments: Any, own: Array, names: Sequence[str]
 ) -> UnknownCombination:
-    """Return what known combinations leave open of their parameters."""
+    """Return the combination that the known ones leave open."""
     if len(group) == 1 and len(group[0].terms) == 2:
         other = group[0].mirrored()
         wide = width(other.weight, *moments(other.terms))

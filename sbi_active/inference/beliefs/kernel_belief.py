@@ -34,8 +34,8 @@ class KernelBelief(Belief):
 
     Args:
         prior: The original prior, which gives the support.
-        draws: Shape (n, theta_dim).
-        weight: Normalized, shape (n,); None weighs all alike.
+        draws: Draws, shape (n, theta_dim).
+        weight: Normalized weights, shape (n,); None weighs all alike.
 
     References:
         Scott, *Multivariate Density Estimation*, 1992; Kim & Matsubara, Applied

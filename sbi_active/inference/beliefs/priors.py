@@ -1,4 +1,4 @@
-"""What a prior must be, so that a belief can begin from it."""
+"""Checks of a prior before a belief begins from it."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def require_support(
 
 
 def _require_defaults() -> None:
-    """Raise where torch makes tensors that no belief can be computed with."""
+    """Raise if torch makes tensors that no belief can be computed with."""
     dtype, device = torch.get_default_dtype(), torch.get_default_device()
     if dtype not in (torch.float32, torch.float64) or device.type == "meta":
         raise ValueError(
@@ -125,12 +125,12 @@ def _shown_prior(prior: Distribution) -> str:
 def require_width(
     prior: Distribution, names: Sequence[str] | None = None, *, seed: int
 ) -> None:
-    """Raise where a prior is empty, or has no width that float32 can hold.
+    """Raise if a prior is empty, or has no width that float32 can hold.
 
     Args:
-        prior: Of the parameters.
-        names: Of the parameters, for the error.
-        seed: Of some draws.
+        prior: Prior of the parameters.
+        names: Names of the parameters, for the error.
+        seed: Seed of some draws.
     """
     enumeration = Enumeration.of(prior)
     if enumeration is not None:
@@ -164,7 +164,7 @@ def require_width(
 
 
 def _require_no_atoms(draws: Tensor, names: Sequence[str] | None) -> None:
-    """Raise where half of the draws of a parameter, shape (n, d), repeat others."""
+    """Raise if half of the draws of a parameter, shape (n, d), repeat others."""
     few = [len(column.unique()) < len(draws) / 2 for column in draws.T]
     if any(few):
         k = few.index(True)

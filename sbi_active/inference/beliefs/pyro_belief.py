@@ -16,7 +16,7 @@ class PyroBelief(TorchDistribution):
     """A distribution of an event shape (d,), as a Pyro sample site takes it.
 
     Args:
-        belief: What is drawn and scored.
+        belief: Belief that is drawn and scored.
     """
 
     arg_constraints = {}  # pyright: ignore

@@ -1,7 +1,7 @@
 """The posterior under declared noise: its likelihood is simulated, and so exact.
 
-Here lives what makes a belief of a fit: how far it is to be trusted, and what trials
-show that contradict one another. Nothing is regressed here.
+This package makes a belief of a fit: its diagnostics, and the trials that contradict
+one another. It contains no regression.
 """
 
 from sbi_active.inference.declared.refining import refine_declared

@@ -1,8 +1,8 @@
 r"""Trials that contradict one another: how much wider the noise must be.
 
-Where even the best fit is far outside the declared noise, the posterior under that
-noise has no width: it lies at the best fit, or at another place to which the search was
-led, with deviations of 0. The noise is then inflated by one factor s for all trials,
+If even the best fit is far outside the declared noise, the posterior under that noise
+has no width: it lies at the best fit, or at another place that the search found, with
+deviations of 0. The noise is then inflated by one factor s for all trials,
 
 .. math::
     s^2 = \max\Bigl(\frac{\sum_k |r_k|^2}{N - d},\;
@@ -50,12 +50,12 @@ INFORMED = 1e-3  # derivative below which no trial informs a parameter
 
 @dataclass(frozen=True)
 class Contradiction:
-    """What trials show that contradict one another.
+    """The contradiction between trials.
 
     Attributes:
         inflation: Factor s of the noise's standard deviation.
         probability: Tail probability of all residuals under the declared noise.
-        probability_of_trial: The same of each trial.
+        probability_of_trial: Tail probability of each trial's residuals.
         trials: The trials that contradict, in a clause.
     """
 
@@ -89,13 +89,14 @@ def find_contradiction(
     level: float = LEVEL,
     rng: np.random.Generator,
 ) -> Contradiction | None:
-    """Return what contradicts at the best fit; None where the noise explains it.
+    """Return the contradiction at the best fit; None if the noise explains it.
 
     Args:
         likelihood: Likelihood of all trials under the declared noise.
         theta: Best fit, then parameters around it, shape (n, d).
         residual: Whitened residuals at the best fit, shape (N,), 0 where not observed.
-        jacobian: Their derivatives in coordinates of a standard normal prior, (N, d).
+        jacobian: Derivatives of the residuals in coordinates of a standard normal
+            prior, (N, d).
         level: Tail probability below which trials contradict.
         rng: Source of the draws of the noise.
     """
@@ -132,7 +133,7 @@ def contradiction_at(
     level: float = LEVEL,
     rng: np.random.Generator,
 ) -> Contradiction | None:
-    """Return what contradicts at parameters that are about the best, shape (1, d)."""
+    """Return the contradiction at parameters that are about the best, shape (1, d)."""
     squares = []
     for action, x in zip(likelihood.action, likelihood.x, strict=True):
         gap = x - torch.from_numpy(likelihood.table.mean(theta, action)[0])
@@ -159,7 +160,7 @@ def compared(
     num_fitted: int,
     level: float = LEVEL,
 ) -> Contradiction | None:
-    """Return what contradicts by the squares alone; None where nothing does.
+    """Return the contradiction by the squares alone; None if there is none.
 
     Args:
         action: Executed actions, shape (t, action_dim).
@@ -214,7 +215,7 @@ def _beyond_noise(
 def _repeats(
     action: Tensor, x: Tensor, whiten: Callable[[Tensor], Tensor], level: float
 ) -> str:
-    """Return the repeats of one action that contradict most; "" where none does."""
+    """Return the repeats of one action that contradict most; "" if none does."""
     worst, text = level, ""
     for own in action.unique(dim=0):
         same = torch.nonzero((action == own).all(1)).flatten().tolist()

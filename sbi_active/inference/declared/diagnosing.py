@@ -1,4 +1,4 @@
-"""How far a belief by a simulated likelihood can be trusted."""
+"""Diagnostics of a belief by a simulated likelihood."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def diagnose_fit(
 
 
 def _assumptions(fit: Fit) -> tuple[dict[str, Assumption], list[str]]:
-    """Return what was taken for granted, and a sentence for each that fails."""
+    """Return the assumptions, and a sentence for each that fails."""
     effective, dim = fit.effective_sample_size, int((~fit.free).sum())
     needed = max(COARSE, dim * (dim + 3) / (4 * TOLERATED))
     found = {"enough_draws": Assumption(effective >= needed, effective)}
@@ -110,8 +110,8 @@ def _assumptions(fit: Fit) -> tuple[dict[str, Assumption], list[str]]:
 def misplaced(tail: list[float], joint: float, edge_mass: float) -> list[str]:
     """Return warnings of a belief that may be far from the truth.
 
-    By the tail probability of each trial and of all, and the belief's mass near the
-    edge of one parameter.
+    They rest on the tail probability of each trial and of all, and the belief's mass
+    near the edge of one parameter.
     """
     warnings = []
     if joint < RARE or min(tail) < RARE / len(tail):
@@ -131,7 +131,7 @@ def misplaced(tail: list[float], joint: float, edge_mass: float) -> list[str]:
 def _tail_probability(
     likelihood: SimulatedLikelihood, theta: Tensor, seed: int
 ) -> list[float]:
-    r"""Return how often the noise is less likely than what was observed.
+    r"""Return the probability that noise is less likely than what was observed.
 
     .. math::
         P\big(p(x' | \theta) \le p(x_o | \theta)\big), \quad \theta \sim b,\;

@@ -72,9 +72,10 @@ def refine_declared(
         simulator: Deterministic beside a declared noise.
         prior: The original prior.
         action: Executed actions, shape (t, action_dim).
-        x: Their outcomes, shape (t, *x_shape).
-        hints: Where else to look first.
-        past: Of an earlier call: draws to go on from, and what needs no simulation.
+        x: Outcomes of the actions, shape (t, *x_shape).
+        hints: Distributions that say where else to look first.
+        past: State of an earlier call: draws to go on from, and what needs no
+            simulation.
         settings: Budget.
         seed: Seed of everything random.
 
@@ -169,7 +170,7 @@ def _gone_on(
     own: Settings,
     rng: np.random.Generator,
 ) -> Fit | None:
-    """Return the posterior from draws of the earlier trials; None where it fails."""
+    """Return the posterior from draws of the earlier trials; None if it fails."""
     pool = past.with_trials(potential, own)
     if not len(pool.u):
         return None

@@ -38,8 +38,8 @@ class RefinementOptions:
             by an error of the surrogate: a truth that it misses costs log(1 / share)
             nats and not infinitely many. Moments see the share too: .01 of a wide
             prior outweighs a sharp posterior.
-        workers: Where simulations run; in a campaign, its own are taken. A history of
-            which a row stays lost is left out.
+        workers: Workers that run the simulations; in a campaign, its own are taken. A
+            history of which a row stays lost is left out.
     """
 
     num_histories: int = 3_000

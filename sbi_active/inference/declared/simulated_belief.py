@@ -25,7 +25,7 @@ NUM_FITTED = 1_000  # draws behind the smooth density
 
 @dataclass(frozen=True)
 class DeclaredRecord:
-    """What a belief goes on from when a further trial is known.
+    """The record that a belief goes on from when a further trial is known.
 
     Attributes:
         trials: Actions and outcomes in the likelihood of the draws.
@@ -57,7 +57,7 @@ class SimulatedBelief(Belief):
         b(\theta) = (1 - \epsilon)\, \frac{p(\theta)}{Z} \prod_k
         p\big(x_k \mid f(\theta, \xi_k)\big) + \epsilon\, p(\theta)
 
-    Draws are the weighted ones of a fit, again and again, whose density costs nothing.
+    Draws are resampled from the weighted ones of a fit, whose density costs nothing.
     Parameters that no trial informs, and that are independent of the others under the
     prior, are drawn from the prior afresh. ``log_prob`` elsewhere costs a simulation a
     trial and row; ``smooth_log_prob`` has a mixture fitted to the draws in place of the
@@ -70,7 +70,7 @@ class SimulatedBelief(Belief):
         defensive: The share :math:`\epsilon`.
 
     Attributes:
-        histories: What a refinement goes on from after a further trial.
+        histories: Histories that a refinement goes on from after a further trial.
         free: Parameters that keep their prior, shape (d,).
     """
 

@@ -1,8 +1,8 @@
 r"""Particles between bounds that cut a posterior along many axes.
 
-Of a normal approximation hardly a draw lies within all of them, and its center may be
-far beyond one. What a linear response says has no such trouble: with the residuals r
-and their derivatives J at the modes m,
+Hardly any draw of a normal approximation lies within all of them, and its center may be
+far beyond one. A linear response has no such trouble: with the residuals r and their
+derivatives J at the modes m,
 
 .. math::
     q(u) \propto p(u) \sum_m \exp\Bigl(-\frac{\| r_m + J_m (u - m) \|^2}{2 w^2}\Bigr)
@@ -37,7 +37,7 @@ class Particles(Proposal):
 
     Attributes:
         drawn: Places, shape (n, d).
-        log_density: Its normalized log density, (n, d) -> (n,).
+        log_density: Normalized log density, (n, d) -> (n,).
     """
 
     drawn: Array
@@ -78,7 +78,7 @@ class LinearResponse:
 
     Args:
         potential: Potential of all trials.
-        found: Its modes.
+        found: Modes of the density.
         axes: Axes that places are of; others change nothing.
     """
 
@@ -148,7 +148,7 @@ class LineMoves(Moves):
             self._normals.append((np.linalg.solve(precision, center), precision))
 
     def propose(self, u: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Return where particles may go, and the log ratio of the normal densities."""
+        """Return proposed particles, and the log ratio of the normal densities."""
         mean, precision = self._normals[rng.integers(len(self._normals))]
         new = u.copy()
         pull = (new - mean) @ precision

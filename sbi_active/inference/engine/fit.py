@@ -1,4 +1,4 @@
-"""What is found of a posterior."""
+"""The fit of a posterior: weighted draws and figures."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class WeightedDraws:
 
     Attributes:
         u: Draws in the potential's coordinates, shape (n, d).
-        weight: Their weights, which sum to 1, shape (n,).
+        weight: Weights of the draws, which sum to 1, shape (n,).
         log_evidence: Log of the integral of prior times likelihood, nats.
         standard_error: Standard error of log_evidence, nats.
         effective_sample_size: Number of draws that count.
-        method: What gave the draws, "importance", "smc" or "laplace".
+        method: Method that gave the draws, "importance", "smc" or "laplace".
     """
 
     u: Array
@@ -49,8 +49,8 @@ class Fit(WeightedDraws):
         tail_shape: Shape of the tail of the weights; NaN where they are equal.
         is_rough: Whether the likelihood had to be tempered often.
         free: Parameters that keep their prior, shape (d,).
-        found: What the search found; None where it got nowhere.
-        particles: What moved them; None of importance sampling.
+        found: Result of the search; None if it got nowhere.
+        particles: Particles of sequential Monte Carlo; None of importance sampling.
         pool: Draws to go on from after a further trial.
     """
 

@@ -70,7 +70,7 @@ def importance_sample(
         rng: Source of the draws.
         num_components: Number of components of a proposal at most.
         settings: Numbers of draws.
-        found: Modes, to propose along ridges from; None where there are none.
+        found: Modes, to propose along ridges from; None if there are none.
         rivaled: Log evidence of a better model.
     """
     own, start = settings, potential.num_simulations
@@ -196,8 +196,8 @@ def defended(
 ) -> Defended:
     """Return a mixture fitted to weighted draws, with a share of a wider one.
 
-    What is dense around the draws alone misses tails, and of a rough likelihood the
-    peaks between those that were found.
+    A mixture that is dense around the draws alone misses tails, and the peaks of a
+    rough likelihood between those that were found.
     """
     main = fitted(pool.u, weight, num_components, settings, rng)
     wide = fitted(pool.u, _flattened(pool, settings), 2, settings, rng)
@@ -215,9 +215,9 @@ def fitted(
 
     Args:
         u: Draws, shape (n, d).
-        weight: Their weights, which sum to 1, shape (n,).
+        weight: Weights of the draws, which sum to 1, shape (n,).
         num_components: Number of components at most; fewer where few draws count.
-        settings: How much wider it is.
+        settings: Settings that say how much wider it is.
         rng: Source of its starts.
     """
     dim = u.shape[1]
@@ -244,9 +244,9 @@ def wider(factor: float, dim: int) -> float:
 def pareto_shape(log_weight: Array) -> float:
     r"""Return the shape k of the tail of weights, of which moments below 1/k exist.
 
-    Of the excess x over a threshold, taken for generalized Pareto, by the estimate of
-    Zhang and Stephens: k is the mean of :math:`\log(1 - b x)` with b averaged over its
-    likelihood, and is drawn to .5 as by ten further numbers.
+    The excess x over a threshold is taken for generalized Pareto, and k is estimated as
+    by Zhang and Stephens: it is the mean of :math:`\log(1 - b x)` with b averaged over
+    its likelihood, and is drawn to .5 as by ten further numbers.
 
     Args:
         log_weight: Log weights, shape (n,).

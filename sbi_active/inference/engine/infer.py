@@ -7,7 +7,7 @@
    while few of them outweigh all others. Otherwise particles are led from the modes to
    it by sequential Monte Carlo, whose cost grows little with the number of parameters.
 
-A model far behind another is known well enough by the Laplace approximation.
+The Laplace approximation is precise enough for a model far behind another.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def infer(
         potential: Log density of the parameters given all trials, with residuals where
             modes of it were found.
         rng: Source of the draws.
-        found: Modes of the potential; None where a search got nowhere.
+        found: Modes of the potential; None if a search got nowhere.
         past: Draws for the first of these trials, with the likelihood of all, to which
             are added.
         near: Draws of a guess, shape (n, d), looked at where the modes do not suffice.

@@ -117,7 +117,7 @@ def learned_fit(
     near: Array | None = None,
     num_effective: float = 3_000.0,
 ) -> LearnedFit | None:
-    """Return the posterior of a learned likelihood; None where nothing has any.
+    """Return the posterior of a learned likelihood; None if nothing has any.
 
     Args:
         learned: Learned likelihood of all trials.

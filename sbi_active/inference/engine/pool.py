@@ -46,7 +46,7 @@ class Pool:
         log_likelihood: Log likelihood of the trials so far, shape (n,).
         log_mixture: Log of the sum over proposals, each times its number of draws.
         log_own: Log density of the proposal that each was drawn from.
-        is_final: Which of them the posterior rests on, shape (n,).
+        is_final: Mask of those that the posterior rests on, shape (n,).
         num_final: Draws of their proposal, also those that do not count.
         proposals: Pairs of the number of draws and the proposal.
         num_trials: Number of trials in the likelihood.
@@ -80,7 +80,7 @@ class Pool:
 
     @property
     def log_weight(self) -> Array:
-        """Log weights of the posterior, shape (n,); -inf where it does not rest."""
+        """Log weights of the posterior, shape (n,); -inf if it does not rest."""
         log_weight = self.log_prior + self.log_likelihood - self.log_own
         return np.where(self.is_final, log_weight, -np.inf)
 
@@ -121,7 +121,7 @@ class Pool:
         """Simulate draws of a proposal, shape (n, d), and weigh all.
 
         Args:
-            proposal: What they were drawn from.
+            proposal: Proposal that they were drawn from.
             drawn: The draws.
             potential: Potential of all trials.
             floor: Log likelihood below which a draw is given up.
@@ -144,7 +144,7 @@ class Pool:
         log_past = np.zeros(len(u))
         if self.num_past:
             assert isinstance(potential, SimulatedPotential)  # as in with_trials
-            # Of what counts every trial has been simulated; this only looks it up.
+            # Every trial of draws that count has been simulated; this only looks it up.
             log_past = potential.log_likelihood(u, last=self.num_past)
         self.log_past = np.concatenate([self.log_past, log_past])
         self.is_final = np.concatenate([self.is_final, np.ones(len(u), dtype=bool)])
@@ -155,7 +155,7 @@ class Pool:
 
         Args:
             potential: Potential of these trials and further ones.
-            settings: How far below the best a draw is left out.
+            settings: Settings that say how far below the best a draw is left out.
         """
         log_weight = self.log_mixture_weight
         rows = np.flatnonzero(

@@ -74,14 +74,14 @@ class Potential(Density, LeastSquares, Protocol):
     num_observed: int
 
     def whitener(self, u: Array | None = None) -> Whitener:
-        """Return what whitens residuals, by the likeliest error at u, shape (1, dim).
+        """Return the whitener of residuals by the likeliest error at u, shape (1, dim).
 
-        The same object where nothing of the error is unknown; None begins a search.
+        It is the same object if nothing of the error is unknown; None begins a search.
         """
         ...
 
     def regimes(self, u: Array) -> list[Whitener]:
-        """Return what whitens residuals where the error leaves other widths."""
+        """Return whiteners of residuals where the error leaves other widths."""
         ...
 
     def splits_off(self, axes: NDArray[np.bool_], rng: np.random.Generator) -> bool:
@@ -129,7 +129,7 @@ class SimulatedPotential:
         return self.coordinates.sample(num, rng)
 
     def whitener(self, u: Array | None = None) -> Whitener:
-        """Return what whitens residuals: nothing of the error is unknown."""
+        """Return the whitener of residuals: nothing of the error is unknown."""
         return unchanged
 
     def regimes(self, u: Array) -> list[Whitener]:
@@ -176,7 +176,7 @@ class SimulatedPotential:
     def residual(self, u: Array) -> tuple[Array]:
         """Return residuals of all trials in deviations of the noise, shape (n, N).
 
-        Those of a simulation without a number are large.
+        Residuals of a simulation without a number are large.
         """
         theta, parts = self.coordinates.to_theta(u), []
         own = self.likelihood

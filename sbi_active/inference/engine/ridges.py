@@ -33,7 +33,7 @@ def along_ridges(
     rng: np.random.Generator,
     settings: Settings,
 ) -> StudentMixture | None:
-    """Return narrow t distributions along the ridges; None where nothing is likely.
+    """Return narrow t distributions along the ridges; None if nothing is likely.
 
     Draws of the normal approximations, and points, are brought back to the ridge by
     steps that a prior around each damps, so that they move across it and not along.
@@ -77,7 +77,7 @@ def reweighted(mixture: StudentMixture, u: Array, weight: Array) -> StudentMixtu
     Args:
         mixture: Components.
         u: Draws, shape (n, dim).
-        weight: Their weights, which sum to 1, shape (n,).
+        weight: Weights of the draws, which sum to 1, shape (n,).
     """
     parts = mixture.log_parts(u)
     share = np.exp(parts - log_sum_exp(parts, axis=0))

@@ -71,7 +71,7 @@ class SearchSettings:
 
 @dataclass(frozen=True)
 class Found:
-    """What a search found.
+    """The result of a search.
 
     Attributes:
         guess: A normal component a mode, weighted by its mass; behind these, one an
@@ -97,7 +97,7 @@ def search(
     near: Array | None = None,
     settings: SearchSettings = SearchSettings(),  # noqa: B008  (frozen)
 ) -> Found | None:
-    r"""Return normal approximations at the modes; None where no search gets anywhere.
+    r"""Return normal approximations at the modes; None if no search gets anywhere.
 
     Searches begin at the best of some draws of the prior and at points near, and again
     at the best of more draws until the best mode was found several times and explains
@@ -178,7 +178,7 @@ def laplace_precision(
     Args:
         problem: The sum of squares.
         u: Places, shape (n, d).
-        whiten: What whitens residuals.
+        whiten: Whitener of the residuals.
     """
     _, jac = problem.jacobian(u, whiten, problem.step)
     # Never wider than the prior: a flat direction has its variance.

@@ -16,9 +16,9 @@ class Settings:
             a belief is off by about their number to the power -1/2, in nats.
         plenty: Times as many are drawn while they are cheap: with half of it heavy
             tails are cut by a tenth.
-        divergence: Of a normal fit to the draws, in nats, that is asked while they are
-            cheap, and twice that always: n draws of d parameters are d (d + 3) / 4 n
-            off. Half asks for twice as many of 10 parameters and more.
+        divergence: Divergence of a normal fit to the draws, in nats, that is asked
+            while they are cheap, and twice that always: n draws of d parameters are d
+            (d + 3) / 4 n off. Half asks for twice as many of 10 parameters and more.
         behind: Nats below a better model's evidence beyond which fewer draws do: at
             half, a model that has a tenth of its weight is known less well.
         num_behind: Effective draws that end the sampling of such a model.
@@ -38,8 +38,8 @@ class Settings:
         fewest: Effective draws below which the likelihood is tempered.
         few_tempered: Rounds of this beyond which the likelihood is called rough.
         broad: Effective draws that shape the wide share of a proposal.
-        share_of_wide: That share.
-        share_if_rough: That share where the likelihood is rough.
+        share_of_wide: Share of a proposal that is wide.
+        share_if_rough: Share of a proposal that is wide where the likelihood is rough.
         num_components: Components of a proposal at least; one a mode.
         efficient: Share of a proposal's draws that are effective, with which it is good
             enough: more is drawn from it in place of fitting another.

@@ -44,7 +44,7 @@ class MeanTable:
 
     Attributes:
         num_simulations: Rows simulated so far.
-        num_missing: Those among them that a fault lost.
+        num_missing: Number of those simulations that a fault lost.
     """
 
     def __init__(self, simulator: SimulatorModel, workers: Workers) -> None:

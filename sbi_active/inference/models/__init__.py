@@ -1,7 +1,7 @@
-"""What a trainer learned, as a function of parameters, outcome and action.
+"""Learned models as functions of parameters, outcome and action.
 
-Here live posteriors, likelihoods and ratios. Beliefs, which have seen a trial, live in
-``beliefs``.
+This package contains posteriors, likelihoods and ratios. Beliefs, which have seen a
+trial, are in ``beliefs``.
 """
 
 from sbi_active.inference.models.factors import ActionLikelihood, ActionRatio

@@ -1,4 +1,4 @@
-"""What a trial of an action contributes to the belief, as a network learned it."""
+"""Learned factors that a trial of an action contributes to the belief."""
 
 from __future__ import annotations
 
@@ -52,9 +52,10 @@ class ActionLikelihood(ActionFactor):
         r"""Return :math:`\log q(x_i | \theta_i, \xi_i)` row by row, shape (n,).
 
         Args:
-            x: Shape (n, *x_shape); NaN throughout a row where there was no measurement.
-            theta: Shape (n, theta_dim).
-            action: Shape (n, action_dim).
+            x: Outcomes, shape (n, *x_shape); NaN throughout a row where there was no
+                measurement.
+            theta: Parameters, shape (n, theta_dim).
+            action: Actions, shape (n, action_dim).
         """
         outcome = outcome_rows(x, self.x_shape).flatten(1)
         return self.estimator.log_prob(outcome[None], self._condition(theta, action))[0]
@@ -63,8 +64,8 @@ class ActionLikelihood(ActionFactor):
         r"""Return :math:`\log q(x_i | \theta_j, \xi)` of every pair, shape (n, m).
 
         Args:
-            x: Shape (n, *x_shape).
-            theta: Shape (m, theta_dim).
+            x: Outcomes, shape (n, *x_shape).
+            theta: Parameters, shape (m, theta_dim).
             action: One action, shape (action_dim,).
         """
         outcome = outcome_rows(x, self.x_shape).flatten(1)
@@ -79,8 +80,8 @@ class ActionLikelihood(ActionFactor):
         """Return one outcome a row, shape (n, *x_shape); NaN for no measurement.
 
         Args:
-            theta: Shape (n, theta_dim).
-            action: Shape (n, action_dim).
+            theta: Parameters, shape (n, theta_dim).
+            action: Actions, shape (n, action_dim).
         """
         condition = self._condition(theta, action)
         with torch.no_grad():
@@ -103,9 +104,10 @@ class ActionRatio(ActionFactor):
         r"""Return :math:`\log r(\theta_i; x_i, \xi_i)` row by row, shape (n,).
 
         Args:
-            theta: Shape (n, theta_dim).
-            x: Shape (n, *x_shape); NaN throughout a row where there was no measurement.
-            action: Shape (n, action_dim).
+            theta: Parameters, shape (n, theta_dim).
+            x: Outcomes, shape (n, *x_shape); NaN throughout a row where there was no
+                measurement.
+            action: Actions, shape (n, action_dim).
         """
         rows = outcome_rows(x, self.x_shape)
         action = action_rows(action, self.action_dim, num_rows=len(rows))

@@ -51,7 +51,7 @@ class LFIRE:
         powers: Exponents.
         num_marginal: Rows of the marginal in one regression, at most.
         num_penalties: Strengths to choose from, 0.1 to 10,000 inverse.
-        num_folds: Of the cross-validation.
+        num_folds: Number of folds of the cross-validation.
 
     References:
         Thomas, Dutta, Corander, Kaski & Gutmann, Bayesian Analysis 2022, who take a
@@ -74,9 +74,9 @@ class LFIRE:
         """Return summaries, and whether there was a measurement, shape (n, q + 1).
 
         Args:
-            x: Shape (n, *x_shape); NaN where there was no measurement.
+            x: Outcomes, shape (n, *x_shape); NaN where there was no measurement.
             center: Subtracted from the numbers before powers are taken, (x_dim,).
-            scale: They are divided by, shape (x_dim,).
+            scale: Scale by which they are divided, shape (x_dim,).
         """
         flat = x.double().flatten(1)
         valid = flat.isfinite().all(1, keepdim=True)
@@ -95,7 +95,7 @@ class LFIRE:
         Args:
             own: Summaries of its outcomes, shape (n, q).
             marginal: Summaries of outcomes of the belief, shape (m, q).
-            seed: Of the folds.
+            seed: Seed of the folds.
         """
         fewest = FEWEST * self.num_folds
         if min(len(own), len(marginal)) < fewest:

@@ -20,11 +20,11 @@ class LFIREModel:
     r"""Log ratios of particles at the actions that were simulated.
 
     Attributes:
-        settings: Of the regressions.
+        settings: Settings of the regressions.
         particles: Parameter sets, shape (p, theta_dim).
-        action: Shape (a, action_dim).
-        center: Of the outcomes of each action, shape (a, x_dim).
-        scale: Alike.
+        action: Actions, shape (a, action_dim).
+        center: Center of the outcomes of each action, shape (a, x_dim).
+        scale: Scale of the outcomes of each action, shape (a, x_dim).
         log_ratios: A row an action, an entry a particle.
     """
 
@@ -45,8 +45,8 @@ class LFIREModel:
 
         Args:
             theta: Particles, shape (n, theta_dim).
-            x: Shape (n, *x_shape); NaN where there was no measurement.
-            action: Simulated ones, shape (n, action_dim).
+            x: Outcomes, shape (n, *x_shape); NaN where there was no measurement.
+            action: Simulated actions, shape (n, action_dim).
         """
         particle = _places(theta, self.particles, "theta", "particles")
         place = _places(action, self.action, "action", "simulated actions")
@@ -115,7 +115,7 @@ def fit_log_ratios(
 
 
 def _places(rows: Tensor, known: Tensor, name: str, what: str) -> Tensor:
-    """Return where each row is among those known, shape (n,)."""
+    """Return the place of each row among those known, shape (n,)."""
     rows = torch.as_tensor(rows, dtype=torch.float32)
     rows, inverse = rows.unique(dim=0, return_inverse=True)
     same = (rows[:, None] == known).all(-1)

@@ -21,9 +21,9 @@ from sbi_active.messages import warn
 class ActionPosterior:
     r"""Amortized posterior :math:`q(\theta | x, \xi)`.
 
-    It has the methods of sbi's posteriors with ``x=`` and ``action=`` together. What
-    only knows a posterior over x takes :meth:`at`, and one over packed (x, action)
-    takes :meth:`packed`.
+    It has the methods of sbi's posteriors with ``x=`` and ``action=`` together. Code
+    that only knows a posterior over x takes :meth:`at`, and code that knows one over
+    packed (x, action) takes :meth:`packed`.
 
     Args:
         packed: sbi's posterior over packed conditions.
@@ -58,11 +58,11 @@ class ActionPosterior:
         """Return draws given one outcome.
 
         Args:
-            sample_shape: Any shape.
+            sample_shape: Shape of the draws, any.
             x: The outcome, shape x_shape or (1, *x_shape); NaN where there was no
                 measurement.
             action: The action that led to it, shape (action_dim,) or (1, action_dim).
-            kwargs: Passed to sbi's ``sample``.
+            kwargs: Arguments passed to sbi's ``sample``.
 
         Returns:
             Shape (*sample_shape, theta_dim).
@@ -85,10 +85,10 @@ class ActionPosterior:
         """Return draws given each of b outcomes, shape (*sample_shape, b, theta_dim).
 
         Args:
-            sample_shape: Any shape.
-            x: Shape (b, *x_shape).
-            action: Shape (b, action_dim), or (action_dim,) for all.
-            kwargs: Passed to sbi's ``sample_batched``.
+            sample_shape: Shape of the draws, any.
+            x: Outcomes, shape (b, *x_shape).
+            action: Actions, shape (b, action_dim), or (action_dim,) for all.
+            kwargs: Arguments passed to sbi's ``sample_batched``.
         """
         kwargs.setdefault("show_progress_bars", False)
         posterior, condition = self._given(x, action)
@@ -104,10 +104,10 @@ class ActionPosterior:
         """Return the log density of parameters given one outcome.
 
         Args:
-            theta: Shape (n, theta_dim).
+            theta: Parameters, shape (n, theta_dim).
             x: The outcome, shape x_shape or (1, *x_shape).
             action: The action that led to it.
-            kwargs: Passed to sbi's ``log_prob``.
+            kwargs: Arguments passed to sbi's ``log_prob``.
 
         Returns:
             Shape (n,); -inf outside the prior's support.
@@ -126,10 +126,10 @@ class ActionPosterior:
         """Return log densities given each of several outcomes, shape (n, b).
 
         Args:
-            theta: Shape (n, b, theta_dim).
-            x: Shape (b, *x_shape).
-            action: Shape (b, action_dim), or (action_dim,) for all.
-            kwargs: Passed to sbi's ``log_prob_batched``.
+            theta: Parameters, shape (n, b, theta_dim).
+            x: Outcomes, shape (b, *x_shape).
+            action: Actions, shape (b, action_dim), or (action_dim,) for all.
+            kwargs: Arguments passed to sbi's ``log_prob_batched``.
         """
         self._direct()
         posterior, condition = self._given(x, action)
@@ -143,7 +143,7 @@ class ActionPosterior:
         Args:
             x: The outcome, shape x_shape or (1, *x_shape).
             action: The action that led to it.
-            kwargs: Passed to sbi's ``map``.
+            kwargs: Arguments passed to sbi's ``map``.
         """
         posterior, condition = self._given(x, action)
         if "init_method" not in kwargs:
@@ -154,12 +154,12 @@ class ActionPosterior:
     def log_posterior(self, theta: Tensor, x: Tensor, action: Tensor) -> Tensor:
         r"""Return :math:`\log q(\theta_i | x_i, \xi_i)` row by row, shape (n,).
 
-        Without leakage correction, which a bound on the information does not need.
+        There is no leakage correction, which a bound on the information does not need.
 
         Args:
-            theta: Shape (n, theta_dim).
-            x: Shape (n, *x_shape); NaN where there was no measurement.
-            action: Shape (n, action_dim).
+            theta: Parameters, shape (n, theta_dim).
+            x: Outcomes, shape (n, *x_shape); NaN where there was no measurement.
+            action: Actions, shape (n, action_dim).
         """
         condition = self._condition(x, action)
         return self._direct().posterior_estimator.log_prob(
@@ -230,7 +230,7 @@ def at_conditions(
     row has none.
 
     Args:
-        direct: Over packed conditions.
+        direct: Estimator over packed conditions.
         condition: Packed conditions, shape (n, c).
 
     Returns:

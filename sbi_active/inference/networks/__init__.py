@@ -1,7 +1,7 @@
 """Networks and what prepares their inputs.
 
-Here live densities and classifiers of plain tensors, and their training. What they mean
-for an action lives in ``models``.
+This package contains densities and classifiers of plain tensors, and their training.
+Their meaning for an action is in ``models``.
 """
 
 from sbi_active.inference.networks.action_scaling import (

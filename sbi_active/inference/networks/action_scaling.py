@@ -32,7 +32,7 @@ class Polynomials(nn.Module):
     Rows further out are moved to the edge, since nothing was seen there.
 
     Args:
-        rows: Shape (n, d).
+        rows: Rows of numbers, shape (n, d).
         exponents: :math:`j`, shape (p, d).
     """
 
@@ -151,10 +151,10 @@ def fit_location_and_scale(
         design: F, shape (n, p), columns from coarse to fine.
         sizes: Numbers of leading columns to choose from.
         noise_design: G, shape (n, q), its first column one.
-        noise_sizes: Alike for G.
+        noise_sizes: Numbers of leading columns of G to choose from.
         y: Shape (n, m).
         test: Mask of held-out rows, shape (n,).
-        num_iterations: Of the pair.
+        num_iterations: Number of iterations of the pair of regressions.
 
     Returns:
         beta, shape (p, m), and gamma, shape (q, m).
@@ -242,7 +242,7 @@ class ActionScaling(nn.Module):
 
     Args:
         y: Shape (n, m), finite.
-        action: Shape (n, action_dim).
+        action: Actions, shape (n, action_dim).
     """
 
     mean: Tensor

@@ -59,7 +59,7 @@ class Baseline(Response):
     Args:
         u: Whitened parameters, shape (n, d).
         y: Finite outcomes, of scale one over all actions, shape (n, m).
-        action: Shape (n, action_dim).
+        action: Actions, shape (n, action_dim).
         kind: Whether f is linear in u.
     """
 
@@ -115,7 +115,7 @@ class Baseline(Response):
         residual = y[:, None] - self.parameter_basis(self.centers) @ beta
         misfit = 0.5 * (residual.square().sum(-1) + self.centers.square().sum(-1))
         first = self._descend(self.centers[misfit.argmin(1)][:, None], y, beta)
-        # Of the quadratic around the first solution, the centers' distances to it.
+        # Distances of the centers to the quadratic around the first solution.
         step = self.centers - first[0]
         quadratic = (step * (step @ first[2][:, 0])).sum(-1) * 0.5 + first[1]
         second = (misfit.log() - quadratic.clamp_min(1e-12).log()).argmin(1)
@@ -171,7 +171,7 @@ class Baseline(Response):
 def precision_factor(precision: Tensor) -> Tensor:
     """Return the lower factor of I + J J^T, which rounding may have made indefinite.
 
-    That happens where noise is extrapolated to nearly nothing; a share of the largest
+    This happens where noise is extrapolated to nearly nothing; a share of the largest
     entry, raised until it suffices, then stands for the lost I.
     """
     factor, info = torch.linalg.cholesky_ex(precision)

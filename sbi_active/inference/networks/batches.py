@@ -20,8 +20,9 @@ def log_prob_of_batch(
         network: Knows the shapes of an input and of a condition.
         density: Log density of inputs (sample_dim, batch_dim, d), given conditions
             (batch_dim, condition_dim).
-        input: Shape (sample_dim, batch_dim, d) or (batch_dim, d).
-        condition: Shape (batch_dim, condition_dim), or with the sample_dim too.
+        input: Inputs, shape (sample_dim, batch_dim, d) or (batch_dim, d).
+        condition: Conditions, shape (batch_dim, condition_dim), or with the sample_dim
+            too.
     """
     network._check_condition_shape(condition)
     network._check_input_shape(input)

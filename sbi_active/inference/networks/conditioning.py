@@ -1,4 +1,4 @@
-"""What a network sees instead of raw parameters and conditions, and the way back."""
+"""Transforms of a network's parameters and conditions, and their inverses."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ class Conditioning(nn.Module):
     noise of scale one.
 
     Args:
-        theta: Shape (n, theta_dim).
+        theta: Parameters, shape (n, theta_dim).
         condition: Packed (x, action), shape (n, x_dim + action_dim); NaN in x where
             there was no measurement.
         action_dim: Numbers in an action.
         scaling: Whether x, without a baseline, is standardized given the action or over
             all rows.
         whiten: Whether theta is whitened by its full covariance or only scaled.
-        baseline: Whose frames to use; "best" compares Gaussian log scores on held-out
-            rows.
+        baseline: Baseline whose frames are used; "best" compares Gaussian log scores on
+            held-out rows.
         most_numbers: Number of an outcome's numbers beyond which
             :class:`.Directions` stand for them. Half of it summarizes what a network
             learns as well in ten times the time.
@@ -163,7 +163,7 @@ class Conditioning(nn.Module):
         return -self.theta_factor.diagonal().log().sum()
 
     def forward(self, condition: Tensor) -> tuple[Tensor, Frames]:
-        """Return what the network sees, (n, x_dim + action_dim + ...), and the frames.
+        """Return the network's inputs, (n, x_dim + action_dim + ...), and the frames.
 
         Numbers of x that are missing are zero; a row with any has trivial frames.
         """

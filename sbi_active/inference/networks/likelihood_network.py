@@ -40,7 +40,8 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
     given the action, or over all rows.
 
     Args:
-        settings: Of the mixture; ``baseline`` and ``scaling`` are those of the outcome.
+        settings: Settings of the mixture; ``baseline`` and ``scaling`` are those of the
+            outcome.
         x: Training outcomes, shape (n, x_dim); NaN throughout a row where there was no
             measurement.
         condition: Packed (theta, action), shape (n, theta_dim + action_dim).
@@ -101,7 +102,7 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         return nn.Identity()
 
     def residual_rows(self, x: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what the mixture is trained on: residuals and their conditions."""
+        """Return the training rows of the mixture: residuals and their conditions."""
         valid = _valid(x)
         with torch.no_grad():
             z, _ = self._standardize(x[valid].double(), condition[valid])
@@ -123,9 +124,10 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         """Return log q(input | condition), shape (sample_dim, batch_dim), float32.
 
         Args:
-            input: Shape (sample_dim, batch_dim, x_dim) or (batch_dim, x_dim).
-            condition: Shape (batch_dim, condition_dim), or with the sample_dim too.
-            kwargs: Not used.
+            input: Outcomes, shape (sample_dim, batch_dim, x_dim) or (batch_dim, x_dim).
+            condition: Conditions, shape (batch_dim, condition_dim), or with the
+                sample_dim too.
+            kwargs: Arguments that are not used.
         """
         return log_prob_of_batch(self, self._log_density, input, condition)
 

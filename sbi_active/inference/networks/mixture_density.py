@@ -33,14 +33,14 @@ class MixtureDensity:
         activation: Function between layers, "silu" or "relu". The smooth one reaches
             the same loss in half of the steps.
         anneal: Whether the learning rate falls to zero along a cosine.
-        scaling: "action" standardizes x given the action, "global" over all rows; with
-            a baseline, that does the former.
+        scaling: Scaling of x: "action" standardizes it given the action, "global" over
+            all rows; with a baseline, that does the former.
         whiten: Whether theta is whitened by its full covariance, or number by number.
         baseline: Gaussian posterior that the network corrects: "linear" or "curved" in
             theta, "none", or "best" of these on held-out rows, see
             :class:`.Conditioning`.
-        embedding_net: Maps the packed condition (n, x_dim + action_dim) to features,
-            for example an :class:`.ActionEmbedding`. It sees x scaled over
+        embedding_net: Network that maps the packed condition (n, x_dim + action_dim)
+            to features, for example an :class:`.ActionEmbedding`. It sees x scaled over
             all rows, and there is no baseline.
 
     References:
@@ -110,7 +110,7 @@ class MixtureDensity:
         """Build the network on rows standardized number by number, as in sbi.
 
         Args:
-            theta: Shape (n, theta_dim).
+            theta: Parameters, shape (n, theta_dim).
             x: Packed conditions, shape (n, condition_dim); NaN where a simulation gave
                 no measurement.
         """

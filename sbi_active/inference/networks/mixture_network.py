@@ -55,14 +55,15 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         condition: Training conditions, shape (n, condition_dim).
         action_dim: Numbers of the action at the end of a condition; None leaves them
             unknown, and the next three arguments without effect.
-        scaling: As in :class:`.MixtureDensity`, with all that follow.
-        whiten: Of theta.
+        scaling: Scaling of the condition, as in :class:`.MixtureDensity`; so are all
+            that follow.
+        whiten: Whether theta is whitened.
         baseline: Gaussian posterior that the network corrects.
         activation: Name of the function between layers.
         hidden_features: Width of each hidden layer.
         num_components: Gaussian components K.
-        embedding_net: Of the condition, which is then scaled over all rows, without a
-            baseline.
+        embedding_net: Embedding network of the condition, which is then scaled over all
+            rows, without a baseline.
     """
 
     condition_mean: Tensor
@@ -187,9 +188,11 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         """Return log q(input | condition), shape (sample_dim, batch_dim).
 
         Args:
-            input: Shape (sample_dim, batch_dim, theta_dim) or (batch_dim, theta_dim).
-            condition: Shape (batch_dim, condition_dim), or with the sample_dim too.
-            kwargs: Not used.
+            input: Parameters, shape (sample_dim, batch_dim, theta_dim) or (batch_dim,
+                theta_dim).
+            condition: Conditions, shape (batch_dim, condition_dim), or with the
+                sample_dim too.
+            kwargs: Arguments that are not used.
         """
         return log_prob_of_batch(self, self._log_density, input, condition)
 
@@ -262,7 +265,7 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         return (logits + component + log_det).logsumexp(-1) - logits.logsumexp(-1)
 
     def _see(self, condition: Tensor) -> tuple[Tensor, Frames | None]:
-        """Return what the layers see of a condition, and the frames of its row."""
+        """Return the layers' input for a condition, and the frames of its row."""
         if self.conditioning is None:
             z, frames = (condition - self.condition_mean) / self.condition_scale, None
         else:

@@ -31,9 +31,9 @@ class RatioClassifier:
         baseline: Whether the classifier corrects the ratio of a regression of x on
             parameters and action, or starts from nothing.
         batch_size: Rows a step.
-        learning_rate: Of Adam.
+        learning_rate: Learning rate of Adam.
         num_iterations: Steps of stochastic gradient descent, at most.
-        stop_after_epochs: Without improvement on held-out rows.
+        stop_after_epochs: Epochs without improvement on held-out rows that end it.
     """
 
     hidden_features: tuple[int, ...] = (64, 64)

@@ -39,7 +39,7 @@ class Response(nn.Module):
     Args:
         u: Whitened parameters, shape (n, d).
         y: Finite outcomes, of scale one over all actions, shape (n, m).
-        action: Shape (n, action_dim).
+        action: Actions, shape (n, action_dim).
         kind: Whether f is linear in u.
     """
 
@@ -110,8 +110,8 @@ class Response(nn.Module):
     def best(u: Tensor, y: Tensor, action: Tensor) -> Response:
         """Return the linear or the curved regression, by held-out log score.
 
-        The curved one has many more coefficients to be wrong about, so what it gains
-        must be beyond chance.
+        The curved one has many more coefficients to fit, so its gain must be beyond
+        chance.
         """
         linear = Response(u, y, action, kind="linear")
         if linear.bend(u, y, action) <= STRAIGHT:
@@ -123,9 +123,9 @@ class Response(nn.Module):
         return curved if exceeds_chance(gain) else linear
 
     def weights(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        r"""Return what makes the noise of an action standard normal, and f's weights.
+        r"""Return the whitener of an action's noise, and f's weights.
 
-        A root of :math:`S^{-1}`, shape (n, m, m), and :math:`\beta` for
+        They are a root of :math:`S^{-1}`, shape (n, m, m), and :math:`\beta` for
         :math:`\psi(u)`, in the outcome's own units, shape (n, p, m).
         """
         phi = self.action_basis(action)

@@ -20,7 +20,7 @@ from sbi_active.inference.networks.mixture_network import (
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingBudget:
-    """How long and how to train.
+    """Length and settings of the training.
 
     Attributes:
         num_iterations: Steps of gradient descent.
@@ -65,13 +65,13 @@ def train_mixture_density(
     network ends with its best weights on the held-out rows.
 
     Args:
-        network: Changed in place.
-        optimizer: Over the network's parameters.
-        theta: Shape (n, theta_dim).
-        condition: Shape (n, condition_dim).
+        network: Network that is changed in place.
+        optimizer: Optimizer of the network's parameters.
+        theta: Parameters, shape (n, theta_dim).
+        condition: Conditions, shape (n, condition_dim).
         train_rows: Indices of rows to train on.
         held_out_rows: Indices of rows to validate on; may be empty.
-        budget: How long to train.
+        budget: Budget of the training.
         calibration_kernel: Weight K of a row; None is 1.
 
     Returns:

@@ -19,7 +19,8 @@ class ValidityNetwork(nn.Module):
 
     Args:
         seen: Standardized inputs, shape (n, p).
-        valid: Which rows gave a measurement, shape (n,), bool; both kinds occur.
+        valid: Mask of the rows that gave a measurement, shape (n,), bool; both kinds
+            occur.
     """
 
     def __init__(self, seen: Tensor, valid: Tensor) -> None:

@@ -1,6 +1,7 @@
 """Beliefs that are the prior times learned factors of all trials.
 
-Here live the product and its samplers. What learns the factors lives in ``trainers``.
+This package contains the product and its samplers. The trainers of the factors are in
+``trainers``.
 """
 
 from sbi_active.inference.products.product import Product, TrainedRegion, widened

@@ -19,7 +19,7 @@ from sbi_active.threads import single_thread
 
 Array = NDArray[Any]
 
-#: Of the mixture whose level set is a region: a choice, enough for a few modes.
+#: Components of the mixture whose level set is a region: enough for a few modes.
 NUM_COMPONENTS = 6
 NUM_FITTED = 2_000  # rows that a region is fitted to
 LOST = 2e-3  # share of the rows that may lie outside
@@ -29,7 +29,7 @@ BATCH_SIZE = 20_000  # rows at once, which bounds the memory
 
 
 class TrialModel(Protocol):
-    """What is learned of one trial's likelihood."""
+    """Learned model of one trial's likelihood."""
 
     def log_factor(self, theta: Tensor, x: Tensor, action: Tensor) -> Tensor:
         """Return log p(x_i | theta_i, action_i), (n,), but for a term without theta."""
@@ -38,10 +38,10 @@ class TrialModel(Protocol):
 
 @dataclass(frozen=True)
 class TrainedRegion:
-    """Where a network was trained: what it says elsewhere is made up.
+    """Region where a network was trained; its values elsewhere mean nothing.
 
     Attributes:
-        mixture: Fitted to the rows.
+        mixture: Mixture fitted to the rows.
         floor: Log density of the mixture at the edge.
     """
 
@@ -66,7 +66,7 @@ def widened(
 ) -> Array:
     """Return draws spread up to twice as wide as those of a belief, within the support.
 
-    A belief may be off by as much as it is wide; a likelihood can be learned from
+    The error of a belief may be as large as its width; a likelihood can be learned from
     parameters of any distribution. Each component of a Gaussian mixture of z, shape (n,
     d), is doubled, so that modes stay apart.
     """
@@ -93,11 +93,11 @@ class Product:
     the posterior. The factors are exact products; only q is learned.
 
     Args:
-        coordinates: Of the prior.
+        coordinates: Coordinates of the prior.
         model: q, up to factors without theta.
         trials: The history.
         region: R; None is the whole support.
-        previous: Takes the prior's place, where beliefs are chained.
+        previous: Belief that takes the prior's place, where beliefs are chained.
     """
 
     def __init__(

@@ -1,6 +1,6 @@
 """Rows of a round: simulations, what they are conditioned on, what sbi is given.
 
-Here live the shapes and checks that all trainers share. Nothing here learns.
+This package contains the shapes and checks that all trainers share. It does not learn.
 """
 
 from sbi_active.inference.rounds.condition import (

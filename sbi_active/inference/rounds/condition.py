@@ -32,7 +32,7 @@ def action_rows(
     """Return actions as float32 rows of their own, one repeated where one is given.
 
     Args:
-        action: Shape (action_dim,), (1, action_dim) or (n, action_dim).
+        action: Action, shape (action_dim,), (1, action_dim) or (n, action_dim).
         action_dim: The dimension to expect; None takes that of ``action``.
         num_rows: Rows n to return; None keeps as many as there are.
 
@@ -87,7 +87,7 @@ class ActionEmbedding(nn.Module):
     condition, the network inside sees x in its own shape.
 
     Args:
-        net: Maps x of shape (n, *x_shape) to (n, num_features).
+        net: Network that maps x of shape (n, *x_shape) to (n, num_features).
         x_shape: Shape of one outcome, for example (1, 32, 32).
         action_dim: Numbers in an action.
 

@@ -1,4 +1,4 @@
-"""What goes into a round with actions: checked rows, and the trials that ended it."""
+"""Contents of a round with actions: checked rows, and the trials that ended it."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ def round_rows(
     """Return the rows of a round, or say what is wrong with them.
 
     Args:
-        theta: Shape (n, theta_dim), within the prior's support.
-        x: Shape (n, *x_shape), or (n,) where x is one number.
-        action: Shape (n, action_dim), or (action_dim,) for all rows.
-        prior: Gives theta_dim and the support.
+        theta: Parameters, shape (n, theta_dim), within the prior's support.
+        x: Outcomes, shape (n, *x_shape), or (n,) where x is one number.
+        action: Actions, shape (n, action_dim), or (action_dim,) for all rows.
+        prior: Prior that gives theta_dim and the support.
         x_shape: Shape of earlier outcomes; None takes that of these.
-        action_dim: Of earlier actions; None takes that of these.
+        action_dim: Dimension of earlier actions; None takes that of these.
         exclude_invalid: Drop rows in which a number is missing.
         may_be_invalid: Whether it is plausible that no row has a measurement, as under
             a belief from trials that had none.
@@ -106,7 +106,7 @@ def round_rows(
 
 
 def require_whole(x: Tensor) -> None:
-    """Raise where numbers of an outcome (n, *x_shape) are missing and others not."""
+    """Raise if numbers of an outcome (n, *x_shape) are missing and others not."""
     present = torch.as_tensor(x).reshape(len(x), -1).isfinite()
     partly = present.any(1) & ~present.all(1)
     if bool(partly.any()):

@@ -10,9 +10,9 @@ P = ParamSpec("P")
 R = TypeVar("R")
 Ours = TypeVar("Ours", bound=Callable[..., Any])
 
-#: As many epochs as sbi's own default allows.
+#: Number of epochs that sbi's own default allows.
 NEVER = 2**31 - 1
-#: Of NPE_C: they choose between losses of several rounds.
+#: Arguments of NPE_C, which choose between losses of several rounds.
 _NO_MEANING_WITH_ACTION = ("discard_prior_samples", "use_combined_loss", "num_atoms")
 
 

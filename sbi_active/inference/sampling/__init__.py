@@ -1,6 +1,7 @@
 """Samplers and proposals over the parameters' unbounded coordinates.
 
-Here live tools that know a density and nothing of trials, networks or simulators.
+This package contains tools that know a density and nothing of trials, networks or
+simulators.
 """
 
 from sbi_active.inference.sampling.coordinates import PriorCoordinates

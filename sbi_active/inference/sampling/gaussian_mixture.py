@@ -19,10 +19,10 @@ class GaussianMixture:
     """Gaussian mixture with full covariances.
 
     Attributes:
-        log_weight: Shape (k,).
-        mean: Shape (k, d).
+        log_weight: Log weights, shape (k,).
+        mean: Means, shape (k, d).
         factor: Lower Cholesky factors, shape (k, d, d).
-        log_likelihood: Of the points it was fitted to, a point.
+        log_likelihood: Mean log likelihood of the points it was fitted to.
     """
 
     log_weight: Array

@@ -40,7 +40,7 @@ class LeastSquares(Protocol):
 
     @property
     def coordinates(self) -> Bounds:
-        """Of the search."""
+        """Coordinates of the search."""
         ...
 
     @property
@@ -80,10 +80,11 @@ def descend(
     Args:
         problem: The model.
         u: Starts, shape (n, dim).
-        whiten: Of the residuals.
-        step: Of finite differences.
-        iterations: At most; a start that is expected to gain nothing stops.
-        center: Of the penalty, shape (n, dim); None has that of the prior.
+        whiten: Whitener of the residuals.
+        step: Step of finite differences.
+        iterations: Number of iterations at most; a start that is expected to gain
+            nothing stops.
+        center: Center of the penalty, shape (n, dim); None has that of the prior.
         secant: Derivatives are updated from the steps made, by Broyden's rule, and not
             computed again.
         known: Whitened residuals at the starts and their derivatives, shapes (n, N) and
@@ -144,9 +145,9 @@ def within(system: Array, gradient: Array, u: Array, low: Array, high: Array) ->
     it.
 
     Args:
-        system: Shape (n, dim, dim).
-        gradient: Shape (n, dim).
-        u: Shape (n, dim); a step is subtracted.
+        system: Matrices of the normal equations, shape (n, dim, dim).
+        gradient: Gradients, shape (n, dim).
+        u: Coordinates, shape (n, dim); a step is subtracted.
         low: Lower bounds, shape (dim,).
         high: Upper bounds.
 

@@ -32,16 +32,16 @@ class NormalCoordinates:
     is whitened together would be oblique, and a smooth density would be cut.
 
     Args:
-        coordinates: Of the prior.
+        coordinates: Coordinates of the prior.
         rng: Source of the draws behind its moments.
         keeps_edges: Whether axes keep two bounds.
 
     Attributes:
-        low: Bounds of a search, shape (d,).
-        high: As low.
+        low: Lower bounds of a search, shape (d,).
+        high: Upper bounds of a search, shape (d,).
         center: Mean of the normal that stands for the prior, shape (d,).
-        precision: Its inverse variance, shape (d,): 0 of a uniform number, which has
-            its bounds, and up to 1 of one that is narrow between them.
+        precision: Inverse variance, shape (d,): 0 of a uniform number, which has its
+            bounds, and up to 1 of one that is narrow between them.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class NormalCoordinates:
         self.line = Unbounding(bounded & ~kept)
         y = self.line.to_line(z)
         shift, spread = y.mean(0), y.std(0)
-        # Those of a uniform number are known.
+        # The moments of a uniform number are known.
         is_flat = kept & (np.abs(spread - UNIFORM) < CHANCE * FLAT_ERROR)
         self._shift = np.where(is_flat, 0.0, shift)
         spread = np.where(is_flat, UNIFORM, spread)
@@ -102,7 +102,7 @@ class NormalCoordinates:
     def splits_off(self, axes: NDArray[np.bool_], rng: np.random.Generator) -> bool:
         r"""Return whether the prior is a product over some axes and all others.
 
-        Of two draws a and b, the density must not see which the axes come from:
+        The density must not depend on which of two draws a and b the axes come from:
 
         .. math::
             p(a)\, p(b) = p(a_S, b_R)\, p(b_S, a_R).

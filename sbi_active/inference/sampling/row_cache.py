@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 
 class RowCache(Generic[T]):
-    """What was simulated once, so that no parameters are simulated twice.
+    """Cache of simulated rows, so that no parameters are simulated twice.
 
     A search returns to its best point, draws of a weighted sample repeat, and rivals
     that differ in their errors alone ask for the same parameters. Beyond ``most``
@@ -33,10 +33,10 @@ class RowCache(Generic[T]):
         """Return the values of all rows, simulating those that are new.
 
         Args:
-            label: What the rows belong to, such as an action.
+            label: Label that the rows belong to, such as an action.
             rows: Parameters, shape (n, dim); always of one dtype for a label.
-            simulate: Maps places among the rows, shape (m,), to m values: arrays,
-                tuples of them, or None.
+            simulate: Function that maps places among the rows, shape (m,), to m values:
+                arrays, tuples of them, or None.
         """
         keys = [(label, row.tobytes()) for row in np.ascontiguousarray(rows)]
         known, new = self._known, {}
@@ -56,7 +56,7 @@ class RowCache(Generic[T]):
 
 
 def _count(value: Any) -> int:
-    """Return how many numbers a value holds."""
+    """Return the count of numbers in a value."""
     if isinstance(value, tuple):
         return sum(_count(part) for part in value)
     return 0 if value is None else value.size

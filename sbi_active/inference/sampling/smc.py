@@ -33,15 +33,16 @@ class Bridged:
     """Particles of a density.
 
     Attributes:
-        u: Equally weighted, shape (n, d).
-        log_likelihood: Of each, shape (n,).
+        u: Particles of equal weight, shape (n, d).
+        log_likelihood: Log likelihood of each particle, shape (n,).
         log_evidence: Log of the integral of the density, nats.
-        standard_error: Of log_evidence.
-        effective_sample_size: Of the particles, by families and what moves forgot.
-        acceptance: Of the last moves.
+        standard_error: Standard error of log_evidence.
+        effective_sample_size: Effective number of the particles, by families and what
+            moves forgot.
+        acceptance: Acceptance rate of the last moves.
         memory: Largest correlation with where the moves of a step began; those of the
             last may end sooner, where its particles share little.
-        num_steps: Between the two densities.
+        num_steps: Number of steps between the two densities.
     """
 
     u: Array
@@ -66,7 +67,7 @@ def bridge(
     max_moves: int = 100,
     forgotten: float = FORGOTTEN,
 ) -> Bridged | None:
-    r"""Return particles of :math:`p(u) L(u)`, or None where it takes too many moves.
+    r"""Return particles of :math:`p(u) L(u)`, or None if it takes too many moves.
 
     They go from the guess q along
 
@@ -82,7 +83,7 @@ def bridge(
         log_likelihood: Log L, (n, d) -> (n,); -inf allowed.
         guess: q.
         rng: Source of randomness.
-        num_particles: n.
+        num_particles: Number of particles n.
         most: Evaluations of the likelihood at most.
         moves: Proposals; None takes :class:`NormalMoves`.
         max_moves: A step.
@@ -131,7 +132,7 @@ def bridge(
         u, target, start, b = u[which], target[which], start[which], power
         kept = 1.0
         for _ in range(max_moves):
-            # Of the last step's particles all count, but for what they share.
+            # All particles of the last step count, but for what they share.
             if kept <= forgotten or (b == 1 and kept**2 * shared <= SHARED):
                 break
             new, gain = moves.propose(u, rng)
@@ -170,15 +171,15 @@ class Moves(Protocol):
 
         Args:
             u: Particles, shape (n, d).
-            weight: Their weights at this step, which sum to 1, shape (n,).
-            power: Of the target at this step.
+            weight: Weights of the particles at this step, which sum to 1, shape (n,).
+            power: Power of the target at this step.
         """
         ...
 
     def propose(self, u: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Return where particles may go (n, d), and the log ratio of own densities.
+        """Return proposed particles (n, d), and the log ratio of own densities.
 
-        That of where they are over that of where they go, shape (n,).
+        The ratio is the density where they are over that where they go, shape (n,).
         """
         ...
 
@@ -187,7 +188,7 @@ class Moves(Protocol):
 
         Args:
             before: Particles, shape (n, d).
-            after: Where they are after it, shape (n, d).
+            after: Particles after it, shape (n, d).
             acceptance: Share of them that moved.
         """
         ...
@@ -217,7 +218,7 @@ class NormalMoves:
         self._factor = np.linalg.cholesky(cov + 1e-14 * np.eye(u.shape[1]))
 
     def propose(self, u: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Return where particles may go, and the log ratio of the normal densities."""
+        """Return proposed particles, and the log ratio of the normal densities."""
         mean, factor, length = self._mean, self._factor, self._length
         new = mean + np.sqrt(1 - length**2) * (u - mean)
         new = new + length * rng.standard_normal(u.shape) @ factor.T

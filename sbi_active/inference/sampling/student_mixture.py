@@ -63,7 +63,7 @@ class StudentMixture:
     """Mixture of multivariate t distributions.
 
     Attributes:
-        means: Shape (k, dim).
+        means: Means of the components, shape (k, dim).
         factors: Lower Cholesky factors of the scale matrices, shape (k, dim, dim).
         weights: Sum to 1, shape (k,); None has equal ones.
         freedom: Degrees of freedom.
@@ -164,7 +164,7 @@ class NormalMixture(Proposal):
 
     Attributes:
         weights: Sum to 1, shape (k,).
-        means: Shape (k, d).
+        means: Means of the components, shape (k, d).
         factors: Lower Cholesky factors, shape (k, d, d).
     """
 
@@ -227,7 +227,7 @@ class Defended(Proposal):
 def lower_factors(cov: Array) -> Array:
     """Return lower Cholesky factors of covariances, shape (..., dim, dim).
 
-    One that is singular in floating point, as where a few trials are believed to many
+    A covariance that is singular in floating point, as if a few trials determine many
     digits, has its smallest variances raised to 1e-12 of the largest.
     """
     try:

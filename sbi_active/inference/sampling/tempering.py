@@ -1,4 +1,4 @@
-"""How far to go from one density towards another in a step."""
+"""Step lengths from one density towards another."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ def largest_power(
 ) -> float:
     """Return the largest power that suffices, between a start and an end.
 
-    By bisection; from 0 by powers of ten first, since where a likelihood is narrow the
-    first power may be of the order of 1e-8.
+    The search is by bisection; from 0 by powers of ten first, since where a likelihood
+    is narrow the first power may be of the order of 1e-8.
 
     Args:
         suffices: Whether a power of a likelihood, or of a ratio of densities, leaves
             draws enough effective; true up to the answer and false beyond.
-        start: Taken to suffice.
-        end: Returned where it suffices.
+        start: Power that is taken to suffice.
+        end: Power that is returned where it suffices.
         least: Gone beyond the start even where that does not suffice, so that a
             sequence of steps moves on.
-        num_steps: Of the bisection.
+        num_steps: Number of steps of the bisection.
     """
     if suffices(end):
         return end

@@ -16,10 +16,10 @@ Array = NDArray[Any]
 class Unbounding:
     """Maps axes in [-1, 1] to the real line, where a uniform number is normal.
 
-    Draws of a density that is cut at many edges would else nearly all miss it.
+    Otherwise nearly all draws of a density that is cut at many edges would miss it.
 
     Attributes:
-        axes: Which axes are mapped, shape (d,); the others stay.
+        axes: Mask of the axes that are mapped, shape (d,); the others stay.
     """
 
     axes: NDArray[np.bool_]

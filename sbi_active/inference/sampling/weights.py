@@ -14,7 +14,7 @@ Array = NDArray[Any]
 def log_sum_exp(values: Array, axis: int | None = None) -> Any:
     """Return the log of a sum of exponentials over an axis, or over all.
 
-    It is -inf where every term vanishes. As SciPy's, and in an eighth of its time for
+    It is -inf if every term vanishes. It equals SciPy's, in an eighth of its time for
     the few hundred terms of a likelihood that is a sum over a grid.
     """
     top = values.max(axis=axis, keepdims=True)
@@ -28,8 +28,8 @@ def normalized(log_weight: Array) -> Array:
     """Return weights that sum to one, shape (n,), whatever their size.
 
     Args:
-        log_weight: Shape (n,). Beyond 1e16 a sum of several is lost in the rounding of
-            its logarithm; where none is finite, all count the same.
+        log_weight: Log weights, shape (n,). Beyond 1e16 a sum of several is lost in the
+            rounding of its logarithm; where none is finite, all count the same.
     """
     if not np.isfinite(log_weight).any():
         return np.full(len(log_weight), 1 / len(log_weight))
@@ -42,7 +42,7 @@ def effective_sample_size(log_weight: Array) -> float:
     r"""Return :math:`(\sum w_i)^2 / \sum w_i^2`; 0 where no weight is positive.
 
     Args:
-        log_weight: Not normalized, shape (n,).
+        log_weight: Log weights, not normalized, shape (n,).
 
     References:
         Kong, Liu & Wong, Journal of the American Statistical Association 89 (1994).
@@ -60,9 +60,9 @@ def systematic(weight: Array, num: int, offset: float) -> NDArray[np.intp]:
     Each index is drawn as often as its weight times ``num`` says, rounded up or down.
 
     Args:
-        weight: Normalized, shape (n,).
+        weight: Normalized weights, shape (n,).
         num: Indices to return.
-        offset: Uniform in [0, 1); a fixed one gives indices without randomness.
+        offset: Offset, uniform in [0, 1); a fixed one gives indices without randomness.
 
     References:
         Douc, Cappe & Moulines, Comparison of resampling schemes, ISPA 2005.

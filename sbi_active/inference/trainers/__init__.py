@@ -1,5 +1,6 @@
 """The trainers: sbi's interface with actions, one method a module.
 
-Here lives what users call to append, train and update. What is trained lives in
-``networks``, what they return in ``models`` and ``beliefs``.
+This package contains the classes that users call to append, train and update. The
+networks that they train are in ``networks``, their results in ``models`` and
+``beliefs``.
 """

@@ -27,17 +27,17 @@ from sbi_active.threads import single_thread
 class ActionRounds(ActiveInference):
     r"""Rows by round of the belief they were drawn from, and the trials in between.
 
-    To be mixed in before a trainer of sbi's, whose private hooks it overrides
+    It is mixed in before a trainer of sbi's, whose private hooks it overrides
     (``tests/inference/trainers/test_sbi_hooks.py`` lists them). Without actions that
     trainer does what it always does. A round with them is that of Algorithm 1: this
     round's rows, a network built anew, plain maximum likelihood.
 
     Args:
-        args: Of sbi's trainer. Rounds with actions need a prior with a support. What
-            is trained is a name or a builder of sbi's, or this library's settings; None
-            is sbi's default without actions and the default settings with them. Without
-            a tracker nothing is tracked, so that no folder appears.
-        kwargs: Alike, by name.
+        args: Arguments of sbi's trainer. Rounds with actions need a prior with a
+            support. What is trained is a name or a builder of sbi's, or this library's
+            settings; None is sbi's default without actions and the default settings
+            with them. Without a tracker nothing is tracked, so that no folder appears.
+        kwargs: Arguments of sbi's trainer by name.
 
     References:
         Kim & Matsubara, Applied Intelligence 2025, arXiv:2510.15331.
@@ -50,7 +50,7 @@ class ActionRounds(ActiveInference):
     _sbi_default: ClassVar[str]
     _sbi_builder: ClassVar[Callable[..., Any]]
 
-    # Of sbi's trainers.
+    # Attributes of sbi's trainers.
     _device: str
     _round: int
     _neural_net: Any
@@ -108,8 +108,9 @@ class ActionRounds(ActiveInference):
     def train(self, *args: Any, **kwargs: Any) -> Any:
         """Train the estimator, with the arguments of sbi's own ``train``.
 
-        What is not given is sbi's default, with actions what the settings say. With
-        actions the network is built anew at each call, unless ``resume_training``.
+        Arguments that are not given are sbi's defaults, or with actions those of the
+        settings. With actions the network is built anew at each call, unless
+        ``resume_training``.
 
         Returns:
             The trained estimator; with actions its condition is packed.
@@ -165,7 +166,7 @@ class ActionRounds(ActiveInference):
 
     @abstractmethod
     def _model(self, estimator: Any, *arguments: Any) -> Any:
-        """Return what was learned, of the arguments of ``_create_posterior``."""
+        """Return the learned model, from the arguments of ``_create_posterior``."""
 
     def _create_posterior(
         self,

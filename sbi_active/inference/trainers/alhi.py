@@ -46,10 +46,10 @@ class ALHI(ProductRounds, MixtureRounds, NLE_A):
             regression of x on (theta, action), and a mixture density network on what
             it leaves.
             ``MixtureDensity.faithful()`` is the paper's.
-        args: Further ones of sbi's; without a tracker nothing is tracked.
-        kwargs: Alike, by name.
-        posterior: How beliefs are sampled, see :class:`.ProductRounds`; "kde" is the
-            paper's.
+        args: Further arguments of sbi's; without a tracker nothing is tracked.
+        kwargs: Further arguments of sbi's by name.
+        posterior: Sampling method for beliefs, see :class:`.ProductRounds`; "kde" is
+            the paper's.
 
     References:
         Kim & Matsubara, Applied Intelligence 2025, arXiv:2510.15331; Papamakarios,

@@ -63,19 +63,19 @@ class ASBI(MixtureRounds, NPE_C):
     (:func:`.refine`). That needs no network; where one was trained in this round,
     ``belief.diagnostics`` compares the two.
 
-    NaN in x_o is information, as it is in the simulations: "no measurement" where it is
-    NaN throughout, else a number that was not observed. Where no simulation of this
-    round lacked those numbers, the network has never seen such an outcome and what it
-    would say is arbitrary. Without a simulator the belief then stays "unchanged", with
-    a warning: that the outcome is rare all over the belief says nothing about where it
-    is less rare, so there is no reason to widen it either.
+    NaN in x_o is information, as it is in the simulations: "no measurement" if it is
+    NaN throughout, else a number that was not observed. If no simulation of this round
+    lacked those numbers, the network has never seen such an outcome and its answer
+    would be arbitrary. Without a simulator the belief then stays "unchanged", with a
+    warning: an outcome that is rare everywhere under the belief does not say where it
+    is less rare, so there is no reason to widen the belief either.
 
     Args:
         prior: The prior over parameters. Rounds with actions need one with a support.
         density_estimator: An sbi string or builder, or :class:`MixtureDensity`. None is
             sbi's default ("maf") without actions and ``MixtureDensity()`` with them.
-        args: Further ones of sbi's; without a tracker nothing is tracked.
-        kwargs: Alike, by name.
+        args: Further arguments of sbi's; without a tracker nothing is tracked.
+        kwargs: Further arguments of sbi's by name.
 
     References:
         Kim & Matsubara, Applied Intelligence 2025, arXiv:2510.15331; Greenberg et al.,
@@ -123,15 +123,15 @@ class ASBI(MixtureRounds, NPE_C):
         Args:
             theta: Parameters, shape (n, theta_dim), drawn from the belief.
             x: Outcomes, shape (n, *x_shape); NaN where there was no measurement.
-            proposal: Without actions as in sbi. With them, None, the belief itself or
-                sbi's ``RestrictedPrior`` of it.
-            exclude_invalid_x: With actions, None keeps rows with NaN as information
-                for :class:`MixtureDensity`, and drops them for sbi's networks, which
-                cannot take them, with a warning. True drops them: information gain is
-                then biased towards actions that fail, since what failures tell about
-                theta is lost and what is left is all success.
-            data_device: Where to keep the rows.
-            action: Shape (n, action_dim), or (action_dim,) for all rows.
+            proposal: Proposal, without actions as in sbi. With them, None, the belief
+                itself or sbi's ``RestrictedPrior`` of it.
+            exclude_invalid_x: Whether to drop rows with NaN. With actions, None keeps
+                them with NaN as information for :class:`MixtureDensity`, and drops them
+                for sbi's networks, which cannot take them, with a warning. True drops
+                them: information gain is then biased towards actions that fail, since
+                what failures tell about theta is lost and what is left is all success.
+            data_device: Device that keeps the rows.
+            action: Actions, shape (n, action_dim), or (action_dim,) for all rows.
             belief: The distribution of theta in this round; None is the current one.
 
         Returns:
@@ -246,7 +246,7 @@ class ASBI(MixtureRounds, NPE_C):
     def _chained(self, trial: Observation, *, required: bool) -> Belief | None:
         """Return the network's value at the trial.
 
-        It is None where there is no network, or it has never seen such an outcome; if
+        It is None if there is no network, or it has never seen such an outcome; if
         a belief is required, the first is an error and the second the belief before.
         """
         network, previous = self._neural_net, self.belief

@@ -1,4 +1,4 @@
-"""What every active inference method offers, whatever it learns."""
+"""The interface of every active inference method."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ from sbi_active.inference.rounds.rows import Observation
 
 @dataclass(frozen=True)
 class Told:
-    """What a belief is to be inferred from.
+    """Trials and options from which a belief is inferred.
 
     Attributes:
-        trials: All of them, the new one last.
-        simulator: To refine the belief with; None takes the word of the network.
-        refinement: Budget of that; None is ``RefinementOptions()``.
-        given_seed: By the caller; None for none.
+        trials: Trials, all of them, the new one last.
+        simulator: If given, simulator to refine the belief with; otherwise use the
+            network.
+        refinement: Budget of the refinement; None is ``RefinementOptions()``.
+        given_seed: Seed given by the caller; None for none.
         afresh: Whether to begin at the prior, without the belief before the last trial
             and without this round's network.
     """
@@ -38,7 +39,7 @@ class Told:
 
     @property
     def settings(self) -> RefinementOptions:
-        """Of the refinement."""
+        """Settings of the refinement."""
         return RefinementOptions() if self.refinement is None else self.refinement
 
     def seed(self) -> int:
@@ -50,7 +51,7 @@ class Told:
 class ActiveInference(ABC):
     r"""A method that learns from simulations and updates a belief by real trials.
 
-    A round: rows drawn under the current belief go to ``append_simulations(theta, x,
+    In a round, rows drawn under the current belief go to ``append_simulations(theta, x,
     action=, belief=)``, ``train()`` learns from them, ``build_posterior()`` gives the
     model that actions are designed with, and :meth:`update` takes the real trial. The
     model has ``log_posterior``, ``log_likelihood`` or ``log_ratio``, which is all that
@@ -65,7 +66,7 @@ class ActiveInference(ABC):
             ``model.belief`` draws.
         starts_at_network: Whether a refinement begins at this round's network, where
             there is one.
-        network_serves: A refinement that does: as its "start", or also for the
+        network_serves: Use of that network: the "start" of a refinement, or also its
             "diagnostics", which compare it with the refined belief.
     """
 
@@ -117,10 +118,10 @@ class ActiveInference(ABC):
                 was no measurement.
             action: The executed action, shape (action_dim,) or (1, action_dim); it need
                 not be one of the actions that were asked for.
-            simulator: ``simulator(theta, action)`` to refine the belief with; None
-                takes the word of this round's network.
+            simulator: If given, ``simulator(theta, action)`` to refine the belief
+                with; otherwise use this round's network.
             refinement: Budget of the refinement; None is ``RefinementOptions()``.
-            seed: Of everything random in the refinement; None draws one from torch's
+            seed: Seed of all draws in the refinement; None draws one from torch's
                 global generator.
 
         Returns:
@@ -146,10 +147,10 @@ class ActiveInference(ABC):
         """Return the refined belief of these trials alone, computed from scratch.
 
         Args:
-            trials: They replace the history.
-            simulator: As in :meth:`update`, with what follows.
+            trials: Trials that replace the history.
+            simulator: Simulator to refine the belief with, as in :meth:`update`.
             refinement: Budget of the refinement.
-            seed: Of everything random here.
+            seed: Seed of all draws; None draws one from torch's global generator.
 
         Raises:
             ValueError: If there is no trial.
@@ -162,8 +163,8 @@ class ActiveInference(ABC):
         """Go on from a belief that was inferred before.
 
         Args:
-            belief: After the trials.
-            trials: They replace the history.
+            belief: Belief after the trials.
+            trials: Trials that replace the history.
         """
         self._belief, self.trials = belief, [*trials]
         self._forget_round()

@@ -45,9 +45,9 @@ NUM_PROBES = 64  # draws of the prior, at one of which a factor is finite
 class ProductRounds(ActionRounds):
     r"""Rounds of a method that learns a factor of each trial's likelihood.
 
-    The belief is the original prior times the product over the history, in which every
-    trial counts by what the latest network says of it, within the region of its
-    training rows:
+    The belief is the original prior times the product over the history, in which the
+    latest network gives the factor of every trial, within the region of its training
+    rows:
 
     .. math::
         b_r(\theta) \propto p(\theta)\, 1[\theta \in R_r]
@@ -60,11 +60,11 @@ class ProductRounds(ActionRounds):
     two stages or, from the prior, four; the options' ``num_histories`` is their sum.
 
     Args:
-        args: Of :class:`.ActionRounds`.
-        posterior: How the belief is sampled: "importance", tempered importance
+        args: Arguments of :class:`.ActionRounds`.
+        posterior: Sampling method for the belief: "importance", tempered importance
             sampling; or "kde", the paper's: draws of the belief before times the last
             trial's factor, as a kernel density estimate.
-        kwargs: Of :class:`.ActionRounds`.
+        kwargs: Arguments of :class:`.ActionRounds` by name.
 
     References:
         Papamakarios, Sterratt & Murray, AISTATS 2019 (likelihoods need no correction
@@ -105,13 +105,14 @@ class ProductRounds(ActionRounds):
             theta: Parameters, shape (n, theta_dim), drawn from the belief.
             x: Outcomes, shape (n, *x_shape); NaN throughout a row where there was no
                 measurement.
-            exclude_invalid_x: With actions, None keeps rows without a measurement for
-                this library's networks, which learn their probability, and drops them
-                for sbi's, with a warning.
-            from_round: As in sbi; without meaning where there are actions.
-            algorithm: As in sbi; None is sbi's.
-            data_device: Where to keep the rows.
-            action: Shape (n, action_dim), or (action_dim,) for all rows.
+            exclude_invalid_x: Whether to drop rows without a measurement. With actions,
+                None keeps them for this library's networks, which learn their
+                probability, and drops them for sbi's, with a warning.
+            from_round: Round number, as in sbi; without meaning where there are
+                actions.
+            algorithm: Algorithm name, as in sbi; None is sbi's.
+            data_device: Device that keeps the rows.
+            action: Actions, shape (n, action_dim), or (action_dim,) for all rows.
             belief: The distribution of theta in this round; None is the current one.
 
         Raises:
@@ -222,7 +223,7 @@ class ProductRounds(ActionRounds):
         return belief
 
     def _places(self, belief: Distribution, num: int, seed: int) -> Tensor:
-        """Return where to simulate, around a belief, shape (num, theta_dim)."""
+        """Return parameters to simulate around a belief, shape (num, theta_dim)."""
         prior = require_support(self._prior)
         with forked_generators(seed, "theta"):
             theta = belief.sample(torch.Size([num]))

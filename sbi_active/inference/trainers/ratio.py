@@ -26,7 +26,7 @@ LFIRE_KEYWORDS = {"settings", "num_particles"}
 
 
 class AmortizedRounds(ProductRounds, RatioEstimatorTrainer):
-    r"""What the two losses share.
+    r"""The base of both losses.
 
     Without ``action=`` these are sbi's trainers, to the last bit at the same torch seed
     (but for a silent tracker). With it a round trains a classifier of (theta, x,
@@ -45,9 +45,9 @@ class AmortizedRounds(ProductRounds, RatioEstimatorTrainer):
         prior: The prior over parameters. Rounds with actions need one with a support.
         classifier: An sbi string or builder, or :class:`RatioClassifier`. None is sbi's
             default ("resnet") without actions and ``RatioClassifier()`` with them.
-        args: Further ones of sbi's; without a tracker nothing is tracked.
-        kwargs: Alike, by name.
-        posterior: How beliefs are sampled, see :class:`.ProductRounds`.
+        args: Further arguments of sbi's; without a tracker nothing is tracked.
+        kwargs: Further arguments of sbi's by name.
+        posterior: Sampling method for beliefs, see :class:`.ProductRounds`.
     """
 
     _factor = ActionRatio

@@ -57,10 +57,10 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
 
     Args:
         prior: The prior over parameters, with a support.
-        settings: Of the logistic regressions; None is ``LFIRE()``.
-        num_particles: In a round; None makes as many as each has simulations.
-        tracker: Not used: no network is trained.
-        show_progress_bars: Not used.
+        settings: Settings of the logistic regressions; None is ``LFIRE()``.
+        num_particles: Particles of a round; None makes as many as each has simulations.
+        tracker: Tracker, which is not used: no network is trained.
+        show_progress_bars: Flag that is not used.
 
     References:
         Kleinegesse, Drovandi & Gutmann, Bayesian Analysis 2021, arXiv:2003.09379.
@@ -145,7 +145,7 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         Args:
             theta: Particles, each of them several times, shape (n, theta_dim).
             x: Outcomes, shape (n, *x_shape); NaN where there was no measurement.
-            action: Shape (n, action_dim).
+            action: Actions, shape (n, action_dim).
             belief: The distribution of the particles; None is the current belief.
         """
         if action is None:
@@ -176,8 +176,8 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         """Fit the log ratio of every particle at every action.
 
         Args:
-            seed: Of the cross-validation's folds and the choice of marginal rows; None
-                draws one from torch's global generator.
+            seed: Seed of the cross-validation's folds and the choice of marginal rows;
+                None draws one from torch's global generator.
 
         Raises:
             RuntimeError: If there are no simulations.

@@ -1,7 +1,7 @@
 """Estimators of the expected information gain, one a module.
 
-Here live those that a designer can be given, and what chooses among them. The fits they
-rest on live in ``fits``.
+This package contains the estimators that a designer can be given, and the choice among
+them. The fits that they rest on are in ``fits``.
 """
 
 from sbi_active.information_gain.estimators.automatic import (

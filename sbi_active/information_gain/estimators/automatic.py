@@ -1,4 +1,4 @@
-"""Which estimator to use, by what can be checked."""
+"""The choice of an estimator by what can be checked."""
 
 from __future__ import annotations
 
@@ -67,9 +67,9 @@ def choose_estimator(
 ) -> tuple[InformationGainEstimator, list[str]]:
     """Return the first estimator whose assumptions pass their checks.
 
-    With declared noise: entropies where x is one number, else nested Monte Carlo. With
-    replicates: entropies for one or two numbers, else nested Monte Carlo on the
-    smoothed outcomes. Where checks fail, what the model can say: the bound of a
+    With declared noise it is entropies if x is one number, else nested Monte Carlo.
+    With replicates it is entropies for one or two numbers, else nested Monte Carlo on
+    the smoothed outcomes. If checks fail, it depends on the model: the bound of a
     posterior, nested Monte Carlo on a likelihood, or InfoNCE on a ratio, which no
     normalization of it can fool, but the mean log ratio where that is near its largest
     value. Beside it, why others were not taken.
@@ -107,9 +107,9 @@ def disagreements(
     belief: Distribution | None,
     gain: Tensor,
 ) -> list[str]:
-    """Say what an estimate gives to know, and compare it with others that apply.
+    """Return cautions about an estimate, which is compared with others that apply.
 
-    In short sentences, one a disagreement, by the estimator's contributions (a, n).
+    There is one short sentence for each disagreement, by the contributions (a, n).
     """
     others: list[InformationGainEstimator] = []
     num_outcomes = simulations.x[0, 0].numel()

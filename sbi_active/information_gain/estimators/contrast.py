@@ -38,8 +38,8 @@ class Contrast(InformationGainEstimator):
     errors from contributions include it.
 
     Args:
-        num_contrastive: L.
-        seed: Of the draws.
+        num_contrastive: Number of contrastive draws L.
+        seed: Seed of the draws.
         batch_size: Rows in one pass of the network.
 
     Raises:
@@ -125,7 +125,7 @@ def near_limit(gain: Tensor, limits: Sequence[float], text: str) -> list[str]:
 
     Args:
         gain: Contributions, shape (a, n).
-        limits: Of each action, nats.
+        limits: Limit of each action, nats.
         text: The caution, with {limit} and {where}.
     """
     mean = gain.nanmean(1)

@@ -28,8 +28,8 @@ class ContrastiveGain(Contrast):
     information with L. It cannot exceed log(L + 1), near which it does not rank.
 
     Args:
-        num_contrastive: L.
-        seed: Of the draws.
+        num_contrastive: Number of contrastive draws L.
+        seed: Seed of the draws.
         batch_size: Rows in one pass of the network.
 
     References:

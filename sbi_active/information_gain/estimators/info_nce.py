@@ -36,7 +36,7 @@ class InfoNCEGain(InformationGainEstimator):
     not change where f is off by a function of x. It cannot exceed log K, near which
     it does not rank. No further draws of the belief are needed.
 
-    The mean over a block is what it is; as its simulations share each other's
+    The mean over a block is unchanged; as its simulations share each other's
     parameters, a contribution includes what its own parameters do to the others,
 
     .. math::

@@ -29,8 +29,8 @@ class LikelihoodGain(Contrast):
     noise is declared.
 
     Args:
-        num_contrastive: L.
-        seed: Of the draws.
+        num_contrastive: Number of contrastive draws L.
+        seed: Seed of the draws.
         batch_size: Rows in one pass of the network.
 
     References:

@@ -45,8 +45,8 @@ class LinearGain(InformationGainEstimator):
     For a subset S of the parameters J is the regression on these alone: what the others
     do counts as noise, whose covariance is that which the belief gives them.
 
-    Of heavy tails the standard deviation counts. That an outcome is lost, or a part of
-    it, tells nothing here.
+    For heavy tails the standard deviation counts. The loss of an outcome, or of a part
+    of it, counts as no information.
 
     Args:
         index: Parameters S; None are all.

@@ -40,8 +40,8 @@ class RivalPredictive(Protocol):
 
         Args:
             action: One action, shape (action_dim,).
-            num_samples: n.
-            seed: Of the draws; the same for all actions and models.
+            num_samples: Number of draws n.
+            seed: Seed of the draws; the same for all actions and models.
 
         Returns:
             Shape (n, *x_shape), NaN where there is no measurement.
@@ -60,7 +60,7 @@ class NoisyRivalPredictive(RivalPredictive, Protocol):
     def predict_mean(
         self, action: Tensor, num_samples: int, seed: int
     ) -> tuple[Tensor, Tensor]:
-        """Return what the draws of ``predict`` with the same arguments are made of.
+        """Return means and deviations behind the draws of ``predict``.
 
         Returns:
             The outcomes without noise, and the standard deviations of the noise in
@@ -89,10 +89,10 @@ class RivalSampler:
     Args:
         rivals: Models.
         action: Candidates, shape (a, action_dim).
-        seed: Of everything drawn.
+        seed: Seed of all draws.
 
     Attributes:
-        probability: Of the models, shape (K,), float64.
+        probability: Probability of the models, shape (K,), float64.
         declared: False: no noise is declared.
         num_drawn: Outcomes so far.
         num_missing: 0: rivals lose none.
@@ -130,9 +130,10 @@ class RivalSampler:
         """Draw outcomes.
 
         Args:
-            num_samples: Of a candidate; rounded to an even number of each model.
+            num_samples: Number of outcomes of a candidate; rounded to an even number of
+                each model.
             candidates: Indices, shape (k,).
-            replicates: Of no use here.
+            replicates: Flag of the sampler it stands in for; it has no effect here.
 
         Raises:
             ValueError: If a rival returns another number of rows or another shape.

@@ -212,7 +212,7 @@ def _enough(simulations: CandidateSimulations) -> Tensor:
 def _of_sharing(
     influence: Tensor, share: Tensor, chance: Tensor, counted: Tensor
 ) -> Tensor:
-    r"""Return what simulations add to the error by being in others' evidence, (n,).
+    r"""Return the error that simulations add by being in others' evidence, (n,).
 
     Simulation j, of completeness :math:`v_j`, changes :math:`- \sum_i \log \hat p(x_i)`
     by minus its share in the evidences. Without local draws that is :math:`v_j` but for

@@ -58,7 +58,7 @@ class ParameterGain(InformationGainEstimator):
 
     Args:
         index: Parameters S.
-        names: Of the parameters, for errors.
+        names: Names of the parameters, for errors.
 
     Raises:
         ValueError: If no parameter or one twice is named.
@@ -104,7 +104,7 @@ class NormalScores:
     a distribution function F that interpolates a few quantiles monotonically.
 
     Args:
-        draws: Of the parameter, shape (m,).
+        draws: Draws of the parameter, shape (m,).
 
     References:
         Fritsch & Carlson, SIAM Journal on Numerical Analysis 1980.

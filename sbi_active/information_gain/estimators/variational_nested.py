@@ -69,7 +69,7 @@ class VariationalNestedGain(InformationGainEstimator):
     Args:
         proposal: :math:`q(\theta | x, \xi)`; None is the model itself.
         num_contrastive: L, at least 2.
-        seed: Of the draws.
+        seed: Seed of the draws.
         batch_size: Rows in one pass of the network.
 
     Raises:

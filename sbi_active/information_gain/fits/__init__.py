@@ -1,7 +1,7 @@
 """Regressions, densities and classifiers that the estimators rest on.
 
-Here lives what is fitted to simulations of one action. Nothing here estimates a gain of
-parameters.
+This package contains fits to simulations of one action. It does not estimate any
+information gain.
 """
 
 from sbi_active.information_gain.fits.classification import cross_fitted, probability

@@ -25,7 +25,7 @@ def class_members(
 ) -> list[LogDensities]:
     """Fit relative densities of each class, in several ways.
 
-    In this order: none; Gaussians with a common covariance; Gaussians with one each,
+    The order is: none; Gaussians with a common covariance; Gaussians with one each,
     shrunk to the common one; kernel densities with these covariances.
 
     Args:

@@ -31,8 +31,8 @@ class ParameterFeatures:
     """Low-order features of whitened parameters.
 
     Attributes:
-        center: Shape (d,).
-        transform: Shape (d, d).
+        center: Center of the parameters, shape (d,).
+        transform: Whitening transform, shape (d, d).
         knots: Whitened parameters at the center of a radial feature, shape (k, d).
     """
 
@@ -117,7 +117,8 @@ def probability(
 ) -> Callable[[Tensor], Tensor]:
     """Return a smooth log probability of a label, of parameters (k, d) -> (k,).
 
-    By parameters (n, d) and labels 0 or 1, shape (c, n); weight 0 leaves a row out.
+    It is fitted to parameters (n, d) and labels 0 or 1, shape (c, n); weight 0 leaves a
+    row out.
     """
     nothing = torch.zeros(1, *label.shape, 0, dtype=label.dtype)
     _, (best,) = cross_fitted(theta, label[None], nothing, weight[None])

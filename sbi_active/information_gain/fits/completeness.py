@@ -1,4 +1,4 @@
-"""How probable a complete outcome is, as a function of the parameters."""
+"""Probability of a complete outcome, as a function of the parameters."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from sbi_active.information_gain.fits.presence import random_presence
 
 @dataclass(frozen=True)
 class Completeness:
-    """How probable a complete outcome of one candidate is.
+    """Probability of a complete outcome of one candidate.
 
     Attributes:
-        share: Of a row's outcomes that are complete, shape (n,).
+        share: Share of a row's outcomes that are complete, shape (n,).
         counted: Rows that are not missing, shape (n,).
-        smooth: Its log probability as a function of the parameters, where it is random.
+        smooth: Log probability as a function of the parameters, where it is random.
     """
 
     share: Tensor

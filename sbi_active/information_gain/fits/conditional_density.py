@@ -28,7 +28,7 @@ Density = Callable[[Tensor, Tensor], Tensor]
 def conditional_members(u: Tensor, x: Tensor) -> list[Density]:
     """Fit conditional densities of u (n, s), close to standard normal, given x (n, q).
 
-    In this order: a Gaussian without x; Gaussians around a linear, a quadratic and a
+    The order is: a Gaussian without x; Gaussians around a linear, a quadratic and a
     kernel regression, each with a constant covariance and with one that is scaled by a
     log-linear function of x; a mixture of Gaussians of (u, x), conditioned on x. Each
     has a share of the standard normal, so that no row costs more than a few nats. They
@@ -71,8 +71,8 @@ class _Residual:
     Attributes:
         location: m, shape (s,).
         factor: L, shape (s, s).
-        slope: Of log s in features of x; None where s is 1.
-        offset: Of log s.
+        slope: Slope of log s in features of x; None if s is 1.
+        offset: Offset of log s.
     """
 
     location: Tensor

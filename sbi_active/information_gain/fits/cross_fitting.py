@@ -20,7 +20,7 @@ def cross_fit(
             by each member fitted to the training rows, shape (members, test).
         block: Number of the block that a row belongs to, shape (n,): rows of a block
             share a fold, which the member scores that is the best on the others.
-        weight: Of rows in the choice, shape (n,).
+        weight: Weight of each row in the choice, shape (n,).
     """
     fold = block % NUM_FOLDS
     held_out: Tensor | None = None

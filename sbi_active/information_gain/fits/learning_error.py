@@ -1,4 +1,4 @@
-"""What the error of a learned model adds to that of its information."""
+"""Error of the information that comes from the error of a learned model."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 def learning_error(
     slope: Tensor, z: Tensor, difference: Tensor, residual: Tensor, share: Tensor
 ) -> Tensor:
-    r"""Return what the noise of each pair does to the information, to first order.
+    r"""Return the effect of each pair's noise on the information, to first order.
 
     With :math:`x = f(\theta) + \epsilon`, standard normal noise, and errors
     :math:`\delta f` of the mean and :math:`\delta S` of the covariance,
@@ -33,8 +33,9 @@ def learning_error(
         slope: J, shape (n, q, d).
         z: Coordinates of the parameters, shape (n, d).
         difference: d, shape (n, q); zero for incomplete pairs.
-        residual: Of the pairs' averages, shape (n, q); zero where there is none.
-        share: Of a pair that is complete, shape (n,).
+        residual: Residual of the pairs' averages, shape (n, q); zero if there is
+            none.
+        share: Share of a pair that is complete, shape (n,).
 
     Returns:
         Shape (n,), nats, of mean zero; it adds to errors and leaves the estimate.

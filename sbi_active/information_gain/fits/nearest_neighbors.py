@@ -10,9 +10,9 @@ from scipy.special import digamma
 from torch import Tensor
 
 FLOAT32 = 2.0**-23  # outcomes are float32: no two are closer than their rounding
-#: Of the jackknife's estimate of an outcome's effect on its neighbors. All of it is too
-#: much, as distances are not smooth in the outcomes; with .27 the variance of the mean
-#: was found right for uniform outcomes, one to three dimensions, k = 1 to 10.
+#: Share of the jackknife's estimate of an outcome's effect on its neighbors. All of it
+#: is too much, as distances are not smooth in the outcomes; with .27 the variance of
+#: the mean was right for uniform outcomes, one to three dimensions, k = 1 to 10.
 SHARED = 0.27
 
 

@@ -38,7 +38,7 @@ def noise_members(
 
     Args:
         mean: Outcomes without noise, shape (n, q).
-        sd: Of the noise, shape (n, q).
+        sd: Standard deviation of the noise, shape (n, q).
         label: Class, shape (n,).
         enough: Whether a class has rows enough, shape (k,), bool; where one has not, or
             outcomes are long, there are no members.

@@ -1,4 +1,4 @@
-"""What the mere presence of a measurement tells about the parameters."""
+"""Information about the parameters in the mere presence of a measurement."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def presence_information(simulations: CandidateSimulations) -> Tensor:
 
 
 def random_presence(simulations: CandidateSimulations) -> Tensor:
-    """Return where outcomes at the same parameters differ in what is present, (a,)."""
+    """Return a mask of candidates whose outcomes differ in what is present, (a,)."""
     first, second = _patterns(simulations).unbind(1)
     return ((first != second) & simulations.counted).any(1)
 
@@ -58,7 +58,7 @@ def presence_problems(simulations: CandidateSimulations) -> list[str]:
 
 
 def presence_notes(simulations: CandidateSimulations) -> list[str]:
-    """Say where outcomes without all their numbers make the estimate a bound."""
+    """Return notes where incomplete outcomes make the estimate a bound."""
     notes = []
     random = int(random_presence(simulations).sum())
     if random:

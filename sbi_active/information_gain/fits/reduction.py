@@ -20,9 +20,9 @@ class Reduction:
     numbers on x, and on the leading principal components, six in all.
 
     Attributes:
-        center: Shape (q,).
-        scale: Shape (q,).
-        direction: Shape (q, r).
+        center: Center of the outcomes, shape (q,).
+        scale: Scale of the outcomes, shape (q,).
+        direction: Directions, shape (q, r).
     """
 
     center: Tensor

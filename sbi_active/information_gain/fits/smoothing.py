@@ -25,13 +25,14 @@ class Learned:
     """Simulations of a learned model, and what it was learned from.
 
     Attributes:
-        simulations: In whitened coordinates with mean and noise, x of shape (a, n, q).
+        simulations: Simulations in whitened coordinates with mean and noise, x of shape
+            (a, n, q).
         score: Leave-one-out mean squares over their expectation under the noise, near 1
             where smoothing misses nothing, shape (a, q).
-        difference: Of the pairs, of unit mean square; zero for incomplete ones,
-            (a, n, q).
-        residual: Of the pairs' averages to the smoothed mean; zero where there is
-            none, shape (a, n, q).
+        difference: Difference of each pair, of unit mean square; zero for incomplete
+            ones, (a, n, q).
+        residual: Residual of each pair's average to the smoothed mean; zero if there
+            is none, shape (a, n, q).
     """
 
     simulations: CandidateSimulations

@@ -1,4 +1,4 @@
-"""How effects act: on the model, and as generalized forces."""
+"""Effects on the model, and effects that are generalized forces."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ def model_effect(name: str, change: Any, *, prior: Any, **options: Any) -> Effec
     """Return an effect that changes the model.
 
     Args:
-        name: Of the effect.
+        name: Name of the effect.
         change: A :class:`.ModelChange`.
-        prior: Of phi.
-        **options: As in :class:`.Effect`; the null is 0 unless given.
+        prior: Prior of phi.
+        **options: Options of :class:`.Effect`; the null is 0 unless given.
     """
     options = {"null": 0.0, **options}
     return Effect(
@@ -32,10 +32,10 @@ def force_effect(name: str, force: Any, *, prior: Any, **options: Any) -> Effect
     """Return an effect that is a generalized force.
 
     Args:
-        name: Of the effect.
+        name: Name of the effect.
         force: A :class:`.Force`, zero at the null.
-        prior: Of phi.
-        **options: As in :class:`.Effect`; the null is 0 unless given.
+        prior: Prior of phi.
+        **options: Options of :class:`.Effect`; the null is 0 unless given.
     """
     options = {"null": 0.0, **options}
     return Effect(

@@ -39,8 +39,8 @@ def of_actuators(
     """Yield the effects of actuators that share each phi, or of one.
 
     Args:
-        group: Of actuators.
-        sizes: Of the model.
+        group: Group of actuators.
+        sizes: Sizes of the model.
         driven: Actuators whose inputs are signals over time.
     """
     model = sizes.model

@@ -36,7 +36,8 @@ TURNING = 0.1
 class FrictionChange(StateChange):
     r"""Adds dry friction to joints.
 
-    By position, more towards either end of the range in which a joint moves,
+    Friction by position is larger towards either end of the range in which a joint
+    moves,
 
     .. math::
         F = \phi_1 (1 - w)^2 + \phi_2 w^2, \qquad
@@ -48,10 +49,10 @@ class FrictionChange(StateChange):
     them dissipate. Writes ``dof_frictionloss`` before every step.
 
     Attributes:
-        names: Of the joints.
-        what: What it follows.
+        names: Names of the joints.
+        what: Quantity that the friction follows.
         low: Lower end of each joint's range, rad or m.
-        high: Upper end.
+        high: Upper end of each joint's range, rad or m.
         speed: :math:`v_s`, rad/s or m/s.
     """
 
@@ -86,10 +87,10 @@ def of_friction(
     """Yield dry friction that follows the state of joints that share each phi.
 
     Args:
-        group: Of joints.
-        sizes: Of the model.
-        force: One prior deviation.
-        unit: Of a force.
+        group: Group of joints.
+        sizes: Sizes of the model.
+        force: Force of one prior deviation.
+        unit: Unit of a force.
     """
     model = sizes.model
     dofs = [

@@ -48,10 +48,10 @@ class Transmission(Insertion):
     ``dof_damping``.
 
     Attributes:
-        names: Of the joints.
-        is_spring: A spring rather than play.
-        inertias: Behind each joint, kg m^2 or kg.
-        step: Of the simulation, s.
+        names: Names of the joints.
+        is_spring: Whether it is a spring rather than play.
+        inertias: Inertia behind each joint, kg m^2 or kg.
+        step: Time step of the simulation, s.
         least: Smallest phi that is simulated.
     """
 
@@ -116,9 +116,9 @@ def least_compliance(inertia: float, armature: float, step: float) -> float:
     """Return the compliance of the stiffest spring that steps can follow.
 
     Args:
-        inertia: Behind the joint.
-        armature: Of the joint, 0 for none.
-        step: s.
+        inertia: Inertia behind the joint.
+        armature: Armature of the joint, 0 for none.
+        step: Time step, s.
     """
     motor = armature if armature > 0 else ROTOR * inertia
     reduced = inertia * motor / (inertia + motor)

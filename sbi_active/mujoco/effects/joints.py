@@ -25,11 +25,11 @@ __all__ = ["of_joints"]
 
 #: One prior deviation, as a share of the generalized force along nominal trajectories.
 SHARE = 0.2
-#: Of the inertia that a joint feels.
+#: Share of the inertia that a joint feels.
 INERTIA = 0.2
 #: Play, and the deflection of a spring under a typical force, in ranges of positions.
 PLAY, DEFLECTION = 0.05, 0.1
-#: Of a deviation, the least play that is simulated.
+#: Least play that is simulated, as a share of a deviation.
 LEAST = 0.2
 #: Zero offset, as a share of the range of positions, and at most, rad or m.
 ZERO, MOST = 0.1, 0.1
@@ -39,8 +39,8 @@ def of_joints(group: Group, sizes: Nominal) -> Iterator[Effect]:
     """Yield the effects of joints that share each phi, or of one.
 
     Args:
-        group: Of joints.
-        sizes: Of the model.
+        group: Group of joints.
+        sizes: Sizes of the model.
     """
     model = sizes.model
     dofs = [

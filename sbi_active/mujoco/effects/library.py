@@ -1,4 +1,4 @@
-"""What a plain model lacks: its effects, enumerated from the model itself."""
+"""The library of effects that a plain model lacks, enumerated from the model."""
 
 from __future__ import annotations
 
@@ -50,13 +50,14 @@ def mjcf_effects(
     include: str | Sequence[str] = "*",
     exclude: str | Sequence[str] = (),
 ) -> list[Effect]:
-    r"""Return what a plain model may lack, with names, units, nulls and priors.
+    r"""Return effects that a plain model may lack, with names, units, nulls and priors.
 
-    Each effect is called by its element, as in "hinge friction loss". Elements that are
-    alike, such as the knees of four legs, are offered together, as in "all knee
-    friction loss", and one by one. Priors are as wide as what moves the robot allows: a
-    friction's deviation is a fifth of the generalized force along nominal trajectories.
-    What is a parameter already, and what changes nothing there, is left out.
+    Each effect is named after its element, as in "hinge friction loss". Similar
+    elements, such as the knees of four legs, are offered together, as in "all knee
+    friction loss", and one by one. Priors are scaled by the forces that move the robot:
+    a friction's deviation is a fifth of the generalized force along nominal
+    trajectories. Effects that are parameters already, or that change nothing there, are
+    left out.
 
     ============= ==================================================================
     of            effects
@@ -74,11 +75,12 @@ def mjcf_effects(
     Args:
         model: The simulator of :func:`.from_mjcf` or :func:`.from_sysid`, or what they
             return, or an ``MjSpec``, a path or the text of an MJCF.
-        trials: Whose actions and inputs say how the robot moves; None takes those of
-            a robot, else its signals or actions, else it is released around its start.
-        actions: In place of the robot's.
+        trials: Trials whose actions and inputs say how the robot moves; None takes
+            those of a robot, else its signals or actions, else it is released around
+            its start.
+        actions: Actions in place of the robot's.
         include: Pattern of names that are kept, as in "\* friction loss", or several.
-        exclude: Those that are not.
+        exclude: Patterns of names that are left out.
 
     Raises:
         ValueError: If a pattern fits no effect.
@@ -95,11 +97,11 @@ def mjcf_effects(
 
 
 def likely_effects(robot: Robot, trials: Trials) -> list[Effect]:
-    """Return what joints and drives most often have and an MJCF does not say.
+    """Return effects that joints and drives most often have and an MJCF does not say.
 
     Args:
-        robot: From its MJCF.
-        trials: Whose actions and inputs say how it moves.
+        robot: Robot from its MJCF.
+        trials: Trials whose actions and inputs say how it moves.
     """
     simulator, actions, trials = _simulator(robot, None, trials)
     sizes, call = nominal(simulator, trials, actions)
@@ -149,7 +151,7 @@ def _all(
 def _that_matter(
     simulator: SimulatorModel, effects: Sequence[Effect], call: dict[str, Any]
 ) -> list[Effect]:
-    """Return those that are no parameter and change what is read."""
+    """Return the effects that are no parameter and change the readings."""
     function = simulator.fn
     assert isinstance(function, MujocoFunction)
     bare = SimulatorModel(

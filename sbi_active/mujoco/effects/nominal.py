@@ -1,4 +1,4 @@
-"""How large things are in a model as it usually moves: what priors are scaled by."""
+"""Nominal sizes of a model as it usually moves, by which priors are scaled."""
 
 from __future__ import annotations
 
@@ -36,18 +36,19 @@ class Nominal:
     """Sizes along nominal trajectories, at the middle of the parameters' bounds.
 
     Attributes:
-        model: At these parameters.
+        model: Model at these parameters.
         position: Half the range that 90 % of the time is spent in, (nv,), rad or m.
         lowest: Lower end of all of it, (nv,), as a hinge or slide is read.
         highest: Upper end.
-        velocity: Root mean square, (nv,).
+        velocity: Root mean square of the velocity, (nv,).
         force: Root of the mean square of gravity and inertia, of actuators and of
             passive forces, (nv,), N m or N.
-        inertia: Of each degree of freedom with all others held, (nv,).
-        actuator_force: Root mean square, one an actuator.
-        actuator_velocity: The same of its length.
+        inertia: Inertia of each degree of freedom with all others held, (nv,).
+        actuator_force: Root mean square of the force, one an actuator.
+        actuator_velocity: Root mean square of the velocity of its length, one an
+            actuator.
         reading: Standard deviation of each channel, (c,).
-        times: Of the readings of one row, (k,).
+        times: Times of the readings of one row, (k,).
         has_contacts: Whether anything touched.
     """
 
@@ -71,9 +72,9 @@ def nominal(
     """Return sizes, and rows on which effects can be tried.
 
     Args:
-        simulator: Of :class:`.MujocoFunction`.
-        trials: That say how the robot moves; None takes signals or actions.
-        actions: Permitted ones, where there are no trials.
+        simulator: Simulator of a :class:`.MujocoFunction`.
+        trials: Trials that say how the robot moves; None takes signals or actions.
+        actions: Permitted actions, where there are no trials.
 
     Returns:
         The sizes; and theta, action and keyword arguments of a call.
@@ -202,7 +203,7 @@ def _scalars(model: Any, data: Any) -> Array:
 
 
 def _zeros(model: Any) -> Array:
-    """Return what joints read where :func:`_scalars` counts from, (nv,)."""
+    """Return the joints' readings where :func:`_scalars` counts from, (nv,)."""
     zeros = np.zeros(model.nv)
     for name, place in start_places(model).items():
         if place < model.nq and "[" not in name:

@@ -31,10 +31,10 @@ class PowerForce:
         """Return the force, shape (n, nv).
 
         Args:
-            q: Shape (n, nq).
-            v: Shape (n, nv).
-            t: Not used.
-            phi: Shape (n, 1).
+            q: Positions, shape (n, nq).
+            v: Velocities, shape (n, nv).
+            t: Time, which is not used.
+            phi: Parameters of the effect, shape (n, 1).
         """
         force = np.zeros_like(v)
         for place, dof, rest in self.joints:

@@ -28,9 +28,10 @@ def of_sensors(
     """Yield the effects of each channel.
 
     Args:
-        channels: Of x.
-        sizes: Of the model.
-        sds: Of the noise, one or one a channel; None where it is not known.
+        channels: Channels of x.
+        sizes: Sizes of the model.
+        sds: Standard deviations of the noise, one or one a channel; None if they are
+            not known.
     """
     times = torch.as_tensor(sizes.times)
     for k, channel in enumerate(channels):

@@ -24,7 +24,7 @@ __all__ = ["of_bodies", "of_contacts", "of_surroundings"]
 #: Payload as a share of a body's mass, center of mass as one of its radius of gyration.
 PAYLOAD, CENTER = 0.2, 0.2
 TILT = 0.05  # rad
-#: Of air at sea level.
+#: Density and viscosity of air at sea level.
 DENSITY, VISCOSITY = 1.2, 1.8e-5
 #: Logarithms of factors of contacts.
 FRICTION, SOFTNESS, RESTITUTION = 0.3, 0.5, 0.7

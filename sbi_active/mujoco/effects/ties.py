@@ -24,8 +24,8 @@ class Group:
     """Elements that share a phi, or a single one.
 
     Attributes:
-        names: Of the elements.
-        label: What effects are called by.
+        names: Names of the elements.
+        label: Label that effects are named by.
     """
 
     names: tuple[str, ...]
@@ -107,7 +107,7 @@ def _grouped(names: Sequence[str], features: Sequence[Any]) -> list[Group]:
 
 
 def _common(names: Sequence[str]) -> str:
-    """Return what to call several elements, as in "all calf_joint"."""
+    """Return a name for several elements, as in "all calf_joint"."""
     end = os.path.commonprefix([name[::-1] for name in names])[::-1]
     begin = os.path.commonprefix([*names])
     shared = max(end, begin, key=len).strip("_- ./")

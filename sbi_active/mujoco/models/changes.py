@@ -1,4 +1,4 @@
-"""What an effect changes in a model: keys of the simulator's ``model`` and ``force``.
+"""Changes of a model by an effect: keys of the simulator's ``model`` and ``force``.
 
 Both are keyword arguments of a simulator's function, {change: phi}, with phi of shape
 (n, k). A change of the model is a :class:`ModelChange`; a generalized force is a
@@ -62,18 +62,18 @@ class Insertion(ModelChange):
         """Move what was inserted to where it rests under the load at the start.
 
         Args:
-            model: Written.
-            data: At the start, its forces computed.
-            phi: Shape (k,).
+            model: Model that was written into.
+            data: Data at the start, its forces computed.
+            phi: Parameters of the effect, shape (k,).
         """
 
 
 class StateChange(ModelChange):
     """A change that follows the state of joints: added to theirs before every step.
 
-    What a force cannot do, such as hold a joint still by dry friction that depends on
-    where it is, MuJoCo's own solver then does. Rows with such a change are stepped
-    together, as those with a :class:`Force`.
+    MuJoCo's own solver then does what a force cannot, such as hold a joint still by dry
+    friction that depends on where it is. Rows with such a change are stepped together,
+    as those with a :class:`Force`.
     """
 
     @abstractmethod
@@ -82,13 +82,13 @@ class StateChange(ModelChange):
 
     @abstractmethod
     def values(self, q: Array, v: Array, load: Array, phi: Array) -> Array:
-        """Return what is added for each joint, shape (n, joints).
+        """Return the values added for each joint, shape (n, joints).
 
         Args:
-            q: Their positions, shape (n, joints).
-            v: Their velocities.
+            q: Positions of the joints, shape (n, joints).
+            v: Velocities of the joints.
             load: Forces of the actuators on them in the step before.
-            phi: Shape (n, k).
+            phi: Parameters of the effect, shape (n, k).
         """
 
     @override

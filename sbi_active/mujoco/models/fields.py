@@ -17,8 +17,8 @@ class Entry:
 
     Attributes:
         field: Name in ``mjModel``, as in "dof_damping" or "opt.density".
-        index: Of the number in the field; () for a field that is one number.
-        factor: By which the quantity is multiplied.
+        index: Index of the number in the field; () for a field that is one number.
+        factor: Factor by which the quantity is multiplied.
     """
 
     field: str

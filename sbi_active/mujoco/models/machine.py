@@ -27,14 +27,14 @@ POOL = 32
 
 @dataclass
 class Rows:
-    """What one model simulates at once.
+    """Rows that one model simulates at once.
 
     Attributes:
         theta: Parameters, shape (n, d).
-        changes: By change, shape (n, k).
-        forces: By force, shape (n, k).
+        changes: Parameters by change, shape (n, k).
+        forces: Parameters by force, shape (n, k).
         start: Positions and velocities at the start, by name, (n,).
-        controls: Shape (n, steps, nu), held over each step.
+        controls: Controls, shape (n, steps, nu), held over each step.
     """
 
     theta: Array
@@ -69,14 +69,14 @@ class Model:
     """A compiled model, copies of it, and what writes parameters.
 
     Attributes:
-        base: As compiled; nothing is written into it.
-        writer: Of the parameters.
-        data: To work in.
+        base: Compiled model; nothing is written into it.
+        writer: Writer of the parameters.
+        data: Data to work in.
         positions: Places of the machine's ``qpos`` in that of this model.
-        velocities: The same of its ``qvel``.
-        inserted: What it has beyond the machine's model.
+        velocities: Places of the machine's ``qvel`` in that of this model.
+        inserted: Insertions that the machine's model does not have.
         pool: Copies of the base that are written into.
-        datas: To step rows together.
+        datas: Data to step rows together.
         originals: Fields as compiled, of those that are ever written.
     """
 
@@ -96,9 +96,9 @@ class Model:
         """Return a model with its parameters and changes.
 
         Args:
-            number: Of the copy to write into.
-            theta: Shape (d,).
-            changes: By change, shape (k,).
+            number: Number of the copy to write into.
+            theta: Parameters, shape (d,).
+            changes: Parameters by change, shape (k,).
         """
         model = self.writer.model(theta)
         if model is None:
@@ -119,12 +119,12 @@ class Machine:
     """A model with parameters.
 
     Args:
-        source: Of the model.
-        parameters: In the order of theta.
+        source: Source of the model.
+        parameters: Parameters in the order of theta.
         edit: ``edit(spec, theta)`` of all of them at once, in place of theirs.
 
     Attributes:
-        model: As compiled.
+        model: Compiled model.
     """
 
     def __init__(
@@ -150,9 +150,9 @@ class Machine:
         return {**vars(self), "_models": {}}
 
     def require_inertia(self) -> None:
-        """Raise where a joint has no inertia at the lowest parameters.
+        """Raise if a joint has no inertia at the lowest parameters.
 
-        Every state is then NaN, which would pass for an outcome that was invalid.
+        Every state would then be NaN, and the outcome would count as invalid.
         """
         low = np.array([p.low for p in self.parameters])
         with quiet():
@@ -173,13 +173,13 @@ class Machine:
         """Run rows, whatever models they need.
 
         Args:
-            rows: All of them.
+            rows: Rows, all of them.
             run: ``run(model, models, rows)`` simulates some rows, each by its model,
                 and returns one result a row.
             size: Most rows at a time.
 
         Returns:
-            What ``run`` returned, in the order of the rows.
+            Results of ``run``, in the order of the rows.
         """
         found: Array | None = None
         for inserted, places, weights in self._groups(rows):
@@ -212,7 +212,7 @@ class Machine:
         return [known[key] for key in keys]
 
     def _groups(self, rows: Rows) -> list[tuple[tuple[Insertion, ...], Array, Array]]:
-        """Return what is inserted, in which rows, and its weight in what they read."""
+        """Return the insertions, their rows, and their weights in the readings."""
         insertions = [c for c in rows.changes if isinstance(c, Insertion)]
         if not insertions:
             return [((), np.arange(len(rows)), np.ones(len(rows)))]
@@ -251,7 +251,7 @@ class Machine:
         return self._models[inserted]
 
     def _order(self, base: Any) -> tuple[Array, Array]:
-        """Return where the machine's positions and velocities are in a model."""
+        """Return the places of the machine's positions and velocities in a model."""
         own, other = start_places(self.model), start_places(base)
         places = np.array([other[name] for name in sorted(own, key=own.__getitem__)])
         nq, nv = self.model.nq, self.model.nv

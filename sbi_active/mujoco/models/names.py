@@ -33,7 +33,7 @@ KINDS = {
 def names_of(model: Any, kind: str) -> list[str]:
     """Return the names of a kind of element in their order.
 
-    What has none is called by its kind and number, as in "joint 0".
+    An element without a name is called by its kind and number, as in "joint 0".
     """
     mujoco = mujoco_of()
     mark, count = KINDS[kind]
@@ -58,7 +58,7 @@ def element_id(model: Any, kind: str, name: str) -> int:
 
 
 def require_name(name: str, known: Iterable[str], what: str) -> None:
-    """Raise where a name is not among those that are known."""
+    """Raise if a name is not among those that are known."""
     known = [*known]
     if name in known:
         return
@@ -117,7 +117,7 @@ def held_places(model: Any) -> dict[str, int]:
 
 
 def meaning(name: str, model: Any) -> str:
-    """Return what an entry of an action sets, by its name among start states.
+    """Return the quantity that an entry of an action sets, by its name.
 
     A name that a joint and an actuator share is the actuator's, as in "hinge control";
     the joint's start is then "hinge position".

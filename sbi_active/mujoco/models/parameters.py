@@ -62,11 +62,11 @@ class Bounded:
     """A parameter of a model.
 
     Attributes:
-        name: What reports call it.
+        name: Name in reports.
         low: Lowest value.
         high: Highest value.
-        unit: Of it.
-        quantity: Whose value it is; None where it edits the spec.
+        unit: Unit of the values.
+        quantity: Quantity whose value it is; None if it edits the spec.
         edit: ``edit(spec, value)`` before the model is compiled; None for a quantity.
     """
 
@@ -88,7 +88,7 @@ class Writer(Protocol):
     fields: tuple[str, ...]
 
     def model(self, theta: Array) -> Any | None:
-        """Return a model of its own for parameters (d,), None where it writes them."""
+        """Return a model of its own for parameters (d,), None if it writes them."""
         ...
 
     def write(self, model: Any, theta: Array) -> None:
@@ -100,10 +100,10 @@ def bounded(model: Any, parameters: Mapping[str, Any]) -> tuple[Bounded, ...]:
     """Return parameters as users declare them.
 
     Args:
-        model: Compiled, to find quantities and units.
-        parameters: By name: (low, high) of the quantity of that name; (low, high,
-            "element.attribute") under a name of one's own; or (low, high, edit) with a
-            function ``edit(spec, value)``.
+        model: Compiled model, to find quantities and units.
+        parameters: Parameters by name: (low, high) of the quantity of that name; (low,
+            high, "element.attribute") under a name of one's own; or (low, high, edit)
+            with a function ``edit(spec, value)``.
 
     Raises:
         ValueError: If there is none, bounds are not in order, or a name is unknown.
@@ -160,15 +160,15 @@ def writer_of(
     edit: Callable[[Any, Array], Any] | None = None,
     text: Callable[[], Any] | None = None,
 ) -> Writer:
-    """Return what writes parameters into a model.
+    """Return the writer of parameters into a model.
 
     Args:
-        spec: Returns a spec that compiles to the model.
-        model: As compiled.
-        parameters: In the order of theta.
+        spec: Function that returns a spec that compiles to the model.
+        model: Compiled model.
+        parameters: Parameters in the order of theta.
         edit: ``edit(spec, theta)`` of all parameters at once, in place of theirs.
-        text: Returns a spec as another process has it, for parameters that are
-            compiled there; None takes ``spec``.
+        text: Function that returns a spec as another process has it, for parameters
+            that are compiled there; None takes ``spec``.
     """
     if edit is None and all(p.edit is None for p in parameters):
         quantities = [p.quantity for p in parameters if p.quantity is not None]
@@ -203,8 +203,8 @@ def renew(model: Any, data: Any) -> None:
     MuJoCo does not renew the mean inertia, by which its solver knows when to stop.
 
     Args:
-        model: Written.
-        data: Of such a model, to work in.
+        model: Model that was written into.
+        data: Data of such a model, to work in.
     """
     mean = float(model.dof_M0.mean()) if model.nv else 0.0
     is_own = abs(model.stat.meaninertia - mean) <= AFFINE * mean
@@ -271,7 +271,7 @@ class _Compiled:
 def _affine(
     compiled: Callable[[Array], Any], low: Array, high: Array
 ) -> _Affine | None:
-    """Return what writes affine numbers, None where some are not."""
+    """Return the writer of affine numbers, None if some are not."""
     middle, half = 0.5 * (low + high), 0.25 * (high - low)
     base = _numbers(compiled(middle))
     steps = []

@@ -62,9 +62,10 @@ class Quantity:
     """One number of a model.
 
     Attributes:
-        kind: Of the element: "joint", "body", "actuator", "geom", "tendon", "option".
-        name: Of the element; "option" for those of the whole model.
-        attribute: As in the table above.
+        kind: Kind of the element: "joint", "body", "actuator", "geom", "tendon",
+            "option".
+        name: Name of the element; "option" for those of the whole model.
+        attribute: Attribute of the element, as in the table above.
     """
 
     kind: str
@@ -80,7 +81,7 @@ class Quantity:
         return ATTRIBUTES[self.kind][self.attribute](model, i)
 
     def value(self, model: Any) -> float:
-        """Return what the model has."""
+        """Return the value in the model."""
         first = self.entries(model)[0]
         now = field_of(model, first.field)
         return float(now[first.index] if first.index else now) / first.factor
@@ -99,7 +100,7 @@ class Quantity:
 
 
 def joint_of_actuator(model: Any, quantity: Quantity) -> str | None:
-    """Return the joint that an actuator drives, None where it is something else."""
+    """Return the joint that an actuator drives, None if it is something else."""
     mujoco = mujoco_of()
     i = element_id(model, "actuator", quantity.name)
     joints = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT
@@ -125,9 +126,9 @@ def find_quantity(model: Any, text: str) -> Quantity:
     """Return the quantity that is called "element.attribute".
 
     Args:
-        model: Compiled.
-        text: Its name; "joint:element.attribute" where elements of two kinds share a
-            name and an attribute.
+        model: Compiled model.
+        text: Name of the quantity; "joint:element.attribute" where elements of two
+            kinds share a name and an attribute.
 
     Raises:
         ValueError: If there is no such element or attribute, with the nearest ones.
@@ -159,7 +160,7 @@ def find_quantity(model: Any, text: str) -> Quantity:
 def is_movable(model: Any, body: str) -> bool:
     """Return whether a body's center of mass can be written.
 
-    Of a body that is compiled as simple its inertia matrix has no room for that.
+    The inertia matrix of a body that is compiled as simple has no room for it.
     """
     return not int(model.body_simple[element_id(model, "body", body)])
 
@@ -270,7 +271,7 @@ NEVER_NEGATIVE = frozenset(
     }
 )
 
-#: Of hinges and slides.
+#: Units on hinges and on slides.
 _UNITS = {
     "joint": {
         "damping": ("N m s/rad", "N s/m"),

@@ -26,13 +26,13 @@ Array = NDArray[Any]
 
 
 def readings(model: Model, models: list[Any], rows: Rows, *, threads: int = 1) -> Array:
-    """Return what the sensors read, NaN throughout for a row that diverged.
+    """Return the sensors' readings, NaN throughout for a row that diverged.
 
     Args:
-        model: Of all rows.
-        models: One a row.
+        model: Model of all rows.
+        models: Models, one a row.
         rows: Rows whose controls have shape (n, steps, nu + 7 nmocap).
-        threads: Of MuJoCo's rollout.
+        threads: Threads of MuJoCo's rollout.
 
     Returns:
         Shape (n, steps, sensordata).
@@ -77,14 +77,14 @@ def begin(model: Any, data: Any, state: Array, held: Array) -> None:
 
 
 def held_kind() -> int:
-    """Return which of MuJoCo's states a row's controls are."""
+    """Return the kind of MuJoCo's state that a row's controls are."""
     state = mujoco_of().mjtState
     kinds = state.mjSTATE_CTRL, state.mjSTATE_MOCAP_POS, state.mjSTATE_MOCAP_QUAT
     return sum(kind.value for kind in kinds)
 
 
 def held_states(model: Model) -> Array:
-    """Return what is held where nothing says otherwise, shape (nu + 7 nmocap,)."""
+    """Return the states held where nothing says otherwise, shape (nu + 7 nmocap,)."""
     mujoco = mujoco_of()
     mujoco.mj_resetData(model.base, model.data)
     held = np.empty(mujoco.mj_stateSize(model.base, held_kind()))

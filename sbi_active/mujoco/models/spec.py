@@ -55,7 +55,8 @@ class Source:
 
     Args:
         given: Path of an MJCF, its text, or an ``MjSpec``, which is copied.
-        edits: Called with the spec in this order; they go to other processes too.
+        edits: Functions that are called with the spec in this order; they go to other
+            processes too.
 
     Raises:
         FileNotFoundError: If there is no such file.

@@ -1,7 +1,7 @@
 """Simulations on disk, and their reuse.
 
-Here live the file, its checksums and locks, and weights. Nothing here simulates. A name
-is imported when it is used: a store needs no torch.
+This package contains the file, its checksums and locks, and weights. It does not
+simulate. Names are imported when they are used: a store needs no torch.
 """
 
 from __future__ import annotations

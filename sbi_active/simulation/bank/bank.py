@@ -42,12 +42,13 @@ class Bank:
     Args:
         path: Folder, in which the bank is the file ``store.db``; made where there is
             none and ``simulator`` is given. Or the store of a campaign.
-        simulator: Whose rows these are. Its name, settings and source are compared
+        simulator: Simulator of these rows. Its name, settings and source are compared
             with those in the bank.
-        version: Of the simulator, yours; given, it stands for the source code.
-        parameter_names: One a parameter; None takes those of the simulator.
+        version: Version of the simulator, yours; given, it stands for the source code.
+        parameter_names: Names of the parameters; None takes those of the simulator.
         created: Date to note in a new bank.
-        name: Of the bank in its file, which may hold several, as a campaign's does.
+        name: Name of the bank in its file, which may hold several, as a campaign's
+            does.
 
     Attributes:
         path: The folder.
@@ -142,7 +143,7 @@ class Bank:
 
     @property
     def labels(self) -> list[str]:
-        """Names of the proposals, in order of appearance; "" where not known."""
+        """Names of the proposals, in order of appearance; "" if not known."""
         return [*dict.fromkeys(segment.label for segment in self._rows.segments())]
 
     @property
@@ -162,11 +163,11 @@ class Bank:
         """Store simulations; they are on the disk when this returns.
 
         Args:
-            simulations: Of this bank's simulator.
-            seed: That they were simulated with.
-            proposal: That theta was drawn from; None where it is not known, and then
-                the rows cannot be reweighted.
-            label: Of the proposal, "prior" or "round 3"; given with it.
+            simulations: Simulations of this bank's simulator.
+            seed: Seed that they were simulated with.
+            proposal: Proposal that theta was drawn from; None if it is not known,
+                and then the rows cannot be reweighted.
+            label: Label of the proposal, "prior" or "round 3"; given with it.
             log_action: Log density, or log mass, of the actions, a number or (n,).
 
         Returns:
@@ -192,12 +193,13 @@ class Bank:
         label: str | None,
         log_action: float | Tensor = float("nan"),
     ) -> LabeledStore:
-        """Return this bank as a store for simulations whose theta has one proposal.
+        """Return this bank as a store of simulations whose theta has one proposal.
 
         Args:
-            proposal: As in :meth:`append`.
-            label: As in :meth:`append`.
-            log_action: As in :meth:`append`; a tensor is indexed as the run's rows are.
+            proposal: Proposal that theta was drawn from, as in :meth:`append`.
+            label: Label of the proposal, as in :meth:`append`.
+            log_action: Log density of the actions, as in :meth:`append`; a tensor is
+                indexed as the run's rows are.
 
         Example:
             ``simulate(..., store=bank.drawn_from(prior, label="prior"))``
@@ -210,13 +212,13 @@ class Bank:
         return LabeledStore(self, proposal, label or "", torch.as_tensor(log_action))
 
     def load(self, run: str) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Return what is stored of a run: index (k,), x (k, *x_shape), status (k,).
+        """Return the stored rows of a run: index (k,), x (k, *x_shape), status (k,).
 
         Args:
             run: Name of the run.
 
         Returns:
-            None where there is nothing.
+            None if there is nothing.
         """
         parts = []
         for segment in self._rows.segments():
@@ -274,10 +276,10 @@ class Bank:
         """Return whole columns without the others.
 
         Args:
-            names: Among ``theta``, ``action``, ``x``, ``status``, ``index`` (of the row
-                in its run), ``seed`` (of the run; a row's own one is
-                ``row_seeds(seed, 1, first=index)``), ``log_proposal``, ``log_action``
-                and ``label`` (an index into :attr:`labels`).
+            names: Names of columns among ``theta``, ``action``, ``x``, ``status``,
+                ``index`` (of the row in its run), ``seed`` (of the run; a row's own one
+                is ``row_seeds(seed, 1, first=index)``), ``log_proposal``,
+                ``log_action`` and ``label`` (an index into :attr:`labels`).
         """
         readable = {*COLUMNS} | {"seed", "label"}
         if unknown := {*names} - readable:
@@ -288,7 +290,7 @@ class Bank:
         return dict(zip(names, self._rows.gather([*names], None), strict=True))
 
     def verify(self) -> list[str]:
-        """Return what is wrong with the file, one line each; none where all is well.
+        """Return the problems of the file, one line each; none where all is well.
 
         Every byte of every column is compared with its checksum.
         """

@@ -23,7 +23,7 @@ class CorruptSegmentError(Explained, OSError):
 
     Attributes:
         path: The file, or the folder where one is not there.
-        reason: What is wrong with it.
+        reason: Text that says what is wrong with it.
     """
 
     code = "SA605"
@@ -41,7 +41,7 @@ class LockedError(Explained, OSError):
     """Somebody else is writing.
 
     Attributes:
-        pid: Process that holds the lock, None where it did not say.
+        pid: Process that holds the lock, None if it did not say.
     """
 
     code = "SA608"
@@ -57,7 +57,7 @@ class LockedError(Explained, OSError):
 
 
 def require_no_link(path: Path) -> None:
-    """Raise where a file that is written to is a link: it would lead elsewhere.
+    """Raise if a file that is written to is a link: it would lead elsewhere.
 
     Raises:
         OSError: If the path is a symbolic link.
@@ -70,10 +70,10 @@ def require_no_link(path: Path) -> None:
 
 
 def require(path: Path, holds: bool, reason: str) -> None:
-    """Raise where something does not hold.
+    """Raise if something does not hold.
 
     Raises:
-        CorruptSegmentError: With the reason.
+        CorruptSegmentError: If it does not hold, with the reason.
     """
     if not holds:
         raise CorruptSegmentError(path, reason)
@@ -101,7 +101,7 @@ def parsed(path: Path, content: bytes) -> dict[str, Any]:
 
     Args:
         path: Named in the error.
-        content: Its bytes, or those of the text within.
+        content: Bytes of the record, or those of the text within.
 
     Raises:
         CorruptSegmentError: If it is no object, or one that no bank writes.

@@ -14,7 +14,7 @@ def write_file(path: Path, content: bytes) -> None:
     """Write a file so that its name never stands for less than its whole content.
 
     Raises:
-        OSError: As the system gives it; the former file, if any, is untouched.
+        OSError: If the system refuses it; the former file, if any, is untouched.
     """
     temporary = path.with_name(f"{TEMPORARY}{os.getpid()}-{path.name}")
     try:

@@ -1,4 +1,4 @@
-"""What tells one simulator from another: its name, its settings and its source."""
+"""Fingerprint of a simulator: its name, its settings and its source."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def fingerprint(simulator: Callable[..., Any], *, version: str = "") -> dict[str
 
 
 def differences(expected: Mapping[str, Any], got: Mapping[str, Any]) -> list[str]:
-    """Return where two fingerprints differ, one line each; none for one simulator."""
+    """Return the differences of two fingerprints, one line each; none if they agree."""
     if expected["version"] != got["version"]:
         return [f"version {expected['version']!r} there, {got['version']!r} here"]
     lines = _compare("simulator", expected["simulator"], got["simulator"])
@@ -144,7 +144,7 @@ def _globals(functions: list[types.FunctionType]) -> dict[str, Any]:
     """Return the global variables that functions use, from function to function.
 
     Args:
-        functions: Where to begin.
+        functions: Functions to begin with.
     """
     found: dict[str, Any] = {}
     waiting, seen = [f for f in functions if not _is_library(f)], {*functions}

@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 
 class Rows(Protocol):
-    """Where rows are kept: a bank."""
+    """The bank that keeps rows."""
 
     def load(self, run: str) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Return what is stored of a run."""
+        """Return the stored rows of a run."""
         ...
 
     def store(self, run: dict[str, Any], columns: dict[str, NDArray[Any]]) -> None:
@@ -40,7 +40,7 @@ class LabeledStore:
         self._proposal, self._label, self._log_action = proposal, label, log_action
 
     def load(self, run: str) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Return what is stored of a run, as :meth:`.Bank.load` does."""
+        """Return the stored rows of a run, as :meth:`.Bank.load` does."""
         return self._bank.load(run)
 
     def save(self, run: str, **rows: Unpack[StoredRows]) -> None:

@@ -13,11 +13,12 @@ from sbi_active.support import support_of
 def log_density(distribution: Any, theta: Tensor) -> Tensor:
     """Return the log density of rows, -inf outside the support.
 
-    A torch distribution that validates its arguments raises outside of its support.
+    Otherwise a torch distribution that validates its arguments would raise outside of
+    its support.
 
     Args:
         distribution: Anything with ``log_prob``.
-        theta: Shape (n, theta_dim).
+        theta: Parameters, shape (n, theta_dim).
 
     Returns:
         Shape (n,), float64.

@@ -28,11 +28,12 @@ class ReusedRows:
     r"""Rows of a bank, weighted for a target.
 
     Attributes:
-        bank: Where the rows are.
-        rows: Their positions, shape (k,), int64.
-        weights: Sum to one, shape (k,), float64.
-        denominator: "mixture" of all proposals, or each row's "own" proposal.
-        share: Of the weight, by label of the proposal.
+        bank: Bank that has the rows.
+        rows: Positions of the rows, shape (k,), int64.
+        weights: Weights that sum to one, shape (k,), float64.
+        denominator: Denominator of the weights: "mixture" of all proposals, or each
+            row's "own".
+        share: Share of the weight, by label of the proposal.
     """
 
     bank: Bank
@@ -61,7 +62,7 @@ class ReusedRows:
 
         Args:
             num_rows: Rows to return.
-            seed: Of the draw and the order.
+            seed: Seed of the draw and the order.
 
         References:
             Douc, Cappe & Moulines, Comparison of resampling schemes, ISPA 2005.
@@ -100,7 +101,7 @@ def reuse(
     which is consistent only where *each* proposal covers the target, and of larger
     variance. Neither can tell whether the proposals cover the target.
 
-    What is weighted is the law of theta *given an action*, as a posterior estimator of
+    Weights are for the law of theta *given an action*, as a posterior estimator of
     q(theta | x, action) needs it. Proposals may have met with different actions, so by
     default the mixture is taken anew among the rows of each action. Where every action
     is another one, that amounts to the second formula: set ``same_actions``.
@@ -111,8 +112,8 @@ def reuse(
     Args:
         bank: The rows.
         target: A prior or belief, anything with ``log_prob``.
-        action: Only rows with this action, shape (action_dim,); None takes all.
-        proposals: By label, all of those in the bank that have one.
+        action: Action of the rows that are taken, shape (action_dim,); None takes all.
+        proposals: Proposals by label, all of those in the bank that have one.
         same_actions: Whether all proposals drew actions from one law, whatever theta.
 
     Returns:

@@ -26,12 +26,12 @@ class Rows:
 
     Args:
         store: The file.
-        name: Of the bank.
+        name: Name of the bank.
 
     Attributes:
-        store: As given.
-        name: As given.
-        key: Of the bank's header.
+        store: File with the segments.
+        name: Name of the bank.
+        key: Key of the bank's header.
     """
 
     def __init__(self, store: Store, name: str) -> None:
@@ -136,11 +136,11 @@ class Rows:
 
 
 def positions(rows: Any, total: int) -> np.ndarray | None:
-    """Return the positions of rows, int64; None where all are meant.
+    """Return the positions of rows, int64; None if all are meant.
 
     Args:
         rows: Positions, a slice, a mask over all rows, or None.
-        total: How many rows there are.
+        total: Number of all rows.
 
     Raises:
         ValueError: If they are anything else.

@@ -1,7 +1,7 @@
 """Segments of rows in a store: columns as bytes, and what is known of them.
 
-A segment belongs to one run, and is never changed. What a file holds is compared with
-what a bank writes: anybody can make records whose checksums are right.
+A segment belongs to one run, and is never changed. The content of a file is compared
+with what a bank writes, since valid checksums alone can be forged.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ TABLES = ("theta", "action", "x")  # of more than one number a row
 
 @dataclass(frozen=True)
 class Segment:
-    """What is known of a segment without its columns.
+    """Header of a segment, without its columns.
 
     Attributes:
-        number: Its place among those of the bank, from 1.
+        number: Place of the segment among those of the bank, from 1.
         num_rows: Rows in it.
-        counts: Of rows by outcome.
+        counts: Counts of rows by outcome.
         run: Name of the run that its rows belong to.
-        seed: Of the run.
-        label: Of the run's proposal; "" where it is not known.
+        seed: Seed of the run.
+        label: Label of the run's proposal; "" if it is not known.
     """
 
     number: int
@@ -63,8 +63,8 @@ def write_segment(
 
     Args:
         store: The file.
-        name: Of the bank.
-        run: Its ``run``, ``seed`` and ``label``.
+        name: Name of the bank.
+        run: Run, with ``run``, ``seed`` and ``label``.
         columns: Arrays of the same length, by name.
     """
     counts = [int((columns["status"] == outcome).sum()) for outcome in Outcome]
@@ -78,7 +78,7 @@ def write_segment(
 
 
 def find_segment(store: Store, name: str, number: int) -> Segment:
-    """Return what is known of a segment.
+    """Return the header of a segment.
 
     Raises:
         CorruptSegmentError: If it is not there, or not what a bank writes.
@@ -106,10 +106,10 @@ def read_columns(
 
     Args:
         store: The file.
-        name: Of the bank.
-        segment: Which one.
-        names: Of the columns.
-        shapes: Of theta, action and x, of a row.
+        name: Name of the bank.
+        segment: Segment to read.
+        names: Names of the columns.
+        shapes: Shapes of theta, action and x, of a row.
 
     Raises:
         CorruptSegmentError: If one is not what was written.
@@ -152,10 +152,10 @@ def _is_known(known: Mapping[str, Any]) -> bool:
 
 
 def require_header(path: Path, header: Mapping[str, Any]) -> None:
-    """Raise where the header of a bank is none that a bank writes.
+    """Raise if the header of a bank is none that a bank writes.
 
     Raises:
-        CorruptSegmentError: It names the entry.
+        CorruptSegmentError: If an entry is missing or wrong; it names the entry.
     """
     for name, is_valid in _ENTRIES.items():
         require(path, name in header, f"no entry {name!r}")

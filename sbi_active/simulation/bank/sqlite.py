@@ -1,8 +1,8 @@
 """Connections to a store's file, which may come from anybody: it is never executed.
 
-SQLite is made to refuse what a file could have it do: tables are compared with those of
-a store before anything is read from them, no journal is played back that none leaves,
-and no link is followed.
+SQLite is configured to refuse commands that a file may contain: tables are compared
+with those of a store before anything is read from them, no journal is played back that
+none leaves, and no link is followed.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def connected(path: Path, mode: str, *, timeout: float) -> sqlite3.Connection:
 
     Args:
         path: The file.
-        mode: As SQLite names it, "rw" or "rwc".
+        mode: Mode as SQLite names it, "rw" or "rwc".
         timeout: Seconds to wait for others.
 
     Raises:
@@ -78,8 +78,8 @@ def connected(path: Path, mode: str, *, timeout: float) -> sqlite3.Connection:
 def opened(path: Path, what: str) -> tuple[sqlite3.Connection, bool]:
     """Return a connection to a store, and whether it is for one look alone.
 
-    That is so where not even the notes of a reader can be written beside the file: it
-    is then read as it is, and others have to wait.
+    This is the case if not even the notes of a reader can be written beside the file:
+    it is then read as it is, and others have to wait.
 
     Args:
         path: The file.
@@ -140,7 +140,7 @@ def is_locked(folder: Path) -> bool:
     """Return whether somebody has the right to write, without taking it.
 
     Args:
-        folder: Of a store.
+        folder: Folder of a store.
     """
     if not (folder / LOCK).exists():
         return False
@@ -158,7 +158,7 @@ def made(folder: Path, what: str) -> None:
     """Make a store in a folder of its own.
 
     Args:
-        folder: Made too where there is none.
+        folder: Folder, made where there is none.
         what: The store is said to be.
 
     Raises:
@@ -233,7 +233,7 @@ def explained(error: Exception, path: Path, what: str) -> Exception:
 
 
 def advice(folder: Path, otherwise: str) -> str:
-    """Return what to do with a folder that has no store."""
+    """Return advice on a folder that has no store."""
     if any((folder / name).exists() for name in ("bank.json", "campaign.json")):
         return f"bring it up to date by: sbi-active migrate {folder}"
     return otherwise

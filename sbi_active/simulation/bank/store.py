@@ -49,12 +49,12 @@ class Store:
     """A file of records in a folder. Any number of processes read, and one writes.
 
     Args:
-        folder: That has or gets the file.
-        what: It is said to be in errors, "bank" or "campaign".
+        folder: Folder that has or gets the file.
+        what: Name of the store in errors, "bank" or "campaign".
         make: Make the file where there is none.
 
     Attributes:
-        folder: As given.
+        folder: Folder of the file.
         path: The file.
 
     Raises:
@@ -125,7 +125,7 @@ class Store:
                 raise explained(error, self.path, self._what) from error
 
     def get(self, table: str, kind: str, number: int = 0) -> bytes | None:
-        """Return the content of a record; None where there is none."""
+        """Return the content of a record; None if there is none."""
         with self.reading() as connection:
             found = connection.execute(
                 f"SELECT content, digest FROM {table} WHERE kind = ? AND number = ?",
@@ -141,11 +141,11 @@ class Store:
         return found[0]
 
     def size(self, table: str, kind: str, number: int = 0) -> int | None:
-        """Return the bytes of a record without reading it; None where there is none."""
+        """Return the bytes of a record without reading it; None if there is none."""
         return self._look("length(content)", table, kind, number)
 
     def remains(self, table: str, kind: str, number: int) -> str:
-        """Return what is left of a damaged record, for people."""
+        """Return the rest of a damaged record, for people."""
         try:
             left = self._look("content", table, kind, number)
             return left.decode(errors="replace")
@@ -166,7 +166,7 @@ class Store:
         return None if content is None else parsed(self.path, content)
 
     def length(self, table: str, series: str) -> int:
-        """Return how many records of a series were written."""
+        """Return the number of records of a series."""
         found = self.text(f"{table} of {series}")
         count: Any = 0 if found is None else found.get("length")
         require(self.path, is_count(count), f"{count!r} as length of {series!r}")
@@ -182,9 +182,9 @@ class Store:
         """Write a record in place of another; for use in :meth:`writing`.
 
         Args:
-            table: One of the tables.
-            kind: Of the record.
-            number: Of the record.
+            table: Name of the table.
+            kind: Kind of the record.
+            number: Number of the record.
             content: Bytes, or JSON data of an object.
         """
         if isinstance(content, dict):
@@ -285,7 +285,7 @@ class Store:
         self._connection, self._signature = None, ()
 
     def problems(self) -> list[str]:
-        """Return what is wrong with the file and its objects, one line each."""
+        """Return the problems of the file and its objects, one line each."""
         wrong = self._structure("9")  # as many as are listed
         for kind in [] if wrong else self.kinds():
             try:
@@ -295,7 +295,7 @@ class Store:
         return wrong
 
     def _structure(self, what: str) -> list[str]:
-        """Return what SQLite finds wrong with the file, or a table of it."""
+        """Return the problems that SQLite finds in the file, or in a table of it."""
         try:
             with self.reading() as connection:
                 check = f"PRAGMA integrity_check({what})"
@@ -315,7 +315,7 @@ class Store:
     def salvage(self) -> None:
         """Write the file anew from the records that are whole.
 
-        The former one is kept, its name ending in ".damaged".
+        The former file is kept, its name ending in ".damaged".
         """
         self.acquire()
         fresh = self.folder / f"{TEMPORARY}{os.getpid()}-{NAME}"
@@ -356,7 +356,7 @@ class Store:
         return digest.digest()
 
     def _found(self) -> tuple[int, ...]:
-        """Return what changes where the file is another one, or is changed."""
+        """Return a value that changes if the file is another one, or is changed."""
         with suppress(OSError):
             state = self.path.stat()
             return state.st_ino, state.st_size, state.st_mtime_ns

@@ -1,4 +1,5 @@
 """Models of the noise of a measurement, and their estimation from repeats.
 
-Here live densities of x given its mean. What gives the mean does not.
+This package contains densities of x given its mean. It does not contain the simulators
+that give the mean.
 """

@@ -40,10 +40,10 @@ class AutocorrelatedNoise(ScaleNoise):
             channel.
         correlation_time: :math:`\tau` in seconds, of all channels. Without time stamps
             it counts samples.
-        posterior: Over (sd, correlation_time), event shape (p,).
+        posterior: Posterior of (sd, correlation_time), event shape (p,).
         measurement_sd: Known standard deviation of the measurement alone, where the
             rest of an unknown sd is what a simulator gets wrong, a number or one a
-            channel; None where nothing is known of it.
+            channel; None if nothing is known of it.
 
     Raises:
         ValueError: If a parameter is negative or not finite.
@@ -83,20 +83,21 @@ class AutocorrelatedNoise(ScaleNoise):
     ) -> Self:
         r"""Return noise of which only the orders of magnitude are known.
 
-        Its parameters have log-uniform priors. For trajectories without error bars:
-        what is wrong with the simulator itself passes for such errors as long as
-        nothing better explains it.
+        Its parameters have log-uniform priors. Use it for trajectories without error
+        bars: errors of the simulator itself count as such noise as long as nothing
+        explains them better.
 
         Args:
             sd: Bounds of the standard deviation, in the units of x; or a pair a
                 channel, whose sizes are then unknown one by one.
             correlation_time: Bounds, s; well below the distance of samples, errors are
                 independent.
-            measurement_sd: Of the sensor alone, where it is known, a number or one a
-                channel. Errors beyond it are the simulator's, and a verdict then says
-                what helps to predict and what is probably the cause (:mod:`.misfit`).
+            measurement_sd: Standard deviation of the sensor alone, where it is known, a
+                number or one a channel. Errors beyond it are the simulator's, and a
+                verdict then says what helps to predict and what is probably the cause
+                (:mod:`.misfit`).
             num_sds: Nodes of the grid over standard deviations.
-            num_times: The same over correlation times.
+            num_times: Nodes of the grid over correlation times.
 
         Raises:
             ValueError: If bounds are not positive and in order.
@@ -223,12 +224,12 @@ def innovations(
     with s the last time observed before t, and :math:`u_t = e_t` where there is none.
 
     Args:
-        residual: Shape (n, T, ...), NaN where not observed.
+        residual: Residuals, shape (n, T, ...), NaN where not observed.
         tau: Correlation times, shape (n,).
-        times: Shape (T,) or (n, T); None for 0, 1, 2, ...
+        times: Times, shape (T,) or (n, T); None for 0, 1, 2, ...
 
     Returns:
-        :math:`u_t^2` and :math:`\log(1 - \rho^2)`, zero where not observed, shapes (n,
+        :math:`u_t^2` and :math:`\log(1 - \rho^2)`, zero if not observed, shapes (n,
         T, rest).
     """
     change, variance = chained(residual, tau, times)
@@ -240,7 +241,7 @@ def innovations(
 def chained(
     residual: Tensor, tau: Tensor, times: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    r"""Return what is new at each time, and its variance in those of the residual.
+    r"""Return the innovation at each time, and its variance in those of the residual.
 
     Arguments are those of :func:`innovations`.
 

@@ -1,4 +1,4 @@
-"""What a noise model is, and what those with a standard deviation share."""
+"""Interface of a noise model, and the base of those with a standard deviation."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ class NoiseModel(ABC):
     unknown :math:`\eta`, draw it from ``posterior`` and give it as ``parameters``.
 
     Attributes:
-        parameter_names: One a parameter.
-        parameters: Their values in natural units, shape (p,), float64.
-        posterior: Over the parameters, event shape (p,); None where they are declared
-            exactly.
-        times: Time stamps of the first axis of x in seconds, shape (T,); None where
-            nobody gave them.
+        parameter_names: Names of the parameters.
+        parameters: Values of the parameters in natural units, shape (p,), float64.
+        posterior: Posterior of the parameters, event shape (p,); None if they are
+            declared exactly.
+        times: Time stamps of the first axis of x in seconds, shape (T,); None if
+            they were not given.
     """
 
     parameter_names: tuple[str, ...] = ()
@@ -71,12 +71,12 @@ class NoiseModel(ABC):
 
         Args:
             mean: Noise-free outputs, shape (n, *x_shape).
-            seeds: One a row, shape (n,), and row i depends on ``seeds[i]`` alone; None
-                draws from torch's global generator.
-            times: Of x's first axis in seconds, shape (T,) or one set a row (n, T);
-                None takes those of the model.
-            parameters: Shape (p,), or one set a row (n, p); None takes the model's own,
-                or for each row a draw from the posterior.
+            seeds: Seeds, one a row, shape (n,), and row i depends on ``seeds[i]``
+                alone; None draws from torch's global generator.
+            times: Times of x's first axis in seconds, shape (T,) or one set a row (n,
+                T); None takes those of the model.
+            parameters: Parameters of the noise, shape (p,), or one set a row (n, p);
+                None takes the model's own, or for each row a draw from the posterior.
 
         Returns:
             Shape (n, *x_shape).
@@ -96,8 +96,9 @@ class NoiseModel(ABC):
         Args:
             x: Observations, shape (n, *x_shape); NaN where a number was not observed.
             mean: Noise-free outputs, broadcastable to x.
-            times: As in :meth:`sample`.
-            parameters: As in :meth:`sample`; None with a posterior gives the marginal.
+            times: Times of x's first axis, as in :meth:`sample`.
+            parameters: Parameters of the noise, as in :meth:`sample`; None with a
+                posterior gives the marginal.
 
         Returns:
             Shape (n,), float64, nats.
@@ -107,16 +108,16 @@ class NoiseModel(ABC):
 class ScaleNoise(NoiseModel):
     r"""Noise with a standard deviation and further parameters common to all channels.
 
-    Checks and shapes stand here; a kind of noise implements ``_draw`` and
+    This class has the checks and shapes; a kind of noise implements ``_draw`` and
     ``_log_density`` given parameters, and ``_marginal`` where it has a closed form.
 
     Args:
         sd: Standard deviation, in the units of x; a number, or one a channel (the last
             axis of x). Its parameters are named "sd", or "sd_1", "sd_2", ...
         shared: Further parameters by name, which follow those.
-        posterior: Over the parameters, event shape (p,). One that
-            :func:`.estimate_noise` did not make is represented
-            by 256 fixed draws of equal weight.
+        posterior: Posterior of the parameters, event shape (p,). One that
+            :func:`.estimate_noise` did not make is represented by 256 fixed draws of
+            equal weight.
     """
 
     def __init__(
@@ -222,7 +223,7 @@ class ScaleNoise(NoiseModel):
         return torch.stack(terms).logsumexp(0) - math.log(len(draws))
 
     def _check(self, parameters: Tensor) -> None:
-        """Raise where parameters (..., p) are outside their range."""
+        """Raise if parameters (..., p) are outside their range."""
         sd = parameters[..., : self._num_sd]
         if not bool((sd.isfinite() & (sd >= 0)).all()):
             raise ValueError(
@@ -231,7 +232,7 @@ class ScaleNoise(NoiseModel):
             )
 
     def _check_shape(self, shape: torch.Size) -> None:
-        """Raise where outcomes (n, *x_shape) do not fit the channels."""
+        """Raise if outcomes (n, *x_shape) do not fit the channels."""
         if len(shape) < 2 or self._num_sd not in (1, shape[-1]):
             raise ValueError(
                 f"expected outcomes of shape (n, ..., {self._num_sd}), one standard "
@@ -285,7 +286,7 @@ class ScaleNoise(NoiseModel):
 def declared_sds(noise: NoiseModel) -> Tensor:
     """Return the standard deviations of a noise model, shape (1,) or (channels,).
 
-    One that has no such parameter is sampled around zero.
+    A noise model that has no such parameter is sampled around zero.
     """
     sds = [
         v
@@ -300,7 +301,7 @@ def declared_sds(noise: NoiseModel) -> Tensor:
 
 
 def observed_terms(terms: Tensor, residual: Tensor) -> Tensor:
-    """Return terms of a sum, zero where the residual was not observed."""
+    """Return terms of a sum, zero if the residual was not observed."""
     return torch.where(residual.isnan(), 0.0, terms)
 
 

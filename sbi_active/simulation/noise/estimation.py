@@ -78,10 +78,11 @@ def estimate_noise(
         repeats: Measurements of one action on one system, shape (k, *x_shape); or a
             sequence of such groups, of several actions. NaN masks a number, and a
             repeat of NaN alone is left out.
-        kind: Of the noise.
+        kind: Kind of the noise.
         times: Time stamps of the first axis of x in seconds, shape (T,).
-        pooled: One standard deviation for all numbers, not one a channel (an entry of
-            the last axis of x). Autocorrelated noise of x of shape (T,) is always so.
+        pooled: Whether to use one standard deviation for all numbers, not one a channel
+            (an entry of the last axis of x). Autocorrelated noise of x of shape (T,) is
+            always so.
 
     Returns:
         The noise model, whose ``posterior`` is over its parameters.

@@ -32,7 +32,7 @@ class GaussianNoise(ScaleNoise):
     Args:
         sd: Standard deviation :math:`\sigma`, in the units of x; a number, or one a
             channel (the last axis of x).
-        posterior: Over the standard deviations, event shape (channels,).
+        posterior: Posterior of the standard deviations, event shape (channels,).
 
     Raises:
         ValueError: If a standard deviation is negative or not finite.

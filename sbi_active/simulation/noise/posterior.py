@@ -57,7 +57,7 @@ class Cells:
     r"""A density on a positive number, constant in its logarithm within each cell.
 
     Args:
-        edges: Of the cells, increasing, shape (..., cells + 1).
+        edges: Edges of the cells, increasing, shape (..., cells + 1).
         log_weight: Log probability of the cells, shape (..., cells).
     """
 
@@ -95,7 +95,7 @@ class SdGrid:
     """Standard deviations on a grid.
 
     Args:
-        edges: Of the cells of sd, shape (channels, s + 1).
+        edges: Edges of the cells of sd, shape (channels, s + 1).
         log_weight: Log probability of the cells, shape (cells, channels, s).
     """
 
@@ -134,8 +134,8 @@ class NoisePosterior(Distribution):
 
     Args:
         sd: Standard deviations given the cell of the shared parameter.
-        shared: Of the shared parameter :math:`\psi`, its cells and weights (shape
-            (cells,)); None where there is none.
+        shared: Cells and weights (shape (cells,)) of the shared parameter :math:`\psi`;
+            None if there is none.
     """
 
     arg_constraints: dict[str, Any] = {}  # pyright: ignore
@@ -198,9 +198,9 @@ def log_grid_evidence(
 
     Args:
         square: Sum of squares, shape (n, channels).
-        count: Their number m, alike.
+        count: Number m of the squares, shape (n, channels).
         sd: The grid.
-        cell: Of the shared parameter.
+        cell: Cell of the shared parameter.
 
     Returns:
         Shape (n, channels), nats.
@@ -222,9 +222,9 @@ def log_student_evidence(
 
     Args:
         square: Sum of squares, shape (n, channels).
-        count: Their number m, alike.
+        count: Number m of the squares, shape (n, channels).
         sd: Posterior of the standard deviations.
-        cell: Of the shared parameter.
+        cell: Cell of the shared parameter.
 
     Returns:
         Shape (n, channels), nats.

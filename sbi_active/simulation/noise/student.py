@@ -26,9 +26,8 @@ class StudentTNoise(ScaleNoise):
         sd: Standard deviation :math:`\sigma`, in the units of x; a number, or one a
             channel (the last axis of x).
         df: Degrees of freedom :math:`\nu > 2`, of all channels.
-        posterior: Over (sd, df), event shape (p,). That of
-            :func:`.estimate_noise` is a grid, over which
-            densities are summed.
+        posterior: Posterior of (sd, df), event shape (p,). That of
+            :func:`.estimate_noise` is a grid, over which densities are summed.
 
     Raises:
         ValueError: If a standard deviation is negative, or df is not above 2, where

@@ -1,6 +1,7 @@
 """The engine: rows of simulations over processes or a cluster.
 
-Here lives how rows are run, lost and stored. What a row means does not.
+This package runs rows, handles lost ones and stores them. It does not know what a row
+means.
 """
 
 from sbi_active.simulation.workers.cluster import DaskPool

@@ -39,14 +39,14 @@ class Call:
     """Rows to simulate in one call.
 
     Attributes:
-        rows: Their indices in the whole set, shape (k,), int64.
+        rows: Indices of the rows in the whole set, shape (k,), int64.
         theta: Parameters, shape (k, theta_dim).
         action: Actions, shape (k, action_dim).
-        seeds: One a row, shape (k,), int64.
-        seed: Of the whole set.
-        draws: Where the random numbers come from: "seeds" passes those to the
-            simulator; "blocks" forks the global generators for each block of 256 rows,
-            and the rows are whole blocks; "alone" forks them for the single row.
+        seeds: Seeds, one a row, shape (k,), int64.
+        seed: Seed of the whole set.
+        draws: Source of the random numbers: "seeds" passes those to the simulator;
+            "blocks" forks the global generators for each block of 256 rows, and the
+            rows are whole blocks; "alone" forks them for the single row.
         is_probe: Whether it only asks if the simulator works, its x being dropped.
         is_second: Whether it is tried again after its worker died.
     """
@@ -82,12 +82,12 @@ class Call:
 
 @dataclass(frozen=True, eq=False)
 class Reply:
-    """What came of a call.
+    """The result of a call.
 
     Attributes:
-        x: Shape (k, *x_shape), float32; None where there is a fault.
+        x: Outcomes, shape (k, *x_shape), float32; None if there is a fault.
         seconds: Wall time that the simulator took.
-        fault: What went wrong; None if nothing did.
+        fault: Fault that occurred; None if nothing did.
         traceback: Text that tells it.
         error: The exception itself, where it was raised in this process.
     """
@@ -112,7 +112,8 @@ def answer(
     """Run the simulator over the rows of a call; its exceptions become a reply.
 
     Args:
-        simulator: Takes theta, the action, and seeds where the call says so.
+        simulator: Simulator that takes theta, the action, and seeds where the call says
+            so.
         call: The rows.
         catches: Exceptions that become a reply. All of them in a process that serves
             calls alone, where nobody else would tell what was raised.

@@ -48,7 +48,7 @@ class DaskPool(Pool):
     (``distributed.deploy.lost-worker-timeout``), for good; those are asked for again.
 
     Args:
-        simulator: Sent once to each worker.
+        simulator: Simulator, sent once to each worker.
         num_workers: Calls at a time.
         client: A ``distributed.Client``.
     """
@@ -185,7 +185,7 @@ class JoblibPool(Pool):
     the executor does not replace it.
 
     Args:
-        simulator: Sent with each call, and unpickled once a worker.
+        simulator: Simulator, sent with each call, and unpickled once a worker.
         num_workers: Calls at a time.
     """
 

@@ -83,8 +83,8 @@ def simulate(
         theta: Parameters, shape (n, theta_dim).
         action: Actions, shape (n, action_dim).
         seed: Seed of the whole set.
-        workers: Where the rows run and what one may cost, or the number of calls at a
-            time; None is this process.
+        workers: Workers that run the rows and what one may cost, or the number of calls
+            at a time; None is this process.
         batch_size: Rows a call; None gives workers as many as take a quarter of a
             second. A simulator in this process is given all at once, or, after its
             first rows have shown that this would take long, as many as take about a
@@ -93,7 +93,7 @@ def simulate(
         show_progress: Show a progress bar.
         store: Keeps finished rows, every half second, and gives those that it has;
             None takes that of the campaign whose directory this is called for, if any.
-        check_noise: Simulate the first rows under a second seed and raise where
+        check_noise: Whether to simulate the first rows under a second seed and raise if
             nothing differs.
 
     Returns:

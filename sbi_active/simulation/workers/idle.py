@@ -44,9 +44,9 @@ class IdleWorkers:
         """Let workers wait that have answered all their calls.
 
         Args:
-            key: As for :meth:`take`.
+            key: Digest of the simulator and its surroundings, as for :meth:`take`.
             workers: Loaded with that simulator.
-            at_most: How many of them may wait; the others end.
+            at_most: Number of them that may wait; the others end.
         """
         with self._lock:
             room = 0
@@ -84,7 +84,7 @@ def _end(workers: Sequence[Worker]) -> None:
         worker.end()
 
 
-#: Those of this process.
+#: Idle workers of this process.
 IDLE = IdleWorkers()
 
 atexit.register(IDLE.end)

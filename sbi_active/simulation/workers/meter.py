@@ -1,4 +1,4 @@
-"""How many rows were simulated, and how many may be."""
+"""Numbers of rows that were simulated, and that may be."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How many rows a call in this process gets, so that an interrupt costs about a second.
+"""Rows a call in this process, so that an interrupt costs about a second.
 
 A call cannot be interrupted without losing its rows, so a long simulation is cut into
 parts. A vectorized simulator takes as long for few rows as for many, and would lose
@@ -13,7 +13,7 @@ from weakref import WeakKeyDictionary
 
 
 class Pace:
-    """What calls of a simulator took, a fixed time and a time a row.
+    """Times that calls of a simulator took: a fixed time and a time a row.
 
     Example:
         >>> pace = Pace()
@@ -101,7 +101,7 @@ _PACES: WeakKeyDictionary[Any, dict[str, Pace]] = WeakKeyDictionary()
 
 
 def pace_of(simulator: Callable[..., Any]) -> Pace:
-    """Return what is known of a simulator in this process."""
+    """Return the known pace of a simulator in this process."""
     owner = getattr(simulator, "__self__", simulator)
     try:
         paces = _PACES.setdefault(owner, {})

@@ -1,4 +1,4 @@
-"""Where calls of a simulator run: in this process, or in worker processes."""
+"""Pools that run calls of a simulator, in this process or in worker processes."""
 
 from __future__ import annotations
 
@@ -81,12 +81,12 @@ class InProcess(Pool):
 class WorkerPool(Pool):
     """Runs calls in processes of its own, each of which has one call at a time.
 
-    So a worker that dies or is killed at its time limit takes no other call with it,
-    and the guilty call is known. Those that have answered are kept for the next pool
-    of the same simulator, folder, path and environment.
+    A worker that dies or is killed at its time limit therefore loses no other call, and
+    the guilty call is known. Workers that have answered are kept for the next pool of
+    the same simulator, folder, path and environment.
 
     Args:
-        simulator: Sent once to each worker.
+        simulator: Simulator, sent once to each worker.
         num_workers: Number of processes.
     """
 

@@ -54,10 +54,10 @@ class Worker:
         simulator: Pickled.
 
     Attributes:
-        connection: Gives None at the start of a call and then its reply, both pickled;
-            and an end of file where the process died.
-        call: What it was given last.
-        deadline: When that is given up, which is known once it has been started.
+        connection: Connection that gives None at the start of a call and then its
+            reply, both pickled; and an end of file where the process died.
+        call: Call that it was given last.
+        deadline: Time when that is given up, which is known once it has been started.
     """
 
     call: Call
@@ -88,7 +88,7 @@ class Worker:
             self.connection.send_bytes(pickle.dumps(call, protocol=5))
 
     def reply(self) -> Reply | None:
-        """Return what came of the call; None while it runs."""
+        """Return the reply of the call; None while it runs."""
         try:
             while self.connection.poll():
                 reply = pickle.loads(self.connection.recv_bytes())
@@ -121,7 +121,7 @@ class Worker:
     def end(self) -> int:
         """Kill the process and what it started; return its exit code.
 
-        That is the negative signal of one that was killed.
+        The code of a killed process is its negative signal.
         """
         if self.connection.closed:
             return self._process.exitcode or 0

@@ -1,4 +1,4 @@
-"""Which rows are simulated together, and what is done about calls that fail."""
+"""The schedule of a simulation: rows simulated together, and calls that fail."""
 
 from __future__ import annotations
 
@@ -35,22 +35,24 @@ class Schedule:
     and without company.
 
     Args:
-        theta: Shape (n, theta_dim).
-        action: Shape (n, action_dim).
-        seed: Of the whole set.
+        theta: Parameters, shape (n, theta_dim).
+        action: Actions, shape (n, action_dim).
+        seed: Seed of the whole set.
         has_seeds: Whether the simulator takes them.
         batch_size: Rows a call; None measures how many take ``BATCH_SECONDS``.
         pace: Sizes the calls where no batch size is given, as one worker needs it:
             a short simulation is one call, a long one is cut.
         workers: The seconds that a row may take, and how often a missing one is tried
             again.
-        on_rows: Told about finished rows: index (k,), x (k, *x_shape), status (k,).
+        on_rows: Function that is told about finished rows: index (k,), x (k, *x_shape),
+            status (k,).
 
     Attributes:
-        x: Shape (n, *x_shape), NaN where there is none; None until a call succeeds.
-        status: Shape (n,), int8, -1 for rows that are not finished.
-        tracebacks: Of the missing rows.
-        faults: How many rows are missing for which fault.
+        x: Outcomes, shape (n, *x_shape), NaN where there is none; None until a call
+            succeeds.
+        status: Status of each row, shape (n,), int8, -1 for rows that are not finished.
+        tracebacks: Tracebacks of the missing rows.
+        faults: Numbers of missing rows by fault.
     """
 
     #: A call is sized to take this long, which hides what sending it costs.

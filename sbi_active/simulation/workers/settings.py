@@ -1,4 +1,4 @@
-"""Where simulations run, and what a row may cost."""
+"""Workers that run simulations, and the cost of a row."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ from sbi_active.expected import require
 
 @dataclass(frozen=True)
 class Workers:
-    """Where simulations run, and what a row may cost; nothing of x depends on it.
+    """Workers that run simulations, and the cost of a row; x does not depend on them.
 
     Attributes:
-        num_workers: Calls at a time; -1 means one a core. One worker without a time
-            limit is this process.
+        num_workers: Number of calls at a time; -1 means one a core. One worker without
+            a time limit is this process.
         time_limit: Seconds a row, loading the simulator not counted; a batch may take
             as much as its rows. None waits for ever. With it, or with more than one
             worker, a simulator that ends its process costs a row.
-        num_retries: How often a missing row is tried again, with the same seed.
+        num_retries: Number of times that a missing row is tried again, with the same
+            seed.
 
     Raises:
         ValueError: If a number is out of its range.

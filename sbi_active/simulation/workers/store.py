@@ -1,4 +1,4 @@
-"""What a store of rows offers to the engine, and when rows are handed to it."""
+"""Interface of a store of rows, and the times when rows are handed to it."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ class StoredRows(TypedDict):
     """Rows of a set, as a store gets them.
 
     Attributes:
-        index: Which of the set's rows these are, shape (k,), int64.
+        index: Indices of these rows in the set, shape (k,), int64.
         theta: Parameters, shape (k, theta_dim).
         action: Actions, shape (k, action_dim).
         x: Outcomes, shape (k, *x_shape), float32.
         status: An :class:`.Outcome` a row, shape (k,), int8.
-        seed: Of the whole set.
+        seed: Seed of the whole set.
     """
 
     index: Tensor
@@ -44,7 +44,7 @@ class RowStore(Protocol):
     """
 
     def load(self, run: str) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Return what is stored of a set of rows, or None.
+        """Return the stored rows of a set, or None.
 
         Args:
             run: Digest of the set, see :func:`run_digest`.
@@ -75,7 +75,7 @@ def storing(find: FindStore) -> Iterator[None]:
     """Have all simulations in the block stored that are given no store of their own.
 
     Args:
-        find: Returns the store of a simulator's rows.
+        find: Function that returns the store of a simulator's rows.
     """
     token = _FINDERS.set(find)
     try:
