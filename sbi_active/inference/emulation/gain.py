@@ -24,8 +24,8 @@ def mixture_gain(
     """Return contributions to the information of the first parameters, (num_outer,).
 
     Args:
-        mean: Of outcomes at parameters, shape (m, q).
-        variance: Of the mean, shape (m, q).
+        mean: Mean outcomes at the parameters, shape (m, q).
+        variance: Variance of the mean, shape (m, q).
         root: Cholesky factor of the noise, shape (q, q).
         normal: Standard normal numbers, shape (num_outer, q).
         num_outer: Parameters that outcomes are drawn at.

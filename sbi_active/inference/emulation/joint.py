@@ -53,13 +53,13 @@ def candidate_gains(
     from the same raw rows.
 
     Args:
-        pool: Of raw simulations.
+        pool: Pool of raw simulations.
         reference: Coordinates of draws from the belief, shape (n, d).
-        candidates: As simulated, shape (a, action_dim).
+        candidates: Simulated actions, shape (a, action_dim).
         summaries: K of them.
-        noise: That was declared, or None.
-        coordinates: Of the prior.
-        seed: Of outcomes.
+        noise: Declared noise, or None.
+        coordinates: Coordinates of the prior.
+        seed: Seed of the outcomes.
 
     Returns:
         Shapes (a, K, m), nats, and (a,).

@@ -43,17 +43,17 @@ class TrialLikelihood:
     """Likelihood of one trial as a function of the prior's coordinates.
 
     Attributes:
-        region: Its coordinates are those of the processes.
+        region: Region whose coordinates the processes take.
         processes: One for all numbers where noise is declared, else one each; empty
             where nothing was measured.
         observed: The numbers that were observed, or their statistics, shape (q,).
-        noise: That was declared; None where it was learned.
-        x_shape: Of the outcome that noise is declared for.
+        noise: Declared noise; None if it was learned.
+        x_shape: Shape of the outcome that noise is declared for.
         used: Which of its numbers were observed, shape (k,).
         root: Cholesky factor of the correlation of learned noise, shape (q, q).
         freedom: Degrees of freedom of learned noise.
         outcome: Probability of a measurement, or of none; None where simulations agree.
-        label: Of the summary.
+        label: Label of the summary.
         num_rows: Simulations behind it.
     """
 
@@ -180,7 +180,7 @@ class PooledLikelihood:
     """Likelihood of all trials, each learned from simulations at its own action.
 
     Attributes:
-        coordinates: Of the prior.
+        coordinates: Coordinates of the prior.
         trials: One a trial.
     """
 

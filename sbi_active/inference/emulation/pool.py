@@ -22,7 +22,7 @@ class Batch:
     Attributes:
         theta: Parameters, shape (n, theta_dim), float32.
         action: Actions, shape (n, action_dim).
-        seed: Of the call.
+        seed: Seed of the call.
         log_proposal: Log density that theta was drawn from, shape (n,), float64.
     """
 
@@ -37,12 +37,12 @@ class Pool:
 
     Args:
         simulator: ``simulator(theta, action)``; where noise is declared, without it.
-        batches: Of an earlier pool, to go on from: their outcomes are read from the
-            campaign's store, or simulated anew.
-        workers: Of the simulations.
+        batches: Batches of an earlier pool to go on from: their outcomes are read from
+            the campaign's store, or simulated anew.
+        workers: Workers that run the simulations.
 
     Attributes:
-        batches: What was simulated, in order.
+        batches: Simulated batches, in order.
         num_missing: Rows lost to faults of the simulator so far.
     """
 

@@ -70,7 +70,7 @@ class PooledTrial:
     Attributes:
         action: Executed, as simulated, shape (action_dim,).
         x: Raw outcome, shape x_shape.
-        label: Of the summary that it is to be seen by; None takes the best.
+        label: Label of the summary of the outcome; None takes the best.
     """
 
     action: Tensor
@@ -83,13 +83,13 @@ class Processes(Stages):
 
     Args:
         prior: The original prior.
-        pool: Of raw simulations, noise-free where noise is declared.
-        noise: That was declared; None where the simulator is the noise.
-        x_shape: Of a raw outcome.
-        summaries: Of raw outcomes.
-        settings: Of the belief.
+        pool: Pool of raw simulations, noise-free if noise is declared.
+        noise: Declared noise; None if the simulator draws it.
+        x_shape: Shape of a raw outcome.
+        summaries: Summaries of raw outcomes.
+        settings: Settings of the belief.
         before: The belief before the last trial; it says where to look first.
-        seed: Of everything random here.
+        seed: Seed of everything random here.
     """
 
     def __init__(
@@ -296,7 +296,7 @@ def nearest(
     Rows far from it would make what is close to it look as if it were one place.
 
     Args:
-        z: Of simulations, shape (n, d).
+        z: Coordinates of simulations, shape (n, d).
         valid: Which of them may be taken, shape (n,).
         reference: Draws from the belief, shape (m, d).
         most: Rows to take.

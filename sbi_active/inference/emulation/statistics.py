@@ -31,8 +31,8 @@ class Statistic:
     """A linear map of summaries (n, q) to statistics (n, s).
 
     Attributes:
-        center: Of the summaries, shape (q,).
-        scale: Of the summaries, shape (q,); infinite where nothing varies.
+        center: Mean of the summaries, shape (q,).
+        scale: Deviation of the summaries, shape (q,); infinite if one never varies.
         weight: Shape (q, s); None keeps the numbers as they are.
         offset: Shape (s,).
     """
@@ -58,7 +58,7 @@ def learned_statistic(
     Args:
         summary: Finite summaries, shape (n, q).
         z: Coordinates of their parameters, shape (n, d).
-        seed: Of the folds.
+        seed: Seed of the folds.
 
     Returns:
         The statistic, and those of the rows by regressions without them, (n, s).

@@ -23,7 +23,7 @@ class Summary:
     """A summary of raw outcomes, fitted where it is of that kind.
 
     Attributes:
-        label: Its name.
+        label: Name of the summary.
         of: The function, or the fitted object.
         fill: Mean of the raw outcomes it was fitted to, shape (k,), which takes the
             place of what was not measured; None for a function, which gets NaN.

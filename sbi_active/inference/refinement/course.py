@@ -28,8 +28,8 @@ class Stage:
         defensive: Share of the prior in the density.
         draws: Equally weighted particles, shape (n, d).
         excess: Worst misfit of a region with mass.
-        mass: Of each region, shape (k,).
-        entropy: Of the density, in nats.
+        mass: Mass of each region, shape (k,).
+        entropy: Entropy of the density, in nats.
         error: Expected divergence in nats, as the simulations are finite in number.
     """
 

@@ -62,13 +62,14 @@ def refine(
             continuous ones in sbi's ``MultipleIndependent``, are enumerated.
         action: Executed actions, shape (t, action_dim).
         x: Their observed outcomes, shape (t, *x_shape); NaN where nothing was measured.
-        start: Where else to look first, for example a chained belief and the belief
-            before the last trial. It adds simulations and no weight, so it cannot bias.
+        start: Distributions to look at first, for example a chained belief and the
+            belief before the last trial. It adds simulations and no weight, so it
+            cannot bias.
         past: ``belief.histories`` of an earlier call whose trials are the first of
             these: what still lies in a region is simulated at the new actions only.
         settings: Budget; None is ``RefinementOptions()``.
         stages: Settings of a likelihood that is learned; None is ``StageSettings()``.
-        seed: Of everything random here.
+        seed: Seed of everything random here.
 
     Returns:
         The belief; ``belief.diagnostics`` says how far to trust it.

@@ -63,9 +63,9 @@ class Regions(Stages):
     """Histories in regions, and a polynomial in each.
 
     Args:
-        task: What is to be refined.
+        task: Task that is refined.
         past: Histories of the first of its trials.
-        seed: Of everything random here.
+        seed: Seed of everything random here.
         further_noise: Standard deviations of noise to add, shape (t, q).
     """
 

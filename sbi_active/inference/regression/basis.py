@@ -17,7 +17,7 @@ class Basis:
     """Monomials up to a degree, and random cosines.
 
     Attributes:
-        degree: Of the monomials.
+        degree: Degree of the monomials.
         frequency: Shape (d, w), w = 0 for none.
         phase: Shape (w,).
         is_additive: Whether monomials are powers of one coordinate each.

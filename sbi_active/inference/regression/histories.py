@@ -73,12 +73,12 @@ class Histories:
     Args:
         simulator: ``simulator(theta, action)``.
         action: Executed actions, shape (t, action_dim).
-        x: What was observed, shape (t, q); NaN where it was not.
-        coordinates: Of the prior.
-        seed: Of the simulations.
+        x: Observed outcomes, shape (t, q); NaN where nothing was.
+        coordinates: Coordinates of the prior.
+        seed: Seed of the simulations.
         past: Histories of the first of these trials; those that are still of use are
             simulated at the further actions only.
-        workers: Of the simulations.
+        workers: Workers that run the simulations.
         further_noise: Standard deviations of noise to add to each trial's outcomes,
             shape (t, q); None adds none.
 
@@ -87,7 +87,7 @@ class Histories:
         x: Outcomes less the observed ones, or themselves where nothing was observed,
             shape (n, t * q).
         present: Which outcomes were there at the first attempt, shape (n, t * q).
-        observed: What was observed, zero where nothing was, shape (t * q,).
+        observed: Observed numbers, zero where nothing was, shape (t * q,).
         used: Which numbers were observed, shape (t * q,).
         num_drawn: Histories simulated here or taken over, those lost to faults of the
             simulator included.

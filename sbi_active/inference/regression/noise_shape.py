@@ -49,9 +49,9 @@ class ShapeSettings:
         gain: Nats a number by which left-out residuals must be likelier than under a
             Gaussian. Half is what a few hundred Gaussian residuals lose by chance;
             twice leaves a Student t of ten degrees of freedom Gaussian.
-        num_components: Of the mixture. With two, beliefs of ``dear.skewed`` are .058
-            nats off at 3,000 histories and .17 at 500, with three .048 and .14, with
-            four .045 and .13.
+        num_components: Components of the mixture. With two, beliefs of ``dear.skewed``
+            are .058 nats off at 3,000 histories and .17 at 500, with three .048 and
+            .14, with four .045 and .13.
         most_fitted: Residuals that the mixture is fitted to.
         floor: Size of the prediction, in its root mean square, below which the noise
             does not shrink: half lets the noise vanish where a mean crosses zero.
@@ -78,7 +78,7 @@ class NoiseShape:
         floor: f, shape (q,).
         scale: c, shape (q,).
         mixture: F.
-        covariance: Of the normal scores y.
+        covariance: Covariance of the normal scores y.
         shift: Mean of the scores, shape (q,).
         score: Normal scores of the simulations over their deviations, shape (n, q).
         coefficient: Coefficients of outcomes less the observed ones, shape (p, q).

@@ -55,7 +55,7 @@ class TrialOutcome:
     r"""Probability in one region that a trial's outcome is what it was.
 
     Attributes:
-        region: Where it holds.
+        region: Region where it holds.
         trial: Index of the trial.
         basis: f.
         coefficient: Shape (p,).
@@ -85,9 +85,9 @@ class TrialOutcome:
         Args:
             region: Gives the coordinates.
             trial: Index of the trial.
-            z: Of simulations, shape (n, d).
+            z: Coordinates of simulations, shape (n, d).
             agrees: Whether their outcome is what was observed, shape (n,).
-            pairs: Of simulations at the same parameters, shape (r, 2).
+            pairs: Pairs of simulations at the same parameters, shape (r, 2).
         """
         u, n = region.scaled(z), len(z)
         degrees = DEGREES if 0 < agrees.sum() < n else (0,)

@@ -26,12 +26,12 @@ class ResidualCovariance:
     which are independent given theta; misfit does.
 
     Attributes:
-        deviation: Of the residuals, shape (q,).
+        deviation: Deviation of the residuals, shape (q,).
         blocks: Outcomes that correlate, and the inverse Cholesky factor of their
             correlation; all at once, or trial by trial where S has nothing between
             them, which takes a ninth of the time for three.
-        shrinkage: Of the correlations within a trial and across trials, 1 where S has
-            none.
+        shrinkage: Shrinkage of the correlations within a trial and across trials, 1
+            where S has none.
         precision: Factor that makes the inverse of the sample covariance unbiased.
         log_volume: log det L.
     """
@@ -57,7 +57,7 @@ class ResidualCovariance:
             standardized: The residuals.
             deviation: Shape (q,).
             freedom: Rows less coefficients.
-            trial: Of each outcome, shape (q,).
+            trial: Trial of each outcome, shape (q,).
             independent: Whether there is no misfit, and so nothing across trials.
         """
         q = len(deviation)

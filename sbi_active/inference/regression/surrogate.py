@@ -60,8 +60,8 @@ class NoiseEstimate:
     """Noise from pairs of outcomes at the same parameters.
 
     Attributes:
-        variance: Of each outcome, shape (q,).
-        num_pairs: How many pairs it rests on.
+        variance: Variance of each outcome, shape (q,).
+        num_pairs: Number of pairs behind it.
     """
 
     variance: Array
@@ -82,7 +82,7 @@ class LocalRegression:
     r"""Regression of the outcomes, less the observed ones, in one region.
 
     Attributes:
-        region: Where it holds.
+        region: Region where it holds.
         basis: f.
         coefficient: :math:`B L^{-\top}`, outcomes whitened by S = L L^T, shape (p, q).
         root: :math:`R^{-1}` of F = Q R, so that h = |f R^{-1}|^2, shape (p, p).
@@ -92,7 +92,7 @@ class LocalRegression:
             and no residual.
         roughness: Share of the variance of some outcome that a cubic misses.
         ratio: Residual over noise variance, mean over outcomes.
-        excess: The same with chance removed, and more of many numbers, whose misfit
+        excess: This ratio with chance removed, and more of many numbers, whose misfit
             adds up: above 1 means misfit.
         residual: Whitened residuals, shape (n, q).
         standardized: Residuals over their deviations, not rotated, shape (n, q).
@@ -275,7 +275,7 @@ class Surrogate:
     """Prior times learned likelihood of all trials, each place in its nearest region.
 
     Attributes:
-        coordinates: Of the prior.
+        coordinates: Coordinates of the prior.
         regressions: One a region.
         is_cautious: Whether regions with misfit are taken with their caution, to find
             where to simulate next and not what to believe.
