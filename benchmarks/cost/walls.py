@@ -107,7 +107,9 @@ def measure(kind: str, num: int) -> dict[str, float]:
 
 def main() -> None:
     """Run what is not there yet, and print the table."""
-    found = json.loads(RESULT.read_text()) if RESULT.exists() else {"rounds": {}}
+    found: dict[str, Any] = {"rounds": {}}
+    if RESULT.exists():
+        found = json.loads(RESULT.read_text())
     found["date"] = date.today().isoformat()
     for kind, sizes in SIZES.items():
         for num in sizes:

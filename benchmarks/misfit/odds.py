@@ -33,7 +33,7 @@ from benchmarks.misfit.cases import FIRST_JUDGED, Kind, draw_case
 from benchmarks.misfit.machines import GROUPS
 from benchmarks.rows import append, read
 from sbi_active.criticism import close_loop
-from sbi_active.criticism.under_misfit import DECLARED, FAR, REMAINING, Odds
+from sbi_active.criticism.under_misfit import Odds
 from sbi_active.display.table import Table
 
 __all__ = ["COLUMNS", "claims", "main", "table"]
@@ -75,7 +75,7 @@ def claims(group: str, kind: Kind, number: int) -> list[Row]:
     return [
         known
         | {"effect": name, "right": int(name in right), "cause": misfit.cause[name]}
-        | vars(odds)
+        | {k: value for k, value in vars(odds).items() if k in COLUMNS}
         for name, odds in misfit.odds.items()
     ]
 
@@ -92,9 +92,11 @@ def table(rows: Sequence[Row]) -> list[str]:
     odds = [_odds(row) for row in rows]
     factors = {  # a hundredth keeps what gains nothing finite
         "nats gained": [np.log(o.by_gain + 0.01) for o in odds],
-        "what remains": [np.log1p((o.remains / REMAINING) ** 2) for o in odds],
-        "error": [np.log1p(o.error / FAR) for o in odds],
-        "guesses": [np.logaddexp(0.0, o.guessed - np.log(DECLARED)) for o in odds],
+        "what remains": [np.log1p((o.remains / o.own.remaining) ** 2) for o in odds],
+        "error": [np.log1p(o.error / o.own.far) for o in odds],
+        "guesses": [
+            np.logaddexp(0.0, o.guessed - np.log(o.own.declared)) for o in odds
+        ],
         "effects that help": [o.helping for o in odds],
         "parameters at bounds": [o.at_bounds for o in odds],
     }

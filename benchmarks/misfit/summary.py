@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.criticism.intervals import rate
 from benchmarks.misfit.machines import get_machine
-from sbi_active.criticism.under_misfit import NAMED
+from sbi_active.criticism.under_misfit import OddsSettings
 from sbi_active.display.table import Table
 
 __all__ = ["summary"]
@@ -95,7 +95,8 @@ def _said(row: Row, column: str) -> set[str]:
     """Return the effects that are said to be a cause, or to help."""
     if column == "helps":
         return {*json.loads(row["helps"])}
-    return {name for name, p in json.loads(row["cause"]).items() if p > NAMED}
+    named = OddsSettings().named
+    return {name for name, p in json.loads(row["cause"]).items() if p > named}
 
 
 def _true(row: Row) -> set[str]:
