@@ -117,6 +117,7 @@ def eliminate(
         ]
     contributions = torch.stack([gains[0][a] for a in active])
     notes += evaluator.disagreements(halves[0], contributions)
+    notes += getattr(sampler, "notes", [])
     return Estimates(
         action=action,
         choosing=gains[0],

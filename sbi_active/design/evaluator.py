@@ -100,7 +100,6 @@ class GainEvaluator:
                 first = own.draw(num_samples, index, replicates=replicates)
         else:
             self.notes = self._chosen.problems(first)
-        self.notes += getattr(self.sampler, "notes", [])
         self.replicates = first.replicate is not None
         return first
 

@@ -46,7 +46,9 @@ class LinearSummaries:
             told at most.
 
     Attributes:
-        left_out: Largest information that the summaries of an action leave out, nats.
+        left_out: Largest information that the summaries of an action leave out, nats,
+            by the outcomes so far: a few hundred that the directions were fitted to
+            among them, so that it is low where an action has few.
     """
 
     def __init__(
@@ -95,5 +97,5 @@ class LinearSummaries:
         """Return a note on what is compared in place of how many numbers."""
         return (
             f"{self._num_kept} linear summaries stand for the {num_numbers} numbers of "
-            f"an outcome, and leave out at most {self.left_out:.2g} nats"
+            f"an outcome, and leave out about {self.left_out:.2g} nats"
         )

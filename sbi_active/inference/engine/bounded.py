@@ -154,14 +154,17 @@ class LineMoves(Moves):
         pull = (new - mean) @ precision
         before = ((new - mean) * pull).sum(1)
         scale = np.sqrt(np.diag(precision))
+        # Axes that are not coupled are moved together as well, now and then.
         coupled = np.abs(precision) / scale / scale[:, None] + 1e-3
         np.fill_diagonal(coupled, 0.0)
         for _ in range(self._num):
             size = min(int(rng.choice(self._sizes)), len(mean))
             first = int(rng.integers(len(mean)))
-            share = coupled[first] / max(coupled[first].sum(), 1e-300)
-            others = rng.choice(len(mean), size - 1, replace=False, p=share)
-            axes = np.append(first, others).astype(int)
+            axes = np.array([first])
+            if size > 1:
+                share = coupled[first] / coupled[first].sum()
+                others = rng.choice(len(mean), size - 1, replace=False, p=share)
+                axes = np.append(axes, others)
             own = precision[axes[:, None], axes]
             root = np.linalg.inv(np.linalg.cholesky(own))
             step = rng.standard_normal((len(u), size)) @ root

@@ -64,9 +64,10 @@ class Settings:
         per_parameter: Particles a parameter of sequential Monte Carlo, in effective
             draws.
         fewest_particles: Particles at least.
-        passes: Likelihoods a particle that the rows are to suffice for: there are no
-            more particles than that leaves. Half has twice as many, which may get
-            nowhere; twice as many steps are hardly ever taken.
+        passes: Number of likelihoods of each particle that the rows have to suffice
+            for, which bounds the number of particles; a quarter of them is tried where
+            they did not. With half, forty curved parameters get nowhere at first; twice
+            as many leave half of the particles.
         most_cut: Share of the normal guess outside the bounds of the prior, beyond
             which particles are led between them; with .5 more is computed, and with
             .99 SMC begins at a handful.

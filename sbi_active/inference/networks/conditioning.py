@@ -168,6 +168,7 @@ class Conditioning(nn.Module):
         Numbers of x that are missing are zero; a row with any has trivial frames.
         """
         x, action = condition.split([self.x_dim, condition.shape[1] - self.x_dim], 1)
+        lost = ~x.isfinite().all(1)[:, None]
         x, action = self._summarized(x), action.double()
         missing = ~x.isfinite()
         # Missing numbers are replaced before any arithmetic, lest gradients be NaN.
@@ -183,7 +184,7 @@ class Conditioning(nn.Module):
         )
         if self.baseline is None:
             return torch.cat(seen, 1), trivial
-        frames, lost = self.baseline(y, action), missing.any(1)[:, None]
+        frames = self.baseline(y, action)
         frames = Frames(
             torch.where(lost[..., None], 0.0, frames.mean),
             torch.where(lost[..., None, None], trivial.factor, frames.factor),

@@ -47,9 +47,17 @@ class Directions(nn.Module):
         self.register_buffer("rows", rows.contiguous())
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return summaries, shape (n, k), NaN where any number is."""
-        parts = [self._standardized(part) @ self.rows.T for part in x.split(BLOCK)]
+        """Return summaries, shape (n, k).
+
+        A number that is missing counts as the mean; an outcome without any is NaN.
+        """
+        parts = [self._summaries(part) for part in x.split(BLOCK)]
         return torch.cat(parts)
+
+    def _summaries(self, x: Tensor) -> Tensor:
+        seen = x.isfinite()
+        known = torch.where(seen, self._standardized(x), 0.0) @ self.rows.T
+        return torch.where(seen.any(1, keepdim=True), known, torch.nan)
 
     def _standardized(self, x: Tensor) -> Tensor:
         return (x.double() - self.mean) / self.scale

@@ -24,7 +24,9 @@ SHARE = 0.5  # particles that a step leaves effective
 MAX_STEPS = 200
 ACCEPTED = 0.35  # share of moves that the step's length is adapted to
 FORGOTTEN = 0.05  # correlation with the start after the moves of a step
-SHARED = 0.1  # more of them after the last step, by what families share
+SHARED = (
+    0.1  # of the particles after the last step, lost to copies: with less, more moves
+)
 SHRUNK = 0.05  # share of the guess's covariance in that of the particles
 
 

@@ -61,13 +61,22 @@ def test_few_numbers_stay_as_they_are():
     assert Conditioning(theta, few, 1, **ALL_ROWS).directions is None
 
 
-def test_missing_outcomes_have_no_summary():
+def test_an_outcome_that_lacks_a_number_is_seen_by_the_others():
     theta, condition = rows(300, 0)
+    whole = condition.clone()
     condition[5, :NUM], condition[9, 4] = torch.nan, torch.nan
-    seen, _ = Conditioning(theta, condition, 1, **ALL_ROWS)(condition)
-    assert seen.shape[1] < 50
+    own = Conditioning(theta, condition, 1, **ALL_ROWS)
+    assert own.num_frames == 2
+    seen, frames = own(condition)
+    before, _ = own(whole)
     assert bool(seen.isfinite().all())
-    assert bool((seen[5, :-1] == seen[9, :-1])[:20].all())
+    directions = slice(0, 32)
+    assert bool((seen[5, directions] == 0).all())  # nothing was measured
+    apart = (seen[9] - before[9])[directions].norm()
+    assert float(apart) < 0.2 * float(before[9, directions].norm())
+    # No frame is trusted where a number lacks.
+    for row in (5, 9):
+        assert bool((frames.mean[row] == 0).all())
 
 
 def test_directions_are_orthonormal_and_hold_what_parameters_move():
