@@ -8,17 +8,14 @@ from benchmarks.pouring.bank import (
     ROWS_A_FILE,
     draw,
 )
-from benchmarks.pouring.figures import log_prob_figure, selected_figure
 from benchmarks.pouring.likelihood import (
     ImageLikelihood,
     components,
-    doubted,
     observed,
     repeated,
     thumbnails,
 )
 from benchmarks.pouring.power import cross_validated, grid
-from benchmarks.pouring.reference import abc_log_prob
 from sbi_active.tasks import get_task  # pyright: ignore
 
 
@@ -31,33 +28,6 @@ def pours(n, seed=0, noise=0.1):
     return theta, summary, theta[:, 0] > 0.8
 
 
-@pytest.fixture(scope="module")
-def told():
-    return cross_validated(*pours(100))
-
-
-@pytest.mark.slow
-def test_left_out_pours_are_told_as_well_as_the_exact_posterior_tells(told):
-    _, log_p, mass = told
-    filled = ~pours(100)[2]
-    weight = np.random.default_rng(9).normal(size=(3, 12))
-    # The entropy of the exact posterior, away from bounds; the grid costs some of it.
-    volume = np.linalg.slogdet(weight @ weight.T / 0.1**2)[1]
-    exact = 0.5 * volume - 1.5 * np.log(2 * np.pi * np.e)
-    cell = 3 * np.log(10)
-    assert min(exact, cell) - 1.5 < log_p[filled].mean() < cell
-    assert 0.75 < (mass[filled] <= 0.9).mean() <= 1
-
-
-@pytest.mark.slow
-def test_an_image_without_cubes_tells_what_makes_it_empty(told):
-    likelihood = told[0]
-    cells = grid(6)
-    log_p = likelihood.at(cells, None)
-    high, low = cells[:, 0] > 0.8, cells[:, 0] < 0.6
-    assert log_p[high].min() > log_p[low].max()
-
-
 def test_outcomes_without_information_have_no_gain():
     rng = np.random.default_rng(1)
     theta = rng.random((60, 3))
@@ -68,28 +38,11 @@ def test_outcomes_without_information_have_no_gain():
     assert abs(gain.mean()) < 0.3
 
 
-@pytest.mark.slow
-def test_gain_is_that_of_the_left_out_pours(told):
-    likelihood, log_p, _ = told
-    theta = np.random.default_rng(2).random((800, 3))
-    gain = likelihood.gain(theta, 400, np.random.default_rng(3)).mean()
-    assert gain == pytest.approx(log_p.mean(), abs=1.0)
-
-
 def test_pours_that_are_all_empty_leave_the_prior():
     theta, summary, _ = pours(60)
     fitted = ImageLikelihood.fit(theta, summary, np.ones(60, dtype=bool))
     assert np.ptp(fitted.at(grid(3), observed(fitted, summary[0], True))) == 0
     assert np.isfinite(fitted.at(grid(3), observed(fitted, summary[0], False))).all()
-
-
-def test_nearest_pours_tell_less_than_the_exact_posterior_and_more_than_the_prior():
-    theta, summary, _ = pours(220, noise=1.0)
-    weight = np.random.default_rng(9).normal(size=(3, 12))
-    volume = np.linalg.slogdet(weight @ weight.T + 12 * np.eye(3))[1]
-    most = 0.5 * volume - 1.5 * np.log(2 * np.pi * np.e)  # with a normal prior
-    log_p = abc_log_prob(theta, summary)
-    assert 0.2 < log_p.mean() < most + 1.0
 
 
 def test_thumbnails_and_components_keep_where_cubes_lie():
@@ -123,40 +76,6 @@ def test_a_repeat_tells_less_than_a_first_pour():
     assert same[1] == 1
 
 
-def test_what_may_tell_nothing_is_bounded():
-    log_p = np.log(np.array([1e-30, 1.0, 2.0]))
-    assert doubted(log_p, 1.0) == pytest.approx(
-        np.log([0.1, 0.9 + 0.1, 1.8 + 0.1]), abs=1e-9
-    )
-    assert doubted(0.5 * log_p, 0.5) == pytest.approx(0.5 * doubted(log_p, 1.0))
-    assert (doubted(np.zeros(3), 0.0) == 0).all()
-
-
-def test_repeats_far_out_widen_what_is_expected():
-    theta, summary, empty = pours(60)
-    fitted = ImageLikelihood.fit(theta, summary, np.zeros_like(empty))
-    there = np.array([[0.5, 0.5, 0.5]])
-    mean, spread, freedom = fitted.predict(there)
-    near, far = mean[0], mean[0] + 8 * spread[0]
-    close, wide = (fitted.predict(there, [x])[1:] for x in (near, far))
-    assert close[1] == wide[1] == freedom + 3
-    assert (close[0] < spread).all()
-    assert (wide[0] > 1.3 * close[0]).all()
-
-
-def test_noise_that_grows_with_theta_is_seen():
-    rng = np.random.default_rng(0)
-    theta = rng.random((240, 3))
-    size = np.exp(1.5 * theta[:, :1])
-    summary = theta + 0.05 * size * rng.standard_normal((240, 3))
-    fitted = ImageLikelihood.fit(theta, summary, np.zeros(240, dtype=bool))
-    ends = np.array([[0.1, 0.5, 0.5], [0.9, 0.5, 0.5]])
-    _, _, noise = fitted.parts(ends)
-    ratio = np.sqrt(noise[1] / noise[0])
-    assert ratio.min() > 1.5
-    assert ratio.max() < 6  # 3.3
-
-
 def test_a_bank_of_repeats_pours_each_theta_again():
     pytest.importorskip("pybullet")
     task = get_task("pouring")
@@ -172,21 +91,3 @@ def test_a_bank_of_repeats_pours_each_theta_again():
     first, again = draw(task, "prior", 0).theta, draw(task, "prior", 0).theta
     assert torch.equal(first, again)
     assert len(first.unique(dim=0)) == ROWS_A_FILE
-
-
-def test_figures_are_drawn_of_the_rows(tmp_path):
-    header = "seed,round,height,position,rate,delta,log_prob_true\n"
-    for target in ("1", "2"):
-        rows = [f"{s},{r},20,0,2,{s % 2},{r + s}" for s in (1, 2) for r in (1, 2)]
-        for method in ("asbi", "alhi"):
-            path = tmp_path / f"target_{target}_{method}.csv"
-            path.write_text(header + "\n".join(rows) + "\n")
-    first, second = log_prob_figure(tmp_path).axes
-    assert [line.get_label() for line in first.get_legend().get_lines()] == [
-        "ASBI",
-        "ALHI",
-    ]
-    middle = next(line for line in first.lines if line.get_label() == "ASBI")
-    assert [*middle.get_ydata()] == [2.5, 3.5]  # medians of the two trials
-    bars = selected_figure(tmp_path).axes[0].patches
-    assert [bar.get_height() for bar in bars] == [0.5] * 4

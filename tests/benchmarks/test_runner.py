@@ -1,8 +1,6 @@
 """One command runs every benchmark."""
 
 import re
-import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -130,17 +128,6 @@ def test_all_are_listed(capsys):
 def test_a_table_is_printed(capsys):
     assert main(["table", "cost/doors.json", "--only", "nothing*"]) == 0
     assert capsys.readouterr().out.startswith("| what | value |")
-
-
-def test_it_runs_as_a_process():
-    done = subprocess.run(
-        [sys.executable, "-m", "benchmarks", "oracles", "--summary"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert "| compartments_10 |" in done.stdout
 
 
 def test_every_command_that_is_written_down_names_a_benchmark():

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from benchmarks.__main__ import main as run
-from benchmarks.misfit.start_states import COLUMNS, EFFECTS, SENSOR, draw_case, swing
+from benchmarks.misfit.start_states import COLUMNS, SENSOR, draw_case
 
 
 @pytest.mark.parametrize("number", [0, 1, 2])
@@ -20,20 +20,6 @@ def test_a_case_is_the_same_machine_with_and_without_a_hidden_force(number):
     assert full.size == pytest.approx(moved)
     assert 1 < full.size < 40
     assert full.trials.x.shape == (12, 30)
-
-
-def test_every_effect_moves_x_and_vanishes_at_zero():
-    trials = draw_case(0, is_hidden=False).trials
-    theta = torch.tensor([[9.0, 0.4]]).double().expand(12, -1)
-    bare = swing(theta, trials.action, angle=0.3, speed=1.0)
-    assert len(EFFECTS) == 8
-    for effect in EFFECTS:
-        size = float(effect.prior.stddev)
-        told = {"angle": 0.3, "speed": 1.0}
-        same = swing(theta, trials.action, **told, **{effect.name: 0.0})
-        moved = swing(theta, trials.action, **told, **{effect.name: size})
-        torch.testing.assert_close(same, bare)
-        assert float((moved - bare).square().mean().sqrt()) > SENSOR, effect.name
 
 
 def row(case, hidden, **changes):

@@ -33,12 +33,6 @@ def test_is_the_paper_s(task):
     assert bool(task.prior.support.check(task.prior.sample((9,))).all())
 
 
-def test_a_pusher_that_stands_still_moves_nothing(task):
-    x = task.simulator.mean(task.theta_true[None], torch.zeros(1, 1))
-    # The cube sinks into the table by a fraction of a millimeter.
-    assert torch.allclose(x, torch.tensor([[0.0, 0.0, 0.075]]).double(), atol=3e-4)
-
-
 def test_momentum_passes_to_the_cube(task):
     """A light, slippery cube leaves faster than the pusher, never twice as fast."""
     from sbi_active.tasks.box_collision.scene import Scene  # pyright: ignore
@@ -56,13 +50,6 @@ def test_momentum_passes_to_the_cube(task):
     assert momentum - lost * 0.25 - 1e-3 < total < momentum
 
 
-def test_density_changes_the_impact(task):
-    """The contacts know of the new mass: a heavier cube moves less."""
-    theta = torch.tensor([[0.5, 0.5, d] for d in (0.2, 0.5, 1.0)])
-    x = task.simulator.mean(theta, torch.full((3, 1), 3.0))[:, 0]
-    assert bool((x[:-1] > x[1:]).all())
-
-
 def test_every_parameter_matters(task):
     theta = torch.tensor([[0.5, 0.5, 0.5]]).repeat(4, 1)
     theta[1:] += 0.2 * torch.eye(3)
@@ -78,25 +65,6 @@ def test_fast_pushes_leave_the_table(task):
         assert bool((x.isnan().any(1) == x.isnan().all(1)).all())
         share.append(float(x.isnan().any(1).double().mean()))
     assert share[0] < 0.2 < share[1] < 0.8 < share[2]
-
-
-def test_the_fastest_pusher_does_not_pass_through(task):
-    x = task.simulator.mean(torch.ones(1, 3), torch.full((1, 1), 20.0))
-    assert 0.3 < float(x[0, 0]) < 1.0
-
-
-def test_a_central_push_shows_one_number_and_an_off_center_one_more(task):
-    theta, _ = rows(40)
-    action = torch.full((40, 1), 4.0)
-    straight = task.simulator.mean(theta, action)
-    straight = straight[straight.isfinite().all(1)]
-    assert float(straight[:, 1].abs().max()) < 1e-6
-    # A few cubes are still rocking.
-    assert float((straight[:, 2] - 0.075).abs().median()) < 3e-4
-    turned = get_task("box_collision", variant="off_center").simulator
-    turned = turned.mean(theta, action)
-    turned = turned[turned.isfinite().all(1)]
-    assert float(turned[:, 1].std()) > 0.02
 
 
 def test_early_exit_keeps_the_outcome():
@@ -136,17 +104,6 @@ def permuted(task, theta, action, order):
     return task.simulator.mean(theta[order], action[order]).nan_to_num()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("num_workers", [2, 4])
-def test_workers_change_nothing(task, num_workers):
-    theta, action = rows(300)
-    one = simulate(task.simulator, theta, action, seed=3)
-    more = simulate(task.simulator, theta, action, seed=3, workers=num_workers)
-    assert torch.equal(one.x.nan_to_num(), more.x.nan_to_num())
-    assert torch.equal(one.status, more.status)
-    assert 0 < int(one.valid.sum()) < 300
-
-
 def test_threads_have_a_scene_each(task):
     from concurrent.futures import ThreadPoolExecutor
 
@@ -165,13 +122,6 @@ def test_the_paper_s_code_for_what_left_the_table():
     theta, action = rows(4)
     with pytest.raises(ValueError, match="expected a simulator with noise"):
         simulate(task.simulator, theta, action, seed=0, check_noise=True)
-
-
-def test_an_outcome_off_the_table_is_invalid():
-    task = get_task("box_collision", target=2)
-    theta, action = task.theta_true[None], torch.tensor([[10.0]])
-    rows = simulate(task.simulator, theta, action, seed=0)
-    assert rows.counts == {"ok": 0, "invalid": 1, "missing": 0}
 
 
 def test_noise_is_of_the_declared_size(task):
@@ -227,8 +177,3 @@ def test_missing_mujoco_says_how_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(ImportError, match=r"pip install 'sbi-active\[mujoco\]'"):
         get_task("box_collision")
-
-
-def test_another_truth(task):
-    other = task.with_truth((0.3, 0.4, 0.5))
-    assert other.theta_true.tolist() == pytest.approx([0.3, 0.4, 0.5])

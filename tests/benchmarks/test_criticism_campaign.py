@@ -1,27 +1,12 @@
 """The campaign that starts on the wrong simulator, in small."""
 
-import math
-
-import pytest
 import torch
 
 from benchmarks.criticism.campaign import (
     COLUMNS,
-    draw_truth,
     non_centrality,
-    run_case,
     summary,
 )
-
-
-def test_the_truth_is_drawn_and_clean_is_clean():
-    theta, strength = draw_truth("hidden", 1)
-    assert theta.shape == (1, 2)
-    assert bool((theta.abs() <= 5).all())
-    assert strength != 0
-    assert draw_truth("clean", 1)[1] == 0
-    strengths = torch.tensor([draw_truth("hidden", i)[1] for i in range(200)])
-    assert abs(float(strengths.std()) - 1) < 4 / math.sqrt(400)
 
 
 def test_two_settings_hide_what_a_third_and_the_prior_show():
@@ -47,24 +32,3 @@ def test_the_summary_counts():
     assert "false alarms 0.000 (0/1)" in text
     assert "alarm within 6 trials, lambda > 25 0.500 (1/2)" in text
     assert "theta_true in the 90 % region after adoption 1.000 (1/1)" in text
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [1, 3])
-def test_a_wrong_simulator_is_noticed_and_the_truth_recovered(number):
-    row = run_case("hidden", number)
-    assert row["alarm_at"]
-    assert float(row["mass_before"]) > 0.99  # the belief excludes theta_true
-    assert row["adopted"] == "quadratic"
-    assert float(row["mass_after"]) < 0.99
-    assert float(row["log_p_after"]) > float(row["log_p_before"]) + 5
-    # Within a nat of the posterior of the right model, in closed form.
-    assert abs(float(row["log_p_after"]) - float(row["log_p_exact"])) < 1
-    assert row["health_after"] == "ok"
-
-
-@pytest.mark.slow
-def test_a_right_simulator_is_left_alone():
-    row = run_case("clean", 0)
-    assert row["alarm_at"] == ""
-    assert "adopted" not in row
