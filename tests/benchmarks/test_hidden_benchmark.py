@@ -40,11 +40,3 @@ def test_a_hidden_effect_shows_and_no_parameter_absorbs_it(servo):
     again = hidden_effect(truth, effects, theta, np.random.default_rng(5))
     assert again[0].name == effect.name
     assert again[2] == excess
-
-
-def test_what_a_parameter_does_has_no_excess(servo):
-    truth, effects = servo
-    theta = 0.5 * (truth.low + truth.high).numpy()
-    gain = next(e for e in effects if e.name == "servo gain")
-    null = gain.null_phi(1)[0]
-    assert truth.excess(theta, gain, null) < 1e-6

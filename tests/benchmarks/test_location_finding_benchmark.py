@@ -17,7 +17,6 @@ from benchmarks.location_finding.bounds import (
     contrastive_bounds,
     history_log_likelihood,
     posterior_bounds,
-    proposal_bounds,
 )
 from benchmarks.location_finding.particles import ParticleBelief
 from benchmarks.location_finding.summary import table
@@ -91,20 +90,6 @@ def test_contrastive_bounds_bracket_the_linear_gaussian_information(num_contrast
         assert float(upper.mean()) < INFORMATION + 4 * error_upper
 
 
-def test_the_posterior_as_proposal_leaves_no_gap():
-    theta, x, log_p_true, _, log_evidence = linear_gaussian(50, 1)
-    # Every draw of the posterior has the weight p(h).
-    exact = (log_p_true - log_evidence)[:, None]
-    lower, upper = proposal_bounds(
-        log_p_true,
-        -exact[:, 0],
-        log_evidence[:, None].expand(50, 20),
-        torch.zeros(50, 20),
-    )
-    torch.testing.assert_close(lower, exact[:, 0])
-    torch.testing.assert_close(upper, exact[:, 0])
-
-
 def test_posterior_bounds_of_one_source_are_the_quadrature_s():
     theta, action, x = history(1, 6, seed=10)
     log_evidence, _ = grid_posterior(action, x)
@@ -121,45 +106,10 @@ def test_posterior_bounds_of_one_source_are_the_quadrature_s():
 # ------------------------------------------------------------------ the beliefs
 
 
-def test_particles_of_one_source_are_the_quadrature_s():
-    _, action, x = history(1, 5, seed=20)
-    log_evidence, expectation = grid_posterior(action, x)
-    task = get_task("location_finding", num_sources=1)
-    beliefs = [ParticleBelief(task, num_particles=500, seed=s) for s in range(8)]
-    for belief in beliefs:
-        for place, value in zip(action, x, strict=True):
-            belief.update(place, value)
-    evidence = torch.tensor([b.log_evidence for b in beliefs]).double()
-    ratio = (evidence - log_evidence).exp()  # of mean 1
-    assert abs(float(ratio.mean()) - 1) < 4 * float(ratio.std()) / 8**0.5
-    means = torch.stack([b.theta.mean(0) for b in beliefs])
-    error = means.std(0) / 8**0.5
-    assert bool(((means.mean(0) - expectation).abs() < 4 * error).all())
-
-
 # ------------------------------------------------------------------ the policies
 
 
 # ------------------------------------------------------------------ the roll-outs
-
-
-@pytest.mark.parametrize("policy", ["random", "fixed"])
-def test_static_roll_outs_are_reproducible(policy):
-    row, again = (run_module.roll_out(policy, 3, 2, 2_000) for _ in range(2))
-    assert row["lower"] == again["lower"]
-    assert row["places"] == again["places"]
-    assert row["spce"] <= math.log(2_001)
-    assert row["theta_true"] == run_module.roll_out("random", 3, 1, 10)["theta_true"]
-
-
-@pytest.mark.parametrize(("policy", "trials"), [("myopic", 2), ("myopic_particles", 1)])
-def test_myopic_roll_outs_share_the_truth_and_know_what_they_gained(policy, trials):
-    row = run_module.roll_out(policy, 3, trials, 1_000)
-    assert row["theta_true"] == run_module.roll_out("random", 3, 1, 10)["theta_true"]
-    assert row["num_simulations"] > 1_000
-    assert abs(row["belief_gain"] - row["lower"]) < 0.5
-    # Two log means of draws of which so many are effective.
-    assert row["lower"] <= row["upper"] + 4 / row["effective"] ** 0.5
 
 
 def test_run_goes_on_where_it_stopped(tmp_path, capsys):

@@ -2,35 +2,16 @@
 
 import numpy as np
 import pytest
-import torch
 
 pytest.importorskip("pybullet")
 from benchmarks.pouring import refined  # noqa: E402
 from benchmarks.pouring.around import (  # noqa: E402
-    box_around,
     campaigns,
 )
 from benchmarks.pouring.bank import Rows, draw  # noqa: E402
-from benchmarks.pouring.grid_belief import GridBelief  # noqa: E402
 from benchmarks.pouring.run import RESULTS  # noqa: E402
 from benchmarks.rows import read  # noqa: E402
 from sbi_active.tasks import get_task  # noqa: E402
-
-
-def test_the_box_holds_the_beliefs_in_whole_cells():
-    middles = GridBelief.middles().double()
-    beliefs = [
-        GridBelief(-200 * ((middles - torch.tensor(place)) ** 2).sum(1))
-        for place in ([0.2, 0.5, 0.9], [0.3, 0.5, 0.9])
-    ]
-    box = box_around(beliefs)
-    inside = box.holds(middles.numpy())
-    for belief in beliefs:
-        assert belief.log_density.softmax(0)[inside].sum() > 0.85
-    np.testing.assert_allclose(box.low * 20, np.round(box.low * 20), atol=1e-9)
-    assert box.high[2] == 1.0  # not beyond the prior
-    assert inside.mean() == pytest.approx(box.volume)
-    assert box.volume < 0.25
 
 
 def test_campaigns_are_those_of_the_committed_rows():

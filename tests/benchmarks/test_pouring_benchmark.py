@@ -4,23 +4,10 @@ import torch
 
 from benchmarks.pouring.bank import LIKELY, ROWS_A_FILE, draw
 from benchmarks.pouring.likelihood import (
-    ImageLikelihood,
-    components,
-    observed,
     repeated,
-    thumbnails,
 )
-from benchmarks.pouring.power import cross_validated, grid
+from benchmarks.pouring.power import cross_validated
 from sbi_active.tasks import get_task  # pyright: ignore
-
-
-def pours(n, seed=0, noise=0.1):
-    """Summaries of twelve numbers that see theta, and empty where friction is high."""
-    rng = np.random.default_rng(seed)
-    theta = rng.random((n, 3))
-    weight = np.random.default_rng(9).normal(size=(3, 12))
-    summary = theta @ weight + noise * rng.standard_normal((n, 12))
-    return theta, summary, theta[:, 0] > 0.8
 
 
 def test_outcomes_without_information_have_no_gain():
@@ -30,25 +17,6 @@ def test_outcomes_without_information_have_no_gain():
     likelihood = cross_validated(theta, noise, np.zeros(60, dtype=bool))
     gain = likelihood.gain(rng.random((200, 3)), 100, rng)
     assert abs(gain.mean()) < 0.3
-
-
-def test_pours_that_are_all_empty_leave_the_prior():
-    theta, summary, _ = pours(60)
-    fitted = ImageLikelihood.fit(theta, summary, np.ones(60, dtype=bool))
-    assert np.ptp(fitted.at(grid(3), observed(fitted, summary[0], True))) == 0
-    assert np.isfinite(fitted.at(grid(3), observed(fitted, summary[0], False))).all()
-
-
-def test_thumbnails_and_components_keep_where_cubes_lie():
-    images = np.zeros((6, 150, 150), np.float32)
-    for k, image in enumerate(images):
-        image[20 * k : 20 * k + 10, 40:50] = 4.0
-    small = thumbnails(images.reshape(6, -1))
-    assert small.shape == (6, 900)
-    mean, axes = components(small, 36)
-    assert axes.shape == (900, 5)  # six images span five dimensions
-    back = mean + (small - mean) @ axes @ axes.T
-    np.testing.assert_allclose(back, small, atol=1e-8)
 
 
 def test_a_repeat_tells_less_than_a_first_pour():

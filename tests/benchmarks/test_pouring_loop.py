@@ -6,11 +6,9 @@ pytest.importorskip("pybullet")
 from benchmarks.pouring.loop.emulator import (  # noqa: E402
     NUM_NUMBERS,
     SHIFTS,
-    VOLUME,
     Emulator,
-    pictures_numbers,
 )
-from benchmarks.pouring.loop.run import averaged, poured  # noqa: E402
+from benchmarks.pouring.loop.run import averaged  # noqa: E402
 from benchmarks.pouring.loop.worlds import draw, get_world  # noqa: E402
 
 NOISE = 0.3
@@ -35,23 +33,6 @@ def known():
     return Emulator.fit(world, theta, action, effects, x[:, None] + moved), weight
 
 
-def test_numbers_follow_a_picture_that_moves_and_grows():
-    image = torch.zeros(150, 150)
-    image[70:80, 60:70] = 4.0
-    x = pictures_numbers(image.reshape(1, -1), side=4.0)[0]
-    moved = torch.zeros(150, 150)
-    moved[70:80, 65:75] = 4.0
-    there = pictures_numbers(moved.reshape(1, -1), side=4.0)[0]
-    assert x[3] == pytest.approx(there[2])  # five pixels on
-    # 100 pixels are worth 25 cubes of 4 mm, all of them in the third band.
-    assert x[2, 2] == pytest.approx(np.sqrt(25 + 3 / 8))
-    assert x[2, 3] == pytest.approx(np.sqrt(3 / 8))
-    taller = pictures_numbers(1.1 * image.reshape(1, -1), side=4.0)[0]
-    assert taller[2, : VOLUME[0]] == pytest.approx(x[2, : VOLUME[0]])
-    ratio = (taller[2] ** 2 - 3 / 8) / (x[2] ** 2 - 3 / 8).clip(1e-9)
-    assert ratio[list(VOLUME)] == pytest.approx([1.1, 1.1**2])
-
-
 def test_an_outcome_is_the_mean_of_the_pours_of_an_action():
     action = torch.tensor([[20.0, 0, 2]] * 4 + [[140.0, 0, 2]] * 4)
     x = torch.arange(16.0).reshape(8, 2)
@@ -73,13 +54,3 @@ def test_the_emulator_knows_what_it_learned(known):
     assert root @ (x[2] - x[0]) == pytest.approx(np.full(NUM_NUMBERS, 0.05), abs=1e-6)
     # What is left of a pour is of about unit size.
     assert 0.8 < np.sqrt((root**2).sum(1).mean()) / NOISE < 2
-
-
-def test_a_hidden_effect_is_poured_or_seen(known):
-    world = known[0].world
-    theta, seed = torch.full((3,), 0.5), torch.tensor([1])
-    action = world.actions[:1]
-    bare = poured(world, theta, action, seed, {})
-    grown = poured(world, theta, action, seed, {"camera gain": 0.1})
-    assert torch.allclose(grown, 1.1 * bare)
-    assert not torch.equal(poured(world, theta, action, seed, {"tilt": 2.0}), bare)

@@ -28,21 +28,6 @@ def test_rows_of_the_bank_are_shared_out_by_place(task):
     assert len(draw(task, "compared", 0).action.unique(dim=0)) == 1
 
 
-def test_a_belief_by_points_has_the_mean_of_its_weights():
-    prior = PointBelief.uniform()
-    points = prior.points()
-    assert points.mean(0) == pytest.approx(np.full(8, 0.5), abs=1e-3)
-    assert prior.effective == pytest.approx(len(points))
-    # A normal likelihood of one parameter, well inside.
-    belief = PointBelief(-0.5 * ((points[:, 2] - 0.4) / 0.05) ** 2)
-    assert belief.weight @ points[:, 2] == pytest.approx(0.4, abs=2e-3)
-    share = 0.05 * np.sqrt(4 * np.pi)  # of the prior's points, effective
-    assert belief.effective / len(points) == pytest.approx(share, rel=0.02)
-    draws = belief.sample(400, 0)
-    assert draws[:, 2].std() == pytest.approx(0.05, rel=0.15)
-    assert np.array_equal(belief.sample(400, 0), draws)
-
-
 def test_the_volume_that_a_belief_shares_is_the_mean_over_its_draws():
     rng = np.random.default_rng(0)
     theta = rng.random((120, 8))

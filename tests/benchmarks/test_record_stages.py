@@ -89,19 +89,6 @@ def test_stages_name_what_is_there_and_are_run_once(tmp_path, capsys):
     assert aliases(rows) == "Aliases named: 0 of 1 removals."
 
 
-def test_an_alias_is_what_the_whole_library_does_not_name():
-    rows = {
-        "recorded": {"helps": ["drag"]},
-        "without drag": {"named": ["gain"], "text": "12 % of the\nexcess over"},
-        "without lag": {"named": ["drag"], "text": ""},
-        "without gain": {"named": ["bias", "drag"], "text": ""},
-    }
-    assert aliases(rows) == (
-        "Aliases named: 2 of 3 removals: gain (without drag); bias (without gain); "
-        "the share left said in 1."
-    )
-
-
 @pytest.mark.parametrize("name", ["ball_and_hoop", "cascaded_tanks"])
 def test_without_the_records_it_says_where_they_should_be(name, tmp_path):
     with pytest.raises(SystemExit, match=r"expected a record in .* --data DIR"):

@@ -12,7 +12,6 @@ from benchmarks.criticism.worlds import get_world
 from benchmarks.forces.machines import machine
 from benchmarks.measured import hoop_offset
 from benchmarks.measured.removals import removed, table
-from benchmarks.misfit.odds import claims
 from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR, trials
 
 
@@ -24,11 +23,6 @@ def test_a_strong_effect_of_world_a_is_named_and_lowers_the_error():
     assert {*row} <= {*COLUMNS}
     assert row["verdict"] != "none"
     assert float(row["rmse_after"]) < 0.5 * float(row["rmse_before"])
-
-
-def test_claims_have_the_factors_of_their_odds():
-    rows = claims("letters", "E", 600)
-    assert all(0 <= row["cause"] < 1 and row["right"] in (0, 1) for row in rows)
 
 
 def test_cases_that_judge_are_refused_where_odds_are_tuned(tmp_path):

@@ -7,8 +7,6 @@ import pytest
 import torch
 
 from benchmarks.__main__ import main as run
-from benchmarks.measured import ball_drops as benchmark
-from benchmarks.measured.ball_drops import tables
 from benchmarks.measured.ball_forecast import forecast_error, second_drop_error
 from sbi_active.criticism import AugmentedSimulator
 from sbi_active.tasks import get_task  # pyright: ignore
@@ -98,30 +96,3 @@ def test_least_squares_given_the_effect_finds_it(kind):
     assert second_drop_error(*pair, kind) < 1e-3
     assert forecast_error(*pair, kind, until=0.8) < 1e-2
     assert second_drop_error(*pair, "gravity alone") > 0.5
-
-
-def row(ball="a", **changes):
-    """Return a made-up row of both kinds."""
-    errors = {
-        f"{what} {name}": 1.0
-        for what in ("second drop", "forecast")
-        for name in ("before", "after", *benchmark.KINDS)
-    }
-    found = {"verdict": "linear drag", "probability_of_drag": 0.8, "alarm": True}
-    found |= {"log_bayes_factor": 9.0, "credible_set": ["linear drag", "unexplained"]}
-    found |= {"exponent": [0.6, 1.0, 1.4], "linear_over_quadratic": 2.0, "tested": 1}
-    return {"ball": ball, **errors, "coverage before": 0.5, "coverage after": 0.9} | {
-        **found,
-        **changes,
-    }
-
-
-def test_tables_add_squares_up_and_name_the_family():
-    rows = [row("a", **{"forecast after": 0.3}), row("b", **{"forecast after": 0.4})]
-    rows.append(row("c", verdict="none", probability_of_drag=0.1, alarm=False))
-    text = tables(rows)
-    assert (
-        "| a | drag-like | 0.80 | 9.0 | linear drag, unexplained | 1.00 (0.60" in text
-    )
-    assert "| c | none | 0.10 |" in text
-    assert f"{math.sqrt((0.09 + 0.16 + 1) / 3):.2f} (" in text  # forecast after

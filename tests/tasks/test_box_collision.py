@@ -1,4 +1,3 @@
-import math
 import sys
 
 import pytest
@@ -50,28 +49,11 @@ def test_momentum_passes_to_the_cube(task):
     assert momentum - lost * 0.25 - 1e-3 < total < momentum
 
 
-def test_every_parameter_matters(task):
-    theta = torch.tensor([[0.5, 0.5, 0.5]]).repeat(4, 1)
-    theta[1:] += 0.2 * torch.eye(3)
-    x = task.simulator.mean(theta, torch.full((4, 1), 5.0))[:, 0]
-    assert bool((x[1:] < x[0] - 0.01).all())
-
-
-def test_fast_pushes_leave_the_table(task):
-    theta, _ = rows(60)
-    share = []
-    for speed in (3.0, 7.0, 15.0):
-        x = task.simulator.mean(theta, torch.full((60, 1), speed))
-        assert bool((x.isnan().any(1) == x.isnan().all(1)).all())
-        share.append(float(x.isnan().any(1).double().mean()))
-    assert share[0] < 0.2 < share[1] < 0.8 < share[2]
-
-
 def test_early_exit_keeps_the_outcome():
     from sbi_active.tasks.box_collision.scene import Scene  # pyright: ignore
 
     early, full = Scene(), Scene(early_exit=False)
-    theta, action = rows(150)
+    theta, action = rows(75)
     slippery = [[0.05, 0.1, 0.3]] * 20  # fast ones leave, slow ones just stay
     theta, speeds = theta.tolist() + slippery, action[:, 0].tolist()
     speeds += [1.0 + 0.1 * i for i in range(20)]
@@ -85,7 +67,7 @@ def test_early_exit_keeps_the_outcome():
             assert abs(x - exact).max() < 5e-4  # a tenth of the noise
     assert full.steps == 400
     assert steps < 0.5 * 400 * len(speeds)
-    assert 50 < num_left < 140
+    assert 25 < num_left < 80
 
 
 def test_observations_are_bit_identical(task):
@@ -124,14 +106,6 @@ def test_the_paper_s_code_for_what_left_the_table():
         simulate(task.simulator, theta, action, seed=0, check_noise=True)
 
 
-def test_noise_is_of_the_declared_size(task):
-    theta, action = task.theta_true.expand(400, 3), torch.full((400, 1), 5.0)
-    error = simulate(task.simulator, theta, action, seed=1).x
-    error = error - task.simulator.mean(theta[:1], action[:1])
-    sd = float(error.std())
-    assert abs(sd - 0.005) < 4 * 0.005 / math.sqrt(2 * 1200)
-
-
 class Point:
     def __init__(self, *theta):
         self.theta = torch.tensor(theta)
@@ -149,7 +123,6 @@ def test_reproduction_error_counts_the_code_of_a_fall():
     distance = float((x + 1).norm())
     error = task.reproduction_error(stays, 5.0, num_samples=2)
     assert error == pytest.approx(distance)
-    assert task.reproduction_table(stays)[5.0] == pytest.approx(1e3 * distance)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.integrate import solve_ivp
-from scipy.stats import chi2, kstest
+from scipy.stats import kstest
 from torch import Tensor
 
 from sbi_active.tasks.oscillator import reference as reference_module
@@ -81,11 +81,6 @@ def test_mean_solves_the_equation_of_motion():
         np.testing.assert_allclose(readings, expected, atol=1e-7)
 
 
-def test_mean_starts_at_rest_until_the_delay():
-    theta = torch.tensor([[4.0, 0.1, 1.0, 0.6]])  # beyond the prior: 0.6 > first sample
-    assert mean(theta, torch.tensor([[1.0, 5.0]]))[0, 0] == 0
-
-
 # -------------------------------------------------------------- the posterior
 
 
@@ -119,16 +114,6 @@ def test_evidence_matches_sampling_from_the_prior():
     # negative control: the check sees a noise that is a tenth too large
     wrong = OscillatorReference(action, x, noise_sd=1.1 * NOISE_SD)
     assert abs(wrong.log_evidence - expected) > 4 * error
-
-
-def test_seeds_agree_within_the_stated_error():
-    _, action, x = history(4, seed=5)
-    runs = [OscillatorReference(action, x, seed=s) for s in range(4)]
-    values = np.array([r.log_evidence for r in runs])
-    errors = np.array([r.log_evidence_se for r in runs])
-    assert errors.max() < 0.02
-    statistic = float((((values - values.mean()) / errors) ** 2).sum())
-    assert statistic < chi2.ppf(0.999, len(runs) - 1)
 
 
 def test_samples_follow_log_prob(posterior):
@@ -193,7 +178,7 @@ DESIGN = torch.randn(
 
 
 def test_linear_gaussian_limit(monkeypatch):
-    r"""EIG = log det(I + A^2 D D^T / sd^2) / 2, with and without a first trial."""
+    r"""EIG = log det(I + A^2 D D^T / sd^2) / 2, after a first trial."""
     monkeypatch.setattr(reference_module, "mean", linear_mean)
     action = torch.tensor([[0.01, 1.0], [0.05, 1.0], [0.3, 1.0]]).double()
     information = DESIGN @ DESIGN.T / NOISE_SD**2
@@ -201,55 +186,17 @@ def test_linear_gaussian_limit(monkeypatch):
     first = torch.tensor([[0.05, 1.0]]).double()
     x = first[:, :1] * (torch.tensor([[0.5, -0.3, 0.2, 1.0]]).double() @ DESIGN)
 
-    for trials, precision in (
-        (([], []), eye),
-        ((first, x), eye + 0.05**2 * information),
-    ):
-        posterior = OscillatorReference(*trials)
-        gain, error = posterior.expected_information_gain(action)
-        after = precision + action[:, :1, None] ** 2 * information
-        exact = 0.5 * (torch.logdet(after) - torch.logdet(precision))
-        assert bool((error < 0.05).all())
-        assert bool(((gain - exact).abs() < 4 * error + 0.01).all())
+    precision = eye + 0.05**2 * information
+    posterior = OscillatorReference(first, x)
+    gain, error = posterior.expected_information_gain(action)
+    after = precision + action[:, :1, None] ** 2 * information
+    exact = 0.5 * (torch.logdet(after) - torch.logdet(precision))
+    assert bool((error < 0.05).all())
+    assert bool(((gain - exact).abs() < 4 * error + 0.01).all())
 
     covariance = first[0, 0] ** 2 * DESIGN.T @ DESIGN + NOISE_SD**2 * torch.eye(6)
     marginal = torch.distributions.MultivariateNormal(
         torch.zeros(6).double(), covariance
     )
     exact = float(marginal.log_prob(x))
-    posterior = OscillatorReference(first, x)
     assert abs(posterior.log_evidence - exact) < 4 * posterior.log_evidence_se
-
-
-def test_gain_lies_between_contrastive_bounds():
-    """sPCE below, sNMC above (Foster et al. 2020), from the prior alone."""
-    action = ACTIONS[[2, 9, 16]].double()
-    prior = OscillatorReference([], [])
-    gain, error = prior.expected_information_gain(action)
-    n, m = 400, 20_000
-    contrast = uniform(m, PRIOR_LOW, PRIOR_HIGH, 20)
-    truth = uniform(n, PRIOR_LOW, PRIOR_HIGH, 21)
-    noise = torch.randn(
-        n, 6, generator=torch.Generator().manual_seed(22), dtype=torch.float64
-    )
-    for k, xi in enumerate(action):
-        x = mean(truth, xi[None]) + NOISE_SD * noise
-        distance = torch.cdist(x, mean(contrast, xi[None])) / NOISE_SD
-        log_other = -0.5 * distance.square()
-        log_self = -0.5 * noise.square().sum(-1)
-        everyone = torch.cat([log_self[:, None], log_other], 1)
-        lower = log_self - everyone.logsumexp(-1) + math.log(m + 1)
-        upper = log_self - log_other.logsumexp(-1) + math.log(m)
-        slack = 4 * math.hypot(float(upper.std()) / math.sqrt(n), float(error[k]))
-        assert float(upper.mean() - lower.mean()) < 1.0
-        assert lower.mean() - slack < gain[k] < upper.mean() + slack
-
-
-def test_repeating_a_trial_gains_less(posterior):
-    _, action, _ = history(3, seed=3)
-    first, _ = OscillatorReference([], []).expected_information_gain(
-        action, num_outer=300
-    )
-    again, error = posterior.expected_information_gain(action, num_outer=300)
-    assert bool((again < first + 4 * error).all())
-    assert bool((again > -4 * error).all())
