@@ -157,7 +157,7 @@ def test_samples_where_the_data_leave_the_box(sign: float) -> None:
 
 
 @each_variant
-@each_history
+@pytest.mark.parametrize("history", ["prior", "theta_2 unidentified", "twelve"])
 def test_gain_against_monte_carlo(history: str, variant: str) -> None:
     posterior = posterior_of(history, variant)
     for action in (-5.0, 0.0, 3.7):
