@@ -35,7 +35,7 @@ from benchmarks.measured.go2_leg import DATA, LEGS, Leg, read_leg, usual_paramet
 from benchmarks.measured.go2_tables import tables
 from benchmarks.measured.record_verdicts import center
 from sbi_active.criticism import Criticism, Effect
-from sbi_active.criticism.report.under_misfit import misfit_line
+from sbi_active.criticism.report.summary import misfit_line
 from sbi_active.criticism.results import ModelKey, Tracing
 from sbi_active.mujoco import Robot, force_effects, mjcf_effects
 
@@ -118,9 +118,8 @@ def _row(tracing: Tracing) -> dict[str, Any]:
     describe = {e.name: e.describe for e in tracing.estimates}
     return {
         "verdict": tracing.verdict,
-        "line": f"Verdict: {tracing.verdict}"
-        if misfit is None
-        else misfit_line(tracing.verdict, misfit),
+        "line": "Verdict: "
+        + (tracing.verdict if misfit is None else misfit_line(tracing.verdict, misfit)),
         "named": [*(helps if misfit is None else misfit.named)],
         "helps": [*helps],
         "describe": [describe[name] for name in helps],

@@ -31,7 +31,7 @@ from benchmarks.criticism.intervals import rate
 from benchmarks.rows import append, read
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
-from sbi_active.criticism.report.numbers import FEWEST_DRAWS
+from sbi_active.criticism.report.words import FEWEST_DRAWS
 from sbi_active.criticism.results import NONE
 
 __all__ = ["Case", "draw_case", "main", "score_case", "summary"]

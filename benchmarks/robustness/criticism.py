@@ -29,7 +29,7 @@ from benchmarks.robustness.small_loop import (
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, StudentTNoise
 from sbi_active.criticism import Criticism, Effect, Report, Trials
 from sbi_active.criticism.data import Role
-from sbi_active.criticism.report.suspects import suspects
+from sbi_active.criticism.report.summary import suspects
 
 ATTACKS = Attacks()
 

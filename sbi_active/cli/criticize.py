@@ -23,7 +23,7 @@ from sbi_active.cli.given import (
     with_generic,
     with_noise,
 )
-from sbi_active.cli.output import say
+from sbi_active.cli.output import Answer, say
 from sbi_active.cli.session import Session
 from sbi_active.criticism import Trials, close_loop
 from sbi_active.criticism.data.recordings import read_trials
@@ -39,8 +39,14 @@ PROBLEM = ("simulator", "task", "prior", "theta_low", "theta_high", "actions")
 OF_CAMPAIGN = ("simulator", "effects", "out", "trust")
 
 
-def criticize(trials: Path, **given: Any) -> None:
-    """Compare a simulator with measured trials, and print the report."""
+def criticize(trials: Path, *, json: bool = False, **given: Any) -> Answer:
+    """Return the report of a comparison of a simulator with measured trials.
+
+    Args:
+        trials: Table of trials, folder of recordings, or campaign.
+        json: Whether a program asked, which the caller knows how to answer.
+        **given: Options by name.
+    """
     if trials.is_dir():
         if has_manifest(trials):
             return _criticize_campaign(trials, given)
@@ -80,15 +86,15 @@ def criticize(trials: Path, **given: Any) -> None:
         designed=given["designed"],
         show_progress=sys.stderr.isatty(),
     )
-    print(report)
+    text = [str(report)]
     if table.columns.time is not None or any(table.columns.units.values()):
-        print(f"\n{_described(trials, table, measured)}")
+        text.append(_described(trials, table, measured))
     if given["out"] is not None:
-        print(f"\nsaved: {report.save(given['out'])}")
-    return None
+        text.append(f"saved: {report.save(given['out'])}")
+    return Answer(report.to_dict(), "\n\n".join(text))
 
 
-def _criticize_campaign(folder: Path, given: dict[str, Any]) -> None:
+def _criticize_campaign(folder: Path, given: dict[str, Any]) -> Answer:
     """Compare a campaign with its own trials; it brings most of what a table lacks."""
     source = click.get_current_context().get_parameter_source
     for name in given:
@@ -99,7 +105,7 @@ def _criticize_campaign(folder: Path, given: dict[str, Any]) -> None:
                 f"{folder} has its own"
             )
     with Session(folder) as session:
-        session.call("criticize", **{name: given[name] for name in OF_CAMPAIGN})
+        return session.call("criticize", **{name: given[name] for name in OF_CAMPAIGN})
 
 
 def _take_module(path: Path, given: dict[str, Any]) -> None:

@@ -1,8 +1,11 @@
-"""Numbers in words: as many digits as mean something."""
+"""Numbers, names and actions in words."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+
 import numpy as np
+from numpy.typing import NDArray
 
 #: Digits of a number that any deviation leaves.
 MOST_DIGITS = 6
@@ -71,3 +74,33 @@ def with_error(mean: float, sd: float) -> str:
     if places > most:
         return f"{mean:.{most}f} +- {sd:.2g}"
     return f"{mean:.{places}f} +- {sd:.{places}f}"
+
+
+def listed(names: Iterable[str], last: str = "and") -> str:
+    """Return names in a row, as in "a, b and c"."""
+    *first, end = names
+    return f"{', '.join(first)} {last} {end}" if first else end
+
+
+def called(names: Sequence[str], position: int) -> str:
+    """Return the name of a trial, or its position without names."""
+    return names[position] if names else str(position)
+
+
+def parted(label: str) -> tuple[str, str]:
+    """Return the name and the unit of a label such as "speed [m/s]"."""
+    name, _, unit = label.partition(" [")
+    return name, unit.removesuffix("]")
+
+
+def setting(labels: Sequence[str], action: NDArray[np.float64]) -> str:
+    """Return an action in words, each entry with its name and unit.
+
+    Example:
+        >>> setting(["speed [m/s]", "tilt"], np.array([2.5, 0.125]))
+        'speed = 2.5 m/s, tilt = 0.125'
+    """
+    return ", ".join(
+        f"{name} = {value:.4g} {unit}".rstrip()
+        for (name, unit), value in zip(map(parted, labels), action, strict=True)
+    )
