@@ -29,9 +29,12 @@ def permitted_candidates(rivals: RivalSet, actions: ActionSpace) -> Tensor:
 def simulated(rivals: RivalSet, candidates: Tensor) -> Tensor:
     """Return the candidates at which the bare model gives numbers.
 
-    Beyond the permitted range a simulator may fail in any way.
+    Beyond the permitted range a simulator may fail in any way. There is nothing beyond
+    labels of trials.
     """
     kept = []
+    if rivals.trials.action_is_label:
+        return candidates[:0]
     candidates = candidates[are_known(rivals.model, rivals.trials, candidates)]
     with torch.no_grad():
         for action in candidates:

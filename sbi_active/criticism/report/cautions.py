@@ -82,34 +82,19 @@ def _of_trials(report: Contents, trials: Trials, *, designed: bool) -> list[Row]
     estimated = report.residuals.noise == "estimated" and report.tracing.misfit is None
     in_order = trials.order == "known" and not trials.action_is_label
     growth = report.growth if trials.order == "known" else None
+    grown = f"{growth or 0:.2g} times from the first third to the last"
     return [
-        (
-            estimated,
-            "SA501 noise undeclared: its size has a prior or is estimated from "
-            "repeated trials, which show scatter and no bias, and what differs from "
-            "repeat to repeat passes for noise",
-        ),
-        (
-            num < FEW_TRIALS,
-            f"SA502 fewer than {FEW_TRIALS} trials ({num}): several effects may "
-            "explain as few",
-        ),
+        (estimated, "SA501 noise undeclared: what differs by repeat passes for noise"),
+        (num < FEW_TRIALS, f"SA502 fewer than {FEW_TRIALS} trials ({num})"),
         (
             in_order and _aliased(trials),
-            "SA503 drift aliased with the order of actions: they were executed in "
-            "sorted order, so that what grows with time looks like what grows with "
-            "the action",
+            "SA503 drift aliased with the order of actions, which were sorted",
         ),
-        (
-            designed,
-            "SA504 actions chosen for information and not for deployment: the error "
-            "before and after is that of such actions",
-        ),
+        (designed, "SA504 actions chosen for information and not for deployment"),
         (
             growth,
-            f"SA529 residuals grow from trial to trial, {growth or 0:.2g} times from "
-            "the first third to the last: a parameter may differ by trial; declare it "
-            'as an effect of scope "trial", or what drifts',
+            f"SA529 residuals grow from trial to trial, {grown}: a parameter may "
+            'differ by trial; declare it as an effect of scope "trial", or what drifts',
         ),
     ]
 
@@ -118,20 +103,18 @@ def _of_outcomes(report: Contents) -> list[Row]:
     own = report.residuals
     if report.residuals_after is not None and report.tracing.chosen:
         own = report.residuals_after
+    lost, kept = surprising_outcomes(own)
     disagreeing = [
         f"trial{'s' * (len(which) > 1)} "
         f"{', '.join(called(own.names, i) for i in which)} {what}"
-        for which, what in zip(
-            surprising_outcomes(own),
-            [
-                "gave no measurement where the model is sure of one",
-                "gave a measurement where the model is sure of none",
-            ],
-            strict=True,
+        for which, what in (
+            (lost, "gave no measurement where the model is sure of one"),
+            (kept, "gave a measurement where the model is sure of none"),
         )
         if which
     ]
     rough = np.zeros(1) if own.roughness is None else own.roughness[own.roughness > 0]
+    strays = f"{rough.min():.2g} to {rough.max():.2g}"
     correlation = _correlation(own)
     remedy = "sample_times"
     if own.times is not None:
@@ -140,16 +123,13 @@ def _of_outcomes(report: Contents) -> list[Row]:
         (disagreeing, f"SA505 outcomes that disagree: {' and '.join(disagreeing)}"),
         (
             own.roughness is not None,
-            "SA506 the simulator jumps: where parameters change within their "
-            f"posterior, x strays by {rough.min():.2g} to {rough.max():.2g} from a "
-            "smooth function of them, which counts as an error of its own beside the "
-            "noise, so that less is concluded than the trials may hold",
+            f"SA506 the simulator jumps: x strays by {strays} from a smooth function "
+            "of the parameters, which counts as an error beside the noise",
         ),
         (
             correlation,
             "SA507 independent errors forced on a trajectory: neighboring residuals "
-            f"have a correlation of {correlation:.2f}, which makes false alarms and "
-            f"intervals that are too narrow; declare {remedy}",
+            f"correlate by {correlation:.2f}; declare {remedy}",
         ),
     ]
 
@@ -168,36 +148,28 @@ def _of_evidence(report: Contents) -> list[Row]:
     remains = tracing.chosen and tracing.misfit is None
     check = detection.null_cross_check
     apart = 0.0 if check is None else abs(check - detection.null_log_evidence)
-    least, num = detection.least_chi_square, detection.degrees_of_freedom
+    small = abs(detection.least_chi_square / detection.degrees_of_freedom) ** 0.5
     return [
-        (
-            weak,
-            f"SA508 evidence uncertain of {', '.join(weak)}: so are the probabilities "
-            "that rest on it",
-        ),
+        (weak, f"SA508 evidence uncertain of {', '.join(weak)}"),
         (
             detection.alarm and not detection.by_evidence,
-            "SA509 the alarm rests on the chi-square alone: no alternative has a "
-            "Bayes factor of 20, so that what is lacking is a suggestion",
+            "SA509 the alarm rests on the chi-square alone: a cause is a suggestion",
         ),
         (
             remains and detection.refutes(tracing.evidences[tracing.verdict], REFUTED),
-            f"SA510 {tracing.verdict} explains the most, and not all: the chi-square "
-            f"of the trials with it has p < {REFUTED:g}, so that something else is "
-            "missing too",
+            f"SA510 {tracing.verdict} explains the most, and not all: its chi-square "
+            f"has p < {REFUTED:g}, so that something else is missing too",
         ),
         (
             apart > DISAGREEMENT,
-            "SA511 two estimates of the bare model's evidence differ by "
-            f"{apart:.1f} nats: its posterior has parts that one of them missed",
+            f"SA511 two estimates of the bare model's evidence differ by {apart:.1f} "
+            "nats",
         ),
         (
             detection.lower_p_value <= TOO_SMALL,
-            "SA523 residuals are far smaller than the declared noise allows: their "
-            f"root mean square is {abs(least / num) ** 0.5:.2g} of its standard "
-            f"deviation (chi-square {least:.2g} on {num:.1f} degrees of freedom); "
-            "declare the error of the measurement in the unit of x, since noise that "
-            "is too large hides effects and widens the parameters",
+            "SA523 residuals are far smaller than the declared noise allows, "
+            f"{small:.2g} of its standard deviation: declare the error of the "
+            "measurement in the unit of x",
         ),
     ]
 
@@ -208,10 +180,8 @@ def _of_misses(report: Contents) -> list[Row]:
     rows: list[Row] = [
         (
             True,
-            f"SA513 trial {trial.name} is far outside what the other trials show: its "
-            f"error on the fit to them is {trial.times:.3g} times theirs; it is set "
-            "aside, and had no part in the verdict: check its record, its unit and "
-            "its set-up, then correct, withdraw or repeat it",
+            f"SA513 trial {trial.name} is far outside what the other trials show, "
+            f"{trial.times:.3g} times their error: it is set aside; check its record",
         )
         for trial in tracing.set_aside
     ]
@@ -221,8 +191,7 @@ def _of_misses(report: Contents) -> list[Row]:
             how = "measured where the model is sure of no measurement"
         sentence = (
             f"SA514 held-out trial {trial.name} is far outside what the verdict's "
-            f"model predicts, {how}: check its record and its unit, or the model is "
-            "wrong there"
+            f"model predicts, {how}: check its record and its unit"
         )
         rows.append((True, sentence))
     for p in tracing.bounds.parameters:
@@ -244,9 +213,6 @@ def _of_verdict(report: Contents) -> list[Row]:
         rmse = report.before_after.set_index("metric").loc["rmse"]
         before, after = float(rmse["before"]), float(rmse["after"])
     is_bare = verdict == UNEXPLAINED and not tracing.chosen
-    in_place = (
-        f"beside {ModelKey(tracing.beside)}" if tracing.beside else "in its place"
-    )
     code, why = _withdrawn(tracing)
     p = tracing.probabilities.get(tracing.instead_of)
     share = "" if p is None else f" (probability {p:.2g})"
@@ -260,39 +226,30 @@ def _of_verdict(report: Contents) -> list[Row]:
         (
             verdict == OUTLIER,
             f"SA521 {suspects_in_words(tracing)} does not agree with the others: check "
-            "its record, its unit and its set-up, then correct, withdraw or repeat it; "
-            "nothing is added for it",
+            "its record, then correct, withdraw or repeat it",
         ),
         (tracing.instead_of, f"{code} {tracing.instead_of}{share} is not named, {why}"),
         (
             rests_on_one,
             f"SA522 {verdict} {rests(tracing) if rests_on_one else ''}: without it the "
-            "Bayes factor against the bare model is below 20; repeat its action",
+            "Bayes factor against the bare model is below 20",
         ),
-        (
-            not tracing.robust,
-            "SA517 not robust to its prior: effect priors a third or three times as "
-            "wide give another verdict",
-        ),
+        (not tracing.robust, "SA517 not robust to its prior"),
         (
             is_bare and not tracing.bounds.replaces,
-            "SA518 no declared effect explains the data: the residual process "
-            f"{in_place} does not extrapolate",
+            "SA518 no declared effect explains the data, and what stands in its place "
+            "does not extrapolate",
         ),
         (
             _may_be_force(report),
-            "SA530 what is left may be a force that nobody declared, and the simulator "
-            "takes forces: add those of force_effects to the effects",
+            "SA530 what is left may be a force: add those of force_effects to the "
+            "effects",
         ),
         (
             verdict == SCATTER,
             "SA519 scatter is larger than the declared noise, which is no cause",
         ),
-        (
-            report.exploratory,
-            "SA520 exploratory: library or priors were changed after the data were "
-            "seen, so the false-alarm rate is not what is stated",
-        ),
+        (report.exploratory, "SA520 exploratory: changed after the data were seen"),
     ]
 
 
@@ -318,8 +275,8 @@ def _of_phi(report: Contents) -> list[Row]:
     rows: list[Row] = [
         (
             edge,
-            f"SA515 phi at its prior's edge ({names}): the effect is stronger than "
-            "declared, or stands in for another",
+            f"SA515 phi at its prior's edge ({names}): it is stronger than declared, "
+            "or stands in for another",
         )
     ]
     for effect, phi in edge:
@@ -327,8 +284,7 @@ def _of_phi(report: Contents) -> list[Row]:
         rows.append(
             (
                 effect.hook == "observation" or effect.family in INSTRUMENTS,
-                f"SA516 {effect.name} of {size} is more than an instrument gets "
-                "wrong: it stands in for something else, however well it predicts",
+                f"SA516 {effect.name} of {size} is more than an instrument gets wrong",
             )
         )
     return rows
