@@ -28,7 +28,6 @@ from sbi_active.cli.session import Session
 from sbi_active.criticism import Trials, close_loop
 from sbi_active.criticism.data.recordings import read_trials
 from sbi_active.criticism.data.table import TrialTable
-from sbi_active.criticism.effects.augmented import takes_times
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.bank.sqlite import NAME
 
@@ -39,7 +38,7 @@ PROBLEM = ("simulator", "task", "prior", "theta_low", "theta_high", "actions")
 OF_CAMPAIGN = ("simulator", "effects", "out", "trust")
 
 
-def criticize(trials: Path, *, json: bool = False, **given: Any) -> Answer:
+def criticize(trials: Path, *, json: bool = False, **given: Any) -> Answer | None:
     """Return the report of a comparison of a simulator with measured trials.
 
     Args:
@@ -94,7 +93,7 @@ def criticize(trials: Path, *, json: bool = False, **given: Any) -> Answer:
     return Answer(report.to_dict(), "\n\n".join(text))
 
 
-def _criticize_campaign(folder: Path, given: dict[str, Any]) -> Answer:
+def _criticize_campaign(folder: Path, given: dict[str, Any]) -> Answer | None:
     """Compare a campaign with its own trials; it brings most of what a table lacks."""
     source = click.get_current_context().get_parameter_source
     for name in given:
@@ -183,7 +182,7 @@ def _with_times(model: SimulatorModel, trials: Trials, path: Path) -> SimulatorM
     own, fn = trials.sample_times, model.fn
     assert own is not None
     ragged = not torch.equal(own.expand(len(trials), -1), times.expand(len(trials), -1))
-    if not takes_times(model):
+    if "times" not in model.conditions:
         if ragged:
             raise ValueError(
                 "expected a simulator that takes times=, shape (n, k), where trials "

@@ -3,9 +3,12 @@
 This package proposes a trial. The conclusions from trials are in ``steps``.
 """
 
-from sbi_active.criticism.next_trial.candidates import following
+from sbi_active.criticism.next_trial.candidates import (
+    extrapolated,
+    following,
+    outside_candidates,
+)
 from sbi_active.criticism.next_trial.next_action import PredictedRival, choose_action
-from sbi_active.criticism.next_trial.outside import extrapolated, outside_candidates
 
 __all__ = [
     "PredictedRival",

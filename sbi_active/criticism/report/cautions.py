@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import rankdata
@@ -39,20 +40,38 @@ from sbi_active.seeding import forked_generators
 #: A condition, and the sentence that is said where it holds.
 Row = tuple[object, str]
 
-#: Rank correlation of an action with the order of the trials that is called aliased.
-ALIASED = 0.9
-#: Quantile of an effect's prior beyond which an estimate lies at its edge.
-EDGE = 0.99
 #: Families of effects that blame an instrument, beside those on what is observed.
 INSTRUMENTS = ["sensor", "geometry"]
-#: Effective samples below which, and standard error in nats above which, an evidence
-#: is called uncertain; models below the probability are left out.
-FEW_SAMPLES, UNCERTAIN, NEGLIGIBLE = 50, 0.5, 0.01
-#: Nats by which two estimates of the bare model's evidence may differ.
-DISAGREEMENT = 1.0
-#: Entries a trial from which x may be a trajectory, and the correlation of neighboring
-#: residuals (and its multiple of 1 / sqrt(N)) from which they are not independent.
-LONG, CORRELATED, SIGNIFICANT = 10, 0.3, 4.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """Limits from which a caution is said; half or twice says more or fewer of them.
+
+    Attributes:
+        aliased: Rank correlation of an action with the order of the trials.
+        edge: Quantile of an effect's prior beyond which an estimate is at its edge.
+        few_samples: Effective samples of an evidence.
+        uncertain: Standard error of an evidence, nats.
+        negligible: Probability of a model whose evidence does not matter.
+        disagreement: Difference of two estimates of the bare model's evidence, nats.
+        long: Entries a trial of x that may be a trajectory.
+        correlated: Correlation of neighboring residuals.
+        significant: Standard errors of that correlation.
+    """
+
+    aliased: float = 0.9
+    edge: float = 0.99
+    few_samples: int = 50
+    uncertain: float = 0.5
+    negligible: float = 0.01
+    disagreement: float = 1.0
+    long: int = 10
+    correlated: float = 0.3
+    significant: float = 4.0
+
+
+LIMITS = Limits()
 
 
 def cautions(
@@ -103,13 +122,16 @@ def _of_outcomes(report: Contents) -> list[Row]:
     own = report.residuals
     if report.residuals_after is not None and report.tracing.chosen:
         own = report.residuals_after
-    lost, kept = surprising_outcomes(own)
     disagreeing = [
         f"trial{'s' * (len(which) > 1)} "
         f"{', '.join(called(own.names, i) for i in which)} {what}"
-        for which, what in (
-            (lost, "gave no measurement where the model is sure of one"),
-            (kept, "gave a measurement where the model is sure of none"),
+        for which, what in zip(
+            surprising_outcomes(own),
+            [
+                "gave no measurement where the model is sure of one",
+                "gave a measurement where the model is sure of none",
+            ],
+            strict=True,
         )
         if which
     ]
@@ -137,13 +159,16 @@ def _of_outcomes(report: Contents) -> list[Row]:
 def _of_evidence(report: Contents) -> list[Row]:
     tracing, detection = report.tracing, report.detection
     matter = {NONE, tracing.model}
-    matter |= {n for n, p in tracing.probabilities.items() if p > NEGLIGIBLE}
+    matter |= {n for n, p in tracing.probabilities.items() if p > LIMITS.negligible}
     weak = [
         f"{e.name} ({e.effective_sample_size:.0f} effective samples, {e.engine}, "
         f"+- {e.standard_error:.2g} nats)"
         for name, e in tracing.evidences.items()
         if name in matter
-        and (e.effective_sample_size < FEW_SAMPLES or e.standard_error > UNCERTAIN)
+        and (
+            e.effective_sample_size < LIMITS.few_samples
+            or e.standard_error > LIMITS.uncertain
+        )
     ]
     remains = tracing.chosen and tracing.misfit is None
     check = detection.null_cross_check
@@ -161,7 +186,7 @@ def _of_evidence(report: Contents) -> list[Row]:
             f"has p < {REFUTED:g}, so that something else is missing too",
         ),
         (
-            apart > DISAGREEMENT,
+            apart > LIMITS.disagreement,
             f"SA511 two estimates of the bare model's evidence differ by {apart:.1f} "
             "nats",
         ),
@@ -296,7 +321,7 @@ def _aliased(trials: Trials) -> bool:
     for value in trials.action.numpy().T:
         ranks = rankdata(value)
         varies = len(ranks) > 2 and ranks.std() > 0
-        if varies and abs(np.corrcoef(order, ranks)[0, 1]) > ALIASED:
+        if varies and abs(np.corrcoef(order, ranks)[0, 1]) > LIMITS.aliased:
             return True
     return False
 
@@ -319,10 +344,14 @@ def _correlation(own: Residuals) -> float:
     both = np.isfinite(first) & np.isfinite(second)
     first, second = first[both], second[both]
     varies = len(first) > 2 and first.std() > 0 and second.std() > 0
-    if not (takes_none and z.shape[1] >= LONG and varies):
+    if not (takes_none and z.shape[1] >= LIMITS.long and varies):
         return 0.0
     found = float(np.corrcoef(first, second)[0, 1])
-    return found if found > max(CORRELATED, SIGNIFICANT / np.sqrt(len(first))) else 0.0
+    return (
+        found
+        if found > max(LIMITS.correlated, LIMITS.significant / np.sqrt(len(first)))
+        else 0.0
+    )
 
 
 def _at_edge(tracing: Tracing, effects: Sequence[Effect]) -> list[tuple[Effect, Array]]:
@@ -349,8 +378,8 @@ def _is_extreme(effect: Effect, phi: Array) -> bool:
     finite = np.isfinite(null)
     center = np.where(finite, null, 0.0)
     distance, own = np.abs(draws - center), np.abs(mean - center)
-    beyond = (own > np.quantile(distance, EDGE, axis=0)) & finite
+    beyond = (own > np.quantile(distance, LIMITS.edge, axis=0)) & finite
     # From an infinite null the far end is the one away from it.
-    low, high = np.quantile(draws, [1 - EDGE, EDGE], axis=0)
+    low, high = np.quantile(draws, [1 - LIMITS.edge, LIMITS.edge], axis=0)
     far = np.where(null > 0, mean < low, mean > high) & ~finite
     return bool((beyond | far).any())

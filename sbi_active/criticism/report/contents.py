@@ -13,7 +13,7 @@ from scipy.stats import spearmanr
 from torch.distributions import Distribution
 
 from sbi_active.criticism.contradictions import SevereTest
-from sbi_active.criticism.report.words import called, parted, setting
+from sbi_active.criticism.report.words import TOLD, called, parted, setting
 from sbi_active.criticism.results import (
     NONE,
     UNEXPLAINED,
@@ -32,8 +32,6 @@ from sbi_active.inference.beliefs.identifiability import (
 )
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.model import SimulatorModel
-
-NUM_PRIOR = 2_000  # draws that a width is compared with
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -217,7 +215,7 @@ class Contents:
         evidences = self.tracing.evidences
         evidence = evidences.get(self.tracing.model, evidences[NONE])
         with forked_generators(0, "report"):
-            prior = self.prior.sample(torch.Size([NUM_PRIOR])).double().numpy()
+            prior = self.prior.sample(torch.Size([TOLD.prior_draws])).double().numpy()
         dim = prior.shape[1]
         draws = evidence.draws[:, :dim]  # beyond these there may be those of errors
         if draws.shape[1] < dim:

@@ -7,15 +7,10 @@ import numpy as np
 from sbi_active.criticism.report.contents import Contents, by_channel, root_mean_square
 from sbi_active.criticism.report.figures import METRICS, pictured
 from sbi_active.criticism.report.summary import added, sizes
-from sbi_active.criticism.report.words import called, number
+from sbi_active.criticism.report.words import TOLD, called, number
 from sbi_active.criticism.results import Array, Evaluation, Residuals
 from sbi_active.display.page import Section
 from sbi_active.display.table import Table
-
-SMALLEST_P = 1e-4  # below which the digits of a p-value mean nothing
-#: Trials that are listed, the worst; of any number these are a few lines.
-MOST_TRIALS = 6
-FEW_PAIRS = 8  # scored trials below which the pairs stand in place of an interval
 
 
 def residuals(report: Contents) -> Section:
@@ -36,7 +31,7 @@ def residuals(report: Contents) -> Section:
         "stochastic": "The noise is the simulator's own.",
     }[before.noise]
     p = detection.p_value
-    least = f"p {f'= {p:.2g}' if p >= SMALLEST_P else f'< {SMALLEST_P:g}'}"
+    least = f"p {f'= {p:.2g}' if p >= TOLD.smallest_p else f'< {TOLD.smallest_p:g}'}"
     text = [
         *told,
         f"{noise} Chi-square of the bare model "
@@ -47,9 +42,7 @@ def residuals(report: Contents) -> Section:
     ]
     if before.times is not None:
         text.append(f"Correlation of neighboring errors {before.correlation:.2f}.")
-    return Section(
-        "Residuals", text, table=table, picture=pictured(report, "residuals")
-    )
+    return Section("Residuals", text, table=table, picture=pictured("residuals"))
 
 
 def _by_prediction(
@@ -91,7 +84,7 @@ def by_trial(report: Contents) -> Section:
         [trial.name, "", number(trial.size), "set aside: on the fit to the others"]
         for trial in tracing.set_aside
     ]
-    shown = table.head(max(MOST_TRIALS - len(rows), 0))
+    shown = table.head(max(TOLD.trials - len(rows), 0))
     for one in shown.to_dict("records"):
         name, unit = channels[one["channel"]]
         where = [name] * (len(channels) > 1)
@@ -140,18 +133,18 @@ def before_and_after(report: Contents) -> Section:
         "after / before. Of the other two it is the difference, after - before: more "
         "density is better, and the share should be 0.9.",
     ]
-    if num < FEW_PAIRS:
+    if num < TOLD.pairs:
         text.append(
-            f"Below {FEW_PAIRS} trials an interval over trials covers too little; "
+            f"Below {TOLD.pairs} trials an interval over trials covers too little; "
             "these are the pairs:"
         )
     header = ["metric", "before", "after", "ratio or difference", "90 % interval"]
     return Section(
         title,
         text,
-        items=_pairs(evaluation) if num < FEW_PAIRS else (),
+        items=_pairs(evaluation) if num < TOLD.pairs else (),
         table=Table(header, rows),
-        picture=pictured(report, "before_after"),
+        picture=pictured("before_after"),
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.summary import added
+from sbi_active.criticism.report.words import TOLD
 from sbi_active.criticism.results import Array, Evaluation, Residuals, Tracing
 from sbi_active.display.page import Picture
 
@@ -17,9 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 BEFORE, AFTER, FAINT = "#c1432e", "#2f6f9f", "#9aa3ab"
-MAX_ACTION_PANELS = 3  # a choice: as many as stand legibly in a row
-MOST_NAMED = 16  # trials that have their names at the axis
-LOGARITHMIC_FROM = 12.0  # standard deviations; larger residuals get a symlog axis
 METRICS = {
     "rmse": "RMSE",
     "energy score": "energy score",
@@ -55,26 +53,9 @@ def figures(report: Contents) -> dict[str, Figure]:
     return found
 
 
-def pictured(report: Contents, name: str) -> Picture:
+def pictured(name: str) -> Picture:
     """Return the place of the figure with a name."""
-    words = f"{CAPTIONS[name]} {_told(report, name)}".strip()
-    return Picture(name, words, CAPTIONS[name])
-
-
-def _told(report: Contents, figure: str) -> str:
-    """Return the numbers of a figure in words, for who does not see it."""
-    if figure == "probabilities":
-        shares = sorted(report.probabilities.items(), key=lambda item: -item[1])[:5]
-        return ", ".join(f"{name}: {share:.2f}" for name, share in shares) + "."
-    if figure == "before_after":
-        names = report.before_after["metric"]
-        values = report.before_after[["before", "after"]].to_numpy(dtype=float)
-        pairs = zip(names, values, strict=True)
-        return "; ".join(f"{n}: {a:.3g} to {b:.3g}" for n, (a, b) in pairs) + "."
-    each = report.residuals.refitted
-    finite = each[np.isfinite(each)]
-    largest = np.abs(finite).max(initial=0.0)
-    return f"The largest of the bare model is {largest:.3g} standard deviations."
+    return Picture(name, CAPTIONS[name], CAPTIONS[name])
 
 
 def plot_residuals(
@@ -108,7 +89,7 @@ def plot_residuals(
     labels = action_labels
     if labels is None:
         labels = [f"action {i + 1}" for i in range(before.action.shape[1])]
-    shown = min(len(labels), MAX_ACTION_PANELS)
+    shown = min(len(labels), TOLD.panels)
     several = before.x[0].size > 1
     columns = shown + 1 + several
     figure, axes = _subplots(len(rows), columns, width=3.3, height=2.5)
@@ -238,7 +219,7 @@ def _trial_axis(ax: Axes, residuals: Residuals) -> None:
     index, names = residuals.index, residuals.names
     ax.set_xlabel("trial")
     numbered = all(n == f"{i:.15g}" for n, i in zip(names, index, strict=False))
-    if numbered or len(names) > MOST_NAMED:
+    if numbered or len(names) > TOLD.ticks:
         locator: Any = ax.xaxis.get_major_locator()
         locator.set_params(integer=True)
         return
@@ -250,7 +231,7 @@ def _residual_axis(ax: Axes, each: Array) -> None:
     ax.axhline(0, color="#555555", lw=0.8, zorder=0)
     finite = each[np.isfinite(each)]
     largest = max(float(np.abs(finite).max(initial=0.0)) * 1.15, 3.5)
-    if largest > LOGARITHMIC_FROM:
+    if largest > TOLD.logarithmic:
         largest *= 1.4
         ax.set_yscale("symlog", linthresh=2)
         decades = 10.0 ** np.arange(1, np.floor(np.log10(largest)) + 1)

@@ -11,7 +11,7 @@ from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.figures import pictured
 from sbi_active.criticism.report.summary import added, label, sizes
 from sbi_active.criticism.report.words import (
-    FEWEST_DRAWS,
+    TOLD,
     called,
     estimated,
     listed,
@@ -23,10 +23,6 @@ from sbi_active.criticism.results import NONE, UNEXPLAINED, Tracing
 from sbi_active.criticism.under_misfit import Misfit
 from sbi_active.display.page import Section
 from sbi_active.display.table import Table
-
-SHOWN = 0.01  # probability from which a set of several effects stands in the table
-#: Parameters whose moves are listed.
-MOST_MOVES = 3
 
 CONDITION = (
     "P holds among the declared effects alone: an effect that nobody declared may pass "
@@ -50,7 +46,7 @@ def effects(report: Contents) -> Section:
     null = tracing.evidences[NONE].log_evidence
     rows, left_out = [], 0
     for name, p in tracing.probabilities.items():
-        if tracing.has_several(name) and p < SHOWN and name != tracing.model:
+        if tracing.has_several(name) and p < TOLD.share and name != tracing.model:
             left_out += 1
             continue
         fit, order = ["", ""], -np.inf
@@ -66,7 +62,7 @@ def effects(report: Contents) -> Section:
     rows.sort(key=lambda row: row[:2])
     table = Table(header, [cells for *_, cells in rows])
     text = _explained(report, has_p=has_p, has_sets=has_sets, left_out=left_out)
-    picture = pictured(report, "probabilities") if has_p else None
+    picture = pictured("probabilities") if has_p else None
     return Section("Effects", [*text], table=table, picture=picture)
 
 
@@ -86,7 +82,7 @@ def _explained(
     told += (
         "phi: strength of the effect if it alone is added. log BF: log Bayes factor "
         "against the bare model, nats. ESS: effective samples behind it, below "
-        f"{FEWEST_DRAWS:.0f} too few for a deviation of phi."
+        f"{TOLD.draws:.0f} too few for a deviation of phi."
     )
     if has_p:
         told += (
@@ -102,7 +98,7 @@ def _explained(
         yield "P in any set: that of the effect being there, alone or with others."
     if left_out and has_p:
         many = "sets of several effects have" if left_out > 1 else "set of several has"
-        yield f"{left_out} more {many} P < {SHOWN:g}."
+        yield f"{left_out} more {many} P < {TOLD.share:g}."
     if tracing.chosen:
         yield CONDITION
     if report.guess is not None:
@@ -268,8 +264,8 @@ def parameters(report: Contents) -> Section:
             "deviation that knows of it; of others the posterior's mean and deviation.",
         ),
         (
-            min(draws) < FEWEST_DRAWS,
-            f'"about": below {FEWEST_DRAWS:.0f} effective samples are behind it, too '
+            min(draws) < TOLD.draws,
+            f'"about": below {TOLD.draws:.0f} effective samples are behind it, too '
             "few for a deviation.",
         ),
         (report.tracing.chosen, _moved(report)),
@@ -296,7 +292,7 @@ def _moved(report: Contents) -> str:
         f"{number(table['after'].iloc[i])} "
         f"({'more than 1000' if far[i] > 1_000 else f'{far[i]:.2g}'} of its standard "
         "deviations)"
-        for i in order[:MOST_MOVES]
+        for i in order[: TOLD.moves]
     ]
     rest = len(order) - len(moves)
     more = f", and {rest} more by at least one" if rest else ""

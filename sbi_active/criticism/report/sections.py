@@ -9,14 +9,11 @@ import numpy as np
 from sbi_active.criticism.report import errors, models
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.summary import first_paragraph, verdict_line
-from sbi_active.criticism.report.words import listed, number, parted, probability
+from sbi_active.criticism.report.words import TOLD, listed, number, parted, probability
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, NextAction
 from sbi_active.criticism.under_misfit import Misfit
 from sbi_active.display.page import Page, Section
 from sbi_active.messages import Message, place
-
-#: Entries of an action whose range is listed.
-MOST_ENTRIES = 3
 
 SEVERE = (
     "The free residual is the bare model and a smooth function of the action, both as "
@@ -122,7 +119,7 @@ def _tried(report: Contents) -> str:
     entries = [*zip(map(parted, report.action_labels), action.T, strict=True)]
     ranges = [
         f"{name} from {column.min():.4g} to {column.max():.4g} {unit}".rstrip()
-        for (name, unit), column in entries[:MOST_ENTRIES]
+        for (name, unit), column in entries[: TOLD.entries]
     ]
     rest = len(entries) - len(ranges)
     tried = ", ".join(ranges) + (f", and {rest} more entries" if rest else "")

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from sbi_active.criticism.contradictions import MissedTrial, OutlyingTrial
 from sbi_active.criticism.forces.library import COUPLING, FAMILY
 from sbi_active.criticism.report.contents import Contents, by_channel, root_mean_square
-from sbi_active.criticism.report.words import listed, number, stated
+from sbi_active.criticism.report.words import TOLD, listed, number, stated
 from sbi_active.criticism.results import (
     NONE,
     OUTLIER,
@@ -24,12 +24,6 @@ from sbi_active.criticism.results import (
 from sbi_active.criticism.steps.detection import LEVEL
 from sbi_active.criticism.under_misfit import UNDECLARED, Misfit
 
-#: Probability from which a form of a force is named, and one from which it is listed.
-CERTAIN, SHOWN = 0.9, 0.01
-#: Share of the probability that the suspects of a gross error hold together.
-MASS = 0.9
-#: Trials, or channels, that a line names at most.
-MOST_NAMED = 3
 #: Trials that refute a verdict where none are named.
 NO_PART = "trials that had no part in it"
 
@@ -139,6 +133,8 @@ def _errors(report: Contents) -> str:
     if report.evaluation is None:
         return "No trial was scored."
     rmse = report.before_after.set_index("metric").loc["rmse"]
+    if report.verdict == NONE:
+        return f"Its RMSE on {NO_PART} is {number(rmse['before'])}."
     folds = report.evaluation.scheme != "held out"
     withdrawn = folds and (tracing.refuted or tracing.bounds.replaces)
     model = tracing.instead_of if withdrawn else added(report)
@@ -200,7 +196,7 @@ def _left(report: Contents) -> str:
 def _next(report: Contents) -> str:
     plan = report.next_action
     if plan is not None and plan.action is not None:
-        names, rest = plan.separates[:MOST_NAMED], plan.separates[MOST_NAMED:]
+        names, rest = plan.separates[: TOLD.names], plan.separates[TOLD.names :]
         names += (f"{len(rest)} more",) if rest else ()
         told = f", to tell {listed(names)} apart" if names else ""
         return f"Measure next at {report.setting(plan.action)}{told}."
@@ -260,7 +256,7 @@ def open_form(report: Contents) -> str | None:
     families = {e.name: e.family for e in tracing.estimates}
     chosen = {families.get(name, "") for name in tracing.chosen}
     p = tracing.probabilities
-    if not chosen or p.get(tracing.verdict, 0.0) >= CERTAIN:
+    if not chosen or p.get(tracing.verdict, 0.0) >= TOLD.certain:
         return None
     if not all(family.startswith((FAMILY, COUPLING)) for family in chosen):
         return None
@@ -270,7 +266,7 @@ def open_form(report: Contents) -> str | None:
         if chosen <= {families.get(name) for name in key.split(" + ")}
     }
     forms = sorted(shares.items(), key=lambda item: -item[1])
-    told = [f"{name} ({stated(share)})" for name, share in forms if share >= SHOWN]
+    told = [f"{name} ({stated(share)})" for name, share in forms if share >= TOLD.share]
     cause = " and ".join(sorted(chosen))
     return f"{cause} ({stated(sum(shares.values()))}), form open: {', '.join(told)}"
 
@@ -292,7 +288,7 @@ def _limits(tracing: Tracing) -> str:
 
 def _counted(which: Sequence[MissedTrial | OutlyingTrial], kind: str, are: str) -> str:
     """Return the trials of a kind, or their number where they are many."""
-    if len(which) > MOST_NAMED:
+    if len(which) > TOLD.names:
         return f"; {len(which)} {kind}s are {are}"
     names = " and ".join(trial.name for trial in which)
     return f"; {kind}{'s' * (len(which) > 1)} {names} {_are(which)} {are}"
@@ -332,7 +328,7 @@ def suspects(tracing: Tracing) -> tuple[float, ...]:
     """Return the indices of trials that hold 90 % of a gross error's probability."""
     found, total = [], 0.0
     for index, share in tracing.outliers.items():  # most probable first
-        if total >= MASS:
+        if total >= TOLD.mass:
             break
         found.append(index)
         total += share

@@ -3,14 +3,52 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-#: Digits of a number that any deviation leaves.
-MOST_DIGITS = 6
-#: Effective draws below which a deviation is none to print.
-FEWEST_DRAWS = 50.0
+
+@dataclass(frozen=True, kw_only=True)
+class Told:
+    """How much of it a report tells; none of it decides anything.
+
+    Attributes:
+        names: Trials or models that a line names at most.
+        trials: Trials that are listed, the worst.
+        moves: Parameters whose moves are listed.
+        entries: Entries of an action whose range is listed.
+        pairs: Scored trials below which the pairs stand in place of an interval.
+        share: Probability from which a set of effects, or a form, is listed.
+        certain: Probability from which a form of a force is named.
+        mass: Share of the probability that suspects of a gross error hold together.
+        smallest_p: Value below which the digits of a p-value mean nothing.
+        digits: Digits of a number that any deviation leaves.
+        draws: Effective draws below which a deviation is none to print.
+        prior_draws: Draws that a width is compared with.
+        panels: Panels of a figure by entries of the action.
+        ticks: Trials that have their names at an axis.
+        logarithmic: Residual, in deviations, from which an axis is logarithmic.
+    """
+
+    names: int = 3
+    trials: int = 6
+    moves: int = 3
+    entries: int = 3
+    pairs: int = 8
+    share: float = 0.01
+    certain: float = 0.9
+    mass: float = 0.9
+    smallest_p: float = 1e-4
+    digits: int = 6
+    draws: float = 50.0
+    prior_draws: int = 2_000
+    panels: int = 3
+    ticks: int = 16
+    logarithmic: float = 12.0
+
+
+TOLD = Told()
 
 
 def stated(value: float) -> str:
@@ -47,7 +85,7 @@ def estimated(mean: float, sd: float, draws: float) -> str:
         >>> estimated(0.35992, 0.00071, 400), estimated(0.35992, 0.00071, 3)
         ('0.35992 +- 0.00071', 'about 0.36')
     """
-    if draws >= FEWEST_DRAWS or np.isnan(mean):
+    if draws >= TOLD.draws or np.isnan(mean):
         return with_error(mean, sd)
     return f"about {mean:.2g}"
 
@@ -70,7 +108,7 @@ def with_error(mean: float, sd: float) -> str:
         return f"{mean:.4g} +- {sd:.2g}"
     exponent = int(f"{sd:.1e}".split("e")[1])  # after rounding to two digits
     places = max(1 - exponent, 0)
-    most = max(MOST_DIGITS - int(f"{mean:.{MOST_DIGITS - 1}e}".split("e")[1]) - 1, 0)
+    most = max(TOLD.digits - int(f"{mean:.{TOLD.digits - 1}e}".split("e")[1]) - 1, 0)
     if places > most:
         return f"{mean:.{most}f} +- {sd:.2g}"
     return f"{mean:.{places}f} +- {sd:.{places}f}"

@@ -15,6 +15,7 @@ from sbi_active.criticism.next_trial import (
     choose_action,
     outside_candidates,
 )
+from sbi_active.criticism.next_trial.candidates import simulated
 from sbi_active.criticism.results import ModelKey
 from sbi_active.information_gain import ModelIndexGain, RivalSampler
 
@@ -150,6 +151,17 @@ def test_a_simulator_that_fails_outside_its_range_names_nothing():
     chosen = c.next_action()
     assert chosen.action is None
     assert chosen.outside is None or float(chosen.outside[0]) > 0
+
+
+def test_there_is_nothing_beyond_labels():
+    one = torch.ones(3)
+    own = Trials(None, 0.7 * one, start={"place": one})
+    model = SimulatorModel(
+        lambda theta, xi, *, start: theta * start["place"][:, None],
+        noise=GaussianNoise(NOISE),
+    )
+    c = Criticism(model, PRIOR, own, effects=[BIAS])
+    assert len(simulated(c.rivals, torch.tensor([[3.5]]))) == 0
 
 
 def test_the_same_seed_gives_the_same_choice():
