@@ -100,29 +100,15 @@ def _helping(report: Contents, misfit: Misfit) -> str:
     """Return what helps where every model misses, and what of it is named."""
     if not misfit.helps:
         return "no declared effect helps to predict them"
-    named = [f"{n} ({stated(misfit.cause[n])})" for n in misfit.named]
-    rest = [n for n in misfit.helps if n not in misfit.named]
-    found = [f"{listed(named)} {_are(named)} probably the cause"] if named else []
-    if rest:
-        verb = "helps" if len(rest) == 1 else "help"
-        found.append(
-            f"{listed(rest)} {verb} to predict inside the tried range and "
-            f"{_are(rest)} not named: do not read phi as physics"
-        )
-    described = _described(report, misfit.helps, only_described=True)
-    return "; ".join([*found, *([described] if described else [])])
+    line = misfit_line(report.verdict, misfit).removeprefix(f"{UNEXPLAINED}: ")
+    described = _described(report, misfit.helps)
+    return line if described == listed(misfit.helps) else f"{line}; {described}"
 
 
-def _described(
-    report: Contents, names: Sequence[str], *, only_described: bool = False
-) -> str:
+def _described(report: Contents, names: Sequence[str]) -> str:
     """Return effects with what each does."""
     words = {e.name: e.describe.rstrip(".") for e in report.tracing.estimates}
-    told = [
-        f"{name} ({words[name]})" if words.get(name) else name
-        for name in names
-        if words.get(name) or not only_described
-    ]
+    told = [f"{n} ({words[n]})" if words.get(n) else n for n in names]
     return listed(told) if told else ""
 
 
@@ -175,8 +161,6 @@ def _left(report: Contents) -> str:
     else:
         own = root_mean_square(found.refitted)
         told += f"{own:.2g} times the prediction's standard deviation"
-        if own.size and left.shape[2] == 1:
-            told += f", {sizes(report, root_mean_square(left, (0, 1)))}"
     misfit = report.tracing.misfit
     if misfit is not None and misfit.helps:
         remains = misfit.of(str(ModelKey(misfit.helps))).remains

@@ -61,7 +61,6 @@ def test_the_report_says_what_remains(named):
     assert "), beside something undeclared; cubic helps" in line
     passing = replace(report.tracing.misfit, passes=True)
     assert "); cubic helps" in misfit_line(report.verdict, passing)
-    assert "is probably the cause" in text
     assert "% of the excess over the sensor's remains" in text
     assert "Models that predict" in text
     assert report.parameters.set_index("parameter").loc["lag", "after"] > 0.05
