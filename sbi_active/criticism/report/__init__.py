@@ -5,6 +5,5 @@ fit.
 """
 
 from sbi_active.criticism.report.report import build_report
-from sbi_active.criticism.report.words import with_error
 
-__all__ = ["build_report", "with_error"]
+__all__ = ["build_report"]

@@ -10,12 +10,8 @@ from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
-from sbi_active.criticism.next_trial import (
-    PredictedRival,
-    choose_action,
-    outside_candidates,
-)
-from sbi_active.criticism.next_trial.candidates import simulated
+from sbi_active.criticism.next_trial.candidates import outside_candidates, simulated
+from sbi_active.criticism.next_trial.next_action import PredictedRival, choose_action
 from sbi_active.criticism.results import ModelKey
 from sbi_active.information_gain import ModelIndexGain, RivalSampler
 

@@ -9,7 +9,7 @@ from torch.distributions import Independent, Normal
 from sbi_active import BoxActions, DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism import Criticism, Effect, Trials, generic_effects
-from sbi_active.criticism.next_trial import extrapolated
+from sbi_active.criticism.next_trial.candidates import extrapolated
 from sbi_active.criticism.next_trial.severe_tests import severe_tests
 from sbi_active.criticism.steps import predict
 
@@ -114,7 +114,7 @@ def test_the_verdict_fails_most_where_it_is_put_to_the_test(aliased):
 
 def _missed(criticism, action):
     """Return how far the verdict is from the truth, root mean square over x."""
-    from sbi_active.criticism.next_trial import following
+    from sbi_active.criticism.next_trial.candidates import following
 
     trials = following(criticism.rivals, action[None])
     key = criticism.trace().key

@@ -12,8 +12,8 @@ from sbi.utils import BoxUniform
 from sbi_active import AutocorrelatedNoise, SimulatorModel
 from sbi_active.criticism import Trials, joint_prior
 from sbi_active.criticism.contradictions import MissedTrial, SevereTest
-from sbi_active.criticism.report import with_error
 from sbi_active.criticism.report.summary import sentences
+from sbi_active.criticism.report.words import with_error
 from sbi_active.criticism.under_misfit import Misfit, ModelError, Odds
 from tests.criticism.report.reports import (
     DRAG,
