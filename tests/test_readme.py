@@ -100,7 +100,7 @@ def test_methods(run, capsys):
 
 def test_closing_the_loop(run, capsys):
     pages = run("docs/closing_the_loop.md")
-    _, bare, _, forces, starts, drag, campaign, *motor = pages
+    _, bare, _, forces, drag, starts, campaign, *motor = pages
     printed = capsys.readouterr().out
     assert bare.report.verdict == "unexplained"
     assert printed.startswith("unexplained\nVerdict: drag (P ")

@@ -37,7 +37,7 @@ from benchmarks.measured.go2_leg import DATA, LEGS, Leg, read_leg, usual_paramet
 from benchmarks.measured.verdicts import center, row_of, said
 from benchmarks.rows import keep, measured, stages
 from sbi_active.criticism import Criticism, Effect
-from sbi_active.criticism.report.under_misfit import misfit_line
+from sbi_active.criticism.report.summary import misfit_line
 from sbi_active.criticism.results import ModelKey, Tracing
 from sbi_active.display.table import Table
 from sbi_active.mujoco import Robot, force_effects, mjcf_effects

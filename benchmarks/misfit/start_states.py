@@ -31,7 +31,7 @@ from benchmarks.criticism.intervals import rate
 from benchmarks.rows import append, read
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
-from sbi_active.criticism.report.numbers import FEWEST_DRAWS
+from sbi_active.criticism.report.words import TOLD
 from sbi_active.criticism.results import NONE
 
 __all__ = ["Case", "draw_case", "main", "score_case", "summary"]
@@ -176,7 +176,7 @@ def score_case(number: int, *, is_hidden: bool) -> dict[str, object]:
         "simulations": loop.rivals.simulator.num_simulations,
         "simulator_seconds": spent[0],
         "ess_alone": float(alone.min()),
-        "not_printed": int((alone < FEWEST_DRAWS).sum()),
+        "not_printed": int((alone < TOLD.draws).sum()),
         "inside": inside,
         "intervals": intervals,
         "dearest": f"{dearest.name}: {dearest.num_simulations}",

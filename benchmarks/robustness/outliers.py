@@ -23,7 +23,7 @@ from benchmarks.criticism.cases import draw_case
 from benchmarks.criticism.worlds import get_world
 from benchmarks.rows import append, read
 from sbi_active.criticism import Criticism, Trials
-from sbi_active.criticism.report.suspects import suspects
+from sbi_active.criticism.report.summary import suspects
 from sbi_active.seeding import derive_seed
 
 RESULTS = Path(__file__).parent / "results" / "outliers.csv"

@@ -82,15 +82,16 @@ def _label(actions: Any, what: str, text: str | None) -> None:
 
 def criticize(
     campaign: Campaign, *, effects: str | None, out: Path | None = None
-) -> None:
-    """Compare the campaign's simulator with its trials, and print the report."""
+) -> Answer:
+    """Return the report of a comparison of the simulator with the trials."""
     report = campaign.criticize(library_of(campaign, effects_of([effects])))
-    print(report)
+    text = [str(report)]
     if out is not None:
-        print(f"\nsaved: {report.save(out)}")
+        text.append(f"saved: {report.save(out)}")
     if report.tracing.chosen:
         named = "" if effects is None else f" --effects {effects}"
-        print(f"\nto go on with it: sbi-active adopt {campaign.directory}{named}")
+        text.append(f"to go on with it: sbi-active adopt {campaign.directory}{named}")
+    return Answer(report.to_dict(), "\n\n".join(text))
 
 
 def adopt(campaign: Campaign, *, effects: str | None) -> Answer:

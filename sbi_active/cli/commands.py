@@ -139,7 +139,7 @@ INIT = [
 ]
 CRITICIZE = [
     _argument("trials", "TRIALS.csv", FILE, is_eager=True, callback=take_problem),
-    *(CONFIG, A_TASK, SIMULATOR, *SPACE, EFFECTS, SEED, TRUST),
+    *(CONFIG, A_TASK, SIMULATOR, *SPACE, EFFECTS, SEED, TRUST, JSON),
     _several(
         "--columns",
         "columns that are trial, time, action, x, input, start, role, index or "

@@ -23,12 +23,11 @@ from sbi_active.cli.given import (
     with_generic,
     with_noise,
 )
-from sbi_active.cli.output import say
+from sbi_active.cli.output import Answer, say
 from sbi_active.cli.session import Session
 from sbi_active.criticism import Trials, close_loop
 from sbi_active.criticism.data.recordings import read_trials
 from sbi_active.criticism.data.table import TrialTable
-from sbi_active.criticism.effects.augmented import takes_times
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.bank.sqlite import NAME
 
@@ -39,8 +38,14 @@ PROBLEM = ("simulator", "task", "prior", "theta_low", "theta_high", "actions")
 OF_CAMPAIGN = ("simulator", "effects", "out", "trust")
 
 
-def criticize(trials: Path, **given: Any) -> None:
-    """Compare a simulator with measured trials, and print the report."""
+def criticize(trials: Path, *, json: bool = False, **given: Any) -> Answer | None:
+    """Return the report of a comparison of a simulator with measured trials.
+
+    Args:
+        trials: Table of trials, folder of recordings, or campaign.
+        json: Whether a program asked, which the caller knows how to answer.
+        **given: Options by name.
+    """
     if trials.is_dir():
         if has_manifest(trials):
             return _criticize_campaign(trials, given)
@@ -80,15 +85,15 @@ def criticize(trials: Path, **given: Any) -> None:
         designed=given["designed"],
         show_progress=sys.stderr.isatty(),
     )
-    print(report)
+    text = [str(report)]
     if table.columns.time is not None or any(table.columns.units.values()):
-        print(f"\n{_described(trials, table, measured)}")
+        text.append(_described(trials, table, measured))
     if given["out"] is not None:
-        print(f"\nsaved: {report.save(given['out'])}")
-    return None
+        text.append(f"saved: {report.save(given['out'])}")
+    return Answer(report.to_dict(), "\n\n".join(text))
 
 
-def _criticize_campaign(folder: Path, given: dict[str, Any]) -> None:
+def _criticize_campaign(folder: Path, given: dict[str, Any]) -> Answer | None:
     """Compare a campaign with its own trials; it brings most of what a table lacks."""
     source = click.get_current_context().get_parameter_source
     for name in given:
@@ -99,7 +104,7 @@ def _criticize_campaign(folder: Path, given: dict[str, Any]) -> None:
                 f"{folder} has its own"
             )
     with Session(folder) as session:
-        session.call("criticize", **{name: given[name] for name in OF_CAMPAIGN})
+        return session.call("criticize", **{name: given[name] for name in OF_CAMPAIGN})
 
 
 def _take_module(path: Path, given: dict[str, Any]) -> None:
@@ -177,7 +182,7 @@ def _with_times(model: SimulatorModel, trials: Trials, path: Path) -> SimulatorM
     own, fn = trials.sample_times, model.fn
     assert own is not None
     ragged = not torch.equal(own.expand(len(trials), -1), times.expand(len(trials), -1))
-    if not takes_times(model):
+    if "times" not in model.conditions:
         if ragged:
             raise ValueError(
                 "expected a simulator that takes times=, shape (n, k), where trials "

@@ -118,7 +118,9 @@ def require_fitting(
         times, grid = model.sample_times, trials.input_times
         assert times is not None
         assert grid is not None
-        require_covered(times[None], dict.fromkeys(trials.inputs, grid[None]))
+        require_covered(
+            times[None], dict.fromkeys(trials.inputs, grid[None]), trials.names
+        )
     if actions is not None:
         _warn_outside(trials, actions)
     theta, action = _some_rows(prior, trials)

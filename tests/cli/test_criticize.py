@@ -1,5 +1,6 @@
 """``sbi-active criticize``: from a file to a report."""
 
+import json
 import math
 import subprocess
 import sys
@@ -67,8 +68,10 @@ def test_a_file_gives_a_report(capsys):
 def test_a_held_out_row_in_another_unit_is_named(capsys):
     measure(last=100.0)
     options = [*OPTIONS, "--effects", "my_robot:effects", "--out", "found"]
-    assert run("--simulator", "my_robot:distance", *options) == 0
-    first = capsys.readouterr().out.splitlines()[0]
+    assert run("--simulator", "my_robot:distance", *options, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    first = found["line"]
+    assert "SA514" in [code for code, _ in found["warnings"]]
     assert first.startswith("Verdict: drag (P")  # whatever that row says
     assert "held-out trial 10 is far outside it" in first
     page = Path("found/report.html").read_text()

@@ -29,7 +29,7 @@ CAUGHT = 9
 #: What takes messages.
 GATHERED = re.compile(r"warn|.*\.warned|(texts|warnings|defects|self\.notes)\.append")
 #: What is yielded there is one sentence of a report each.
-YIELDED = {"cautions.py", "suspects.py", "given.py"}
+YIELDED = {"given.py"}
 
 
 def nodes() -> list[tuple[Path, ast.AST]]:
@@ -67,6 +67,9 @@ def texts(path: Path, node: ast.AST) -> list[ast.expr]:
     if isinstance(node, ast.Call):
         called = ast.unparse(node.func)
         return node.args if GATHERED.fullmatch(called) else []
+    if isinstance(node, ast.Tuple) and path.name == "cautions.py":
+        is_row = len(node.elts) == 2 and not constants(node.elts[0])
+        return [e for e in node.elts[1:] if is_row and constants(e)]  # holds, text
     if isinstance(node, ast.Tuple) and path.name == "trust.py":
         return node.elts[2:3]  # holds, figure, text
     return []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -32,6 +32,7 @@ def inputs_of(
     times: Any,
     x: Tensor,
     x_times: Tensor | None,
+    names: Sequence[str],
     *,
     hold: Hold = "previous",
 ) -> tuple[dict[str, Tensor] | None, Tensor | None]:
@@ -43,6 +44,7 @@ def inputs_of(
             such by name; None takes those of x where there are as many.
         x: Observations that were measured, shape (t, k, ...).
         x_times: Times of x, shape (k,) or (t, k).
+        names: Names of the trials.
         hold: Value between two times, as in :func:`on_one_grid`.
 
     Raises:
@@ -52,7 +54,7 @@ def inputs_of(
         if times is not None:
             raise ValueError("expected inputs with input_times; got none; pass inputs=")
         return None, None
-    series = named_series(inputs, len(x))
+    series = _named_series(inputs, names)
     if times is None:
         length = next(iter(series.values())).shape[1]
         if x_times is None or x_times.shape[-1] != length:
@@ -63,45 +65,44 @@ def inputs_of(
             )
         times = x_times
     stamps = _stamps(series, times)
-    grid = on_one_grid(series, stamps, hold=hold)
+    grid = _on_one_grid(series, stamps, names, hold)
     if x_times is not None:
         has_x = x.isfinite().reshape(*x.shape[:2], -1).any(-1)
-        require_covered(x_times.expand(has_x.shape).where(has_x, torch.nan), stamps)
+        measured = x_times.expand(has_x.shape).where(has_x, torch.nan)
+        require_covered(measured, stamps, names)
     return grid
 
 
-def named_series(inputs: Any, num: int) -> dict[str, Tensor]:
-    r"""Return inputs by name, each of shape (num, m), shorter ones padded with NaN.
+def _named_series(inputs: Any, names: Sequence[str]) -> dict[str, Tensor]:
+    r"""Return inputs by name, each of shape (t, m), shorter ones padded with NaN.
 
     Args:
-        inputs: {name: series}, each of shape (num, m), (m,) for one that all trials
-            share, or a list of num arrays; without a name (num, m), (m,), (num, m, c)
-            or a list, called "input", or "input 1" to "input c".
-        num: Number of trials.
-
-    Raises:
-        ValueError: If shapes disagree or a number is infinite.
+        inputs: {name: series}, each of shape (t, m), (m,) for one that all trials
+            share, or a list of t arrays; without a name (t, m), (m,), (t, m, c) or a
+            list, called "input", or "input 1" to "input c".
+        names: Names of the trials.
     """
     if isinstance(inputs, Mapping):
         if not inputs or not all(isinstance(name, str) for name in inputs):
             raise ValueError(
                 f"expected inputs as {{name: series}}; got {[*inputs]}; name each input"
             )
-        return {name: _series(name, value, num) for name, value in inputs.items()}
+        return {name: _series(name, value, names) for name, value in inputs.items()}
     value = padded(inputs)
     if value.ndim == 3 and value.shape[-1] > 1:
         return {
-            f"input {j + 1}": _series(f"input {j + 1}", part, num)
+            f"input {j + 1}": _series(f"input {j + 1}", part, names)
             for j, part in enumerate(value.unbind(-1))
         }
-    return {"input": _series("input", value[..., 0] if value.ndim == 3 else value, num)}
+    value = value[..., 0] if value.ndim == 3 else value
+    return {"input": _series("input", value, names)}
 
 
-def on_one_grid(
+def _on_one_grid(
     series: Mapping[str, Tensor],
     stamps: Mapping[str, Tensor],
-    *,
-    hold: Hold = "previous",
+    names: Sequence[str],
+    hold: Hold,
 ) -> tuple[dict[str, Tensor], Tensor]:
     """Return series on one uniform grid, and the grid.
 
@@ -112,12 +113,9 @@ def on_one_grid(
     Args:
         series: Series by name, shape (t, m), NaN after the last value of a trial.
         stamps: Times of the values, by name, shape (t, m), NaN where there are none.
+        names: Names of the trials.
         hold: "previous" holds each value until the next one, as a command is held;
             "linear" draws lines between them.
-
-    Raises:
-        ValueError: If times and values differ in number, a value is missing, times do
-            not increase, or leave a gap.
     """
     if hold not in get_args(Hold):
         raise ValueError(
@@ -125,12 +123,12 @@ def on_one_grid(
         )
     lengths = {
         name: [
-            _length(f"input {name!r} of trial {i}", u, t)
-            for i, (u, t) in enumerate(zip(value, stamps[name], strict=True))
+            _length(f"input {name!r} of trial {trial}", u, t)
+            for trial, u, t in zip(names, value, stamps[name], strict=True)
         ]
         for name, value in series.items()
     }
-    grid = _grid(stamps, lengths)
+    grid = _grid(stamps, lengths, names)
     if grid is None:
         own = next(iter(stamps.values()))[0].clone()
         return {name: value.clone() for name, value in series.items()}, own
@@ -162,12 +160,15 @@ def held_at(
     return {name: value[:, place] for name, value in series.items()}
 
 
-def require_covered(x_times: Tensor, stamps: Mapping[str, Tensor]) -> None:
+def require_covered(
+    x_times: Tensor, stamps: Mapping[str, Tensor], names: Sequence[str]
+) -> None:
     """Raise if x was measured long before or after an input of its trial.
 
     Args:
         x_times: Times of what was measured, shape (t, k), NaN for none.
         stamps: Times of the inputs, by name, shape (t, m).
+        names: Names of the trials.
     """
     for name, times in stamps.items():
         for i, row in enumerate(x_times):
@@ -179,9 +180,9 @@ def require_covered(x_times: Tensor, stamps: Mapping[str, Tensor]) -> None:
             far = own[(own < first - slack) | (own > last + slack)]
             if len(far):
                 raise ValueError(
-                    f"expected x of trial {i} measured within the time of its input "
-                    f"{name!r}, {first:g} to {last:g}; got x at {far[0]:g}; give both "
-                    "in one unit and from one origin, or leave out the samples beyond"
+                    f"expected x of trial {names[i]} measured within the time of its "
+                    f"input {name!r}, {first:g} to {last:g}; got x at {far[0]:g}; give "
+                    "both in one unit and from one origin, or leave out what is beyond"
                 )
 
 
@@ -206,8 +207,8 @@ def _stamps(series: Mapping[str, Tensor], times: Any) -> dict[str, Tensor]:
     return found
 
 
-def _series(name: str, value: Any, num: int) -> Tensor:
-    found = padded(value)
+def _series(name: str, value: Any, names: Sequence[str]) -> Tensor:
+    found, num = padded(value), len(names)
     if found.ndim == 3 and found.shape[-1] == 1:
         found = found[..., 0]
     if found.ndim == 1 and len(found) > 1:
@@ -221,8 +222,8 @@ def _series(name: str, value: Any, num: int) -> Tensor:
     if bool(found.isinf().any()):
         i, k = found.isinf().nonzero()[0].tolist()
         raise ValueError(
-            f"expected finite values of input {name!r}; got inf in trial {i}, value "
-            f"{k}; correct it"
+            f"expected finite values of input {name!r}; got inf in trial {names[i]}, "
+            f"value {k}; correct it"
         )
     return found
 
@@ -255,8 +256,13 @@ def _length(what: str, values: Tensor, times: Tensor) -> int:
         )
     has = values.isfinite()
     last = int(has.nonzero().max()) + 1 if bool(has.any()) else 0
-    if last < 2 or not bool(has[:last].all()):
-        k = 0 if last < 2 else int((~has[:last]).nonzero()[0])
+    if last < 2:
+        raise ValueError(
+            f"expected two or more values; got {last} of {what}; pass what does not "
+            "vary in time as the action, action_* in a table"
+        )
+    if not bool(has[:last].all()):
+        k = int((~has[:last]).nonzero()[0])
         raise ValueError(
             f"expected a value at each time; got NaN for {what}, value {k}; fill it "
             "in, or leave the trial out"
@@ -270,7 +276,9 @@ def _length(what: str, values: Tensor, times: Tensor) -> int:
 
 
 def _grid(
-    stamps: Mapping[str, Tensor], lengths: Mapping[str, list[int]]
+    stamps: Mapping[str, Tensor],
+    lengths: Mapping[str, list[int]],
+    names: Sequence[str],
 ) -> Array | None:
     """Return the grid, None if all are on one that is uniform already."""
     every = [*stamps.values()]
@@ -287,35 +295,38 @@ def _grid(
     step = min(float(np.median(np.diff(t))) for own in known for t in own)
     ends = [(min(t[0] for t in own), max(t[-1] for t in own)) for own in known]
     low, high = min(begin for begin, _ in ends), max(end for _, end in ends)
-    _require_one_origin(ends, low)
+    _require_one_origin(ends, low, names)
     # Where the last time is between two steps, the grid goes up to the next.
     num = max(int(np.ceil((high - low) / step - ON_TIME)), 1)
     return low + step * np.arange(num + 1)
 
 
-def _require_one_origin(ends: list[tuple[float, float]], low: float) -> None:
+def _require_one_origin(
+    ends: list[tuple[float, float]], low: float, names: Sequence[str]
+) -> None:
     """Raise, or warn, where trials begin long after the grid: they hold what is first.
 
     Pieces of one record have its clock, and a simulator would run up to each.
     """
     late = [
-        (i, begin - low, end - begin)
-        for i, (begin, end) in enumerate(ends)
+        (name, begin - low, end - begin)
+        for name, (begin, end) in zip(names, ends, strict=True)
         if begin - low > FAR * (end - begin)
     ]
     if not late:
         return
-    i, after, span = max(late, key=lambda each: each[1] / each[2])
+    name, after, span = max(late, key=lambda each: each[1] / each[2])
     remedy = "give the times of each trial, those of x too, from its own begin"
     if after > span:
         raise ValueError(
-            f"expected trials that begin at similar times; got trial {i} of {span:g} "
-            f"that begins {after:g} after the earliest; {remedy}, and all in one unit"
+            "expected trials that begin at similar times; got trial "
+            f"{name} of {span:g} that begins {after:g} after the earliest; {remedy}, "
+            "and all in one unit"
         )
     warn(
-        f"SA208 trials {[i for i, *_ in late]} begin up to {after:g} after the "
-        f"earliest, and hold their first inputs until then: {remedy} where a "
-        "simulator starts there",
+        f"SA208 trials {', '.join(each[0] for each in late)} begin up to {after:g} "
+        "after the earliest, and hold their first inputs until then: "
+        f"{remedy} where a simulator starts there",
         stacklevel=stack_level(),
     )
 

@@ -25,13 +25,29 @@ from sbi_active.criticism.data.trials import Trials
 
 Array = NDArray[Any]
 
-#: Correlation of neighboring innovations that counts as none, and the multiple of its
-#: standard error :math:`1 / \sqrt{N}` that does.
-INDEPENDENT, SIGNIFICANT = 0.2, 3.0
-#: Samples of the median trial that are left, at least.
-FEWEST = 8
-#: Correlation times that are tried, from .2 steps to 2 spans of the recording.
-NUM_TIMES, SHORTEST, LONGEST = 40, 0.2, 2.0
+
+@dataclass(frozen=True, kw_only=True)
+class NeedSettings:
+    """Settings of the sampling that trials need.
+
+    Attributes:
+        independent: Correlation of neighboring innovations that counts as none.
+        significant: Multiple of its standard error that counts as none.
+        fewest: Samples of the median trial that are left, at least.
+        num_times: Number of correlation times that are tried.
+        shortest: The shortest of them, in steps.
+        longest: The longest of them, in spans of the recording.
+    """
+
+    independent: float = 0.2
+    significant: float = 3.0
+    fewest: int = 8
+    num_times: int = 40
+    shortest: float = 0.2
+    longest: float = 2.0
+
+
+NEED = NeedSettings()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +125,7 @@ def suggested_sampling(trials: Trials, residuals: Any, times: Any = None) -> Sam
     count = int(np.median(np.isfinite(series).sum(1)))
     found: list[float] = []
     is_hidden = True  # and may yet show
-    for every in range(1, max(count // FEWEST, 1) + 1):
+    for every in range(1, max(count // NEED.fewest, 1) + 1):
         correlation, num = _innovations(series, stamps, every)
         found.append(correlation)
         if not _independent(correlation, num):
@@ -171,7 +187,7 @@ def _stamps(trials: Trials, times: Any) -> Array:
 
 def _independent(correlation: float, num: int) -> bool:
     # Differences of independent errors are correlated as well, with the other sign.
-    return correlation <= max(INDEPENDENT, SIGNIFICANT / np.sqrt(max(num, 1)))
+    return correlation <= max(NEED.independent, NEED.significant / np.sqrt(max(num, 1)))
 
 
 def _innovations(series: Array, stamps: Array, every: int) -> tuple[float, int]:
@@ -188,7 +204,9 @@ def _innovations(series: Array, stamps: Array, every: int) -> tuple[float, int]:
         return 0.0, 0
     step, span = np.nanmedian(gaps), np.nanmax(t) - np.nanmin(t)
     best, chosen = -np.inf, np.zeros((len(r), 0))
-    for tau in np.geomspace(SHORTEST * step, max(LONGEST * span, step), NUM_TIMES):
+    for tau in np.geomspace(
+        NEED.shortest * step, max(NEED.longest * span, step), NEED.num_times
+    ):
         variance = -np.expm1(-2 * gaps / tau)
         e = (r[:, 1:] - np.exp(-gaps / tau) * r[:, :-1]) / np.sqrt(variance)
         seen = np.isfinite(e)

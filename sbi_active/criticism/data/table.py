@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from sbi_active.callers import stack_level
 from sbi_active.criticism.data.table_columns import Columns, bare, find_columns
-from sbi_active.criticism.data.table_inputs import InputRows
-from sbi_active.criticism.data.table_rows import Rows, read_frame
+from sbi_active.criticism.data.table_rows import InputRows, Rows, read_frame
 from sbi_active.messages import warn
 
 Array = NDArray[Any]
@@ -179,12 +178,6 @@ class _TrialRows(Rows):
             found["action"] = None
         if inputs is not None:
             found |= inputs.arguments()
-            if columns.time is not None:
-                has_x = np.isfinite(x).any(1)
-                at = np.flatnonzero(has_x)
-                inputs.require_covered(
-                    self.code[at], time[at], lambda i: self.place(at[i]), self.source
-                )
         if columns.start:
             found["start"] = {columns.short(c): self.constant(c) for c in columns.start}
         if columns.time is not None:

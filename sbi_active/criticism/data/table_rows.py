@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +13,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from sbi_active.callers import stack_level
 from sbi_active.criticism.data.table_columns import PREFIXES, Columns
-from sbi_active.criticism.data.table_inputs import InputRows
+from sbi_active.messages import warn
 
 Array = NDArray[Any]
 
@@ -25,6 +28,77 @@ def read_frame(table: str | Path | pd.DataFrame, name: str) -> tuple[pd.DataFram
     frame = table if is_frame else read_csv(Path(table))
     frame = frame.set_axis([str(c).strip() for c in frame.columns], axis=1)
     return frame, name if is_frame else str(table)
+
+
+@dataclass(frozen=True, kw_only=True)
+class InputRows:
+    """The rows of a table that hold inputs.
+
+    Attributes:
+        names: Names of the inputs, each with its label.
+        values: Values of the inputs, shape (n, c), NaN where a cell is empty.
+        time: Times in s, shape (n,).
+        members: Rows of each trial.
+        trials: Names of the trials; one empty name where all share the series.
+        place: Function that returns the name of a row in messages.
+        source: Name of the table in messages.
+    """
+
+    names: dict[str, str]
+    values: Array
+    time: Array
+    members: Sequence[Array]
+    trials: Sequence[str]
+    place: Callable[[Any], str]
+    source: str
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the inputs as arguments of ``Trials``."""
+        has = np.isfinite(self.values)
+        found, times = {}, {}
+        for j, name in enumerate(self.names):
+            rows = [at[has[at, j]] for at in self.members]
+            found[name] = [self.values[at, j] for at in rows]
+            times[name] = [self.time[at] for at in rows]
+        return {
+            "inputs": found,
+            "input_times": times,
+            "input_labels": [*self.names.values()],
+        }
+
+    def note_empty(self, measured: Array) -> None:
+        """Warn of rows with a measurement in which no input stands.
+
+        Args:
+            measured: Mask of the rows that have one, shape (n,), bool.
+        """
+        lost = np.flatnonzero(measured & ~np.isfinite(self.values).any(1))
+        if len(lost):
+            warn(
+                f"SA209 {len(lost)} rows of {self.source} have a measurement and no "
+                f"input, the first in {self.place(lost[0])}; there the input before "
+                "holds",
+                stacklevel=stack_level(),
+            )
+
+    def of(self, trials: Sequence[str]) -> InputRows:
+        """Return the rows of some trials, in their order.
+
+        Raises:
+            ValueError: If one of them has none.
+        """
+        place = {name: i for i, name in enumerate(self.trials)}
+        if [*place] == [""]:
+            place = dict.fromkeys(trials, 0)
+        for name in trials:
+            if name not in place:
+                raise ValueError(
+                    f"expected inputs of each trial; got none of trial {name} in "
+                    f"{self.source}, whose trials are {', '.join(self.trials)}; add "
+                    "its rows, or leave the trial out"
+                )
+        members = [self.members[place[name]] for name in trials]
+        return replace(self, members=members, trials=[*trials])
 
 
 class Rows:

@@ -166,8 +166,9 @@ class Trials:
         self._names = require_names(names, n)
         self.x = without_inf(self.x, self.names)
         self.sample_times = sample_times_of(sample_times, self.x, self.names)
+        measured_x = (self.x, self.sample_times, self.names)
         self.inputs, self.input_times = inputs_of(
-            inputs, input_times, self.x, self.sample_times, hold=input_hold
+            inputs, input_times, *measured_x, hold=input_hold
         )
         self.start = start_states(start, n)
         self.repeat_of = (
@@ -193,8 +194,7 @@ class Trials:
                 f"expected at least one valid trial; got {n} trials without a "
                 "measurement; check x and mask for NaN"
             )
-        lost = [i for i in self.held_out_positions if not bool(self.valid[i])]
-        if lost:
+        if lost := [i for i in self.held_out_positions if not bool(self.valid[i])]:
             raise ValueError(
                 f"expected measurements in the held-out trials; got NaN in "
                 f"{self.called(lost)}; hold out other trials"

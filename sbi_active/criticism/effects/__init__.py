@@ -4,7 +4,6 @@ This package contains effects, their checks and priors. The comparison of effect
 trials is elsewhere.
 """
 
-from sbi_active.criticism.effects.declarations import require_nested
 from sbi_active.criticism.effects.joint_prior import JointPrior
 
-__all__ = ["JointPrior", "require_nested"]
+__all__ = ["JointPrior"]

@@ -11,10 +11,13 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from sbi_active.criticism.effects.application import applied
+from sbi_active.criticism.effects.application import (
+    applied,
+    change_at_null,
+    require_positive,
+)
 from sbi_active.criticism.effects.declarations import require_distinct
 from sbi_active.criticism.effects.effect import Context, Effect
-from sbi_active.criticism.effects.null_check import change_at_null, require_positive
 from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.conditions import CONDITIONS, at_rows, played, typed
@@ -56,8 +59,6 @@ class AugmentedSimulator(SimulatorModel):
     Attributes:
         base: The simulator without any effect.
         effects: Effects, all of them.
-        takes_times: Whether the simulator's function has an argument ``times``, shape
-            (n, k), for the times at which each row is measured.
     """
 
     def __init__(
@@ -71,7 +72,6 @@ class AugmentedSimulator(SimulatorModel):
         is_more = isinstance(model, AugmentedSimulator)
         before = model.effects if is_more else []
         base = self.base = model.base if is_more else model
-        self.takes_times = takes_times(base)
         self.effects = [*before, *effects]
         require_distinct(self.effects, base.parameter_names or ())
         self.next_index = next_index
@@ -116,7 +116,6 @@ class AugmentedSimulator(SimulatorModel):
         action: Tensor,
         *,
         index: Tensor | None = None,
-        times: Tensor | None = None,
         context: Context | None = None,
         seeds: Tensor | None = None,
         merge: bool = False,
@@ -130,9 +129,8 @@ class AugmentedSimulator(SimulatorModel):
             phi: Parameters by effect, (n, phi_dim); effects that are left out vanish.
             action: Actions as commanded, shape (n, action_dim).
             index: Place of each row's trial, shape (n,); None is ``next_index``.
-            times: Sample times, shape (k,) or (n, k); None takes the model's.
-            context: Conditions under which each row's trial was run, in place of index
-                and times.
+            context: Conditions under which each row's trial was run, in place of the
+                index.
             seeds: Seeds, one a row, for a simulator that takes them; None gives each
                 row 0 where the noise is declared.
             merge: Whether to simulate equal rows only once, as where an action was
@@ -141,7 +139,7 @@ class AugmentedSimulator(SimulatorModel):
         Returns:
             Shape (n, *x_shape).
         """
-        context = self._row_context(action, index, times, context)
+        context = self._row_context(action, index, context)
         self._check_first(theta, action, context)
         merge = merge and self.noise is not None  # a draw is another at each call
         return self._evaluate(theta, phi, action, context, seeds, merge=merge)
@@ -153,7 +151,6 @@ class AugmentedSimulator(SimulatorModel):
         sd: Tensor,
         *,
         index: Tensor | None = None,
-        times: Tensor | None = None,
         context: Context | None = None,
     ) -> Tensor:
         """Return the noise's standard deviation with effects, of the shape of ``sd``.
@@ -163,10 +160,9 @@ class AugmentedSimulator(SimulatorModel):
             action: Shape (n, action_dim).
             sd: Standard deviation without effects, shape (n, *x_shape).
             index: Place of each row's trial, as in :meth:`evaluate`.
-            times: Sample times, as in :meth:`evaluate`.
             context: Context of the rows, as in :meth:`evaluate`.
         """
-        context = self._row_context(action, index, times, context)
+        context = self._row_context(action, index, context)
         for effect in self._active("noise", phi):
             sd = applied(effect, sd, phi[effect.name], action, context)
         return sd
@@ -244,14 +240,13 @@ class AugmentedSimulator(SimulatorModel):
         self,
         action: Tensor,
         index: Tensor | None = None,
-        times: Tensor | None = None,
         given: Context | None = None,
     ) -> Context:
         """Return what effects may know of rows, of the type of their actions."""
         if given is None:
             if index is None:
                 index = torch.full((len(action),), float(self.next_index))
-            given = Context(index, times)
+            given = Context(index)
         if given.times is None:
             given = replace(given, times=self._times)
         return Context(**{k: typed(v, action.dtype) for k, v in vars(given).items()})
@@ -382,11 +377,6 @@ class AugmentedSimulator(SimulatorModel):
         seeds = row_seeds(0, len(theta))
         with forked_generators(0, "null"):
             return self._evaluate(theta, phi, action, context, seeds)
-
-
-def takes_times(model: SimulatorModel) -> bool:
-    """Return whether the simulator is to be asked for each trial's own times."""
-    return "times" in model.conditions
 
 
 def _row_tensors(keywords: Mapping[str, Any], num: int) -> list[Tensor]:

@@ -7,18 +7,22 @@ from functools import partial
 
 import torch
 from torch import Tensor
-from torch.distributions import (
-    Distribution,
-    HalfNormal,
-    Independent,
-    Normal,
-    Uniform,
-)
+from torch.distributions import Distribution, Independent, Uniform
 
 from sbi_active.actions import ActionSpace, DiscreteActions
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.effects.effect import Context, Effect
+from sbi_active.criticism.effects.changes import (
+    add,
+    clamp_log,
+    drift,
+    scale,
+    shift_in_time,
+)
+from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.generic_series import (
+    SCALES,
+    normal,
+    of_actuator,
     of_inputs,
     of_samples,
     on_channel,
@@ -32,18 +36,6 @@ from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.noise.base import declared_sds
 
-#: Relative error of an actuator or sensor, one prior deviation.
-GAIN = 0.1
-#: Offset and dead zone of an actuator, in ranges of the action space.
-OFFSET = 0.05
-#: Bias of a sensor and its drift a trial, in standard deviations of its noise.
-BIAS, DRIFT = 5.0, 1.0
-#: Error of a clock, in spans of the recording.
-CLOCK = 0.02
-#: Where an actuator saturates, in largest actions.
-LIMIT = (0.3, 1.0)
-#: Where a sensor saturates, in deviations of the prior predictive.
-RANGE = (0.1, 10.0)
 NUM_ACTIONS, NUM_PRIOR = 256, 256
 #: Sensors along a trajectory that have effects each for itself.
 MOST_SENSORS = 4
@@ -170,45 +162,9 @@ def _of_series(
 
 def _of_action(actions: ActionSpace) -> list[Effect]:
     some = actions.sample((NUM_ACTIONS,), seed=0).double()
-    low, high = some.min(0).values, some.max(0).values
-    width = torch.where(high > low, high - low, high.abs().clamp(min=1e-12))
-    largest = some.abs().max(0).values.clamp(min=1e-12)
     units = actions.units[0] if len({*actions.units}) == 1 else ""
-    make = partial(Effect, hook="action", null=0.0)
-    found = [
-        make(
-            "action gain",
-            prior=_normal(torch.full_like(width, GAIN)),
-            apply=_gain,
-            describe="the action that is executed is a multiple of the commanded one",
-        ),
-        make(
-            "action offset",
-            prior=_normal(OFFSET * width),
-            apply=_add,
-            units=units,
-            describe="the action that is executed is shifted from the commanded one",
-        ),
-        make(
-            "action saturation",
-            prior=Independent(Uniform(LIMIT[0] * largest, LIMIT[1] * largest), 1),
-            null=torch.inf,
-            apply=_clamp,
-            units=units,
-            describe="actions beyond a limit are executed at that limit",
-        ),
-    ]
-    if bool(((low < 0) & (high > 0)).any()):
-        found.append(
-            make(
-                "dead zone",
-                prior=Independent(HalfNormal(OFFSET * width), 1),
-                apply=_dead_zone,
-                units=units,
-                describe="actions are executed smaller by a constant, small ones not",
-            )
-        )
-    return found
+    make = partial(Effect, hook="action", units=units)
+    return of_actuator(make, some, "action ", "", "the action")
 
 
 def _of_observation(
@@ -218,20 +174,20 @@ def _of_observation(
     found = [
         make(
             "bias",
-            prior=_normal(BIAS * sd),
-            apply=_add,
+            prior=normal(SCALES.bias * sd),
+            apply=add,
             describe="the sensor reads a constant too much",
         ),
         make(
             "sensor gain",
-            prior=_normal(torch.full_like(sd, GAIN)),
-            apply=_gain,
+            prior=normal(torch.full_like(sd, SCALES.gain)),
+            apply=scale,
             describe="the sensor reads a multiple of the truth",
         ),
         make(
             "drift",
-            prior=_normal(DRIFT * sd),
-            apply=_drift,
+            prior=normal(SCALES.drift * sd),
+            apply=drift,
             units="a trial",
             describe="the sensor's bias grows from trial to trial",
             needs_order=True,
@@ -242,84 +198,25 @@ def _of_observation(
         found.append(
             make(
                 "clock offset",
-                prior=_normal(torch.tensor([CLOCK * span]).double()),
-                apply=_shift_in_time,
+                prior=normal(torch.tensor([SCALES.late * span]).double()),
+                apply=shift_in_time,
                 units="s",
                 describe="the time stamps are late by a constant",
             )
         )
     if spread is not None:
-        low, high = (torch.log(f * spread.reshape(1)) for f in RANGE)
+        low, high = (torch.log(f * spread.reshape(1)) for f in SCALES.range)
         found.append(
             make(
                 "sensor saturation",
                 prior=Independent(Uniform(low, high), 1),
                 null=torch.inf,
-                apply=_clamp_log,
+                apply=clamp_log,
                 units="log",
                 describe="readings beyond a limit are that limit",
             )
         )
     return found
-
-
-def _normal(sd: Tensor) -> Distribution:
-    # Zero where nothing is known of the noise yet; Pyro turns the check of it on.
-    normal = Normal(torch.zeros_like(sd), sd, validate_args=False)
-    return Independent(normal, 1, validate_args=False)
-
-
-def _lift(phi: Tensor, x: Tensor) -> Tensor:
-    """Return phi (n, k) shaped to act on the last axis of x."""
-    return phi.reshape(len(phi), *[1] * (x.ndim - 2), phi.shape[1])
-
-
-def _add(value: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
-    return value + _lift(phi, value)
-
-
-def _gain(value: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
-    return value * (1 + _lift(phi, value))
-
-
-def _drift(value: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
-    return value + _lift(phi * context.index[:, None], value)
-
-
-def _clamp(value: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
-    limit = _lift(phi, value)
-    return torch.minimum(torch.maximum(value, -limit), limit)
-
-
-def _clamp_log(value: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
-    return _clamp(value, phi.exp(), action, context)
-
-
-def _dead_zone(value: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
-    return value.sign() * (value.abs() - _lift(phi, value)).clamp(min=0)
-
-
-def _shift_in_time(
-    value: Tensor, phi: Tensor, action: Tensor, context: Context
-) -> Tensor:
-    """Return x at times + phi, linear between samples and beyond the ends."""
-    if context.times is None:
-        raise ValueError(
-            "expected sample times for an offset of the clock; got none; give "
-            "SimulatorModel(sample_times=...)"
-        )
-    times = context.times.expand(len(value), -1).contiguous()
-    wanted = (times + phi).contiguous()
-    last = times.shape[1] - 2
-    low = (torch.searchsorted(times, wanted, right=True) - 1).clamp(0, last)
-    step = times.gather(1, low + 1) - times.gather(1, low)
-    # What pads a shorter trial has the time of its last sample.
-    step = step.where(step > 0, torch.ones_like(step))
-    weight = (wanted - times.gather(1, low)) / step
-    shape = (*low.shape, *[1] * (value.ndim - 2))
-    index = low.reshape(shape).expand_as(value)
-    weight = weight.reshape(shape)
-    return (1 - weight) * value.gather(1, index) + weight * value.gather(1, index + 1)
 
 
 def _prior_draws(

@@ -1,4 +1,4 @@
-"""Generic effects of what varies in time: actuators on inputs, sensors on samples."""
+"""Generic effects of actuators, and of sensors along their samples."""
 
 from __future__ import annotations
 
@@ -17,38 +17,53 @@ from torch.distributions import (
     Uniform,
 )
 
-from sbi_active.criticism.effects.effect import Context, Effect
+from sbi_active.criticism.effects import changes
+from sbi_active.criticism.effects.changes import (
+    AlongInput,
+    AlongSamples,
+    Change,
+    OnChannel,
+    OnInput,
+)
+from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.series import (
     delayed_input,
     delayed_samples,
     lagged_input,
     lagged_samples,
-    played,
-    rounded,
 )
 
-#: Relative error of an actuator, one prior deviation.
-GAIN = 0.1
-#: Offset, dead zone and backlash of an actuator, in ranges of its input.
-OFFSET = 0.05
-#: Where an actuator saturates, in largest inputs.
-LIMIT = (0.3, 1.0)
-#: Delays and lags, in spans of a recording, and at most in its steps.
-LATE, STEPS = 0.02, 10.0
-#: Quantum of a sensor, and its drift over a recording, in deviations of its noise.
-QUANTUM, DRIFT = 5.0, 5.0
 
-#: Kinds of lateness: what they are called, what they do, and how reports say it.
-LATE_INPUTS = (
-    ("delay", delayed_input, "later"),
-    ("lag", lagged_input, "behind a first-order lag"),
-)
-LATE_SAMPLES = (
-    ("delay", delayed_samples, "what was there before"),
-    ("lag", lagged_samples, "behind a first-order lag"),
-)
+@dataclass(frozen=True, kw_only=True)
+class Scales:
+    """Prior deviations of generic effects, of which half or twice changes odds little.
 
-Change = Callable[[Tensor, Tensor, Context], Tensor]
+    Attributes:
+        gain: Relative error of an actuator or sensor.
+        offset: Offset, dead zone and backlash of an actuator, in ranges of its input.
+        limit: Where an actuator saturates, in largest inputs.
+        bias: Bias of a sensor, in deviations of its noise.
+        drift: Drift of a sensor a trial, in deviations of its noise.
+        creep: Drift of a sensor over a recording, in deviations of its noise.
+        quantum: Quantum of a sensor, in deviations of its noise.
+        range: Where a sensor saturates, in deviations of the prior predictive.
+        late: Delays, lags and a clock's error, in spans of a recording.
+        steps: Steps of a recording that delays and lags are at most.
+    """
+
+    gain: float = 0.1
+    offset: float = 0.05
+    limit: tuple[float, float] = (0.3, 1.0)
+    bias: float = 5.0
+    drift: float = 1.0
+    creep: float = 5.0
+    quantum: float = 5.0
+    range: tuple[float, float] = (0.1, 10.0)
+    late: float = 0.02
+    steps: float = 10.0
+
+
+SCALES = Scales()
 
 
 def typical_delay(times: Tensor) -> float:
@@ -63,7 +78,60 @@ def typical_delay(times: Tensor) -> float:
     span = max(float(row.max() - row.min()) for row in known)
     gaps = torch.cat([row.diff() for row in known])
     step = float(gaps[gaps > 0].median()) if bool((gaps > 0).any()) else span
-    return min(LATE * span, STEPS * step)
+    return min(SCALES.late * span, SCALES.steps * step)
+
+
+def of_actuator(
+    make: Callable[..., Effect], some: Tensor, called: str, before: str, who: str
+) -> list[Effect]:
+    """Return gain, offset, saturation and dead zone of an actuator.
+
+    Args:
+        make: Constructor of an effect from name, prior, null, apply and description.
+        some: Commands, shape (n, k).
+        called: Beginning of the effects' names.
+        before: Beginning of the dead zone's name.
+        who: Name of the command in descriptions.
+    """
+    low, high = some.min(0).values, some.max(0).values
+    width = torch.where(high > low, high - low, high.abs().clamp(min=1e-12))
+    largest = some.abs().max(0).values.clamp(min=1e-12)
+    least, most = SCALES.limit
+    found = [
+        make(
+            f"{called}gain",
+            prior=normal(torch.full_like(width, SCALES.gain)),
+            null=0.0,
+            apply=changes.scale,
+            units="",
+            describe=f"what acts is a multiple of {who}",
+        ),
+        make(
+            f"{called}offset",
+            prior=normal(SCALES.offset * width),
+            null=0.0,
+            apply=changes.add,
+            describe=f"what acts is shifted from {who}",
+        ),
+        make(
+            f"{called}saturation",
+            prior=Independent(Uniform(least * largest, most * largest), 1),
+            null=torch.inf,
+            apply=changes.clamp,
+            describe=f"{who} acts up to a limit",
+        ),
+    ]
+    if bool(((low < 0) & (high > 0)).any()):
+        found.append(
+            make(
+                f"{before}dead zone",
+                prior=_half(SCALES.offset * width),
+                null=0.0,
+                apply=changes.dead_zone,
+                describe=f"{who} acts smaller by a constant, and not where it is small",
+            )
+        )
+    return found
 
 
 def of_inputs(
@@ -79,83 +147,48 @@ def of_inputs(
     found = []
     for name, value in inputs.items():
         before = f"{name} " if len(inputs) > 1 else ""
-        found += _of_input(name, before, value, delay, units.get(name, ""))
+        if bool((value != 0).any()):
+            found += _of_input(name, before, value, delay, units.get(name, ""))
     return found
 
 
 def _of_input(
-    name: str, before: str, value: Tensor, delay: float, units: str
+    name: str, before: str, value: Tensor, delay: float, unit: str
 ) -> list[Effect]:
-    low, high = float(value.min()), float(value.max())
-    largest = max(abs(low), abs(high))
-    if largest == 0:
-        return []
-    width = high - low if high > low else largest
-    called = before or "input "
-    who = f"the input {name}"
+    called, who = before or "input ", f"the input {name}"
 
-    def make(what: str, change: Change, prior: Distribution, **options: Any) -> Effect:
-        return Effect(
-            what,
-            hook="input",
-            prior=Independent(prior, 1),
-            apply=_OfInput(name, change),
-            **{"null": 0.0, **options},
-        )
+    def make(what: str, *, apply: Change, units: str = unit, **options: Any) -> Effect:
+        on = OnInput(name, apply)
+        return Effect(what, hook="input", apply=on, units=units, **options)
 
-    found = [
-        make(
-            f"{called}gain",
-            _gain,
-            _normal(GAIN),
-            describe=f"what acts is a multiple of {who}",
-        ),
-        make(
-            f"{called}offset",
-            _offset,
-            _normal(OFFSET * width),
-            units=units,
-            describe=f"what acts is shifted from {who}",
-        ),
-        make(
-            f"{called}saturation",
-            _clamp,
-            _between(LIMIT[0] * largest, LIMIT[1] * largest),
-            null=torch.inf,
-            units=units,
-            describe=f"{who} acts up to a limit",
-        ),
-    ]
-    if low < 0 < high:
+    known = value[value.isfinite()].double()[:, None]
+    found = of_actuator(make, known, called, before, who)
+    if not bool((value.diff(dim=1) != 0).any()):
+        return found
+    width = known.max(0).values - known.min(0).values
+    for kind, change, how in (
+        ("delay", delayed_input, "later"),
+        ("lag", lagged_input, "behind a first-order lag"),
+    ):
         found.append(
             make(
-                f"{before}dead zone",
-                _dead_zone,
-                _half(OFFSET * width),
-                units=units,
-                describe=f"{who} acts smaller by a constant, and not where it is small",
+                f"{called}{kind}",
+                prior=_half(torch.tensor([delay]).double()),
+                null=0.0,
+                apply=AlongInput(change),
+                units="s",
+                describe=f"{who} acts {how}",
             )
         )
-    if bool((value.diff(dim=1) != 0).any()):
-        found += [
-            *[
-                make(
-                    f"{called}{kind}",
-                    partial(_late, change=change),
-                    _half(delay),
-                    units="s",
-                    describe=f"{who} acts {how}",
-                )
-                for kind, change, how in LATE_INPUTS
-            ],
-            make(
-                f"{before}backlash",
-                _backlash,
-                _half(OFFSET * width),
-                units=units,
-                describe=f"{who} acts after a play at each turn",
-            ),
-        ]
+    found.append(
+        make(
+            f"{before}backlash",
+            prior=_half(SCALES.offset * width),
+            null=0.0,
+            apply=changes.backlash,
+            describe=f"{who} acts after a play at each turn",
+        )
+    )
     return found
 
 
@@ -166,34 +199,36 @@ def of_samples(sd: Tensor, times: Tensor) -> list[Effect]:
         sd: Standard deviation of its noise, one or one a channel.
         times: Times of the samples, shape (k,) or (t, k), NaN for none.
     """
-    delay = _half(typical_delay(times))
+    delay = _half(torch.tensor([typical_delay(times)]).double())
     span = float(times.nan_to_num(-torch.inf).max() - times.nan_to_num(torch.inf).min())
     make = partial(Effect, hook="observation", null=0.0)
-    return [
+    late = [
         make(
-            "drift in time",
-            prior=Independent(Normal(torch.zeros_like(sd), DRIFT * sd / span), 1),
-            apply=_creep,
-            units="1/s",
-            describe="the sensor's bias grows along each recording",
-        ),
-        *[
-            make(
-                f"sensor {kind}",
-                prior=Independent(delay, 1),
-                apply=partial(_of_x, change=change),
-                units="s",
-                describe=f"the sensor reads {how}",
-            )
-            for kind, change, how in LATE_SAMPLES
-        ],
-        make(
-            "sensor quantum",
-            prior=Independent(HalfNormal(QUANTUM * sd), 1),
-            apply=_round,
-            describe="the sensor reads multiples of a step",
-        ),
+            f"sensor {kind}",
+            prior=delay,
+            apply=AlongSamples(change),
+            units="s",
+            describe=f"the sensor reads {how}",
+        )
+        for kind, change, how in (
+            ("delay", delayed_samples, "what was there before"),
+            ("lag", lagged_samples, "behind a first-order lag"),
+        )
     ]
+    creep = make(
+        "drift in time",
+        prior=normal(SCALES.creep * sd / span),
+        apply=changes.creep,
+        units="1/s",
+        describe="the sensor's bias grows along each recording",
+    )
+    quantum = make(
+        "sensor quantum",
+        prior=_half(SCALES.quantum * sd),
+        apply=changes.quantize,
+        describe="the sensor reads multiples of a step",
+    )
+    return [creep, *late, quantum]
 
 
 def on_channel(effect: Effect, channel: int, name: str) -> Effect:
@@ -207,101 +242,17 @@ def on_channel(effect: Effect, channel: int, name: str) -> Effect:
     return replace(
         effect,
         name=f"{name} {effect.name}",
-        apply=_OnChannel(channel, effect.apply),
+        apply=OnChannel(channel, effect.apply),
         describe=f"{name}: {effect.describe}",
     )
 
 
-@dataclass(frozen=True)
-class _OnChannel:
-    """Changes one channel."""
-
-    channel: int
-    change: Callable[..., Any]
-
-    def __call__(
-        self, x: Tensor, phi: Tensor, action: Tensor, context: Context
-    ) -> Tensor:
-        parts = [*x.split(1, -1)]
-        parts[self.channel] = self.change(parts[self.channel], phi, action, context)
-        return torch.cat(parts, -1)
+def normal(sd: Tensor) -> Distribution:
+    """Return a normal prior about zero, one entry a number."""
+    # Zero where nothing is known of the noise yet; Pyro turns the check of it on.
+    one = Normal(torch.zeros_like(sd), sd, validate_args=False)
+    return Independent(one, 1, validate_args=False)
 
 
-@dataclass(frozen=True)
-class _OfInput:
-    """Changes one input."""
-
-    name: str
-    change: Change
-
-    def __call__(
-        self, value: dict[str, Tensor], phi: Tensor, action: Tensor, context: Context
-    ) -> dict[str, Tensor]:
-        return {**value, self.name: self.change(value[self.name], phi, context)}
-
-
-def _normal(sd: float) -> Distribution:
-    return Normal(torch.zeros(1).double(), torch.tensor([sd]).double())
-
-
-def _between(low: float, high: float) -> Distribution:
-    return Uniform(torch.tensor([low]).double(), torch.tensor([high]).double())
-
-
-def _half(sd: float) -> Distribution:
-    return HalfNormal(torch.tensor([sd]).double())
-
-
-def _gain(u: Tensor, phi: Tensor, context: Context) -> Tensor:
-    return u * (1 + phi)
-
-
-def _offset(u: Tensor, phi: Tensor, context: Context) -> Tensor:
-    return u + phi
-
-
-def _clamp(u: Tensor, phi: Tensor, context: Context) -> Tensor:
-    return torch.minimum(torch.maximum(u, -phi), phi)
-
-
-def _dead_zone(u: Tensor, phi: Tensor, context: Context) -> Tensor:
-    return u.sign() * (u.abs() - phi).clamp(min=0)
-
-
-def _backlash(u: Tensor, phi: Tensor, context: Context) -> Tensor:
-    return played(u, phi)
-
-
-def _late(u: Tensor, phi: Tensor, context: Context, *, change: Any) -> Tensor:
-    assert context.input_times is not None
-    return change(u, phi, context.input_times[1] - context.input_times[0])
-
-
-def _sample_times(x: Tensor, context: Context) -> Tensor:
-    if context.times is None:
-        raise ValueError(
-            "expected sample times for an effect along them; got none; give "
-            "Trials(sample_times=...)"
-        )
-    return context.times.to(x.dtype).expand(len(x), -1)
-
-
-def _of_x(
-    x: Tensor, phi: Tensor, action: Tensor, context: Context, *, change: Any
-) -> Tensor:
-    return change(x, phi, _sample_times(x, context))
-
-
-def _creep(x: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
-    times = _sample_times(x, context)
-    since = (times - times[:, :1]).reshape(*times.shape, *[1] * (x.ndim - 2))
-    return x + _along(phi, x) * since
-
-
-def _round(x: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
-    return rounded(x, _along(phi, x))
-
-
-def _along(phi: Tensor, x: Tensor) -> Tensor:
-    """Return phi (n, c) shaped to act on the last axis of x."""
-    return phi.reshape(len(phi), *[1] * (x.ndim - 2), phi.shape[1])
+def _half(sd: Tensor) -> Distribution:
+    return Independent(HalfNormal(sd), 1)

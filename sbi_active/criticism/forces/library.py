@@ -18,6 +18,7 @@ from sbi_active.criticism.forces.dictionary import (
     FORMS,
     FREE,
     NUM_SHAPES,
+    SIZES,
     FormForce,
     Joint,
 )
@@ -28,14 +29,6 @@ from sbi_active.simulation import SimulatorModel
 FAMILY = "force in "
 #: Prefix of forces that depend on another joint.
 COUPLING = "coupling with "
-#: Prior deviation of a force, in root mean squares of what the motion takes.
-SHARE = 0.2
-#: On a slide the unit of q is what 90 % of the time lies within, by this.
-REACH = 1.5
-#: Root mean square of a form along nominal trajectories below which it does not act.
-SMALLEST = 1e-6
-#: Share of the range of q and v by which free shapes reach beyond it.
-MARGIN = 0.1
 
 
 def force_effects(
@@ -117,7 +110,7 @@ def force_effects(
     order = _range_of(trials.index)
     found: list[Effect] = []
     for joint in known:
-        scale = SHARE * nominal.force[joint.dof]
+        scale = SIZES.share * nominal.force[joint.dof]
         for name, family, force in _forces(joint, known, nominal, free=free):
             sized = _sized(force, nominal, scale)
             if sized is not None:
@@ -168,7 +161,7 @@ def _sized(force: FormForce, nominal: Trajectories, scale: float) -> FormForce |
         values = force.values(q, v, float(t) - begin, np.ones(len(q)))
         squares.append((values**2).sum(1).mean())
     size = float(np.sqrt(np.mean(squares)))
-    return None if size < SMALLEST else replace(force, size=scale / size)
+    return None if size < SIZES.smallest else replace(force, size=scale / size)
 
 
 def _effect(
@@ -218,7 +211,7 @@ def _joints(
     found = []
     for k, name in enumerate(names):
         q, v = nominal.q[..., k], nominal.v[..., k]
-        away = np.percentile(np.abs(q), 90) / REACH if name in slides else 1.0
+        away = np.percentile(np.abs(q), 90) / SIZES.reach if name in slides else 1.0
         position = float(max(away, 1e-12))
         velocity = float(max(np.sqrt(np.mean(v**2)), 1e-12))
         low, high = zip(_ends(q / position), _ends(v / velocity), strict=True)
@@ -229,5 +222,5 @@ def _joints(
 
 def _ends(values: Any) -> tuple[float, float]:
     low, high = float(values.min()), float(values.max())
-    margin = MARGIN * max(high - low, 1e-6)
+    margin = SIZES.margin * max(high - low, 1e-6)
     return low - margin, high + margin

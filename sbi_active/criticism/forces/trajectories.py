@@ -14,18 +14,12 @@ from torch.distributions import Distribution, Independent, Normal
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect
+from sbi_active.criticism.forces.dictionary import SIZES
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
 
 Array = NDArray[Any]
-
-#: Parameters at which trials are run, and trials of each at most.
-NUM_DRAWS, NUM_TRIALS = 4, 6
-#: Share of a trial after which what a constant force did to the velocity is read.
-EARLY = 0.01
-#: A constant force that is tried, N or N m; what it does is proportional to it.
-PUSH = 1e-3
 
 
 @dataclass(frozen=True)
@@ -57,7 +51,7 @@ class _Recorder:
         self.seen[float(t)] = q.copy(), v.copy()
         force = np.zeros_like(v)
         if self.dof is not None:
-            force[:, self.dof] = PUSH * phi[:, 0]
+            force[:, self.dof] = SIZES.push * phi[:, 0]
         return force
 
     def read(self) -> tuple[Array, Array, Array]:
@@ -80,21 +74,21 @@ def trajectories(
     Raises:
         ValueError: If the simulator never asks what the force is.
     """
-    some = torch.linspace(0, len(trials) - 1, min(NUM_TRIALS, len(trials))).long()
+    some = torch.linspace(0, len(trials) - 1, min(SIZES.num_trials, len(trials))).long()
     picked = trials.select(some.unique().tolist())
     generator = torch.Generator().manual_seed(seed)
     with forked_generators(int(torch.randint(2**31, (), generator=generator))):
-        theta = prior.sample(torch.Size([NUM_DRAWS])).double()
+        theta = prior.sample(torch.Size([SIZES.num_draws])).double()
     time, q, v = _recorded(model, picked, theta, None)
     kept = np.isfinite(q).all((1, 2)) & np.isfinite(v).all((1, 2))
     q, v = q[kept], v[kept]
-    early = max(int(np.searchsorted(time, EARLY * time[-1])), 1)
+    early = max(int(np.searchsorted(time, SIZES.early * time[-1])), 1)
     acceleration = np.gradient(v, time, axis=1)
     force = np.empty(v.shape[2])
     for dof in range(v.shape[2]):
         pushed = _recorded(model, picked, theta, dof)[2][kept]
         gained = (pushed - v)[:, early, dof] / (time[early] - time[0])
-        inertia = PUSH / np.maximum(np.abs(np.median(gained)), 1e-12)
+        inertia = SIZES.push / np.maximum(np.abs(np.median(gained)), 1e-12)
         force[dof] = inertia * np.sqrt(np.mean(acceleration[..., dof] ** 2))
     return Trajectories(time, q, v, force)
 

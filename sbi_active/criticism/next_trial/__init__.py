@@ -3,14 +3,6 @@
 This package proposes a trial. The conclusions from trials are in ``steps``.
 """
 
-from sbi_active.criticism.next_trial.candidates import following
-from sbi_active.criticism.next_trial.next_action import PredictedRival, choose_action
-from sbi_active.criticism.next_trial.outside import extrapolated, outside_candidates
+from sbi_active.criticism.next_trial.next_action import choose_action
 
-__all__ = [
-    "PredictedRival",
-    "choose_action",
-    "extrapolated",
-    "following",
-    "outside_candidates",
-]
+__all__ = ["choose_action"]

@@ -1,6 +1,8 @@
-"""Actions at which rivals are compared, each as if it were the next trial."""
+"""Actions at which rivals are compared, permitted ones and such as lie beyond."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -13,25 +15,62 @@ from sbi_active.criticism.rivals.further_trials import are_known, conditions_at
 from sbi_active.criticism.steps.predictive import predict
 from sbi_active.seeding import derive_seed
 
-#: A choice: each costs predictions of every rival.
-MAX_CANDIDATES = 64
+
+@dataclass(frozen=True, kw_only=True)
+class PlanSettings:
+    """Settings of the search for the next action.
+
+    Attributes:
+        max_candidates: Permitted actions at most, each predicted by every rival.
+        max_outside: Actions beyond the permitted range at most.
+        wider: Factors by which that range is widened about its center.
+        negligible: Probability below which a rival is left out.
+        max_rivals: Rivals at most.
+        fewest: Probability that a model in question has at least.
+        nothing: Information below which no action is worth a trial, nats.
+        something: Information of another action that is worth a second choice, nats.
+        samples: Outcomes of a candidate and rival, half to choose and half to report.
+            Of a half, three quarters fit a density, which needs some tens.
+        max_tests: Candidates of a severe test, and as many beyond the range.
+        num_draws: Draws of each prediction in a severe test.
+        max_entries: Covariances of the residual process in a severe test.
+    """
+
+    max_candidates: int = 64
+    max_outside: int = 24
+    wider: tuple[float, float] = (1.5, 2.0)
+    negligible: float = 0.01
+    max_rivals: int = 8
+    fewest: float = 1e-3
+    nothing: float = 0.02
+    something: float = 0.1
+    samples: int = 160
+    max_tests: int = 16
+    num_draws: int = 50
+    max_entries: int = 10_000_000
+
+
+PLAN = PlanSettings()
 
 
 def permitted_candidates(rivals: RivalSet, actions: ActionSpace) -> Tensor:
     """Return all permitted actions, or as many at random, shape (a, action_dim)."""
     listed = actions.listed()
-    if listed is not None and len(listed) <= MAX_CANDIDATES:
+    if listed is not None and len(listed) <= PLAN.max_candidates:
         return listed
     seed = derive_seed(rivals.seed, "candidates")
-    return actions.sample((MAX_CANDIDATES,), seed=seed)
+    return actions.sample((PLAN.max_candidates,), seed=seed)
 
 
 def simulated(rivals: RivalSet, candidates: Tensor) -> Tensor:
     """Return the candidates at which the bare model gives numbers.
 
-    Beyond the permitted range a simulator may fail in any way.
+    Beyond the permitted range a simulator may fail in any way. There is nothing beyond
+    labels of trials.
     """
     kept = []
+    if rivals.trials.action_is_label:
+        return candidates[:0]
     candidates = candidates[are_known(rivals.model, rivals.trials, candidates)]
     with torch.no_grad():
         for action in candidates:
@@ -63,3 +102,85 @@ def following(rivals: RivalSet, candidates: Tensor) -> Trials:
     )
     trials.action_is_label = own.action_is_label
     return trials
+
+
+def outside_candidates(
+    actions: ActionSpace, candidates: Tensor, *, limit: int
+) -> Tensor:
+    r"""Return actions that are not permitted, nearest to the permitted ones first.
+
+    They are the zero action, the mirror images of permitted actions in each entry and
+    in all, and the permitted ones in a range widened about its center, as far as they
+    lie beyond the range of the permitted ones.
+
+    Args:
+        actions: The permitted ones.
+        candidates: Candidates, some or all actions, shape (a, action_dim).
+        limit: Actions at most.
+
+    Returns:
+        Shape (b, action_dim), b <= limit.
+
+    Example:
+        >>> from sbi_active import DiscreteActions
+        >>> speeds = DiscreteActions([1.0, 2.0, 3.0])
+        >>> outside_candidates(speeds, speeds.values, limit=9)[:, 0].tolist()
+        [0.5, 3.5, 0.0, 4.0, -1.0, -2.0, -3.0]
+    """
+    dim = candidates.shape[1]
+    signs = 1 - 2 * torch.eye(dim)
+    if dim > 1:
+        signs = torch.cat([signs, -torch.ones(1, dim)])
+    parts = [torch.zeros(1, dim)]
+    parts += [candidates * sign for sign in signs]
+    return _nearest(actions, candidates, [*parts, *_widened(candidates)], limit)
+
+
+def extrapolated(actions: ActionSpace, candidates: Tensor, *, limit: int) -> Tensor:
+    """Return the permitted actions in a range widened about its center, as far beyond.
+
+    Entries that have one sign keep it: a speed or a mass has no other.
+
+    Args:
+        actions: The permitted ones.
+        candidates: Candidates, some or all actions, shape (a, action_dim).
+        limit: Actions at most.
+
+    Returns:
+        Shape (b, action_dim), b <= limit, the nearest first.
+
+    Example:
+        >>> from sbi_active import DiscreteActions
+        >>> speeds = DiscreteActions([1.0, 2.0, 3.0])
+        >>> extrapolated(speeds, speeds.values, limit=9)[:, 0].tolist()
+        [0.5, 3.5, 0.0, 4.0]
+    """
+    low, high = candidates.min(0).values, candidates.max(0).values
+    lowest = torch.where(low < 0, -torch.inf, 0.0)
+    highest = torch.where(high > 0, torch.inf, 0.0)
+    parts = [
+        part[((part >= lowest) & (part <= highest)).all(-1)]
+        for part in _widened(candidates)
+    ]
+    return _nearest(actions, candidates, parts, limit)
+
+
+def _widened(candidates: Tensor) -> list[Tensor]:
+    center = (candidates.min(0).values + candidates.max(0).values) / 2
+    return [center + factor * (candidates - center) for factor in PLAN.wider]
+
+
+def _nearest(
+    actions: ActionSpace, candidates: Tensor, parts: list[Tensor], limit: int
+) -> Tensor:
+    """Return those that lie beyond, at most so many, nearest first."""
+    low, high = candidates.min(0).values, candidates.max(0).values
+    half = (high - low).clamp_min(1e-12) / 2
+    every = torch.cat(parts).unique(dim=0)
+    distance = ((every - every.clamp(low, high)) / half).square().sum(-1)
+    beyond = (distance > 1e-9) & ~actions.contains(every)
+    every, distance = every[beyond], distance[beyond]
+    order = torch.argsort(distance, stable=True)[: 4 * limit]
+    if len(order) > limit:  # spread over the distances rather than the nearest alone
+        order = order[torch.linspace(0, len(order) - 1, limit).round().long()]
+    return every[order]

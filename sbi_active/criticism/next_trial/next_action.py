@@ -15,11 +15,12 @@ from sbi_active.actions import ActionSpace, DiscreteActions
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.next_trial.candidates import (
+    PLAN,
     following,
+    outside_candidates,
     permitted_candidates,
     simulated,
 )
-from sbi_active.criticism.next_trial.outside import outside_candidates
 from sbi_active.criticism.results import ModelKey, NextAction, Tracing
 from sbi_active.criticism.steps.predictive import predict
 from sbi_active.design.design import Design
@@ -27,21 +28,6 @@ from sbi_active.design.designer import InformationGainDesigner
 from sbi_active.seeding import derive_seed
 
 Array = NDArray[Any]
-
-#: Rivals below this probability are left out.
-NEGLIGIBLE = 0.01
-MAX_RIVALS = 8
-#: Information below which no action is worth a trial, nats.
-NOTHING = 0.02
-#: Information of another action that is worth a second choice, nats.
-SOMETHING = 0.1
-#: Probability that a model in question has at least.
-FEWEST = 1e-3
-#: Candidates beyond the permitted range, where the best is not asked for.
-MAX_OUTSIDE = 24
-#: Outcomes of a candidate and rival, half to choose and half to report. Of a half,
-#: three quarters fit a density, which needs some tens.
-SAMPLES_PER_RIVAL = 160
 
 
 class PredictedRival:
@@ -137,7 +123,7 @@ def choose_action(
     candidates = permitted_candidates(rivals, actions)
     misfit = tracing.misfit
     shares = tracing.probabilities if misfit is None else misfit.weights
-    named = [n for n, p in shares.items() if p > NEGLIGIBLE][:MAX_RIVALS]
+    named = [n for n, p in shares.items() if p > PLAN.negligible][: PLAN.max_rivals]
     gain = np.zeros(len(candidates))
     action = None
     if len(named) > 1:
@@ -160,7 +146,7 @@ def choose_action(
     found = replace(found, inseparable=(*groups,))
     if not beyond or not groups:
         return found
-    others = outside_candidates(actions, candidates, limit=MAX_OUTSIDE)
+    others = outside_candidates(actions, candidates, limit=PLAN.max_outside)
     return _look_outside(rivals, tracing, found, simulated(rivals, others))
 
 
@@ -175,14 +161,14 @@ def _most_telling(
     design = _select(rivals, tracing, names, p, candidates)
     gain = design.expected_information_gain.clamp_min(0.0).numpy()
     told = gain[design.index]
-    others = np.flatnonzero(gain >= SOMETHING)
-    if told < NOTHING and len(others):
+    others = np.flatnonzero(gain >= PLAN.something)
+    if told < PLAN.nothing and len(others):
         # The draws that chose it do not report: at some of them alone it tells much.
         part = candidates[torch.from_numpy(others)]
         design = _select(rivals, tracing, names, p, part, again=True)
         gain[others] = design.expected_information_gain.clamp_min(0.0).numpy()
         told = gain[others[design.index]]
-    return (design.action.double().numpy() if told >= NOTHING else None), gain
+    return (design.action.double().numpy() if told >= PLAN.nothing else None), gain
 
 
 def _by_range(
@@ -205,12 +191,14 @@ def _by_range(
         best = int(np.argmax(np.where(inside, -np.inf, gain)))
         beyond, told = found.candidates[best], float(gain[best])
     else:
-        others = outside_candidates(actions, candidates.float(), limit=MAX_OUTSIDE)
+        others = outside_candidates(actions, candidates.float(), limit=PLAN.max_outside)
         others = simulated(rivals, others)
         if not len(others):
             return found
         names = found.separates
-        p = np.array([max(tracing.probabilities.get(n, 0.0), FEWEST) for n in names])
+        p = np.array(
+            [max(tracing.probabilities.get(n, 0.0), PLAN.fewest) for n in names]
+        )
         design = _select(rivals, tracing, names, p / p.sum(), others)
         told = float(design.expected_information_gain[design.index])
         beyond = design.action.double().numpy()
@@ -227,7 +215,7 @@ def _look_outside(
         design = _select(rivals, tracing, names, equal, others)
         gain = float(design.expected_information_gain[design.index])
         error = float(design.standard_error[design.index])
-        if gain - 2 * error >= NOTHING and gain > found.outside_gain:
+        if gain - 2 * error >= PLAN.nothing and gain > found.outside_gain:
             found = replace(
                 found,
                 outside=design.action.double().numpy(),
@@ -252,7 +240,7 @@ def _select(
     ]
     designer = InformationGainDesigner(
         DiscreteActions(candidates),
-        num_samples=SAMPLES_PER_RIVAL * len(models),
+        num_samples=PLAN.samples * len(models),
         eliminate=False,  # a part of the samples would be too few for densities
     )
     seed = derive_seed(rivals.seed, "next action", *names, *["again"] * again)

@@ -30,21 +30,16 @@ from sbi_active.actions import ActionSpace
 from sbi_active.criticism.contradictions import SevereTest
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.next_trial.candidates import (
+    PLAN,
+    extrapolated,
     following,
     permitted_candidates,
     simulated,
 )
-from sbi_active.criticism.next_trial.outside import extrapolated
 from sbi_active.criticism.results import UNEXPLAINED, ModelKey, Tracing
 from sbi_active.criticism.steps.predictive import Prediction, predict
 
 Array = NDArray[Any]
-
-#: Permitted candidates, and as many beyond; one costs some hundred simulated trials.
-MAX_TESTS = 16
-NUM_DRAWS = 50
-#: Covariances of the residual process between candidates and measurements.
-MAX_ENTRIES = 10_000_000
 
 
 def severe_tests(
@@ -60,7 +55,7 @@ def severe_tests(
     if not tracing.chosen:
         return ()
     candidates = permitted_candidates(rivals, actions)
-    few = min(MAX_TESTS, _affordable(rivals))
+    few = min(PLAN.max_tests, _affordable(rivals))
     beyond = extrapolated(actions, candidates, limit=few)
     # Where every model has a residual process, the bare model has one too.
     free = ModelKey(error=None if tracing.misfit else UNEXPLAINED)
@@ -84,7 +79,7 @@ def _most_severe(
     is_permitted: bool,
 ) -> SevereTest:
     trials = following(rivals, candidates)
-    options = {"num_draws": NUM_DRAWS, "scored": False}
+    options = {"num_draws": PLAN.num_draws, "scored": False}
     verdict = predict(rivals, trials, key=key, **options)
     free = predict(rivals, trials, key=residual, **options)
     difference = _difference(verdict, free, len(candidates))
@@ -109,7 +104,7 @@ def _difference(verdict: Prediction, free: Prediction, num: int) -> Array:
 def _affordable(rivals: RivalSet) -> int:
     """Return the number of candidates that the residual process predicts in memory."""
     m = rivals.measurements
-    return max(MAX_ENTRIES // (len(m) * int(np.prod(m.shape[1:]))), 2)
+    return max(PLAN.max_entries // (len(m) * int(np.prod(m.shape[1:]))), 2)
 
 
 def _spread_out(candidates: Tensor, limit: int) -> Tensor:

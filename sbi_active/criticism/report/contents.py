@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import torch
+from scipy.stats import spearmanr
 from torch.distributions import Distribution
 
 from sbi_active.criticism.contradictions import SevereTest
+from sbi_active.criticism.report.words import TOLD, called, parted, setting
 from sbi_active.criticism.results import (
     NONE,
     UNEXPLAINED,
+    Array,
     Detection,
     Evaluation,
     Evidence,
@@ -27,8 +32,6 @@ from sbi_active.inference.beliefs.identifiability import (
 )
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.model import SimulatorModel
-
-NUM_PRIOR = 2_000  # draws that a width is compared with
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,6 +90,15 @@ class Contents:
         return self.tracing.probabilities
 
     @property
+    def has_probabilities(self) -> bool:
+        """Whether probabilities by the fitted trials alone agree with the verdict.
+
+        They do not where every model misses, or other trials speak against the most
+        probable one.
+        """
+        return self.tracing.misfit is None and not self.tracing.instead_of
+
+    @property
     def credible_set(self) -> tuple[str, ...]:
         """Smallest set of names that holds 90 % of the probability."""
         return self.tracing.credible_set
@@ -143,17 +155,100 @@ class Contents:
         return table.rename_axis("parameter").reset_index()
 
     @property
+    def residuals_by_trial(self) -> pd.DataFrame:
+        """Residuals of the verdict's model, one row a trial, the worst first.
+
+        Columns trial, index (its place in the order of execution), deviations (root
+        mean square, in deviations of the sensor where every model misses, else of the
+        prediction), size (in the unit of x, of the channel of the largest), channel and
+        time of the largest.
+        """
+        found = self.residuals_after or self.residuals
+        left = by_channel(found.x - found.mean, found)
+        z = by_channel(found.refitted, found)
+        if self.tracing.misfit is not None:  # a prediction is as wide as the misfit
+            z = left / self.tracing.misfit.sensor
+        times = found.times
+        if times is not None:
+            times = np.broadcast_to(times, left.shape[:2])
+        rows = []
+        for t in np.flatnonzero(np.isfinite(z).any((1, 2))):
+            k, c = np.unravel_index(np.nanargmax(np.abs(z[t])), z[t].shape)
+            when = np.nan if times is None else float(times[t, k])
+            size = float(root_mean_square(left[t, :, c]))
+            deviations = float(root_mean_square(z[t]))
+            name = called(found.names, int(t))
+            rows.append((name, float(found.index[t]), deviations, size, int(c), when))
+        columns = ["trial", "index", "deviations", "size", "channel", "time"]
+        table = pd.DataFrame(rows, columns=pd.Index(columns))
+        return table.sort_values("deviations", ascending=False, kind="stable")
+
+    @property
+    def growth(self) -> float | None:
+        """Ratio of residuals of the last third of trials to the first's, if they grow.
+
+        None where their rank correlation with the order has a tail probability of .01
+        or more, or where they grow by less than twice: a right model is then called
+        growing in less than 1 % of sets.
+        """
+        table = self.residuals_by_trial.sort_values("index")
+        third = len(table) // 3
+        if third < 2 or self.verdict == NONE:
+            return None
+        size = table["deviations"].to_numpy()
+        rank: Any = spearmanr(table["index"], size, alternative="greater")
+        first, last = np.median(size[:third]), np.median(size[-third:])
+        grows = rank.pvalue < 0.01 and last > 2 * first > 0
+        return float(last / first) if grows else None
+
+    @property
+    def sensor(self) -> Array | None:
+        """The sensor's declared error by channel, shape (c,); None without."""
+        if self.tracing.misfit is not None:
+            return self.tracing.misfit.sensor
+        declared = getattr(self.simulator.noise, "measurement_sd", None)
+        return None if declared is None else np.reshape(np.asarray(declared, float), -1)
+
+    @property
     def combinations(self) -> Combinations:
         """Combinations of parameters that the verdict's model knows, and does not."""
         evidences = self.tracing.evidences
         evidence = evidences.get(self.tracing.model, evidences[NONE])
         with forked_generators(0, "report"):
-            prior = self.prior.sample(torch.Size([NUM_PRIOR])).double().numpy()
+            prior = self.prior.sample(torch.Size([TOLD.prior_draws])).double().numpy()
         dim = prior.shape[1]
         draws = evidence.draws[:, :dim]  # beyond these there may be those of errors
         if draws.shape[1] < dim:
             return Combinations()
         return combinations_of_draws(draws, prior, evidence.names[:dim])
+
+    def channels(self, num: int) -> list[tuple[str, str]]:
+        """Return name and unit of each of some channels."""
+        labels: Sequence[str] = self.channel_names or ()
+        if len(labels) != num:
+            labels = [f"channel {c}" for c in range(num)]
+        return [*map(parted, labels)]
+
+    def setting(self, action: Array) -> str:
+        """Return an action in words: a label is the name of its trial."""
+        if not self.action_is_label:
+            return setting(self.action_labels, action)
+        own = np.flatnonzero((self.residuals.action == action).all(1))
+        names = self.residuals.names
+        name = names[own[0]] if len(own) and names else f"{action[0]:g}"
+        return f"the inputs of trial {name}"
+
+
+def by_channel(x: Array, residuals: Residuals) -> Array:
+    """Return trials, times and channels, (t, k, c); each number is one without time."""
+    return x.reshape(len(x), 1 if residuals.times is None else x.shape[1], -1)
+
+
+def root_mean_square(x: Array, axis: int | tuple[int, ...] | None = None) -> Array:
+    """Return the root mean square of the numbers that were measured."""
+    seen = np.isfinite(x)
+    total = np.where(seen, x, 0.0) ** 2
+    return np.sqrt(total.sum(axis) / np.maximum(seen.sum(axis), 1))
 
 
 def _moments(evidence: Evidence, i: int) -> list[float]:

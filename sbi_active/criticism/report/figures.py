@@ -7,22 +7,55 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sbi_active.criticism.report.contents import Contents
+from sbi_active.criticism.report.summary import added
+from sbi_active.criticism.report.words import TOLD
 from sbi_active.criticism.results import Array, Evaluation, Residuals, Tracing
+from sbi_active.display.page import Picture
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 BEFORE, AFTER, FAINT = "#c1432e", "#2f6f9f", "#9aa3ab"
-MAX_ACTION_PANELS = 3  # a choice: as many as stand legibly in a row
-MOST_NAMED = 16  # trials that have their names at the axis
-LOGARITHMIC_FROM = 12.0  # standard deviations; larger residuals get a symlog axis
 METRICS = {
     "rmse": "RMSE",
     "energy score": "energy score",
     "log predictive density": "log predictive density [nats]",
     "coverage": "share inside the central 90 %",
 }
+
+CAPTIONS = {
+    "residuals": "Residuals of the models refitted to all trials, in standard "
+    "deviations of the prediction; the band is two of them. Each row has its scale, "
+    "logarithmic beyond the band where residuals are large.",
+    "probabilities": "Posterior probability of the models that were tried.",
+    "before_after": "One line a scored trial; the bars are over all of them. "
+    "Lower is better for the first two, higher for the third; the dotted line is 90 %.",
+}
+
+
+def figures(report: Contents) -> dict[str, Figure]:
+    """Return the report's figures by name."""
+    found = {
+        "residuals": plot_residuals(
+            report.residuals,
+            report.residuals_after,
+            action_labels=() if report.action_is_label else report.action_labels,
+            channel_names=report.channel_names,
+            added=added(report),
+        ),
+    }
+    if report.has_probabilities:
+        found["probabilities"] = plot_probabilities(report.tracing)
+    if report.evaluation is not None:
+        found["before_after"] = plot_before_after(report.evaluation)
+    return found
+
+
+def pictured(name: str) -> Picture:
+    """Return the place of the figure with a name."""
+    return Picture(name, CAPTIONS[name], CAPTIONS[name])
 
 
 def plot_residuals(
@@ -56,7 +89,7 @@ def plot_residuals(
     labels = action_labels
     if labels is None:
         labels = [f"action {i + 1}" for i in range(before.action.shape[1])]
-    shown = min(len(labels), MAX_ACTION_PANELS)
+    shown = min(len(labels), TOLD.panels)
     several = before.x[0].size > 1
     columns = shown + 1 + several
     figure, axes = _subplots(len(rows), columns, width=3.3, height=2.5)
@@ -186,7 +219,7 @@ def _trial_axis(ax: Axes, residuals: Residuals) -> None:
     index, names = residuals.index, residuals.names
     ax.set_xlabel("trial")
     numbered = all(n == f"{i:.15g}" for n, i in zip(names, index, strict=False))
-    if numbered or len(names) > MOST_NAMED:
+    if numbered or len(names) > TOLD.ticks:
         locator: Any = ax.xaxis.get_major_locator()
         locator.set_params(integer=True)
         return
@@ -198,7 +231,7 @@ def _residual_axis(ax: Axes, each: Array) -> None:
     ax.axhline(0, color="#555555", lw=0.8, zorder=0)
     finite = each[np.isfinite(each)]
     largest = max(float(np.abs(finite).max(initial=0.0)) * 1.15, 3.5)
-    if largest > LOGARITHMIC_FROM:
+    if largest > TOLD.logarithmic:
         largest *= 1.4
         ax.set_yscale("symlog", linthresh=2)
         decades = 10.0 ** np.arange(1, np.floor(np.log10(largest)) + 1)

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
 import cloudpickle
+import numpy as np
 
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.report.cautions import find_warnings
-from sbi_active.criticism.report.conditions import first_paragraph
+from sbi_active.criticism.report.cautions import cautions
 from sbi_active.criticism.report.contents import Contents
-from sbi_active.criticism.report.headline import verdict_line
-from sbi_active.criticism.report.pictures import figures
-from sbi_active.criticism.report.sections import page
+from sbi_active.criticism.report.figures import figures
+from sbi_active.criticism.report.sections import cautions_with_codes, page
+from sbi_active.criticism.report.summary import (
+    first_paragraph,
+    sentences,
+    verdict_line,
+)
 from sbi_active.display.figures import legible
 from sbi_active.display.notebook import card, items, table
 from sbi_active.display.table import Table, number
@@ -42,7 +47,8 @@ class Report(Contents):
             (name, *map(number, row))
             for name, row in zip(scored["metric"], numbers, strict=True)
         ]
-        likely = sorted(self.probabilities.items(), key=lambda item: -item[1])[:5]
+        shares = self.probabilities if self.has_probabilities else {}
+        likely = sorted(shares.items(), key=lambda item: -item[1])[:5]
         return card(
             verdict_line(self),
             first_paragraph(self),
@@ -50,13 +56,48 @@ class Report(Contents):
                 Table(("model", "probability"), [(n, f"{p:.2f}") for n, p in likely])
             ),
             table(Table(("metric", "before", "after", "ratio or difference"), errors)),
-            items(self.warnings),
+            items([f"{code} {said}" for code, said in cautions_with_codes(self)]),
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Effects are lambdas and local functions as a rule, which pickle refuses.
         parts = {f.name: getattr(self, f.name) for f in fields(self)}
         return _restored, (cloudpickle.dumps(parts),)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the report as JSON has it: numbers, texts, and all sections."""
+        made = page(self)
+        plan = None if self.next_action is None else asdict(self.next_action)
+        tables = {
+            "before_after": self.before_after,
+            "parameters": self.parameters,
+            "residuals_by_trial": self.residuals_by_trial,
+        }
+        return _plain(
+            {
+                "verdict": self.verdict,
+                "line": made.title,
+                "summary": sentences(self),
+                "warnings": cautions_with_codes(self),
+                "chosen": self.tracing.chosen,
+                "probabilities": self.probabilities,
+                "credible_set": self.credible_set,
+                "equivalent": self.equivalent,
+                **{name: table.to_dict("records") for name, table in tables.items()},
+                "next_action": plan,
+                "severe_tests": [asdict(test) for test in self.severe_tests],
+                "digest": self.digest,
+                "sections": [
+                    {
+                        "title": section.title,
+                        "text": section.text,
+                        "items": section.items,
+                        "table": section.table and asdict(section.table),
+                    }
+                    for section in made.sections
+                ],
+            }
+        )
 
     def to_markdown(self) -> str:
         """Return the report as Markdown, figures by the names that ``save`` gives."""
@@ -115,28 +156,33 @@ def build_report(
     elif actions is not None:
         pairs = zip(actions.names, actions.units, strict=True)
         labels = [f"{name} [{unit}]" if unit else name for name, unit in pairs]
-    found = find_warnings(
-        trials,
-        parts["residuals"],
-        parts["tracing"],
-        detection=parts["detection"],
-        residuals_after=parts.get("residuals_after"),
-        evaluation=parts.get("evaluation"),
-        effects=getattr(parts["prior"], "effects", ()),
-        exploratory=exploratory,
-        designed=designed,
-    )
     channels = trials.channel_labels or parts["simulator"].channel_names
-    return Report(
+    report = Report(
         **parts,
-        warnings=tuple(map(Message, (*found, *warnings))),
+        warnings=(),
         exploratory=exploratory,
         num_trials=len(trials.fit),
         action_labels=tuple(labels),
         action_is_label=trials.action_is_label,
         channel_names=None if channels is None else tuple(channels),
     )
+    found = cautions(report, trials, designed=designed)
+    return replace(report, warnings=(*found, *map(Message, warnings)))
 
 
 def _restored(parts: bytes) -> Report:
     return Report(**cloudpickle.loads(parts))
+
+
+def _plain(value: Any) -> Any:
+    """Return lists, numbers and texts in place of arrays, tuples and sets."""
+    if isinstance(value, dict):
+        return {str(key): _plain(part) for key, part in value.items()}
+    if isinstance(value, frozenset):
+        return sorted(value)
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    is_lost = isinstance(value, float) and not math.isfinite(value)
+    return None if is_lost else value

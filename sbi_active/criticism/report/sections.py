@@ -1,15 +1,25 @@
-"""Sections of a report."""
+"""Sections of a report, and those on the next action and on the record."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from sbi_active.criticism.report import findings, outlook
-from sbi_active.criticism.report.conditions import first_paragraph
+import numpy as np
+
+from sbi_active.criticism.report import errors, models
 from sbi_active.criticism.report.contents import Contents
-from sbi_active.criticism.report.headline import verdict_line
-from sbi_active.criticism.report.under_misfit import admitted_models
+from sbi_active.criticism.report.summary import first_paragraph, verdict_line
+from sbi_active.criticism.report.words import TOLD, listed, number, parted, probability
+from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, NextAction
+from sbi_active.criticism.under_misfit import Misfit
 from sbi_active.display.page import Page, Section
+from sbi_active.messages import Message, place
+
+SEVERE = (
+    "The free residual is the bare model and a smooth function of the action, both as "
+    "fitted to the trials; the difference is the root mean square over x, in standard "
+    "deviations of the verdict's prediction, noise included."
+)
 
 
 def page(report: Contents) -> Page:
@@ -17,45 +27,170 @@ def page(report: Contents) -> Page:
     return Page(verdict_line(report), [*_sections(report)], [first_paragraph(report)])
 
 
+def cautions_with_codes(report: Contents) -> list[tuple[str, str]]:
+    """Return the code and the sentence of each warning, without its place."""
+    found = []
+    for warning in map(Message, report.warnings):
+        code = warning.code
+        found.append((code, warning.removesuffix(place(code)) if code else warning))
+    return found
+
+
 def _sections(report: Contents) -> Iterator[Section]:
     if report.warnings:
-        yield Section("Warnings", items=report.warnings, warns=True)
+        items = [f"{c} {said}".strip() for c, said in cautions_with_codes(report)]
+        yield Section("Warnings", items=items, warns=True)
     if report.tracing.misfit is not None:
-        yield admitted_models(report, report.tracing.misfit)
-    yield findings.effects(report)
-    yield findings.equivalences(report)
-    yield findings.residuals(report)
-    yield findings.by_trial(report)
-    yield outlook.errors(report)
+        yield models.admitted_models(report, report.tracing.misfit)
+    yield models.effects(report)
+    yield models.equivalences(report)
+    yield errors.residuals(report)
+    yield errors.by_trial(report)
+    yield errors.before_and_after(report)
     if report.leave_one_out:
-        yield findings.leave_one_out(report)
-    yield outlook.parameters(report)
-    yield outlook.next_action(report)
+        yield models.leave_one_out(report)
+    yield models.parameters(report)
+    yield next_action(report)
     yield _record(report)
 
 
+def next_action(report: Contents) -> Section:
+    """Return the action that tells most, and what no permitted action tells."""
+    chosen, title = report.next_action, "Next action"
+    tests = [*_tests(report)]
+    text = [_tried(report)] if report.tracing.chosen else []
+    if chosen is None:
+        none = "None was asked for: there is no set of permitted actions."
+        return Section(title, [none, *text], items=tests)
+    misfit = report.tracing.misfit
+    is_between = misfit is not None and len(chosen.separates) > 1
+    told = [
+        (True, _told(report, chosen)),
+        (is_between, _by_error(misfit) if misfit else ""),
+        (report.tracing.chosen, _tried(report)),
+        (tests, SEVERE),
+    ]
+    items = (*_by_range(report, chosen), *_inseparable(report, chosen), *tests)
+    return Section(title, [said for holds, said in told if holds], items=items)
+
+
+def _told(report: Contents, chosen: NextAction) -> str:
+    """Return the action, or the reason not to choose one."""
+    best = float(np.nanmax(chosen.information_gain, initial=0.0))
+    if chosen.action is not None:
+        between = f" between {', '.join(chosen.separates)}" * bool(chosen.separates)
+        action = report.setting(chosen.action)
+        return f"{action}: at least {best:.2f} nats{between} (a lower bound)."
+    misfit, one = report.tracing.misfit, chosen.separates[:1]
+    found = (
+        "no permitted action tells more about which declared model is right than "
+        f"{max(best, 0.001):.3f} nats."
+    )
+    if len(chosen.separates) == 1:
+        how = f"predicts left-out {misfit.left_out} so well" if misfit else "is left"
+        found = f"of the declared models only {one[0]} {how}."
+    if report.verdict == NONE:
+        return f"Stop: {found}"
+    rest = {
+        UNEXPLAINED: " Declare what else the simulator may lack.",
+        SCATTER: " Repeat an action to see how large it is.",
+    }
+    return found[0].upper() + found[1:] + rest.get(report.verdict, "")
+
+
+def _by_error(misfit: Misfit) -> str:
+    """Return the weights of rivals where all of them are wrong."""
+    shares = ", ".join(f"{n} {probability(w)}" for n, w in misfit.weights.items())
+    return (
+        "Every model misses, so that probabilities among them are too sure. Here they "
+        f"count by their errors on left-out {misfit.left_out}: {shares}; what each "
+        "leaves is a part of its prediction. What nobody declared is not among them, "
+        "and the outcome may agree with none."
+    )
+
+
+def _tried(report: Contents) -> str:
+    """Return the actions that were executed."""
+    if report.action_is_label:
+        return "No other inputs were tried than those of these trials."
+    action = np.unique(report.residuals.action, axis=0)
+    if len(action) == 1:
+        return f"No other action was tried than {report.setting(action[0])}."
+    entries = [*zip(map(parted, report.action_labels), action.T, strict=True)]
+    ranges = [
+        f"{name} from {column.min():.4g} to {column.max():.4g} {unit}".rstrip()
+        for (name, unit), column in entries[: TOLD.entries]
+    ]
+    rest = len(entries) - len(ranges)
+    tried = ", ".join(ranges) + (f", and {rest} more entries" if rest else "")
+    return f"No other action was tried than these {len(action)}: {tried}."
+
+
+def _by_range(report: Contents, chosen: NextAction) -> Iterator[str]:
+    """Yield actions that separate forms of a force, in the tried range and beyond."""
+    for where, action, gain in (
+        ("within the range tried", chosen.within, chosen.within_gain),
+        ("beyond the range tried", chosen.beyond, chosen.beyond_gain),
+    ):
+        if action is not None:
+            told = f"at least {gain:.2f} nats between {', '.join(chosen.separates)}"
+            yield f"{where}, {report.setting(action)}: {told}"
+
+
+def _inseparable(report: Contents, chosen: NextAction) -> Iterator[str]:
+    """Yield each group that no permitted action separates, and what would."""
+    beyond = None if chosen.outside is None else frozenset(chosen.outside_separates)
+    groups = [*chosen.inseparable, *([] if beyond is None else [beyond])]
+    for group in dict.fromkeys(groups):
+        told = f"no permitted action separates {listed(sorted(group))}"
+        if group == beyond and chosen.outside is not None:
+            told += (
+                f"; {report.setting(chosen.outside)}, which is not permitted, would: "
+                f"at least {chosen.outside_gain:.2f} nats"
+            )
+        yield told
+
+
+def _tests(report: Contents) -> Iterator[str]:
+    """Yield each severe test, with how far a free residual's prediction is there."""
+    for test in report.severe_tests:
+        where = "at" if test.is_permitted else "beyond the permitted range at"
+        yield (
+            f"the verdict is put to the test most {where} "
+            f"{report.setting(test.action)}, where its prediction and that of a free "
+            f"residual differ by {number(test.difference)} of its standard deviations"
+        )
+
+
 def _record(report: Contents) -> Section:
-    evidences = report.tracing.evidences
+    evidences, detection = report.tracing.evidences, report.detection
     spent = sum(e.num_simulations for e in evidences.values())
-    items = [f"evidence cost {spent:,} simulated trials"]
-    moved = [name for name, e in evidences.items() if e.engine == "smc"]
-    if report.tracing.misfit is not None:
-        items.append("evidence by linearized models with a residual process in each")
-    elif len(moved) < len(evidences):
-        items.append("evidence by least squares and importance sampling")
-    if moved:
-        which = ", ".join(sorted(moved))
-        items.append(
-            f"evidence by sequential Monte Carlo, where that did not serve: {which}"
-        )
-    if report.detection.null_cross_check is not None:
-        items.append(
-            f"log evidence of the bare model {report.detection.null_log_evidence:.2f}, "
-            f"from other starts {report.detection.null_cross_check:.2f}"
-        )
-    if report.digest:
-        items.append(
-            f"hash of noise, effects and priors, declared before the data: "
-            f"{report.digest}"
-        )
-    return Section("Record", items=tuple(items))
+    moved = sorted(name for name, e in evidences.items() if e.engine == "smc")
+    is_linear = report.tracing.misfit is not None
+    told = [
+        (True, f"evidence cost {spent:,} simulated trials"),
+        (
+            is_linear,
+            "evidence by linearized models with a residual process in each",
+        ),
+        (
+            not is_linear and len(moved) < len(evidences),
+            "evidence by least squares and importance sampling",
+        ),
+        (
+            moved,
+            "evidence by sequential Monte Carlo, where that did not serve: "
+            f"{', '.join(moved)}",
+        ),
+        (
+            detection.null_cross_check is not None,
+            f"log evidence of the bare model {detection.null_log_evidence:.2f}, "
+            f"from other starts {detection.null_cross_check or 0:.2f}",
+        ),
+        (
+            report.digest,
+            "hash of noise, effects and priors, declared before the data: "
+            f"{report.digest}",
+        ),
+    ]
+    return Section("Record", items=[said for holds, said in told if holds])

@@ -61,7 +61,7 @@ def test_values_are_held_on_the_finest_grid():
 
 def test_trials_that_begin_later_are_noted():
     late = torch.stack([FINE, FINE + 0.3])
-    with pytest.warns(UserWarning, match=".1. begin up to 0.3 after the") as noted:
+    with pytest.warns(UserWarning, match="trials 1 begin up to 0.3 after the") as noted:
         found = trials(torch.randn(2, 11), late, sample_times=late[:, [0, 5, 10]])
     assert noted[0].filename == __file__
     assert found.input_times is not None

@@ -122,12 +122,12 @@ def test_columns_of_another_file_may_have_names_of_their_own():
         (
             ["a,0,1,5", "a,1,1,5", "a,2,1,5", "a,9,1,5", "a,10,1,5"],
             "trial,time,input_u,x_y",
-            "no u from 2 to 9 s between row 3 .trial a. and row 4 .* fill in",
+            "no value from 2 to 9 for input 'u' of trial a.* fill in",
         ),
         (
             ["a,0,1,5", "b,0,1,5", "b,1,1,5"],
             "trial,time,input_u,x_y",
-            "two or more values of input u in trial a; got 1 .* as action_",
+            "two or more values; got 1 of input 'u' of trial a; .* action_",
         ),
         (
             ["a,0,1,5,0", "a,1,1,5,1"],
@@ -137,7 +137,7 @@ def test_columns_of_another_file_may_have_names_of_their_own():
         (
             ["a,0,1,5", "a,1,2,5", "b,2,1,6", "b,3,1,7"],
             "trial,time,input_u,x_y",
-            "similar times; got 2 s in row 3 .trial b. .* from its own begin",
+            "similar times; got trial b of 1 that begins 2 after .* from its own begin",
         ),
         (
             ["a,0,1 V,5", "a,1,1,5"],
@@ -164,8 +164,8 @@ def test_a_table_with_inputs_that_is_not_understood(rows, header, message):
         ),
         (
             {"inputs": ["a,0,1", "a,1,2", "b,0,1", "b,1,2"]},
-            "x within the time of its inputs, 0 to 0.001 s in inputs.csv; got x at "
-            "0.02 s in row 2 .trial a. of trials.csv",
+            "x of trial a measured within the time of its input 'u', 0 to 0.001; got "
+            "x at 0.02",
         ),
         (
             {"header": "trial,time,input_u,x_z", "inputs": ["a,0,1,1"]},

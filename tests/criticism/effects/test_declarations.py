@@ -23,7 +23,7 @@ from sbi_active.criticism import (
     generic_effects,
     joint_prior,
 )
-from sbi_active.criticism.effects import require_nested
+from sbi_active.criticism.effects.declarations import require_nested
 
 NAN = float("nan")
 PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))

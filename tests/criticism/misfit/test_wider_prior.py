@@ -82,7 +82,6 @@ def test_the_report_says_the_bound_and_what_is_beyond(narrow):
     first = " ".join(str(narrow).split("\n\n")[0].split())
     said = "riction is at a bound of its prior in the bare model, the lower one (0.5); "
     said += "with the bound moved the best fit has 0.40"
-    assert f"F{said}" in first
     assert any(f"f{said}" in w and "prior-edge" in w for w in narrow.warnings)
     assert not any("no declared effect explains" in w for w in narrow.warnings)
     assert "No declared effect explains" not in first
@@ -116,9 +115,8 @@ def test_a_cause_that_no_bound_makes_up_for_stays_named():
     (found,) = report.tracing.bounds.parameters
     assert (found.model, found.side) == (NONE, "upper")
     assert found.beyond > 0.42
-    first = str(report).split("\n\n")[0]
-    assert "at a bound of its prior in the bare model" in " ".join(first.split())
-    assert "needs no effect" not in first
+    assert "at a bound of its prior in the bare model" in " ".join(report.warnings)
+    assert "needs no effect" not in str(report)
 
 
 def test_a_narrow_prior_without_bounds_names_nothing_either():

@@ -10,11 +10,8 @@ from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
-from sbi_active.criticism.next_trial import (
-    PredictedRival,
-    choose_action,
-    outside_candidates,
-)
+from sbi_active.criticism.next_trial.candidates import outside_candidates, simulated
+from sbi_active.criticism.next_trial.next_action import PredictedRival, choose_action
 from sbi_active.criticism.results import ModelKey
 from sbi_active.information_gain import ModelIndexGain, RivalSampler
 
@@ -150,6 +147,17 @@ def test_a_simulator_that_fails_outside_its_range_names_nothing():
     chosen = c.next_action()
     assert chosen.action is None
     assert chosen.outside is None or float(chosen.outside[0]) > 0
+
+
+def test_there_is_nothing_beyond_labels():
+    one = torch.ones(3)
+    own = Trials(None, 0.7 * one, start={"place": one})
+    model = SimulatorModel(
+        lambda theta, xi, *, start: theta * start["place"][:, None],
+        noise=GaussianNoise(NOISE),
+    )
+    c = Criticism(model, PRIOR, own, effects=[BIAS])
+    assert len(simulated(c.rivals, torch.tensor([[3.5]]))) == 0
 
 
 def test_the_same_seed_gives_the_same_choice():

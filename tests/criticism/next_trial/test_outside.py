@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sbi_active import DiscreteActions
-from sbi_active.criticism.next_trial import extrapolated
+from sbi_active.criticism.next_trial.candidates import extrapolated
 
 
 @pytest.mark.parametrize(

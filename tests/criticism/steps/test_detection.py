@@ -93,7 +93,6 @@ def test_a_mode_that_the_first_search_missed_is_no_alarm(monkeypatch):
 
 def test_the_report_says_what_raised_the_alarm():
     weak = str(criticism(*zigzag(1.7)).report())
-    assert "chi-square, p = " in weak
     assert "rests on the chi-square alone" in " ".join(weak.split())
     x, action = zigzag(0.0)
     strong = criticism(x + 5 * NOISE * action**3, action)

@@ -68,8 +68,7 @@ def test_what_lowers_the_errors_that_are_printed_predicts_better():
     assert made.chosen == ("drag",)
     text = flat(report(tracing=made, evaluation=None))
     assert text.startswith("Verdict: unexplained: drag predicts better, and is not")
-    assert "goes from 1.45 to 1.2;" in text
-    assert "On held-out trials: 0.31 to 0.2." in text
+    assert "goes from 1.45 to 1.2, on held-out trials from 0.31 to 0.2." in text
 
 
 @pytest.mark.parametrize(

@@ -70,18 +70,16 @@ def test_a_trial_in_another_unit_is_named_first(drag):
     x = slid(drag=drag)
     x[7] *= 100
     report = report_of(x)
-    line, paragraph = str(report).split("\n\n")[0].split("\n", 1)
+    line = str(report).splitlines()[0]
     assert report.verdict == ("drag" if drag else NONE)
     assert line.endswith("; held-out trial 7 is far outside it")
     (missed,) = report.evaluation.missed
     size = float((x[7] - x[7] / 100) / SENSOR)
     assert missed.size == pytest.approx(size, rel=0.01)
     assert missed.by_both
-    told = " ".join(paragraph.split())
-    assert "Held-out trial 7 is far outside what the verdict's model predicts" in told
-    assert f"missed by {missed.size:.0f} sensor deviations" in told
     (warning,) = [w for w in report.warnings if "far outside" in w]
     assert warning.startswith("held-out trial 7 is")
+    assert f"missed by {missed.size:.0f} sensor deviations" in warning
     assert "held-out-missed" in warning
     for page in (report.to_markdown(), report.to_html()):
         assert page.count("held-out trial 7 is far outside") >= 2
