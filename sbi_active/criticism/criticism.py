@@ -26,8 +26,8 @@ from sbi_active.criticism.effects.joint_prior import joint_prior
 from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summarize
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.screening import linear_models
-from sbi_active.criticism.misfit.by_sensor import BySensor
 from sbi_active.criticism.misfit.evaluation import evaluate_linear
+from sbi_active.criticism.misfit.linear_evidence import LinearEvidence
 from sbi_active.criticism.misfit.missed import beside_misfit
 from sbi_active.criticism.misfit.record import detected, traced
 from sbi_active.criticism.misfit.rule import Rule
@@ -205,12 +205,11 @@ class Criticism:
                     self.trials, self._equivalent = without(self.trials, found), None
                     self._look()
                     return self.misfit()
-            self._found = Sampled(self.rivals, groups, self._linear)
-            timed = self.rivals.measurements.is_sequence
+            self._found = Sampled(self.rivals, groups)
             jumps = not self.rivals.is_smooth or self.rivals.roughness.any()
-            timed &= self._is_large or not jumps  # which no linear model follows
-            if timed and self._linear is not None and self._misfit is None:
-                self._found = BySensor(self._linear, self.rivals, groups)
+            follows = self._is_large or not jumps  # else no linear model does
+            if follows and self._linear is not None and self._misfit is None:
+                self._found = LinearEvidence(self._linear, self.rivals, groups)
             self._is_searched = True
         return self._misfit
 

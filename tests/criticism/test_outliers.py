@@ -145,7 +145,8 @@ def test_a_gross_error_is_named_by_the_trial_s_own_index(size):
     assert abs(theta["theta_2"] + 2.0) < 0.6  # without the trial
 
 
-def test_a_slip_along_a_trajectory_is_an_outlier_and_no_process():
+@pytest.mark.parametrize(("num", "wrong"), [(4, 0), (5, 4), (8, 5)])
+def test_a_slip_along_a_trajectory_is_an_outlier_and_no_process(num, wrong):
     times = torch.linspace(0.1, 1, 12)
 
     def path(theta, action):
@@ -153,14 +154,14 @@ def test_a_slip_along_a_trajectory_is_an_outlier_and_no_process():
 
     model = SimulatorModel(path, noise=GaussianNoise(0.05), sample_times=times)
     gen = torch.Generator().manual_seed(0)
-    xi = torch.linspace(-2, 2, 8)
-    x = path(torch.tensor([[1.0, 2.0]]).expand(8, -1), xi[:, None])
+    xi = torch.linspace(-2, 2, num)
+    x = path(torch.tensor([[1.0, 2.0]]).expand(num, -1), xi[:, None])
     x = x + 0.05 * torch.randn(x.shape, generator=gen)
-    x[5] = x[5] / 100  # metres for centimetres
+    x[wrong] = x[wrong] / 100  # metres for centimetres
     trials = Trials(xi, x, sample_times=times)
     found = Criticism(model, PRIOR, trials).trace()
     assert found.verdict == "outlier"
-    assert suspects(found) == (5.0,)
+    assert suspects(found) == (float(wrong),)
 
 
 @pytest.mark.parametrize("wrong", [1e15, -1e30, "unit"])

@@ -20,7 +20,6 @@ from sbi_active.criticism.evidence.jumps import STEPS, look_for_jumps
 from sbi_active.criticism.evidence.outliers import OneOutlier
 from sbi_active.criticism.evidence.predicted_before import predicted_before
 from sbi_active.criticism.evidence.settings import (
-    KNOWN,
     NESTED,
     ROUGH,
     THOROUGH,
@@ -83,8 +82,6 @@ class RivalSet:
             ``noise`` has on top of the declared one, shape (N,); 0 where it is smooth.
         fits: The rivals that were asked for.
         found: Modes of some that are not fitted yet.
-        best_fits: Points where least squares ended, of rivals that were fitted so, by
-            their coordinates; their searches begin there.
         warm_up: Time from its first sample in which a trial that was not fitted tells
             of its nuisances, and is not scored.
     """
@@ -126,7 +123,6 @@ class RivalSet:
             self.noise = self.noise.with_extra(self.roughness)
         self.fits: dict[ModelKey, Fit] = {}
         self.found: dict[ModelKey, Found] = {}
-        self.best_fits: dict[ModelKey, Array] = {}
 
     def noise_of(self, measurements: Measurements) -> NoiseGrid:
         """Return the errors of some measurements."""
@@ -257,10 +253,6 @@ class RivalSet:
         rival, seed = self.rival(key), derive_seed(self.seed, "search", str(key))
         near = starts_near_parents(self.fits, rival, seed)
         how = THOROUGH if near is None else NESTED
-        if key in self.best_fits:
-            # Every mode of the bare model counts; of others what is beside the best.
-            near = self.best_fits[key][None]
-            how = THOROUGH if key == ModelKey() else KNOWN
         how = how if self.is_smooth else ROUGH
         return _searched(rival, near, how, seed)
 

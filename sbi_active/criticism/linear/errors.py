@@ -18,6 +18,7 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,8 +47,31 @@ WIDTHS = (1 / 3, 1.0, 3.0)
 SMALLEST, LARGEST, FACTOR = 0.3, 40.0, 1.63
 #: Every so many of the sizes is one of what differs from trial to trial.
 THINNED = 2
-#: Trials below which parts of them are left out in their place, and how many parts.
+#: Trajectories below which parts are left out in their place, and how many parts.
 FEWEST, NUM_FOLDS = 6, 8
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """A linear model's posterior, summed over hypotheses of the errors.
+
+    Attributes:
+        log_evidence: Log evidence, nats.
+        mean: Mean of u, shape (d,).
+        cov: Covariance of u, shape (d, d).
+        log_z: Log evidence of each hypothesis times its prior probability, by factor
+            on the scale of effects' priors, shape (h, w).
+    """
+
+    log_evidence: float
+    mean: Array
+    cov: Array
+    log_z: Array
+
+    @property
+    def share(self) -> Array:
+        """Posterior probability of each hypothesis, shape (h,)."""
+        return np.exp(self.log_z - self.log_evidence).sum(1)
 
 
 @dataclass(frozen=True)
@@ -118,8 +142,9 @@ class Errors:
     ) -> None:
         m = self.measurements = measurements
         self.unit = unit
-        self.fold = parts_of(m, FEWEST, NUM_FOLDS)
-        self.is_by_trial = len(np.unique(m.trial)) >= FEWEST
+        fewest = FEWEST if m.is_sequence else 1
+        self.fold = parts_of(m, fewest, NUM_FOLDS)
+        self.is_by_trial = len(np.unique(m.trial)) >= fewest
         self.num_folds = int(self.fold.max()) + 1
         self.is_scored = np.ones(len(m), dtype=bool)
         if self.is_by_trial:
@@ -205,49 +230,87 @@ class Errors:
             process: Whether u is given the process; else the sensor's error alone.
         """
         use = np.ones(self.num_folds, bool) if folds is None else folds
-        gram, log_det = grams.gram[:, use].sum(1), grams.log_det[:, use].sum(1)
-        shift = np.eye(gram.shape[1])
-        shift[1:, 0] = -model.center
-        gram = shift.T @ gram @ shift
-        found = [integrated(gram, model, factor * width) for width in WIDTHS]
-        log_z = np.stack([f[0] for f in found], 1)  # (h, widths)
-        const = grams.count[use].sum() * LOG_2PI
-        log_z = log_z - 0.5 * (log_det[:, None] + const) - np.log(len(WIDTHS))
-        n = len(self.cells)
-        by_sensor = (log_z[:n] + self.log_cells[:, None]).ravel()
-        by_process = (log_z[n:] + self.log_prior[:, None]).ravel()
-        log_sensor = float(log_sum_exp(by_sensor))
-        log_process = float(log_sum_exp(by_process))
-        log_p = by_process if process else by_sensor
-        p = np.exp(log_p - (log_process if process else log_sensor))
-        which = slice(n, None) if process else slice(n)
-        means = np.stack([f[1] for f in found], 1)[which].reshape(len(p), -1)
-        covs = np.stack([f[2] for f in found], 1)[which]
-        covs = covs.reshape(len(p), *covs.shape[2:])
-        mean = p @ means
-        off = means - mean
-        cov = np.einsum("h,hij->ij", p, covs) + (p[:, None] * off).T @ off
+        gram = grams.gram[:, use].sum(1)
+        log_weight = np.concatenate([self.log_cells, self.log_prior])
+        log_weight += self.constants(grams, use)
+        n, widths = len(self.cells), [factor * width for width in WIDTHS]
+        sensor = summed(gram[:n], log_weight[:n], model, widths)
+        beside = summed(gram[n:], log_weight[n:], model, widths)
+        own = beside if process else sensor
+        log_z = sensor.log_evidence, beside.log_evidence
         if not process:
-            center = mean + model.center
             nothing = np.zeros(1 + self.varying.shape[1])
-            return Posterior(log_sensor, log_process, center, cov, 0.0, 1.0, nothing)
-        end = self.num_processes * len(WIDTHS)
-        shape = len(self.kernels), len(self.times), len(self.sizes), len(WIDTHS)
-        process = p[:end].reshape(shape).sum((0, 1, 3)) @ self.sizes**2
-        differ = p[end:].reshape(-1, len(self.spreads), len(WIDTHS)).sum(2)
-        log_p = by_process[:end]
+            return Posterior(*log_z, own.mean, own.cov, 0.0, 1.0, nothing)
+        shape = len(self.kernels), len(self.times), len(self.sizes)
+        p, end = own.share, self.num_processes
+        process = p[:end].reshape(shape).sum((0, 1)) @ self.sizes**2
+        differ = p[end:].reshape(-1, len(self.spreads))
+        log_p = log_sum_exp(own.log_z[:end], axis=1)
         each = np.exp(log_p - log_sum_exp(log_p)).reshape(shape)
-        sizes, times = each.sum((0, 1, 3)), each.sum((0, 2, 3))
+        sizes, times = each.sum((0, 1)), each.sum((0, 2))
         middle = int(np.searchsorted(np.cumsum(times), 0.5))
         return Posterior(
-            log_sensor,
-            log_process,
-            mean + model.center,
-            cov,
+            *log_z,
+            own.mean,
+            own.cov,
             float(sizes @ self.sizes),
             float(self.times[min(middle, len(self.times) - 1)]),
             np.append(process, differ @ self.spreads**2),
         )
+
+    def constants(self, grams: Grams, use: Any = slice(None)) -> Array:
+        """Return the log constants of densities of some parts of the trials, (h,)."""
+        log_det = grams.log_det[:, use].sum(1)
+        return -0.5 * (log_det + grams.count[use].sum() * LOG_2PI)
+
+    def scaled(self, rows: Array, factors: Array) -> tuple[Array, Array]:
+        """Return Gram matrices of all rows under other sizes of the sensor's error.
+
+        Args:
+            rows: Rows, shape (N, k).
+            factors: Factors on the size, one a number, shape (s, N), or (s, 1).
+
+        Returns:
+            Gram matrices, shape (s c, k, k), and log weights, shape (s c,).
+        """
+        factors = np.broadcast_to(factors, (len(factors), len(rows)))
+        grams, log_weight = [], []
+        for cell, log_p in zip(self.cells, self.log_cells, strict=True):
+            white = cell.whiten(rows.T / factors[:, None])  # (s, k, N)
+            grams.append(white @ np.swapaxes(white, 1, 2))
+            log_det = cell.log_scale + np.log(factors).sum(1)
+            log_weight.append(log_p - log_det - 0.5 * len(rows) * LOG_2PI)
+        return np.concatenate(grams), np.concatenate(log_weight)
+
+    def one_trial(self, grams: Grams) -> tuple[Array, Array]:
+        """Return Gram matrices with a process in one trial, whichever it is.
+
+        The sensor's error elsewhere is the most probable of those declared.
+
+        Args:
+            grams: Gram matrices of a model's rows.
+
+        Returns:
+            Gram matrices, shape (t h, k, k), trial by trial, and log weights, (t h,).
+        """
+        n, own = len(self.cells), int(np.argmax(self.log_cells))
+        some = slice(n, n + self.num_processes)
+        gram, log_det = grams.gram[own].sum(0), grams.log_det[own].sum()
+        found, weights = [], []
+        for at in self.trials:
+            change = grams.gram[some][:, at].sum(1) - grams.gram[own, at].sum(0)
+            found.append(gram + change)
+            change = grams.log_det[some][:, at].sum(1) - grams.log_det[own, at].sum()
+            weights.append(-0.5 * (log_det + change + grams.count.sum() * LOG_2PI))
+        weight = np.concatenate(weights)
+        return np.concatenate(found), weight - np.log(len(weight))
+
+    @property
+    def trials(self) -> list[NDArray[np.bool_]]:
+        """Masks of the parts of each trial, shape (f,)."""
+        trial = self.measurements.trial
+        own = [np.unique(self.fold[trial == t]) for t in np.unique(trial)]
+        return [np.isin(np.arange(self.num_folds), parts) for parts in own]
 
     def weight(self, posterior: Posterior) -> Array:
         """Return weights of the squared errors of trials, mean one, shape (N,).
@@ -266,11 +329,41 @@ class Errors:
         return weight / weight.mean()
 
 
+def summed(
+    gram: Array,
+    log_weight: Array,
+    model: LinearModel,
+    widths: Sequence[float] = (1.0,),
+) -> Mixture:
+    """Return the posterior of a linear model, summed over hypotheses of the errors.
+
+    Args:
+        gram: Gram matrices of its rows, shape (h, 1 + d, 1 + d).
+        log_weight: Log prior probabilities, with the constants of densities, (h,).
+        model: Linear model with its prior.
+        widths: Factors on the scales of effects' priors, equally likely.
+    """
+    found = [integrated(gram, model, width) for width in widths]
+    log_z = np.stack([f[0] for f in found], 1) + log_weight[:, None]
+    log_z = log_z - np.log(len(widths))
+    total = float(log_sum_exp(log_z.ravel()))
+    p = np.exp(log_z - total).ravel()
+    means = np.stack([f[1] for f in found], 1).reshape(len(p), -1)
+    covs = np.stack([f[2] for f in found], 1).reshape(len(p), *gram[0, 1:, 1:].shape)
+    mean = p @ means
+    off = means - mean
+    cov = np.einsum("h,hij->ij", p, covs) + (p[:, None] * off).T @ off
+    return Mixture(total, mean, cov, log_z)
+
+
 def integrated(
     gram: Array, model: LinearModel, width: float
 ) -> tuple[Array, Array, Array]:
-    """Return evidences less their constants, and posterior moments of u - center."""
+    """Return evidences less their constants, and posterior moments of u."""
     sd = model.widened(width)
+    shift = np.eye(gram.shape[1])
+    shift[1:, 0] = -model.center
+    gram = shift.T @ gram @ shift
     g, b, rr = gram[:, 1:, 1:], gram[:, 1:, 0], gram[:, 0, 0]
     precision = sd[:, None] * g * sd + np.eye(len(sd))
     # Columns of very different size, as of what jumps, keep their digits in units of
@@ -290,7 +383,7 @@ def integrated(
         inside = log_inside(mean[:, some], own, low[some], high[some])
         before = log_inside(np.zeros(some.sum()), sd[some], low[some], high[some])
         log_z = log_z + inside.sum(1) - before.sum()
-    return log_z, mean, cov
+    return log_z, mean + model.center, cov
 
 
 def _in_units(cell: NoiseCell, unit: Array) -> NoiseCell:

@@ -21,7 +21,7 @@ from sbi_active.criticism.evidence.predicted_before import NUM_DRAWS
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.linear.candidate import Candidate
-from sbi_active.criticism.linear.errors import Errors
+from sbi_active.criticism.linear.errors import Errors, Mixture, summed
 from sbi_active.criticism.linear.fits import along_secants, best_fit, polished
 from sbi_active.criticism.linear.left_out import leave_out
 from sbi_active.criticism.linear.library import Library
@@ -138,10 +138,9 @@ class Search:
                     scores[key] = max(value, scores.get(key, -np.inf))
             most = own.num_pairs if size == 2 else own.num_larger
             best = sorted(scores, key=scores.__getitem__)[::-1][:most]
-            sampled = self._sampled(size)
-            for key in dict.fromkeys([*best, *sampled]):
+            for key in best:
                 least = max(c.log_p_either for c in self.found.values()) - own.behind
-                if key in sampled or scores[key] > least:
+                if scores[key] > least:
                     self.fit_set(key)
             new = [
                 c.log_p_either for k, c in self.found.items() if len(k.effects) == size
@@ -154,33 +153,19 @@ class Search:
         """Fit one set of effects from its parts, once."""
         if key not in self.found:
             known = [p for p in key.parts if p in self.found]
-            # The effects alone of a set that sampling found may be what was fitted.
-            alone = [ModelKey((n,)) for n in key.effects]
-            alone = [k for k in alone if k in self.found]
-            self.keep(self._fit(key, known or alone or [ModelKey()]))
+            self.keep(self._fit(key, known or [ModelKey()]))
         return self.found[key]
 
-    def best_fits(self) -> dict[ModelKey, Array]:
-        """Return the coordinates of the best fits."""
-        return {key: c.model.u for key, c in self.found.items()}
+    def beside_smooth(self, key: ModelKey) -> Mixture:
+        """Return a model's posterior beside a smooth function of the action.
 
-    def worthy(self) -> list[ModelKey]:
-        """Return the sets of several effects worth a sample, smaller ones first.
-
-        With the sensor's error alone, by log posteriors that are not far behind the
-        best; among the parts of the best all count.
+        It stands for what was not declared where x has no time axis.
         """
-        behind, most = self.settings.behind, self.settings.num_sampled
-        log_p = {key: c.log_p_sensor for key, c in self.found.items()}
-        best = max(log_p, key=log_p.__getitem__)
-        some = {k for k, v in log_p.items() if v > log_p[best] - behind}
-        todo = [best]
-        while todo:
-            parts = [k for k in todo.pop().parts if k in log_p]
-            some |= {*parts}
-            todo += parts
-        several = [k for k in some if len(k.effects) > 1]
-        return sorted(several, key=lambda k: (len(k.effects), -log_p[k]))[:most]
+        model = self.found[key].model
+        rows = self.unit[:, None] * model.rows
+        grams, log_weight = self.rivals.residual_process().grams(rows)
+        units = np.log(self.unit).sum()  # densities are of sensor deviations
+        return summed(grams, log_weight + units, model)
 
     @property
     def explains(self) -> bool:
@@ -234,14 +219,6 @@ class Search:
         ]
         picked = [key for rank in zip(*orders, strict=True) for key in rank]
         return [*dict.fromkeys(picked)][: self.settings.num_bases]
-
-    def _sampled(self, size: int) -> list[ModelKey]:
-        """Return the sets that sampled evidence puts in front, where there is any."""
-        fits = self.rivals.fits
-        keys = [k for k in fits if len(k.effects) == size and k.error is None]
-        keys = [k for k in keys if {*k.effects} <= {*self.names}]
-        best = sorted(keys, key=lambda k: -fits[k].evidence.log_evidence)
-        return best[: self.settings.num_bases]
 
     def _beside(self, base: ModelKey, size: int) -> dict[ModelKey, float]:
         """Return linear log posteriors of larger sets beside a model."""
@@ -331,8 +308,6 @@ class Search:
         u = c.sample(own.num_drawn, seed=derive_seed(self._seed, str(key)))
         u[:, shared] = model.u
         starts = [u]
-        if key in self.rivals.fits:  # what is flat at its null was found by sampling
-            starts.append(self.rivals.fits[key].likeliest[:1])
         if not all(has_null(self.rivals.effects[n]) for n in key.effects):
             seed = derive_seed(self._seed, str(key), "screened")
             far = c.sample(own.num_far, seed=seed)

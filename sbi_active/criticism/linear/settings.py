@@ -29,8 +29,6 @@ class FitSettings:
         max_effects: Effects of a set at most.
         behind: Nats by which linear evidence puts a larger set behind one that is
             fitted, so that it is not fitted.
-        num_sampled: Number of sets that are sampled at most, of those behind by less,
-            where evidence is sampled.
         passes: Tail probability of a chi-square from which nothing larger than a pair
             is looked for.
     """
@@ -51,5 +49,4 @@ class FitSettings:
     num_larger: int = 3
     max_effects: int = 4
     behind: float = 10.0
-    num_sampled: int = 8
     passes: float = 0.01

@@ -11,7 +11,6 @@ from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit.guesses import (
     MARGIN,
     guess_residual,
-    smooth_evidence,
 )
 from sbi_active.criticism.results import ModelKey
 from sbi_active.simulation import GaussianNoise
@@ -127,4 +126,6 @@ def test_the_evidence_of_the_residual_process_is_that_of_its_covariances():
     assert np.logaddexp.reduce(log_weight) == pytest.approx(0, abs=1e-6)
     exact = np.logaddexp.reduce(np.array(log_p) + log_weight)
     assert not np.isfinite(model.low).any()
-    assert smooth_evidence(search) == pytest.approx(exact, abs=1e-6)
+    assert search.beside_smooth(ModelKey()).log_evidence == pytest.approx(
+        exact, abs=1e-6
+    )

@@ -1,8 +1,8 @@
-"""The verdict where some model fits to the sensor's error, by linear evidence alone.
+"""Evidence of linear models in closed form: no trial is simulated for it.
 
-Which effect is missing is told with the rules of the sampled evidence: the alarm, prior
-probabilities, catch-alls, and what a trial's gross error may have done. Forces of one
-family are alternatives of one cause: the family is chosen first, then its form.
+A larger noise scales all Gram matrices. A gross error is a residual process in one
+trial alone, whichever it is; what is "unexplained", a process in all of them, and
+without a time axis a smooth function of the action.
 """
 
 from __future__ import annotations
@@ -12,18 +12,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.evidence.unknown_scale import log_evidence
-from sbi_active.criticism.linear.errors import Posterior
+from sbi_active.criticism.linear.errors import WIDTHS, Mixture, Posterior, summed
 from sbi_active.criticism.linear.search import Search
-from sbi_active.criticism.misfit.catch_alls import (
-    log_one_part,
-    log_scaled,
-    log_without,
-)
 from sbi_active.criticism.misfit.record import detection_of, keep_draws
 from sbi_active.criticism.results import (
     CATCH_ALLS,
@@ -37,25 +33,27 @@ from sbi_active.criticism.results import (
 from sbi_active.criticism.rivals.error_models import NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import scattered
 from sbi_active.criticism.steps.combinations import log_prior
-from sbi_active.criticism.steps.detection import (
-    LEVEL,
-    REFUTED,
-    THRESHOLD,
-)
+from sbi_active.criticism.steps.detection import LEVEL, REFUTED, THRESHOLD
 from sbi_active.criticism.steps.tracing import (
     log_bayes_factor,
     log_priors,
     probabilities_of,
     verdict_of,
 )
-from sbi_active.inference.sampling.weights import log_sum_exp
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.support import support_bounds, support_of
 
 Array = NDArray[Any]
 
+#: Draws of an effect on the noise, over which its evidence is a mean.
+NUM_LOUDER = 200
+#: Trials of which one can be told to be the one that errs: two agree against it.
+FEWEST_TRIALS = 3
+
 
 @dataclass
-class BySensor:
-    """Linear models of which one fits to the sensor's error.
+class LinearEvidence:
+    """Evidence of linear models, of which one may fit to the sensor's error.
 
     Attributes:
         search: Search with its models.
@@ -66,34 +64,12 @@ class BySensor:
     search: Search
     rivals: RivalSet
     equivalent: Sequence[frozenset[str]] = ()
-    _log_z: dict[ModelKey, float] = field(default_factory=dict)
+    _summed: dict[ModelKey, Mixture] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.search.fit_singles()
-        errors, log_z = self.search.errors, self._log_z
-        found = self.search.found
-        log_z |= {key: c.posterior.log_sensor for key, c in found.items()}
-        bare = found[ModelKey()]
-        log_z[ModelKey(error=UNEXPLAINED)] = bare.posterior.log_process
-        noise = scattered(NoiseGrid(self.search.cells))  # in units of the sensor
-        scaled = log_scaled(bare, errors, noise.scales[:, None])
-        log_z[ModelKey(error=SCATTER)] = float(
-            log_sum_exp(scaled + noise.log_scale_prior)
-        )
-        # No column tells of effects on the noise alone, whose evidence is sampled.
-        noisy = [n for n, e in self.rivals.effects.items() if e.hook == "noise"]
-        if noisy:
-            shift = bare.posterior.log_sensor - log_evidence(self.rivals)[0]
-            for key in (ModelKey((n,)) for n in noisy):
-                log_z[key] = shift + log_evidence(self.rivals, key)[0]
-        self._one_part = np.empty(0)
-        if errors.is_by_trial:
-            self._one_part = log_one_part(bare, errors)
-            total = log_sum_exp(self._one_part) - np.log(errors.num_folds)
-            log_z[ModelKey(error=OUTLIER)] = float(total)
         if self.detected().alarm:
             self.search.fit_larger()
-            log_z |= {key: c.posterior.log_sensor for key, c in found.items()}
 
     def posterior(self, key: ModelKey, use: NDArray[np.bool_]) -> Posterior:
         """Return the posterior of a model by some parts of the trials."""
@@ -116,22 +92,22 @@ class BySensor:
     @property
     def catch_alls(self) -> tuple[str, ...]:
         """Catch-alls that are compared after an alarm."""
-        if len(self._one_part):
+        if len(self.search.errors.trials) >= FEWEST_TRIALS:
             return CATCH_ALLS
         return tuple(name for name in CATCH_ALLS if name != OUTLIER)
 
     def detected(self) -> Detection:
         """Return whether the bare model misses the trials."""
+        names = (UNEXPLAINED, SCATTER, *self.rivals.effects)
+        keys = [ModelKey(), *map(ModelKey.of, names)]
+        log_b = log_bayes_factor({k: self.log_evidence(k) for k in keys}, self)
         level = LEVEL if self.rivals.has_known_noise else 0.0
-        log_b = log_bayes_factor(self._log_z, self)
         bare = self.search.found[ModelKey()]
         square, p = self._chi_square(ModelKey())
         found = detection_of(bare, log_b, level)
         found = replace(found, chi_square=square, p_value=p)
-        noise, spare = (
-            self.rivals.model.noise,
-            len(bare.model.residual) - len(bare.model.u),
-        )
+        noise = self.rivals.model.noise
+        spare = len(bare.model.residual) - len(bare.model.u)
         is_declared = noise is not None and noise.posterior is None and spare > 0
         if not is_declared or self.rivals.roughness.any():
             return found
@@ -153,17 +129,78 @@ class BySensor:
 
     def log_evidence(self, key: ModelKey, *, factor: float = 1.0) -> float:
         """Return a model's log evidence, priors of effects as many times as wide."""
-        if factor == 1 or key not in self.search.found:
-            return self._log_z[key]
-        c, errors = self.search.found[key], self.search.errors
-        own = errors.posterior(c.model, c.grams, factor=factor, process=False)
-        return own.log_sensor
+        if factor == 1 or key.error is not None:
+            return self._mixture(key).log_evidence
+        return self._summed_out(key, factor).log_evidence
+
+    def _mixture(self, key: ModelKey) -> Mixture:
+        """Return a model's posterior, computed once."""
+        if key not in self._summed:
+            self._summed[key] = self._summed_out(key)
+        return self._summed[key]
+
+    def _summed_out(self, key: ModelKey, factor: float = 1.0) -> Mixture:
+        """Return a model's posterior, priors of effects as many times as wide."""
+        predicting = self._predicting(key)
+        c, errors = self.search.found[predicting], self.search.errors
+        n, widths = len(errors.cells), [factor * width for width in WIDTHS]
+        rows = c.model.rows
+        if key.error == SCATTER:
+            noise = scattered(NoiseGrid(self.search.cells))  # in units of the sensor
+            grams, log_weight = errors.scaled(rows, noise.scales[:, None])
+            log_weight += np.tile(noise.log_scale_prior, n)
+        elif key.error == OUTLIER:
+            grams, log_weight = errors.one_trial(c.grams)
+        elif key.error == UNEXPLAINED and not self.rivals.measurements.is_sequence:
+            return self.search.beside_smooth(predicting)
+        elif louder := self._louder(key):
+            scale = self._scales(louder, factor)[1]
+            grams, log_weight = errors.scaled(rows, scale)
+            return summed(grams, log_weight - np.log(len(scale)), c.model, widths)
+        else:
+            own = slice(n, None) if key.error else slice(n)
+            prior = errors.log_prior if key.error else errors.log_cells
+            grams = c.grams.gram[own].sum(1)
+            log_weight = prior + errors.constants(c.grams)[own]
+        return summed(grams, log_weight, c.model, (1.0,) if key.error else widths)
+
+    def _louder(self, key: ModelKey) -> list[Effect]:
+        """Return the effects of a set that act on the noise alone."""
+        effects = [self.rivals.effects[name] for name in key.effects]
+        return [e for e in effects if e.hook == "noise"]
+
+    def _scales(self, effects: Sequence[Effect], factor: float) -> tuple[Array, Array]:
+        """Return draws of effects on the noise, and its factors, (n, k) and (n, N)."""
+        parts = []
+        for e in effects:
+            with forked_generators(self.rivals.seed, "louder", e.name):
+                phi = e.sample(NUM_LOUDER).double()
+            null = e.null_phi(1)
+            ends = np.stack(support_bounds(support_of(e.prior), e.phi_dim))
+            if bool(null.isfinite().all()) and not np.isfinite(ends).all(0).any():
+                width = torch.tensor(factor * np.resize(WIDTHS, NUM_LOUDER))
+                phi = null + width[:, None] * (phi - null)
+            parts.append(phi)
+        named = {e.name: phi for e, phi in zip(effects, parts, strict=True)}
+        scale = self.rivals.simulator.noise_scale(named, NUM_LOUDER)
+        assert scale is not None
+        phi = np.concatenate([part.numpy() for part in parts], 1)
+        return phi, np.maximum(scale, 1e-12)
 
     def larger(
         self, singles: Mapping[str, float], prior: Mapping[str, float]
     ) -> dict[ModelKey, float]:
         """Return log posteriors of sets of several effects, where they gain enough."""
-        return self._gaining(self._log_z, prior)
+        noisy = [n for n in singles if n not in self.search.names]
+        others = [n for n in singles if n in self.search.names]
+        keys = [*self.search.found]
+        if noisy and others:  # the best effect with each on the noise
+            best = max(others, key=singles.__getitem__)
+            every = self.rivals.effects
+            pairs = ({best, name} for name in noisy)
+            keys += [ModelKey(tuple(n for n in every if n in pair)) for pair in pairs]
+            keys += [ModelKey((name,)) for name in noisy]
+        return self._gaining({key: self.log_evidence(key) for key in keys}, prior)
 
     def _gaining(
         self, log_z: Mapping[ModelKey, float], prior: Mapping[str, float]
@@ -183,41 +220,46 @@ class BySensor:
 
     def log_with_process(self, key: ModelKey) -> float:
         """Return the log evidence of effects with a residual process beside them."""
-        return self.search.found[self._predicting(key)].posterior.log_process
+        return self.log_evidence(ModelKey(key.effects, UNEXPLAINED))
 
     def record(self, key: ModelKey) -> Evidence:
         """Return the record of a model, and keep its draws."""
-        log_z, bare = self._log_z[key], ModelKey()
-        if key.error is not None:
-            return replace(self.record(bare), key=key, log_evidence=log_z)
-        if key not in self.search.found:  # on the noise, sampled
-            return replace(self.rivals.fit(key).evidence, log_evidence=log_z)
-        model = self.search.model(key)
-        use = np.ones(self.search.errors.num_folds, bool)
-        own = self.posterior(key, use)
-        kept = keep_draws(self.rivals, model, own.mean, own.cov, log_z)
-        return replace(kept, log_evidence=log_z)
+        own, model = self._mixture(key), self.search.model(self._predicting(key))
+        phi = None
+        if louder := self._louder(key):
+            rng = np.random.default_rng(derive_seed(self.rivals.seed, "louder"))
+            share = own.share.reshape(-1, NUM_LOUDER).sum(0)
+            drawn = rng.choice(NUM_LOUDER, size=NUM_LOUDER, p=share / share.sum())
+            phi = self._scales(louder, 1.0)[0][drawn]
+        log_z = own.log_evidence
+        return keep_draws(
+            *(self.rivals, key, model, own.mean, own.cov, log_z), louder=phi
+        )
 
     def outliers(self) -> dict[float, float]:
         """Return the probability that each trial is the one with a gross error."""
-        if not len(self._one_part):
+        if OUTLIER not in self.catch_alls:
             return {}
-        share = np.exp(self._one_part - log_sum_exp(self._one_part))
         index = self.rivals.trials.index.numpy()
         trials = np.unique(self.rivals.measurements.trial)
+        share = self._mixture(ModelKey(error=OUTLIER)).share
+        share = share.reshape(len(trials), -1).sum(1)
         order = np.argsort(-share, kind="stable")
         return {float(index[trials[k]]): float(share[k]) for k in order}
 
     def needed(self, key: ModelKey) -> tuple[float, ...]:
         """Return the trials without which the data do not point to some effects."""
-        errors, found = self.search.errors, self.search.found
-        log_b = self._log_z[key] - self._log_z[ModelKey()]
-        if key not in found or log_b < THRESHOLD or not errors.is_by_trial:
+        bare, found = ModelKey(), self.search.found
+        log_b = self.log_evidence(key) - self.log_evidence(bare)
+        if key not in found or log_b < THRESHOLD or OUTLIER not in self.catch_alls:
             return ()
-        own, bare = (log_without(found[k], errors) for k in (key, ModelKey()))
+        without = [
+            self.posterior(key, ~own).log_sensor - self.posterior(bare, ~own).log_sensor
+            for own in self.search.errors.trials
+        ]
         trials = np.unique(self.rivals.measurements.trial)
         index = self.rivals.trials.index.numpy()[trials]
-        return (*index[own - bare < THRESHOLD].tolist(),)
+        return (*index[np.array(without) < THRESHOLD].tolist(),)
 
     def p_value(self, key: ModelKey) -> float:
         """Return the tail probability of a model's chi-square."""
@@ -225,8 +267,8 @@ class BySensor:
 
     def log_process(self, key: ModelKey) -> float:
         """Return the log Bayes factor of a residual process beside a model, nats."""
-        own = self.search.found[self._predicting(key)].posterior
-        return own.log_process - own.log_sensor
+        key = self._predicting(key)
+        return self.log_with_process(key) - self.log_evidence(key)
 
     def _predicting(self, key: ModelKey) -> ModelKey:
         """Return the effects of a set that change the prediction."""

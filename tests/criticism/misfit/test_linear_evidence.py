@@ -16,7 +16,7 @@ from sbi_active.criticism.forces import force_effects
 from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.sensor import sensor_error
-from sbi_active.criticism.misfit.by_sensor import BySensor
+from sbi_active.criticism.misfit.linear_evidence import LinearEvidence
 from sbi_active.criticism.results import OUTLIER, UNEXPLAINED, ModelKey
 from sbi_active.criticism.steps.tracing import log_priors, trace
 from tests.criticism.forces.test_forces import MODEL, PRIOR, SD, measured
@@ -128,7 +128,7 @@ def test_a_gross_error_of_one_trial_is_found_without_simulations(few):
         list(few.rivals.effects.values()),
     )
     wrong.fit_singles()
-    verdict = BySensor(wrong, wrong.rivals)
+    verdict = LinearEvidence(wrong, wrong.rivals)
     tracing = trace(verdict, verdict.detected(), compare=False)
     assert tracing.verdict == OUTLIER
     assert next(iter(tracing.outliers)) == 3.0
@@ -137,7 +137,7 @@ def test_a_gross_error_of_one_trial_is_found_without_simulations(few):
 def test_clean_trials_have_none(few):
     clean = few_of(measured(seed=2), list(few.rivals.effects.values()))
     clean.fit_singles()
-    verdict = BySensor(clean, clean.rivals)
+    verdict = LinearEvidence(clean, clean.rivals)
     assert not verdict.detected().alarm
     assert trace(verdict, verdict.detected(), compare=False).verdict == "none"
 
