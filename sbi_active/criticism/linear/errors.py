@@ -19,7 +19,8 @@ References:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ from sbi_active.criticism.linear.processes import (
     parts_of,
     time_scales,
 )
-from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell
+from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseGrid
 from sbi_active.criticism.steps.nuisances import is_first_part
 from sbi_active.inference.sampling.truncated import log_inside
 from sbi_active.inference.sampling.weights import log_sum_exp
@@ -111,7 +112,7 @@ class Errors:
     Args:
         measurements: Measurements with a time axis.
         unit: Standard deviation of the sensor, shape (N,).
-        cells: The sensor's error, with what is unknown of its correlation.
+        noise: The sensor's error, with what is unknown of it.
         largest: Root mean square of the residual of a model that misses, in sensor
             deviations: the process may be twice as large.
         warm_up: Time from its first sample in which a left-out trial tells of its
@@ -125,7 +126,8 @@ class Errors:
         num_folds: Number of folds f.
         is_by_trial: Whether the parts are trials.
         cells: The sensor's error in its units, with what is unknown of its correlation.
-        log_cells: Log prior probability of each, shape (c,).
+        scales: Factors on its size, shape (j,).
+        log_sensor: Log prior probability of each of both, cell by cell, shape (c j,).
         is_scored: Numbers that are predicted where their part is left out, bool, (N,).
         varying: Derivatives of mean square one, zero if nothing depends on it.
     """
@@ -134,7 +136,7 @@ class Errors:
         self,
         measurements: Measurements,
         unit: Array,
-        cells: list[NoiseCell],
+        noise: NoiseGrid,
         *,
         largest: float,
         warm_up: float = 0.0,
@@ -158,9 +160,10 @@ class Errors:
         variances = np.stack([np.ones(num), self.sizes**2], 1)
         self.processes = Processes.grid(variances, self.times, self.kernels)
         self.filters = Filters(self.processes, m, self.fold, self.fold)
-        self.cells = [_in_units(cell, unit) for cell in cells]
-        total = log_sum_exp(np.array([c.log_weight for c in self.cells]))
-        self.log_cells = np.array([c.log_weight for c in self.cells]) - total
+        self.cells = [replace(c, sd=c.sd / unit) for c in noise.cells]
+        self.scales = noise.scales
+        log_p = noise.log_prior[:, None] + noise.log_scale_prior
+        self.log_sensor = log_p.ravel()
         if varying is None or not self.is_by_trial:
             varying = np.empty((len(m), 0))
         size = np.sqrt((varying**2).mean(0))
@@ -186,19 +189,21 @@ class Errors:
     def grams(self, rows: Array) -> Grams:
         """Return the Gram matrices of rows (N, k), the sensor's errors first."""
         k, f = rows.shape[1], self.num_folds
-        num = len(self.cells) + len(self.log_prior)
+        n, num = len(self.log_sensor), len(self.log_sensor) + len(self.log_prior)
+        count = np.bincount(self.fold, minlength=f)
         gram, log_det = np.zeros((num, f, k, k)), np.zeros((num, f))
         for i, cell in enumerate(self.cells):
             white = cell.whiten(rows.T).T
             scale = np.log(cell.sd) + 0.5 * np.log1p(-(cell.rho**2))
-            log_det[i] = 2 * np.bincount(self.fold, scale, f)
+            at = slice(i * len(self.scales), (i + 1) * len(self.scales))
+            sizes = 2 * np.log(self.scales)[:, None] * count
+            log_det[at] = 2 * np.bincount(self.fold, scale, f) + sizes
             for j in range(f):
                 own = white[self.fold == j]
-                gram[i, j] = own.T @ own
-        at = len(self.cells) + self.num_processes
+                gram[at, j] = own.T @ own / self.scales[:, None, None] ** 2
+        at = n + self.num_processes
         process = self.filters.grams(rows)
-        gram[len(self.cells) : at] = process.gram
-        log_det[len(self.cells) : at] = process.log_det
+        gram[n:at], log_det[n:at] = process.gram, process.log_det
         for j in range(f) if self.varying.size else ():
             own = rows[self.fold == j]
             plain = own.T @ own
@@ -209,7 +214,7 @@ class Errors:
                 to = slice(at + v * len(growth), at + (v + 1) * len(growth))
                 gram[to, j] = plain - growth[:, None, None] * np.outer(pull, pull)
                 log_det[to, j] = np.log1p(self.spreads**2 * square)
-        return Grams(gram, log_det, np.bincount(self.fold, minlength=f))
+        return Grams(gram, log_det, count)
 
     def posterior(
         self,
@@ -231,9 +236,9 @@ class Errors:
         """
         use = np.ones(self.num_folds, bool) if folds is None else folds
         gram = grams.gram[:, use].sum(1)
-        log_weight = np.concatenate([self.log_cells, self.log_prior])
+        log_weight = np.concatenate([self.log_sensor, self.log_prior])
         log_weight += self.constants(grams, use)
-        n, widths = len(self.cells), [factor * width for width in WIDTHS]
+        n, widths = len(self.log_sensor), [factor * width for width in WIDTHS]
         sensor = summed(gram[:n], log_weight[:n], model, widths)
         beside = summed(gram[n:], log_weight[n:], model, widths)
         own = beside if process else sensor
@@ -271,37 +276,39 @@ class Errors:
             factors: Factors on the size, one a number, shape (s, N), or (s, 1).
 
         Returns:
-            Gram matrices, shape (s c, k, k), and log weights, shape (s c,).
+            Gram matrices, shape (c j s, k, k), and log weights, shape (c j s,).
         """
         factors = np.broadcast_to(factors, (len(factors), len(rows)))
         grams, log_weight = [], []
-        for cell, log_p in zip(self.cells, self.log_cells, strict=True):
-            white = cell.whiten(rows.T / factors[:, None])  # (s, k, N)
+        each = product(self.cells, self.scales)
+        for (cell, size), log_p in zip(each, self.log_sensor, strict=True):
+            white = cell.whiten(rows.T / (size * factors[:, None]))  # (s, k, N)
             grams.append(white @ np.swapaxes(white, 1, 2))
-            log_det = cell.log_scale + np.log(factors).sum(1)
+            log_det = cell.log_scale + np.log(size * factors).sum(1)
             log_weight.append(log_p - log_det - 0.5 * len(rows) * LOG_2PI)
         return np.concatenate(grams), np.concatenate(log_weight)
 
-    def one_trial(self, grams: Grams) -> tuple[Array, Array]:
+    def one_trial(self, model: LinearModel, grams: Grams) -> tuple[Array, Array]:
         """Return Gram matrices with a process in one trial, whichever it is.
 
-        The sensor's error elsewhere is the most probable of those declared.
+        The sensor's error elsewhere is the most probable one by the other trials.
 
         Args:
-            grams: Gram matrices of a model's rows.
+            model: Linear model.
+            grams: Gram matrices of its rows.
 
         Returns:
             Gram matrices, shape (t h, k, k), trial by trial, and log weights, (t h,).
         """
-        n, own = len(self.cells), int(np.argmax(self.log_cells))
+        n, found, weights = len(self.log_sensor), [], []
         some = slice(n, n + self.num_processes)
-        gram, log_det = grams.gram[own].sum(0), grams.log_det[own].sum()
-        found, weights = [], []
         for at in self.trials:
-            change = grams.gram[some][:, at].sum(1) - grams.gram[own, at].sum(0)
-            found.append(gram + change)
-            change = grams.log_det[some][:, at].sum(1) - grams.log_det[own, at].sum()
-            weights.append(-0.5 * (log_det + change + grams.count.sum() * LOG_2PI))
+            others = grams.gram[:n, ~at].sum(1)
+            log_p = self.log_sensor + self.constants(grams, ~at)[:n]
+            own = int(np.argmax(summed(others, log_p, model).share))
+            log_det = grams.log_det[own, ~at].sum() + grams.log_det[some][:, at].sum(1)
+            found.append(others[own] + grams.gram[some][:, at].sum(1))
+            weights.append(-0.5 * (log_det + grams.count.sum() * LOG_2PI))
         weight = np.concatenate(weights)
         return np.concatenate(found), weight - np.log(len(weight))
 
@@ -384,7 +391,3 @@ def integrated(
         before = log_inside(np.zeros(some.sum()), sd[some], low[some], high[some])
         log_z = log_z + inside.sum(1) - before.sum()
     return log_z, mean + model.center, cov
-
-
-def _in_units(cell: NoiseCell, unit: Array) -> NoiseCell:
-    return NoiseCell(cell.log_weight, cell.sd / unit, cell.rho, cell.df)

@@ -20,16 +20,25 @@ from numpy.typing import NDArray
 from sbi_active.criticism.evidence.predicted_before import NUM_DRAWS
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
-from sbi_active.criticism.linear.candidate import Candidate
 from sbi_active.criticism.linear.errors import Errors, Mixture, summed
-from sbi_active.criticism.linear.fits import along_secants, best_fit, polished
-from sbi_active.criticism.linear.left_out import leave_out
+from sbi_active.criticism.linear.fits import (
+    FitSettings,
+    along_secants,
+    best_fit,
+    polished,
+)
+from sbi_active.criticism.linear.left_out import Candidate, leave_out
 from sbi_active.criticism.linear.library import Library
-from sbi_active.criticism.linear.model import LinearModel, chords, enlarged
-from sbi_active.criticism.linear.nulls import at_null, has_null
-from sbi_active.criticism.linear.settings import FitSettings
+from sbi_active.criticism.linear.model import (
+    LinearModel,
+    at_null,
+    chords,
+    enlarged,
+    has_null,
+)
+from sbi_active.criticism.linear.sensor import Sensor
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.rivals.error_models import NoiseCell
+from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.steps.combinations import log_prior
 from sbi_active.seeding import derive_seed
@@ -43,9 +52,8 @@ class Search:
 
     Args:
         rivals: The models and the trials; smooth.
-        unit: Standard deviation of the sensor, shape (N,).
+        sensor: The sensor's error.
         prior: Log prior probabilities of "none" and each effect.
-        cells: The sensor's error alone.
         settings: Settings of what is spent on fits.
 
     Attributes:
@@ -55,9 +63,8 @@ class Search:
     """
 
     rivals: RivalSet
-    unit: Array
+    sensor: Sensor
     prior: dict[str, float]
-    cells: list[NoiseCell]
     settings: FitSettings = FitSettings()
     found: dict[ModelKey, Candidate] = field(default_factory=dict)
 
@@ -66,13 +73,14 @@ class Search:
         self.names = [e.name for e in effects if e.hook != "noise"]
         self._rivals: dict[ModelKey, Rival] = {}
         self._library: Library | None = None
+        self._process: ResidualProcess | None = None
         self._has_larger = False
         self._seed = derive_seed(self.rivals.seed, "misfit")
         bare = self._fit_bare()
         self.errors = Errors(
             self.rivals.measurements,
             self.unit,
-            self.cells,
+            self.sensor.noise,
             largest=bare.rms,
             warm_up=self.rivals.warm_up if self.rivals.nuisances else 0.0,
             varying=bare.jacobian[:, bare.trial_of < 0],
@@ -80,10 +88,15 @@ class Search:
         self.keep(bare)
 
     @property
+    def unit(self) -> Array:
+        """Standard deviation of the sensor, shape (N,)."""
+        return self.sensor.unit
+
+    @property
     def library(self) -> Library:
         """The bare model with the columns of all effects."""
         if self._library is None:
-            self._library = Library(self)
+            self._library = self._library_of(ModelKey(), self.names)
         return self._library
 
     def model(self, key: ModelKey) -> LinearModel:
@@ -163,7 +176,9 @@ class Search:
         """
         model = self.found[key].model
         rows = self.unit[:, None] * model.rows
-        grams, log_weight = self.rivals.residual_process().grams(rows)
+        if self._process is None:
+            self._process = self.rivals.residual_process(self.sensor.noise)
+        grams, log_weight = self._process.grams(rows)
         units = np.log(self.unit).sum()  # densities are of sensor deviations
         return summed(grams, log_weight + units, model)
 
@@ -171,6 +186,8 @@ class Search:
     def explains(self) -> bool:
         """Whether a model leaves no more than the sensor's error."""
         least = self.settings.passes
+        if not self.sensor.is_known:
+            return False
         return any(c.model.chi_square[2] >= least for c in self.found.values())
 
     def columns(self, key: ModelKey, part: ModelKey) -> NDArray[np.bool_]:
@@ -226,7 +243,7 @@ class Search:
         if any(map(self._free, base.effects)):
             return {}
         names = [n for n in self.names if n not in base.effects and not self._free(n)]
-        library = Library(self, base, names) if base.effects else self.library
+        library = self._library_of(base, names) if base.effects else self.library
         library.prepare(names)
         found = {}
         for new in combinations(names, size - len(base.effects)):
@@ -234,6 +251,12 @@ class Search:
             if key not in self.found:
                 found[key] = library.score(new)
         return found
+
+    def _library_of(self, base: ModelKey, names: Sequence[str]) -> Library:
+        """Return a model with columns of effects that it lacks."""
+        columns = {name: self.column(base, name) for name in names}
+        model = self.found[base].model
+        return Library(base, model, columns, self.errors, self.prior)
 
     def _joined(self, base: ModelKey, names: Iterable[str]) -> ModelKey:
         every = {*base.effects, *names}

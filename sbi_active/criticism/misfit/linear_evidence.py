@@ -30,8 +30,7 @@ from sbi_active.criticism.results import (
     Evidence,
     ModelKey,
 )
-from sbi_active.criticism.rivals.error_models import NoiseGrid
-from sbi_active.criticism.rivals.noise_grid import scattered
+from sbi_active.criticism.rivals.noise_grid import inflations
 from sbi_active.criticism.steps.combinations import log_prior
 from sbi_active.criticism.steps.detection import LEVEL, REFUTED, THRESHOLD
 from sbi_active.criticism.steps.tracing import (
@@ -51,6 +50,15 @@ NUM_LOUDER = 200
 FEWEST_TRIALS = 3
 
 
+def is_linear(rivals: RivalSet) -> bool:
+    """Return whether linear models follow the simulator.
+
+    They follow no jumps, and do not tell which trials have an outcome.
+    """
+    told = rivals.measurements.is_sequence or not rivals.can_fail
+    return told and rivals.is_smooth and not rivals.roughness.any()
+
+
 @dataclass
 class LinearEvidence:
     """Evidence of linear models, of which one may fit to the sensor's error.
@@ -68,6 +76,7 @@ class LinearEvidence:
 
     def __post_init__(self) -> None:
         self.search.fit_singles()
+        self.record(ModelKey())  # what is asked first does not matter
         if self.detected().alarm:
             self.search.fit_larger()
 
@@ -143,15 +152,15 @@ class LinearEvidence:
         """Return a model's posterior, priors of effects as many times as wide."""
         predicting = self._predicting(key)
         c, errors = self.search.found[predicting], self.search.errors
-        n, widths = len(errors.cells), [factor * width for width in WIDTHS]
-        rows = c.model.rows
+        n, widths = len(errors.log_sensor), [factor * width for width in WIDTHS]
+        rows, timed = c.model.rows, self.rivals.measurements.is_sequence
         if key.error == SCATTER:
-            noise = scattered(NoiseGrid(self.search.cells))  # in units of the sensor
-            grams, log_weight = errors.scaled(rows, noise.scales[:, None])
-            log_weight += np.tile(noise.log_scale_prior, n)
+            factors = inflations()
+            grams, log_weight = errors.scaled(rows, factors[:, None])
+            log_weight -= np.log(len(factors))
         elif key.error == OUTLIER:
-            grams, log_weight = errors.one_trial(c.grams)
-        elif key.error == UNEXPLAINED and not self.rivals.measurements.is_sequence:
+            grams, log_weight = errors.one_trial(c.model, c.grams)
+        elif key.error and not (timed and self.search.sensor.is_known):
             return self.search.beside_smooth(predicting)
         elif louder := self._louder(key):
             scale = self._scales(louder, factor)[1]
@@ -159,7 +168,7 @@ class LinearEvidence:
             return summed(grams, log_weight - np.log(len(scale)), c.model, widths)
         else:
             own = slice(n, None) if key.error else slice(n)
-            prior = errors.log_prior if key.error else errors.log_cells
+            prior = errors.log_prior if key.error else errors.log_sensor
             grams = c.grams.gram[own].sum(1)
             log_weight = prior + errors.constants(c.grams)[own]
         return summed(grams, log_weight, c.model, (1.0,) if key.error else widths)
@@ -216,7 +225,7 @@ class LinearEvidence:
     def is_refuted(self, key: ModelKey, detection: Detection) -> bool:
         """Return whether the sensor leaves no room for what a model leaves over."""
         names = self._predicting(key)
-        return bool(names.effects) and self.p_value(names) < REFUTED
+        return bool(names.effects) and self.p_value(names) < REFUTED  # NaN: never
 
     def log_with_process(self, key: ModelKey) -> float:
         """Return the log evidence of effects with a residual process beside them."""
@@ -231,10 +240,8 @@ class LinearEvidence:
             share = own.share.reshape(-1, NUM_LOUDER).sum(0)
             drawn = rng.choice(NUM_LOUDER, size=NUM_LOUDER, p=share / share.sum())
             phi = self._scales(louder, 1.0)[0][drawn]
-        log_z = own.log_evidence
-        return keep_draws(
-            *(self.rivals, key, model, own.mean, own.cov, log_z), louder=phi
-        )
+        given = self.rivals, key, model, own.mean, own.cov, own.log_evidence
+        return keep_draws(*given, louder=phi, unit=self.search.unit)
 
     def outliers(self) -> dict[float, float]:
         """Return the probability that each trial is the one with a gross error."""
@@ -262,7 +269,9 @@ class LinearEvidence:
         return (*index[np.array(without) < THRESHOLD].tolist(),)
 
     def p_value(self, key: ModelKey) -> float:
-        """Return the tail probability of a model's chi-square."""
+        """Return the tail probability of a model's chi-square; NaN without a size."""
+        if not self.search.sensor.is_known:
+            return float("nan")
         return self._chi_square(self._predicting(key))[1]
 
     def log_process(self, key: ModelKey) -> float:

@@ -12,7 +12,7 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.rival_set import NUM_DRAWS, RivalSet
-from sbi_active.criticism.linear.candidate import Candidate
+from sbi_active.criticism.linear.left_out import Candidate
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.guesses import guess_residual
@@ -164,6 +164,7 @@ def keep_draws(
     *,
     best: Array | None = None,
     louder: Array | None = None,
+    unit: Array | None = None,
 ) -> Evidence:
     """Return a linear model's record, and keep its draws as its posterior sample.
 
@@ -177,7 +178,13 @@ def keep_draws(
         best: Point from which other trials are predicted, shape (d,); None takes the
             draws.
         louder: Draws of effects on the noise, natural values, shape (n, k).
+        unit: Unit of the model's residuals, shape (N,), where draws are to be weighed
+            by the simulator; None leaves them.
     """
+
+    def linear(u: Array) -> Array:
+        return unit * (model.residual + (u - model.u) @ model.jacobian.T)
+
     if key in rivals.fits:
         return rivals.fits[key].evidence
     before = rivals.simulator.num_simulations if key.effects else 0
@@ -207,7 +214,8 @@ def keep_draws(
         best_chi_square=model.chi_square[0],
         best=None if at is None else rival.coordinates.to_z(at[None])[0, :own],
     )
-    rivals.fits[key] = Fit(rival, sample, evidence, at, mode)
+    weighs = linear if unit is not None and louder is None else None
+    rivals.fits[key] = Fit(rival, sample, evidence, at, mode, weighs)
     return evidence
 
 

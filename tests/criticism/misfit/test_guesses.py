@@ -56,17 +56,6 @@ def test_what_the_sensor_does_is_guessed(change, hidden, formula):
     assert f"What it leaves follows {formula}, with x the output" in text
 
 
-def test_a_force_that_no_formula_of_the_output_is_has_no_guess():
-    assert loop(trials(hidden=0.6)).trace().guesses == ()
-
-
-def test_where_an_effect_helps_nothing_is_guessed():
-    tracing = loop(trials(friction=0.3, hidden=0.3)).trace()
-    assert tracing.misfit is not None
-    assert "friction" in tracing.chosen
-    assert tracing.guesses == ()
-
-
 def test_a_guess_says_in_which_channel():
     def both(theta, action):
         x = MODEL.fn(theta, action)
