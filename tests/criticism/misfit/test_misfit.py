@@ -7,9 +7,7 @@ import torch
 
 from sbi_active import SimulatorModel
 from sbi_active.criticism import Criticism, Trials, close_loop
-from sbi_active.criticism.misfit import find_misfit
 from sbi_active.criticism.report.under_misfit import misfit_line
-from sbi_active.criticism.results import ModelKey
 from sbi_active.simulation import AutocorrelatedNoise
 from tests.criticism.misfit.oscillator import (
     ACTION,
@@ -60,22 +58,6 @@ def test_the_report_says_what_remains(named):
     assert report.evaluation.scheme == "leave one out"
     rmse = report.before_after.set_index("metric").loc["RMSE".lower()]
     assert rmse["ratio"] < 0.6
-
-
-def test_a_misfit_that_passes_for_the_sensor_is_known_once_nothing_explains_it(
-    monkeypatch,
-):
-    """As correlated errors do, until a process that follows the action is tried."""
-
-    def late(search, equivalent, *, is_known=False, rule=None):
-        return find_misfit(search, equivalent, is_known=True) if is_known else None
-
-    monkeypatch.setattr("sbi_active.criticism.criticism.find_misfit", late)
-    found = loop(trials(lag=0.12, hidden=0.15))
-    assert found.misfit() is None
-    assert found.trace().verdict == "lag"
-    assert found.trace().misfit is not None
-    assert found.rivals.fit(ModelKey(("lag",))).evidence.engine == "linear"
 
 
 def test_without_the_effect_in_the_library_nothing_takes_its_place(named):
