@@ -26,11 +26,11 @@ from sbi_active.criticism.effects.joint_prior import joint_prior
 from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summarize
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.screening import linear_models
-from sbi_active.criticism.misfit.by_sensor import BySensor
 from sbi_active.criticism.misfit.evaluation import evaluate_linear
-from sbi_active.criticism.misfit.missed import beside_misfit
+from sbi_active.criticism.misfit.linear_evidence import LinearEvidence, is_linear
 from sbi_active.criticism.misfit.record import detected, traced
 from sbi_active.criticism.misfit.rule import Rule
+from sbi_active.criticism.misfit.second_look import beside_misfit
 from sbi_active.criticism.misfit.stand_ins import judged
 from sbi_active.criticism.misfit.verdict import Misfit, find_misfit, without
 from sbi_active.criticism.next_trial.next_action import choose_action
@@ -179,8 +179,9 @@ class Criticism:
         model, trials, effects = self._parts
         with stage("a look at the simulator", show_progress=self.show_progress):
             parts = model, self.prior, trials.fit, effects
-            self.rivals = RivalSet(*parts, actions=self.actions, seed=self.seed)
-            self.rivals.warm_up = self._warm_up
+            self.rivals = RivalSet(
+                *parts, actions=self.actions, seed=self.seed, warm_up=self._warm_up
+            )
             #: Effects that linear evidence set aside; None where all are fitted.
             self._linear, self.screening = linear_models(self.rivals)
         self._is_large = self._linear is not None and is_large(self.rivals.library)
@@ -205,12 +206,10 @@ class Criticism:
                     self.trials, self._equivalent = without(self.trials, found), None
                     self._look()
                     return self.misfit()
-            self._found = Sampled(self.rivals, groups, self._linear)
-            timed = self.rivals.measurements.is_sequence
-            jumps = not self.rivals.is_smooth or self.rivals.roughness.any()
-            timed &= self._is_large or not jumps  # which no linear model follows
-            if timed and self._linear is not None and self._misfit is None:
-                self._found = BySensor(self._linear, self.rivals, groups)
+            self._found = Sampled(self.rivals, groups)
+            follows = self._is_large or is_linear(self.rivals)
+            if follows and self._linear is not None and self._misfit is None:
+                self._found = LinearEvidence(self._linear, self.rivals, groups)
             self._is_searched = True
         return self._misfit
 
@@ -326,9 +325,10 @@ class Criticism:
             return evaluate_held_out(self.rivals, tracing, held_out, **self._fewer)
         if int(self.trials.valid.sum()) < FEWEST_TRIALS:
             return None
-        linear = self._found if tracing.misfit is None else self._misfit
-        if linear is not None and not isinstance(linear, Sampled):
-            return evaluate_linear(linear, trials.fit)
+        found = self._found if tracing.misfit is None else self._misfit
+        is_known = self._linear is not None and self._linear.sensor.is_known
+        if is_known and found is not None and not isinstance(found, Sampled):
+            return evaluate_linear(found, trials.fit)
         return evaluate_left_out(
             trials.fit, self._fold, show_progress=self.show_progress
         )

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from sbi.utils import BoxUniform
 from scipy.stats import norm
 from torch.distributions import HalfNormal, Independent, MultivariateNormal, Normal
 
@@ -22,9 +21,7 @@ from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals import (
     DISAGREEMENT,
     NUM_REPLICATES,
-    UNKNOWN_RATES,
     TrialSimulator,
-    log_outcomes,
 )
 from sbi_active.criticism.steps import predict
 
@@ -78,20 +75,6 @@ def exact(action, x, extra=0.0):
 
 
 # Outcomes
-
-
-def test_flags_have_the_probability_of_the_rates():
-    p = np.array([[1.0, 1.0, 0.0], [1.0, 0.5, 0.25]])
-    valid = np.array([True, False, False])
-    e = DISAGREEMENT
-    got = np.exp(log_outcomes(p, valid)) * (1 - e) ** 3
-    assert got[0] == pytest.approx((1 - e) * e * (1 - e))
-    assert got[1] == pytest.approx((1 - e) * 0.5 * (0.75 * (1 - e) + 0.25 * e))
-    assert log_outcomes(p[:1], p[0] == 1)[0] == pytest.approx(0.0)
-    each = [np.exp(log_outcomes(p, valid, (rate,))) for rate in UNKNOWN_RATES]
-    np.testing.assert_allclose(
-        np.exp(log_outcomes(p, valid, UNKNOWN_RATES)), np.mean(each, 0)
-    )
 
 
 def test_a_trial_without_a_measurement_costs_its_flag():
@@ -250,16 +233,6 @@ def test_ragged_and_masked_trajectories_go_through_the_whole_loop():
     assert report.simulator(report.prior.sample((3,)), torch.ones(3, 1)).shape == (3, 5)
 
 
-def test_times_of_another_length():
-    with pytest.raises(ValueError, match="as many sample_times as samples in each"):
-        Trials([1.0, 2.0], [torch.ones(3), torch.ones(4)], sample_times=TIMES[::-1])
-
-
-def test_times_that_do_not_increase():
-    with pytest.raises(ValueError, match="expected sample_times that increase"):
-        Trials([1.0, 2.0], torch.ones(2, 3), sample_times=[0.0, 0.2, 0.1])
-
-
 def test_times_beyond_those_of_the_simulator():
     times = torch.linspace(0, 1, 5)
     model = SimulatorModel(
@@ -332,39 +305,3 @@ def test_summaries_need_noise_that_is_known():
 
 
 # Random simulators without declared noise
-
-
-@pytest.mark.slow
-def test_a_synthetic_likelihood_is_calibrated_on_a_small_world():
-    prior = BoxUniform(-3 * torch.ones(2), 3 * torch.ones(2))
-
-    def draw(theta, action, bias=0.0):
-        size = 0.1 + 0.05 * action.abs()  # scatter that depends on the action
-        return (
-            line(theta, action) + size * torch.randn(len(theta), 1) + bias * action**2
-        )
-
-    model = SimulatorModel(draw)
-    curve = effect("curve", apply=lambda x, phi, action, context: x + phi * action**2)
-    drift = effect(
-        "drift",
-        prior=Normal(0.0, 0.3),
-        apply=lambda x, phi, action, context: x + phi * context.index[:, None],
-    )
-    alarms, found = 0, 0
-    for seed in range(6):
-        gen = torch.Generator().manual_seed(seed)
-        with torch.random.fork_rng():
-            torch.manual_seed(seed)
-            theta = prior.sample((1,)).expand(8, -1)
-            action = 4 * torch.rand(8, 1, generator=gen) - 2
-            clean, hidden = draw(theta, action), draw(theta, action, bias=0.4)
-        effects = [curve, drift]
-        loop = Criticism(model, prior, Trials(action, clean), effects=effects)
-        alarms += loop.detect().alarm
-        loop = Criticism(model, prior, Trials(action, hidden), effects=effects)
-        found += loop.trace().verdict == "curve"
-    # At 5 % false alarms, three of 6 have a probability of .002; at 90 % found, at most
-    # three of 6 have one of .02.
-    assert alarms < 3
-    assert found > 3

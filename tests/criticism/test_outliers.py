@@ -16,7 +16,6 @@ from sbi_active.criticism.evidence import OneOutlier, RivalSet
 from sbi_active.criticism.report.summary import suspects, verdict_line
 from sbi_active.criticism.rivals import NoiseCell, NoiseGrid
 from sbi_active.criticism.steps import is_left_to_chance, unless_refuted, withdrawn
-from sbi_active.inference.sampling.student_mixture import lower_factors
 from tests.criticism.report.reports import evaluation, flat, report, tracing
 
 PRIOR = BoxUniform(-5 * torch.ones(2), 5 * torch.ones(2))
@@ -68,21 +67,6 @@ def test_the_density_is_a_mixture_over_trials_and_sizes():
     assert np.allclose(error.sizes, sizes)
     assert error.log_likelihood(r)[0] == pytest.approx(np.log(expected))
     assert error.responsibility(r)[0].argmax() == 1
-
-
-def test_the_density_along_trajectories_is_a_gaussian_mixture():
-    times = torch.linspace(0, 1, 4)
-    trials = Trials(torch.arange(2.0), torch.zeros(2, 4), sample_times=times)
-    m = Measurements.of(trials)
-    cell = NoiseCell.of(m, sd=np.full(8, 0.3), correlation_time=0.4)
-    error = OneOutlier(NoiseGrid([cell]), m, largest=1.0)
-    rng = np.random.default_rng(0)
-    draws = rng.normal(size=(20, 8))
-    # The two trials share the error equally, whatever their numbers.
-    swapped = np.concatenate([draws[:, 4:], draws[:, :4]], 1)
-    assert np.allclose(error.log_likelihood(draws), error.log_likelihood(swapped))
-    one = np.array([[3.0, 3.0, 3.0, 3.0, 0, 0, 0, 0]])
-    assert error.responsibility(one)[0, 0] > 0.99
 
 
 @pytest.mark.parametrize("noise", [GaussianNoise(0.3), StudentTNoise(0.3, 4.0)])
@@ -139,7 +123,8 @@ def test_a_gross_error_is_named_by_the_trial_s_own_index(size):
     assert abs(theta["theta_2"] + 2.0) < 0.6  # without the trial
 
 
-def test_a_slip_along_a_trajectory_is_an_outlier_and_no_process():
+@pytest.mark.parametrize(("num", "wrong"), [(4, 0), (5, 4), (8, 5)])
+def test_a_slip_along_a_trajectory_is_an_outlier_and_no_process(num, wrong):
     times = torch.linspace(0.1, 1, 12)
 
     def path(theta, action):
@@ -147,14 +132,14 @@ def test_a_slip_along_a_trajectory_is_an_outlier_and_no_process():
 
     model = SimulatorModel(path, noise=GaussianNoise(0.05), sample_times=times)
     gen = torch.Generator().manual_seed(0)
-    xi = torch.linspace(-2, 2, 8)
-    x = path(torch.tensor([[1.0, 2.0]]).expand(8, -1), xi[:, None])
+    xi = torch.linspace(-2, 2, num)
+    x = path(torch.tensor([[1.0, 2.0]]).expand(num, -1), xi[:, None])
     x = x + 0.05 * torch.randn(x.shape, generator=gen)
-    x[5] = x[5] / 100  # metres for centimetres
+    x[wrong] = x[wrong] / 100  # metres for centimetres
     trials = Trials(xi, x, sample_times=times)
     found = Criticism(model, PRIOR, trials).trace()
     assert found.verdict == "outlier"
-    assert suspects(found) == (5.0,)
+    assert suspects(found) == (float(wrong),)
 
 
 @pytest.mark.parametrize("wrong", [1e15, -1e30, "unit"])
@@ -176,18 +161,6 @@ def test_a_true_effect_stays_named_beside_the_outlier():
     assert found.verdict == "quadratic"
     assert found.needed == ()
     assert found.probabilities["outlier"] < 1e-3
-
-
-def test_an_effect_for_which_one_doubtful_trial_speaks_is_not_named():
-    xi = torch.tensor([-2.0, -1.0, -1.5, 0.5, -0.5, 0.2, -1.0, 5.0])
-    xi[4], xi[5] = 2.0, 2.5
-    x = measured(xi, seed=3)
-    x[7] += 9.0
-    loop = criticism(x, xi=xi)
-    found = loop.trace()
-    assert found.verdict == "outlier"
-    assert suspects(found) == (7.0,)
-    assert 7.0 in found.needed or not found.instead_of
 
 
 def test_without_an_alarm_no_trial_is_suspected():
@@ -292,20 +265,3 @@ def test_held_out_trials_refute_an_alias():
     assert made.verdict in ("unexplained", "outlier")
     assert made.tracing.instead_of == "quadratic"
     assert made.simulator is loop.model
-
-
-def test_a_few_numbers_beyond_reason_count_as_a_reach():
-    m = Measurements.of(Trials(torch.arange(4.0), torch.tensor([0.0, 1e15, 2.0, 3.0])))
-    center, reach = np.zeros(4), np.full(4, 1e3)
-    assert m.bounded(center, reach).x.tolist() == [0.0, 1e3, 2.0, 3.0]
-    same = m.bounded(center, np.full(4, 0.5))  # most: the model is elsewhere
-    assert same is m
-
-
-def test_factors_of_singular_covariances():
-    root = np.array([[1.0, 0.0], [1e-3, 1e-12]])
-    cov = np.stack([np.eye(2), root @ root.T, np.zeros((2, 2))])
-    factors = lower_factors(cov)
-    assert np.allclose(factors @ factors.swapaxes(1, 2), cov, atol=1e-11)
-    assert (np.diagonal(factors, axis1=1, axis2=2) > 0).all()
-    assert np.allclose(np.triu(factors, 1), 0.0)

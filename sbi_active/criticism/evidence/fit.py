@@ -1,19 +1,24 @@
-"""A rival with its posterior and its evidence."""
+"""A rival with its posterior and its evidence, where searches of larger ones start."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.criticism.results import Evidence
+from sbi_active.criticism.results import Evidence, ModelKey
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.engine import Fit as Sampled
 from sbi_active.inference.engine import WeightedDraws
+from sbi_active.inference.sampling.weights import effective_sample_size, normalized
 
 Array = NDArray[Any]
+
+#: Searches that start at posteriors of smaller rivals.
+NUM_NEAR = 8
 
 
 @dataclass(frozen=True)
@@ -27,6 +32,8 @@ class Fit:
         best: Point from which other trials are predicted, shape (dim,); None takes the
             draws.
         mode: Point at which it is linear, shape (dim,); None if it was sampled.
+        linear: Function from u (n, dim) to the residuals (n, N) of the linear model
+            that draws are of; None if they are of the simulator's own posterior.
     """
 
     rival: Rival
@@ -34,6 +41,7 @@ class Fit:
     evidence: Evidence
     best: Array | None = None
     mode: Array | None = None
+    linear: Callable[[Array], Array] | None = None
 
     @property
     def likeliest(self) -> Array:
@@ -48,9 +56,81 @@ class Fit:
         log_p = self.rival.log_prior(u) + self.rival.log_likelihood(u)
         return u[[int(np.argmax(log_p))]]
 
+    def weighed(
+        self,
+        u: Array,
+        residual: Array,
+        rng: np.random.Generator,
+        *,
+        linear: float = 0.5,
+        fewest: float = 0.2,
+    ) -> tuple[Array, Array]:
+        """Return draws of a linear model, weighed by the simulator where it bends.
+
+        Along the valley of two parameters that make up for each other a Gaussian
+        leaves it soon.
+
+        Args:
+            u: Draws, shape (n, dim).
+            residual: Residuals of the simulator there, shape (n, N).
+            rng: Source of what is drawn from them.
+            linear: Deviation of the log density ratio up to which none is weighed,
+                nats.
+            fewest: Share of draws that weights leave at least, by a power of them: few
+                would make for a narrow interval.
+        """
+        if self.linear is None:
+            return u, residual
+        error = self.rival.error
+        log_w = error.log_likelihood(residual) - error.log_likelihood(self.linear(u))
+        log_w = np.nan_to_num(log_w, nan=-1e9, neginf=-1e9, posinf=-1e9)
+        if log_w.std() < linear:
+            return u, residual
+        power = 1.0
+        while effective_sample_size(power * log_w) < fewest * len(u):
+            power *= 0.8
+        at = rng.choice(len(u), size=len(u), p=normalized(power * log_w))
+        return u[at], residual[at]
+
     def weighted(self) -> tuple[Array, Array, Array]:
         """Return draws u (n, dim) with a weight, the weights, and residuals (n, N)."""
         some = self.sample.weight > 0
         u = self.sample.u[some]
         residual = self.rival.residual(u, penalized=False)[0]
         return u, self.sample.weight[some], residual
+
+
+def starts_near_parents(
+    fits: Mapping[ModelKey, Fit], rival: Rival, seed: int
+) -> Array | None:
+    """Return points at posteriors of smaller rivals, the rest from the prior.
+
+    The parents have one effect less; without effects, or behind a catch-all,
+    it is the bare model.
+
+    Args:
+        fits: Rivals whose posterior is known.
+        rival: Rival whose search starts.
+        seed: Seed of the draws.
+
+    Returns:
+        Shape (k, dim); None without a parent.
+    """
+    parents = ModelKey(rival.key.effects).parts or [ModelKey()]
+    known = [key for key in parents if key in fits]
+    if not known or rival.key == ModelKey():
+        return None
+    rng = np.random.default_rng(seed)
+    parts = []
+    for key in known:
+        parent = fits[key].rival
+        each = max(NUM_NEAR // len(known), 1)
+        drawn = parent.coordinates.to_z(fits[key].sample.draws(each, rng))
+        z = rival.coordinates.to_z(rival.coordinates.sample(each, seed=seed))
+        shared, theta_dim = parent.columns(), parent.theta_dim
+        z[:, :theta_dim] = drawn[:, :theta_dim]
+        for name, place in rival.columns().items():
+            if name in shared:
+                z[:, place] = drawn[:, shared[name]]
+        parts.append(rival.coordinates.from_z(z))
+    return np.concatenate(parts)

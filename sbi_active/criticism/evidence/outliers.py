@@ -4,10 +4,9 @@ r"""One trial with a gross error: a slip of the hand, of the unit, of the record
     p(r) = \frac1t \sum_{k=1}^t p_k(r_k) \prod_{j \ne k} p(r_j),
 
 with the declared noise p of every trial but one, equally likely any of them. That one
-errs by more, to an unknown degree a: the whole trial scatters a times as widely, or,
-where it has several numbers, a smooth function along it is a times the noise. It takes
-the values 3, 9, 27, ... with probabilities in proportion to :math:`1 / i^2`, so that
-the density falls with the size of the error and ends nowhere.
+errs by more, to an unknown degree a: the whole trial scatters a times as widely. It
+takes the values 3, 9, 27, ... with probabilities in proportion to :math:`1 / i^2`, so
+that the density falls with the size of the error and ends nowhere.
 
 References:
     Box & Tiao, Biometrika 55 (1968), 119-129: a Bayesian approach to outliers.
@@ -15,7 +14,6 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,7 +30,6 @@ from sbi_active.criticism.rivals.error_models import (
     drawn,
     student,
 )
-from sbi_active.criticism.rivals.residual_process import smooth_features
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
@@ -42,14 +39,6 @@ Array = NDArray[Any]
 RATIO, FEWEST_SIZES = 3.0, 5
 #: Size that stands for any in a search, and trials that a search sets aside in turn.
 LARGE, MAX_ASIDE = 1e3, 8
-
-
-@dataclass(frozen=True)
-class _Smooth:
-    """A smooth error of one trial in whitened coordinates: cov = I + a^2 Q v Q^T."""
-
-    directions: Array  # Q, (numbers of the trial, m), orthonormal
-    variances: Array  # v, (m,)
 
 
 class OneOutlier(ErrorModel):
@@ -76,10 +65,6 @@ class OneOutlier(ErrorModel):
         steps = 1 + np.arange(max(int(np.ceil(needed)), FEWEST_SIZES))
         self.sizes = RATIO**steps
         self._log_size = np.log(6 / np.pi**2) - 2 * np.log(steps)
-        self._smooth = [
-            [_smooth(cell, measurements, at) for at in self._member.T]
-            for cell in noise.cells
-        ]
 
     @override
     def log_likelihood(self, residual: Array) -> Array:
@@ -126,8 +111,8 @@ class OneOutlier(ErrorModel):
     def whitener(self, residual: Array) -> Whitener:
         joint = self._joint(residual[None])[0]
         best = np.unravel_index(np.argmax(joint), joint.shape)
-        cell, trial, scale, kind, size = map(int, best)
-        return self._whitener(cell, trial, scale, kind, self.sizes[size])
+        cell, trial, scale, size = map(int, best)
+        return self._whitener(cell, trial, scale, self.sizes[size])
 
     @override
     def regimes(self, residual: Array) -> list[Whitener]:
@@ -136,29 +121,14 @@ class OneOutlier(ErrorModel):
         cell = int(np.argmax(self.noise.log_prior))
         scale = len(self.noise.scales) // 2
         return [
-            self._whitener(cell, int(trial), scale, 0, LARGE)
+            self._whitener(cell, int(trial), scale, LARGE)
             for trial in np.argsort(-share, kind="stable")[:MAX_ASIDE]
         ]
 
-    def _whitener(
-        self, cell: int, trial: int, scale: int, kind: int, size: float
-    ) -> Whitener:
-        at = self._member[:, trial]
+    def _whitener(self, cell: int, trial: int, scale: int, size: float) -> Whitener:
         noise, unit = self.noise.cells[cell], self.noise.scales[scale]
-        smooth = self._smooth[cell][trial] if kind else None
-
-        def whiten(residual: Array) -> Array:
-            e = noise.whiten(residual) / unit
-            own = e[..., at]
-            if smooth is None:
-                e[..., at] = own / size
-            else:
-                shrink = 1 / np.sqrt(1 + size**2 * smooth.variances) - 1
-                q = smooth.directions
-                e[..., at] = own + ((own @ q) * shrink) @ q.T
-            return e
-
-        return whiten
+        divisor = unit * np.where(self._member[:, trial], size, 1.0)
+        return lambda residual: noise.whiten(residual) / divisor
 
     def _joint(self, residual: Array) -> Array:
         """Return log p(residual, cell, trial, ...), shape (n, cells, k, ...)."""
@@ -166,7 +136,7 @@ class OneOutlier(ErrorModel):
         return np.stack([self._within(residual, c) for c in cells], 1)
 
     def _within(self, residual: Array, c: int) -> Array:
-        """Return log p(residual, trial, scale, kind, size) in a cell, (n, k, ...)."""
+        """Return log p(residual, trial, scale, size) in a cell, (n, k, ...)."""
         cell, scales = self.noise.cells[c], self.noise.scales
         e = cell.whiten(residual)
         usual = self._density(e, cell, scales)
@@ -174,16 +144,10 @@ class OneOutlier(ErrorModel):
         wide = np.multiply.outer(scales, self.sizes)
         as_wide = self._density(e, cell, wide.ravel())
         as_wide = as_wide.reshape(len(e), *wide.shape, -1)
-        bend = np.full_like(as_wide, -np.inf)
-        for k, smooth in enumerate(self._smooth[c]):
-            if smooth is not None:
-                bend[..., k] = self._bent(e[:, self._member[:, k]], smooth)
-        kinds = np.stack([as_wide, bend], 2)  # (n, scales, kinds, sizes, k)
-        num = 1 + np.array([smooth is not None for smooth in self._smooth[c]])
         prior = self.noise.log_prior[c] - cell.log_scale - np.log(len(self.trials))
-        prior = prior + self._log_size[:, None] - np.log(num)
-        joint = others[:, :, None, None] + kinds + prior
-        joint = joint + self.noise.log_scale_prior[:, None, None, None]
+        prior = prior + self._log_size[:, None]
+        joint = others[:, :, None] + as_wide + prior  # (n, scales, sizes, k)
+        joint = joint + self.noise.log_scale_prior[:, None, None]
         return np.moveaxis(joint, -1, 1)
 
     def _density(self, e: Array, cell: NoiseCell, scales: Array) -> Array:
@@ -195,27 +159,3 @@ class OneOutlier(ErrorModel):
             square = (e**2 @ member)[:, None]
             log_p = -0.5 * square / scales[:, None] ** 2 - 0.5 * num * LOG_2PI
         return log_p - num * np.log(scales)[:, None]
-
-    def _bent(self, e: Array, smooth: _Smooth) -> Array:
-        """Return log densities of one trial with a smooth error, (n, scales, sizes)."""
-        scales, num = self.noise.scales, e.shape[1]
-        q = (e @ smooth.directions) ** 2
-        rest = np.maximum((e**2).sum(1) - q.sum(1), 0.0)
-        total = 1 + self.sizes[:, None] ** 2 * smooth.variances  # (sizes, m)
-        square = rest[:, None] + q @ (1 / total).T
-        log_p = -0.5 * square[:, None] / scales[:, None] ** 2
-        log_p = log_p - 0.5 * np.log(total).sum(1) - num * np.log(scales)[:, None]
-        return log_p - 0.5 * num * LOG_2PI
-
-
-def _smooth(cell: NoiseCell, measurements: Measurements, at: Array) -> _Smooth | None:
-    """Return the smooth error of a trial; None if it has one number, or t noise."""
-    if at.sum() < 2 or np.isfinite(cell.df) or not measurements.has_time:
-        return None
-    own = smooth_features(measurements, at)
-    features = np.zeros((len(at), own.shape[1]))
-    features[at] = cell.sd[at, None] * own
-    whitened = cell.whiten(features.T).T[at]
-    q, size, _ = np.linalg.svd(whitened, full_matrices=False)
-    keep = size > 1e-3 * size.max()
-    return _Smooth(q[:, keep], size[keep] ** 2)

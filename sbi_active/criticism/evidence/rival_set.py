@@ -15,18 +15,16 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.evidence.fit import Fit
+from sbi_active.criticism.evidence.fit import NUM_NEAR, Fit, starts_near_parents
 from sbi_active.criticism.evidence.jumps import STEPS, look_for_jumps
 from sbi_active.criticism.evidence.outliers import OneOutlier
 from sbi_active.criticism.evidence.predicted_before import predicted_before
 from sbi_active.criticism.evidence.settings import (
-    KNOWN,
     NESTED,
     ROUGH,
     THOROUGH,
     settings_of,
 )
-from sbi_active.criticism.evidence.starts import NUM_NEAR, starts_near_parents
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Evidence, ModelKey
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
 from sbi_active.criticism.rivals.error_models import ErrorModel, NoiseGrid
@@ -69,6 +67,8 @@ class RivalSet:
         actions: The permitted ones, for the length scales of the residual process; None
             takes the range of the trials.
         seed: Seed of all draws.
+        warm_up: Time from its first sample in which a trial that was not fitted tells
+            of its nuisances, and is not scored.
 
     Attributes:
         effects: Effects of scope "campaign", by name.
@@ -83,10 +83,6 @@ class RivalSet:
             ``noise`` has on top of the declared one, shape (N,); 0 where it is smooth.
         fits: The rivals that were asked for.
         found: Modes of some that are not fitted yet.
-        best_fits: Points where least squares ended, of rivals that were fitted so, by
-            their coordinates; their searches begin there.
-        warm_up: Time from its first sample in which a trial that was not fitted tells
-            of its nuisances, and is not scored.
     """
 
     def __init__(
@@ -98,6 +94,7 @@ class RivalSet:
         *,
         actions: ActionSpace | None = None,
         seed: int = 0,
+        warm_up: float = 0.0,
     ) -> None:
         self.model, self.prior, self.trials, self.seed = model, prior, trials, seed
         self.actions = actions
@@ -109,7 +106,7 @@ class RivalSet:
         seed_of_trials = derive_seed(seed, "trials")
         self.simulator = TrialSimulator(augmented, trials, seed=seed_of_trials)
         self.measurements = self.simulator.measurements
-        self.warm_up = 0.0
+        self.warm_up = warm_up
         self._factors: tuple[Array, Array] | None = None
         self.noise = self.noise_of(self.measurements)
         self._predictives: dict[tuple[bytes | None, ...], tuple[Array, Array]] = {}
@@ -126,7 +123,6 @@ class RivalSet:
             self.noise = self.noise.with_extra(self.roughness)
         self.fits: dict[ModelKey, Fit] = {}
         self.found: dict[ModelKey, Found] = {}
-        self.best_fits: dict[ModelKey, Array] = {}
 
     def noise_of(self, measurements: Measurements) -> NoiseGrid:
         """Return the errors of some measurements."""
@@ -185,19 +181,29 @@ class RivalSet:
         gaussian = isinstance(self.model.noise, GaussianNoise | AutocorrelatedNoise)
         return gaussian and self.noise.shape == (1, 1)
 
-    def residual_process(self) -> ResidualProcess:
-        """Return the noise with a smooth function of the action and time."""
+    def residual_process(self, noise: NoiseGrid | None = None) -> ResidualProcess:
+        """Return the noise with a smooth function of the action and time.
+
+        Args:
+            noise: Noise without it; None takes that of the bare model, and keeps what
+                is made of it.
+        """
+        if noise is not None:
+            return self._beside_process(noise)
         if not hasattr(self, "_process"):
             noise = self.noise.settled(self._bare_residual)
-            self._process = ResidualProcess(
-                noise,
-                self.measurements,
-                action=self.scaled_actions(),
-                order=self.scaled_order(),
-                largest=float(np.median(self.spread / noise.typical_sd)),
-                spread=None if self.simulator.is_stochastic else self.spread,
-            )
+            self._process = self._beside_process(noise)
         return self._process
+
+    def _beside_process(self, noise: NoiseGrid) -> ResidualProcess:
+        return ResidualProcess(
+            noise,
+            self.measurements,
+            action=self.scaled_actions(),
+            order=self.scaled_order(),
+            largest=float(np.median(self.spread / noise.typical_sd)),
+            spread=None if self.simulator.is_stochastic else self.spread,
+        )
 
     def _bare_residual(self) -> Array:
         return self.rival(ModelKey()).residual(self.fit().likeliest)[0][0]
@@ -257,10 +263,6 @@ class RivalSet:
         rival, seed = self.rival(key), derive_seed(self.seed, "search", str(key))
         near = starts_near_parents(self.fits, rival, seed)
         how = THOROUGH if near is None else NESTED
-        if key in self.best_fits:
-            # Every mode of the bare model counts; of others what is beside the best.
-            near = self.best_fits[key][None]
-            how = THOROUGH if key == ModelKey() else KNOWN
         how = how if self.is_smooth else ROUGH
         return _searched(rival, near, how, seed)
 

@@ -24,8 +24,6 @@ NESTED = SearchSettings(
     iterations=6,
     phases=10,
 )
-#: Searches that begin at a best fit by least squares, and at the best of a few draws.
-KNOWN = replace(NESTED, num_screened=16, num_starts=1, max_starts=2)
 #: Searches where the simulator jumps: derivatives lead to the neighborhood of a mode at
 #: most.
 ROUGH = replace(NESTED, num_screened=128, num_starts=8, max_starts=8, phases=2)

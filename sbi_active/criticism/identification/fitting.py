@@ -23,8 +23,13 @@ from sbi_active.criticism.identification.posterior import (
 )
 from sbi_active.criticism.identification.settings import IdentifySettings
 from sbi_active.criticism.linear.fits import best_fit, polished
-from sbi_active.criticism.linear.model import LinearModel, chords, enlarged, linearize
-from sbi_active.criticism.linear.nulls import at_null
+from sbi_active.criticism.linear.model import (
+    LinearModel,
+    at_null,
+    chords,
+    enlarged,
+    linearize,
+)
 from sbi_active.criticism.linear.processes import Filters, Processes, whitened
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sbi_active.criticism.data.measurements import Measurements
+from sbi_active.criticism.linear.fits import FitSettings
 from sbi_active.criticism.linear.processes import Processes, time_scales
-from sbi_active.criticism.linear.settings import FitSettings
 
 
 @dataclass(frozen=True, kw_only=True)

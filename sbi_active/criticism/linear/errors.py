@@ -18,7 +18,9 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -33,7 +35,7 @@ from sbi_active.criticism.linear.processes import (
     parts_of,
     time_scales,
 )
-from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell
+from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseGrid
 from sbi_active.criticism.steps.nuisances import is_first_part
 from sbi_active.inference.sampling.truncated import log_inside
 from sbi_active.inference.sampling.weights import log_sum_exp
@@ -46,8 +48,31 @@ WIDTHS = (1 / 3, 1.0, 3.0)
 SMALLEST, LARGEST, FACTOR = 0.3, 40.0, 1.63
 #: Every so many of the sizes is one of what differs from trial to trial.
 THINNED = 2
-#: Trials below which parts of them are left out in their place, and how many parts.
+#: Trajectories below which parts are left out in their place, and how many parts.
 FEWEST, NUM_FOLDS = 6, 8
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """A linear model's posterior, summed over hypotheses of the errors.
+
+    Attributes:
+        log_evidence: Log evidence, nats.
+        mean: Mean of u, shape (d,).
+        cov: Covariance of u, shape (d, d).
+        log_z: Log evidence of each hypothesis times its prior probability, by factor
+            on the scale of effects' priors, shape (h, w).
+    """
+
+    log_evidence: float
+    mean: Array
+    cov: Array
+    log_z: Array
+
+    @property
+    def share(self) -> Array:
+        """Posterior probability of each hypothesis, shape (h,)."""
+        return np.exp(self.log_z - self.log_evidence).sum(1)
 
 
 @dataclass(frozen=True)
@@ -87,7 +112,7 @@ class Errors:
     Args:
         measurements: Measurements with a time axis.
         unit: Standard deviation of the sensor, shape (N,).
-        cells: The sensor's error, with what is unknown of its correlation.
+        noise: The sensor's error, with what is unknown of it.
         largest: Root mean square of the residual of a model that misses, in sensor
             deviations: the process may be twice as large.
         warm_up: Time from its first sample in which a left-out trial tells of its
@@ -101,7 +126,8 @@ class Errors:
         num_folds: Number of folds f.
         is_by_trial: Whether the parts are trials.
         cells: The sensor's error in its units, with what is unknown of its correlation.
-        log_cells: Log prior probability of each, shape (c,).
+        scales: Factors on its size, shape (j,).
+        log_sensor: Log prior probability of each of both, cell by cell, shape (c j,).
         is_scored: Numbers that are predicted where their part is left out, bool, (N,).
         varying: Derivatives of mean square one, zero if nothing depends on it.
     """
@@ -110,7 +136,7 @@ class Errors:
         self,
         measurements: Measurements,
         unit: Array,
-        cells: list[NoiseCell],
+        noise: NoiseGrid,
         *,
         largest: float,
         warm_up: float = 0.0,
@@ -118,8 +144,9 @@ class Errors:
     ) -> None:
         m = self.measurements = measurements
         self.unit = unit
-        self.fold = parts_of(m, FEWEST, NUM_FOLDS)
-        self.is_by_trial = len(np.unique(m.trial)) >= FEWEST
+        fewest = FEWEST if m.is_sequence else 1
+        self.fold = parts_of(m, fewest, NUM_FOLDS)
+        self.is_by_trial = len(np.unique(m.trial)) >= fewest
         self.num_folds = int(self.fold.max()) + 1
         self.is_scored = np.ones(len(m), dtype=bool)
         if self.is_by_trial:
@@ -133,9 +160,10 @@ class Errors:
         variances = np.stack([np.ones(num), self.sizes**2], 1)
         self.processes = Processes.grid(variances, self.times, self.kernels)
         self.filters = Filters(self.processes, m, self.fold, self.fold)
-        self.cells = [_in_units(cell, unit) for cell in cells]
-        total = log_sum_exp(np.array([c.log_weight for c in self.cells]))
-        self.log_cells = np.array([c.log_weight for c in self.cells]) - total
+        self.cells = [replace(c, sd=c.sd / unit) for c in noise.cells]
+        self.scales = noise.scales
+        log_p = noise.log_prior[:, None] + noise.log_scale_prior
+        self.log_sensor = log_p.ravel()
         if varying is None or not self.is_by_trial:
             varying = np.empty((len(m), 0))
         size = np.sqrt((varying**2).mean(0))
@@ -161,19 +189,21 @@ class Errors:
     def grams(self, rows: Array) -> Grams:
         """Return the Gram matrices of rows (N, k), the sensor's errors first."""
         k, f = rows.shape[1], self.num_folds
-        num = len(self.cells) + len(self.log_prior)
+        n, num = len(self.log_sensor), len(self.log_sensor) + len(self.log_prior)
+        count = np.bincount(self.fold, minlength=f)
         gram, log_det = np.zeros((num, f, k, k)), np.zeros((num, f))
         for i, cell in enumerate(self.cells):
             white = cell.whiten(rows.T).T
             scale = np.log(cell.sd) + 0.5 * np.log1p(-(cell.rho**2))
-            log_det[i] = 2 * np.bincount(self.fold, scale, f)
+            at = slice(i * len(self.scales), (i + 1) * len(self.scales))
+            sizes = 2 * np.log(self.scales)[:, None] * count
+            log_det[at] = 2 * np.bincount(self.fold, scale, f) + sizes
             for j in range(f):
                 own = white[self.fold == j]
-                gram[i, j] = own.T @ own
-        at = len(self.cells) + self.num_processes
+                gram[at, j] = own.T @ own / self.scales[:, None, None] ** 2
+        at = n + self.num_processes
         process = self.filters.grams(rows)
-        gram[len(self.cells) : at] = process.gram
-        log_det[len(self.cells) : at] = process.log_det
+        gram[n:at], log_det[n:at] = process.gram, process.log_det
         for j in range(f) if self.varying.size else ():
             own = rows[self.fold == j]
             plain = own.T @ own
@@ -184,7 +214,7 @@ class Errors:
                 to = slice(at + v * len(growth), at + (v + 1) * len(growth))
                 gram[to, j] = plain - growth[:, None, None] * np.outer(pull, pull)
                 log_det[to, j] = np.log1p(self.spreads**2 * square)
-        return Grams(gram, log_det, np.bincount(self.fold, minlength=f))
+        return Grams(gram, log_det, count)
 
     def posterior(
         self,
@@ -205,49 +235,89 @@ class Errors:
             process: Whether u is given the process; else the sensor's error alone.
         """
         use = np.ones(self.num_folds, bool) if folds is None else folds
-        gram, log_det = grams.gram[:, use].sum(1), grams.log_det[:, use].sum(1)
-        shift = np.eye(gram.shape[1])
-        shift[1:, 0] = -model.center
-        gram = shift.T @ gram @ shift
-        found = [integrated(gram, model, factor * width) for width in WIDTHS]
-        log_z = np.stack([f[0] for f in found], 1)  # (h, widths)
-        const = grams.count[use].sum() * LOG_2PI
-        log_z = log_z - 0.5 * (log_det[:, None] + const) - np.log(len(WIDTHS))
-        n = len(self.cells)
-        by_sensor = (log_z[:n] + self.log_cells[:, None]).ravel()
-        by_process = (log_z[n:] + self.log_prior[:, None]).ravel()
-        log_sensor = float(log_sum_exp(by_sensor))
-        log_process = float(log_sum_exp(by_process))
-        log_p = by_process if process else by_sensor
-        p = np.exp(log_p - (log_process if process else log_sensor))
-        which = slice(n, None) if process else slice(n)
-        means = np.stack([f[1] for f in found], 1)[which].reshape(len(p), -1)
-        covs = np.stack([f[2] for f in found], 1)[which]
-        covs = covs.reshape(len(p), *covs.shape[2:])
-        mean = p @ means
-        off = means - mean
-        cov = np.einsum("h,hij->ij", p, covs) + (p[:, None] * off).T @ off
+        gram = grams.gram[:, use].sum(1)
+        log_weight = np.concatenate([self.log_sensor, self.log_prior])
+        log_weight += self.constants(grams, use)
+        n, widths = len(self.log_sensor), [factor * width for width in WIDTHS]
+        sensor = summed(gram[:n], log_weight[:n], model, widths)
+        beside = summed(gram[n:], log_weight[n:], model, widths)
+        own = beside if process else sensor
+        log_z = sensor.log_evidence, beside.log_evidence
         if not process:
-            center = mean + model.center
             nothing = np.zeros(1 + self.varying.shape[1])
-            return Posterior(log_sensor, log_process, center, cov, 0.0, 1.0, nothing)
-        end = self.num_processes * len(WIDTHS)
-        shape = len(self.kernels), len(self.times), len(self.sizes), len(WIDTHS)
-        process = p[:end].reshape(shape).sum((0, 1, 3)) @ self.sizes**2
-        differ = p[end:].reshape(-1, len(self.spreads), len(WIDTHS)).sum(2)
-        log_p = by_process[:end]
+            return Posterior(*log_z, own.mean, own.cov, 0.0, 1.0, nothing)
+        shape = len(self.kernels), len(self.times), len(self.sizes)
+        p, end = own.share, self.num_processes
+        process = p[:end].reshape(shape).sum((0, 1)) @ self.sizes**2
+        differ = p[end:].reshape(-1, len(self.spreads))
+        log_p = log_sum_exp(own.log_z[:end], axis=1)
         each = np.exp(log_p - log_sum_exp(log_p)).reshape(shape)
-        sizes, times = each.sum((0, 1, 3)), each.sum((0, 2, 3))
+        sizes, times = each.sum((0, 1)), each.sum((0, 2))
         middle = int(np.searchsorted(np.cumsum(times), 0.5))
         return Posterior(
-            log_sensor,
-            log_process,
-            mean + model.center,
-            cov,
+            *log_z,
+            own.mean,
+            own.cov,
             float(sizes @ self.sizes),
             float(self.times[min(middle, len(self.times) - 1)]),
             np.append(process, differ @ self.spreads**2),
         )
+
+    def constants(self, grams: Grams, use: Any = slice(None)) -> Array:
+        """Return the log constants of densities of some parts of the trials, (h,)."""
+        log_det = grams.log_det[:, use].sum(1)
+        return -0.5 * (log_det + grams.count[use].sum() * LOG_2PI)
+
+    def scaled(self, rows: Array, factors: Array) -> tuple[Array, Array]:
+        """Return Gram matrices of all rows under other sizes of the sensor's error.
+
+        Args:
+            rows: Rows, shape (N, k).
+            factors: Factors on the size, one a number, shape (s, N), or (s, 1).
+
+        Returns:
+            Gram matrices, shape (c j s, k, k), and log weights, shape (c j s,).
+        """
+        factors = np.broadcast_to(factors, (len(factors), len(rows)))
+        grams, log_weight = [], []
+        each = product(self.cells, self.scales)
+        for (cell, size), log_p in zip(each, self.log_sensor, strict=True):
+            white = cell.whiten(rows.T / (size * factors[:, None]))  # (s, k, N)
+            grams.append(white @ np.swapaxes(white, 1, 2))
+            log_det = cell.log_scale + np.log(size * factors).sum(1)
+            log_weight.append(log_p - log_det - 0.5 * len(rows) * LOG_2PI)
+        return np.concatenate(grams), np.concatenate(log_weight)
+
+    def one_trial(self, model: LinearModel, grams: Grams) -> tuple[Array, Array]:
+        """Return Gram matrices with a process in one trial, whichever it is.
+
+        The sensor's error elsewhere is the most probable one by the other trials.
+
+        Args:
+            model: Linear model.
+            grams: Gram matrices of its rows.
+
+        Returns:
+            Gram matrices, shape (t h, k, k), trial by trial, and log weights, (t h,).
+        """
+        n, found, weights = len(self.log_sensor), [], []
+        some = slice(n, n + self.num_processes)
+        for at in self.trials:
+            others = grams.gram[:n, ~at].sum(1)
+            log_p = self.log_sensor + self.constants(grams, ~at)[:n]
+            own = int(np.argmax(summed(others, log_p, model).share))
+            log_det = grams.log_det[own, ~at].sum() + grams.log_det[some][:, at].sum(1)
+            found.append(others[own] + grams.gram[some][:, at].sum(1))
+            weights.append(-0.5 * (log_det + grams.count.sum() * LOG_2PI))
+        weight = np.concatenate(weights)
+        return np.concatenate(found), weight - np.log(len(weight))
+
+    @property
+    def trials(self) -> list[NDArray[np.bool_]]:
+        """Masks of the parts of each trial, shape (f,)."""
+        trial = self.measurements.trial
+        own = [np.unique(self.fold[trial == t]) for t in np.unique(trial)]
+        return [np.isin(np.arange(self.num_folds), parts) for parts in own]
 
     def weight(self, posterior: Posterior) -> Array:
         """Return weights of the squared errors of trials, mean one, shape (N,).
@@ -266,11 +336,41 @@ class Errors:
         return weight / weight.mean()
 
 
+def summed(
+    gram: Array,
+    log_weight: Array,
+    model: LinearModel,
+    widths: Sequence[float] = (1.0,),
+) -> Mixture:
+    """Return the posterior of a linear model, summed over hypotheses of the errors.
+
+    Args:
+        gram: Gram matrices of its rows, shape (h, 1 + d, 1 + d).
+        log_weight: Log prior probabilities, with the constants of densities, (h,).
+        model: Linear model with its prior.
+        widths: Factors on the scales of effects' priors, equally likely.
+    """
+    found = [integrated(gram, model, width) for width in widths]
+    log_z = np.stack([f[0] for f in found], 1) + log_weight[:, None]
+    log_z = log_z - np.log(len(widths))
+    total = float(log_sum_exp(log_z.ravel()))
+    p = np.exp(log_z - total).ravel()
+    means = np.stack([f[1] for f in found], 1).reshape(len(p), -1)
+    covs = np.stack([f[2] for f in found], 1).reshape(len(p), *gram[0, 1:, 1:].shape)
+    mean = p @ means
+    off = means - mean
+    cov = np.einsum("h,hij->ij", p, covs) + (p[:, None] * off).T @ off
+    return Mixture(total, mean, cov, log_z)
+
+
 def integrated(
     gram: Array, model: LinearModel, width: float
 ) -> tuple[Array, Array, Array]:
-    """Return evidences less their constants, and posterior moments of u - center."""
+    """Return evidences less their constants, and posterior moments of u."""
     sd = model.widened(width)
+    shift = np.eye(gram.shape[1])
+    shift[1:, 0] = -model.center
+    gram = shift.T @ gram @ shift
     g, b, rr = gram[:, 1:, 1:], gram[:, 1:, 0], gram[:, 0, 0]
     precision = sd[:, None] * g * sd + np.eye(len(sd))
     # Columns of very different size, as of what jumps, keep their digits in units of
@@ -290,8 +390,4 @@ def integrated(
         inside = log_inside(mean[:, some], own, low[some], high[some])
         before = log_inside(np.zeros(some.sum()), sd[some], low[some], high[some])
         log_z = log_z + inside.sum(1) - before.sum()
-    return log_z, mean, cov
-
-
-def _in_units(cell: NoiseCell, unit: Array) -> NoiseCell:
-    return NoiseCell(cell.log_weight, cell.sd / unit, cell.rho, cell.df)
+    return log_z, mean + model.center, cov

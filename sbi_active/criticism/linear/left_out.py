@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.criticism.linear.errors import Errors
+from sbi_active.criticism.linear.errors import Errors, Grams, Posterior
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.inference.sampling.least_squares import within
 
@@ -60,6 +60,40 @@ class LeftOut:
         n = len(own)
         off = own - own.mean(0)
         return (n - 1) / n * off.T @ off
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model that was fitted.
+
+    Attributes:
+        model: Linearized at its best fit.
+        grams: Gram matrices of its rows.
+        posterior: Posterior under the shared errors.
+        left: Errors of the model on left-out parts of the trials.
+        log_prior: Probability of its set of effects, nats.
+    """
+
+    model: LinearModel
+    grams: Grams
+    posterior: Posterior
+    left: LeftOut
+    log_prior: float
+
+    @property
+    def log_p(self) -> float:
+        """Unnormalized log posterior probability with a residual process, nats."""
+        return self.log_prior + self.posterior.log_process
+
+    @property
+    def log_p_sensor(self) -> float:
+        """Unnormalized log posterior probability with the sensor's error, nats."""
+        return self.log_prior + self.posterior.log_sensor
+
+    @property
+    def log_p_either(self) -> float:
+        """Unnormalized log posterior probability with either, nats."""
+        return self.log_prior + self.posterior.log_evidence
 
 
 def leave_out(

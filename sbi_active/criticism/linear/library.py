@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Protocol
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,64 +19,33 @@ Array = NDArray[Any]
 TOGETHER = 12
 
 
-class Fits(Protocol):
-    """Models that were fitted, and columns of effects beside them."""
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the effects."""
-        ...
-
-    @property
-    def prior(self) -> dict[str, float]:
-        """Log prior probabilities of "none" and each effect."""
-        ...
-
-    @property
-    def errors(self) -> Errors:
-        """Errors that all models share."""
-        ...
-
-    def model(self, key: ModelKey) -> LinearModel:
-        """Return a fitted model."""
-        ...
-
-    def column(
-        self, base: ModelKey, name: str
-    ) -> tuple[LinearModel, NDArray[np.bool_]]:
-        """Return a model with a further effect where it vanishes, and its columns."""
-        ...
-
-    def rms(self, key: ModelKey, u: Array) -> float:
-        """Return the rms residual of a model anywhere, in sensor deviations."""
-        ...
-
-
 class Library:
     """A model at its best fit, with a column of every effect that it lacks.
 
     Coordinates of these effects count from where their columns were taken.
 
     Args:
-        search: Search that has fitted the model.
-        base: Key of the model; the bare one unless given.
-        names: Names of the effects; all unless given.
+        base: Key of the model.
+        fitted: The model.
+        columns: Model with each further effect where it vanishes, and the columns of
+            that effect, by name.
+        errors: Errors that all models share.
+        prior: Log prior probabilities of "none" and each effect.
     """
 
     def __init__(
         self,
-        search: Fits,
-        base: ModelKey = ModelKey(),  # noqa: B008  (frozen)
-        names: Sequence[str] | None = None,
+        base: ModelKey,
+        fitted: LinearModel,
+        columns: Mapping[str, tuple[LinearModel, NDArray[np.bool_]]],
+        errors: Errors,
+        prior: Mapping[str, float],
     ) -> None:
-        self.search, self.base = search, base
-        every = [n for n in search.names if n not in base.effects]
-        self.names = every if names is None else [*names]
-        self.fitted = search.model(base)
-        self._singles: dict[str, LinearModel] = {}
-        self._blocks: dict[str, NDArray[np.bool_]] = {}
-        for name in self.names:
-            self._singles[name], self._blocks[name] = search.column(base, name)
+        self.base, self.fitted = base, fitted
+        self.errors, self.prior = errors, prior
+        self.names = [*columns]
+        self._singles = {name: model for name, (model, _) in columns.items()}
+        self._blocks = {name: own for name, (_, own) in columns.items()}
         self._grams: Grams | None = None
         self._places: dict[str, NDArray[np.intp]] = {}
         self._found: dict[tuple[str, ...], Posterior] = {}
@@ -88,7 +57,7 @@ class Library:
             width = int(self._blocks[name].sum())
             self._places[name] = np.arange(dim, dim + width)
             dim += width
-        self._grams = self.search.errors.grams(self._model(names).rows)
+        self._grams = self.errors.grams(self._model(names).rows)
 
     def beside(self, name: str) -> tuple[LinearModel, NDArray[np.bool_]]:
         """Return the model with one effect where it vanishes, and its columns."""
@@ -106,25 +75,25 @@ class Library:
     def score(self, names: tuple[str, ...]) -> float:
         """Return the log posterior probability of a set, unnormalized."""
         every = (*self.base.effects, *names)
-        return self._posterior(names).log_evidence + log_prior(every, self.search.prior)
+        return self._posterior(names).log_evidence + log_prior(every, self.prior)
 
-    def remains(self, name: str) -> float:
-        """Return the rms of the simulator's residual at an effect's linear optimum."""
+    def optimum(self, name: str) -> tuple[ModelKey, Array]:
+        """Return the key of a model with one effect, and its linear optimum, (d,)."""
         model, own = self._singles[name], self._blocks[name]
         mean = self._posterior((name,)).mean
         u = np.empty(len(model.u))
         u[~own], u[own] = mean[: (~own).sum()], mean[(~own).sum() :] + model.u[own]
-        return self.search.rms(model.key, np.clip(u, model.low, model.high))
+        return model.key, np.clip(u, model.low, model.high)
 
     def _posterior(self, names: tuple[str, ...]) -> Posterior:
         if names not in self._found:
-            model, errors = self._model(names), self.search.errors
+            model, errors = self._model(names), self.errors
             self._found[names] = errors.posterior(model, self._grams_of(names, model))
         return self._found[names]
 
     def _grams_of(self, names: tuple[str, ...], model: LinearModel) -> Grams:
         if self._grams is None or any(n not in self._places for n in names):
-            return self.search.errors.grams(model.rows)
+            return self.errors.grams(model.rows)
         at = np.arange(1 + len(self.fitted.u))
         at = np.concatenate([at, *[self._places[n] for n in names]])
         gram = self._grams.gram[..., at[:, None], at]

@@ -10,14 +10,21 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
-from sbi_active.criticism.linear.library import Library
 from sbi_active.criticism.linear.search import Search
-from sbi_active.criticism.linear.sensor import sensor_error
+from sbi_active.criticism.linear.sensor import sensor_of
+from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.rivals.channel_noise import ChannelNoise
 from sbi_active.criticism.steps.equivalence import MANY
 from sbi_active.criticism.steps.tracing import log_priors
+
+Array = NDArray[Any]
 
 #: Effects that are kept: the best alone, members of the best pairs, and those whose
 #: linear optimum leaves the smallest residual of the simulator itself.
@@ -50,24 +57,39 @@ def linear_models(rivals: RivalSet) -> tuple[Search | None, Screening | None]:
         rivals: The models, with all effects; what is set aside leaves them.
 
     Returns:
-        None for models where the size of the sensor's error is not declared, or the
-        simulator is random or jumps; None for a screening where all effects are to be
-        fitted.
+        None for models where the sensor's error is not Gaussian, or the simulator is
+        random or jumps; None for a screening where all effects are to be fitted.
     """
-    sensor = sensor_error(rivals, needs_time=False)
+    sensor = sensor_of(rivals)
     if sensor is None:
         return None, None
-    unit, cells = sensor
-    search = Search(rivals, unit, log_priors(rivals.library, ()), cells)
+    prior = log_priors(rivals.library, ())
+    search = Search(rivals, sensor, prior)
+    if isinstance(rivals.noise, ChannelNoise):
+        # What is missing may be seen in one channel alone, and no error of it.
+        search.fit_singles()
+        channel = rivals.measurements.channel
+        models = [c.model for c in search.found.values()]
+        best = min(models, key=lambda model: _log_sizes(model.residual, channel))
+        sensor = sensor_of(rivals, [search.model(ModelKey()), best])
+        assert sensor is not None
+        search = Search(rivals, sensor, prior)
     found = None
     if len(rivals.effects) > MANY:
         search.library.look_at_each()
-        found = _best_of(search.library, rivals.effects)
+        found = _best_of(search, rivals.effects)
     if found is None:
         return search, None
     found = _with_kin(found, search)
     rivals.effects = {n: rivals.effects[n] for n in found.kept}
     return search, found if found.behind else None
+
+
+def _log_sizes(residual: Array, channel: Array) -> float:
+    """Return the log size of residuals, summed over numbers, by channel."""
+    count = np.bincount(channel)
+    rms = np.sqrt(np.bincount(channel, residual**2) / np.maximum(count, 1))
+    return float(count @ np.log(np.maximum(rms, 1e-300)))
 
 
 def _with_kin(found: Screening, search: Search) -> Screening:
@@ -92,8 +114,9 @@ def _with_kin(found: Screening, search: Search) -> Screening:
     return Screening(kept, {n: v for n, v in found.behind.items() if n not in kin})
 
 
-def _best_of(linear: Library, every: Collection[str]) -> Screening | None:
+def _best_of(search: Search, every: Collection[str]) -> Screening | None:
     """Return the effects of a library that are worth a fit; None for all."""
+    linear = search.library
     singles = {n: linear.score((n,)) for n in linear.names}
     ranked = sorted(singles, key=singles.__getitem__)[::-1]
     best = dict(singles)
@@ -109,7 +132,7 @@ def _best_of(linear: Library, every: Collection[str]) -> Screening | None:
     kept = {*ranked[:BEST]}
     for pair in sorted(pairs, key=pairs.__getitem__)[::-1][:NUM_PAIRS]:
         kept.update(pair)
-    left = {n: linear.remains(n) for n in ranked[:TRIED]}
+    left = {n: search.rms(*linear.optimum(n)) for n in ranked[:TRIED]}
     kept.update(sorted(left, key=left.__getitem__)[:CLOSEST])
     # Effects on the noise change no prediction, and no column tells of them.
     kept.update(n for n in every if n not in singles)

@@ -20,16 +20,25 @@ from numpy.typing import NDArray
 from sbi_active.criticism.evidence.predicted_before import NUM_DRAWS
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
-from sbi_active.criticism.linear.candidate import Candidate
-from sbi_active.criticism.linear.errors import Errors
-from sbi_active.criticism.linear.fits import along_secants, best_fit, polished
-from sbi_active.criticism.linear.left_out import leave_out
+from sbi_active.criticism.linear.errors import Errors, Mixture, summed
+from sbi_active.criticism.linear.fits import (
+    FitSettings,
+    along_secants,
+    best_fit,
+    polished,
+)
+from sbi_active.criticism.linear.left_out import Candidate, leave_out
 from sbi_active.criticism.linear.library import Library
-from sbi_active.criticism.linear.model import LinearModel, chords, enlarged
-from sbi_active.criticism.linear.nulls import at_null, has_null
-from sbi_active.criticism.linear.settings import FitSettings
+from sbi_active.criticism.linear.model import (
+    LinearModel,
+    at_null,
+    chords,
+    enlarged,
+    has_null,
+)
+from sbi_active.criticism.linear.sensor import Sensor
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.rivals.error_models import NoiseCell
+from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.steps.combinations import log_prior
 from sbi_active.seeding import derive_seed
@@ -43,9 +52,8 @@ class Search:
 
     Args:
         rivals: The models and the trials; smooth.
-        unit: Standard deviation of the sensor, shape (N,).
+        sensor: The sensor's error.
         prior: Log prior probabilities of "none" and each effect.
-        cells: The sensor's error alone.
         settings: Settings of what is spent on fits.
 
     Attributes:
@@ -55,9 +63,8 @@ class Search:
     """
 
     rivals: RivalSet
-    unit: Array
+    sensor: Sensor
     prior: dict[str, float]
-    cells: list[NoiseCell]
     settings: FitSettings = FitSettings()
     found: dict[ModelKey, Candidate] = field(default_factory=dict)
 
@@ -66,13 +73,14 @@ class Search:
         self.names = [e.name for e in effects if e.hook != "noise"]
         self._rivals: dict[ModelKey, Rival] = {}
         self._library: Library | None = None
+        self._process: ResidualProcess | None = None
         self._has_larger = False
         self._seed = derive_seed(self.rivals.seed, "misfit")
         bare = self._fit_bare()
         self.errors = Errors(
             self.rivals.measurements,
             self.unit,
-            self.cells,
+            self.sensor.noise,
             largest=bare.rms,
             warm_up=self.rivals.warm_up if self.rivals.nuisances else 0.0,
             varying=bare.jacobian[:, bare.trial_of < 0],
@@ -80,10 +88,15 @@ class Search:
         self.keep(bare)
 
     @property
+    def unit(self) -> Array:
+        """Standard deviation of the sensor, shape (N,)."""
+        return self.sensor.unit
+
+    @property
     def library(self) -> Library:
         """The bare model with the columns of all effects."""
         if self._library is None:
-            self._library = Library(self)
+            self._library = self._library_of(ModelKey(), self.names)
         return self._library
 
     def model(self, key: ModelKey) -> LinearModel:
@@ -138,10 +151,9 @@ class Search:
                     scores[key] = max(value, scores.get(key, -np.inf))
             most = own.num_pairs if size == 2 else own.num_larger
             best = sorted(scores, key=scores.__getitem__)[::-1][:most]
-            sampled = self._sampled(size)
-            for key in dict.fromkeys([*best, *sampled]):
+            for key in best:
                 least = max(c.log_p_either for c in self.found.values()) - own.behind
-                if key in sampled or scores[key] > least:
+                if scores[key] > least:
                     self.fit_set(key)
             new = [
                 c.log_p_either for k, c in self.found.items() if len(k.effects) == size
@@ -154,38 +166,28 @@ class Search:
         """Fit one set of effects from its parts, once."""
         if key not in self.found:
             known = [p for p in key.parts if p in self.found]
-            # The effects alone of a set that sampling found may be what was fitted.
-            alone = [ModelKey((n,)) for n in key.effects]
-            alone = [k for k in alone if k in self.found]
-            self.keep(self._fit(key, known or alone or [ModelKey()]))
+            self.keep(self._fit(key, known or [ModelKey()]))
         return self.found[key]
 
-    def best_fits(self) -> dict[ModelKey, Array]:
-        """Return the coordinates of the best fits."""
-        return {key: c.model.u for key, c in self.found.items()}
+    def beside_smooth(self, key: ModelKey) -> Mixture:
+        """Return a model's posterior beside a smooth function of the action.
 
-    def worthy(self) -> list[ModelKey]:
-        """Return the sets of several effects worth a sample, smaller ones first.
-
-        With the sensor's error alone, by log posteriors that are not far behind the
-        best; among the parts of the best all count.
+        It stands for what was not declared where x has no time axis.
         """
-        behind, most = self.settings.behind, self.settings.num_sampled
-        log_p = {key: c.log_p_sensor for key, c in self.found.items()}
-        best = max(log_p, key=log_p.__getitem__)
-        some = {k for k, v in log_p.items() if v > log_p[best] - behind}
-        todo = [best]
-        while todo:
-            parts = [k for k in todo.pop().parts if k in log_p]
-            some |= {*parts}
-            todo += parts
-        several = [k for k in some if len(k.effects) > 1]
-        return sorted(several, key=lambda k: (len(k.effects), -log_p[k]))[:most]
+        model = self.found[key].model
+        rows = self.unit[:, None] * model.rows
+        if self._process is None:
+            self._process = self.rivals.residual_process(self.sensor.noise)
+        grams, log_weight = self._process.grams(rows)
+        units = np.log(self.unit).sum()  # densities are of sensor deviations
+        return summed(grams, log_weight + units, model)
 
     @property
     def explains(self) -> bool:
         """Whether a model leaves no more than the sensor's error."""
         least = self.settings.passes
+        if not self.sensor.is_known:
+            return False
         return any(c.model.chi_square[2] >= least for c in self.found.values())
 
     def columns(self, key: ModelKey, part: ModelKey) -> NDArray[np.bool_]:
@@ -235,21 +237,13 @@ class Search:
         picked = [key for rank in zip(*orders, strict=True) for key in rank]
         return [*dict.fromkeys(picked)][: self.settings.num_bases]
 
-    def _sampled(self, size: int) -> list[ModelKey]:
-        """Return the sets that sampled evidence puts in front, where there is any."""
-        fits = self.rivals.fits
-        keys = [k for k in fits if len(k.effects) == size and k.error is None]
-        keys = [k for k in keys if {*k.effects} <= {*self.names}]
-        best = sorted(keys, key=lambda k: -fits[k].evidence.log_evidence)
-        return best[: self.settings.num_bases]
-
     def _beside(self, base: ModelKey, size: int) -> dict[ModelKey, float]:
         """Return linear log posteriors of larger sets beside a model."""
         # A free shape beside a form of its kind says nothing, and costs columns.
         if any(map(self._free, base.effects)):
             return {}
         names = [n for n in self.names if n not in base.effects and not self._free(n)]
-        library = Library(self, base, names) if base.effects else self.library
+        library = self._library_of(base, names) if base.effects else self.library
         library.prepare(names)
         found = {}
         for new in combinations(names, size - len(base.effects)):
@@ -257,6 +251,12 @@ class Search:
             if key not in self.found:
                 found[key] = library.score(new)
         return found
+
+    def _library_of(self, base: ModelKey, names: Sequence[str]) -> Library:
+        """Return a model with columns of effects that it lacks."""
+        columns = {name: self.column(base, name) for name in names}
+        model = self.found[base].model
+        return Library(base, model, columns, self.errors, self.prior)
 
     def _joined(self, base: ModelKey, names: Iterable[str]) -> ModelKey:
         every = {*base.effects, *names}
@@ -331,8 +331,6 @@ class Search:
         u = c.sample(own.num_drawn, seed=derive_seed(self._seed, str(key)))
         u[:, shared] = model.u
         starts = [u]
-        if key in self.rivals.fits:  # what is flat at its null was found by sampling
-            starts.append(self.rivals.fits[key].likeliest[:1])
         if not all(has_null(self.rivals.effects[n]) for n in key.effects):
             seed = derive_seed(self._seed, str(key), "screened")
             far = c.sample(own.num_far, seed=seed)

@@ -1,42 +1,80 @@
-"""The declared error of the sensor."""
+"""The error of the sensor, as linear models take it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.criticism.evidence.predicted_before import NUM_DRAWS
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.rivals.error_models import NoiseCell
+from sbi_active.criticism.linear.fits import FitSettings, best_fit
+from sbi_active.criticism.linear.model import LinearModel
+from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.rivals.channel_noise import ChannelNoise, SettledNoise
+from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import measurement_sds
+from sbi_active.seeding import derive_seed
 
 Array = NDArray[Any]
 
 
-def sensor_error(
-    rivals: RivalSet, *, needs_time: bool = True
-) -> tuple[Array, list[NoiseCell]] | None:
-    """Return the sensor's deviation (N,), and its error with what is unknown of it.
+@dataclass(frozen=True)
+class Sensor:
+    """The error of the sensor alone.
 
-    None if the size of the sensor's error is not declared, x has no time axis, or
-    the simulator is random or jumps, unless ``measurement_sd`` says so all the same.
+    Attributes:
+        unit: Its standard deviation, shape (N,); a typical one where it is unknown.
+        noise: Distribution of the error.
+        is_known: Whether its size is declared.
+    """
+
+    unit: Array
+    noise: NoiseGrid
+    is_known: bool
+
+
+def sensor_of(rivals: RivalSet, likely: Sequence[LinearModel] = ()) -> Sensor | None:
+    """Return the sensor's error; None where no linear model has it.
+
+    This is so if the simulator is random or jumps, unless ``measurement_sd`` says what
+    the sensor's error is, and if the error is not Gaussian.
 
     Args:
         rivals: The models, with the noise as it was declared.
-        needs_time: Whether x has to have a time axis.
+        likely: Models whose residuals tell the ratio of unknown sizes from channel to
+            channel; the bare one is fitted without any.
     """
-    noise, m = rivals.model.noise, rivals.measurements
-    if noise is None or (needs_time and not m.is_sequence):
+    noise, m, grid = rivals.model.noise, rivals.measurements, rivals.noise
+    if noise is None:
         return None
     measured = measurement_sds(noise, m)
     if measured is not None:
         unit = np.broadcast_to(measured, len(m)).astype(float)
-        return unit, [NoiseCell.of(m, sd=unit)]
+        return Sensor(unit, NoiseGrid([NoiseCell.of(m, sd=unit)]), is_known=True)
     jumps = not rivals.is_smooth or bool(rivals.roughness.any())
-    if jumps or noise.posterior is not None or len(rivals.noise.scales) > 1:
+    if jumps or any(np.isfinite(cell.df) for cell in grid.cells):
         return None
-    unit = rivals.noise.cells[0].sd
-    if any(np.isfinite(c.df) or (c.sd != unit).any() for c in rivals.noise.cells):
-        return None
-    return unit, rivals.noise.cells
+    unit, is_declared = grid.cells[0].sd, noise.posterior is None
+    one_size = all((cell.sd == unit).all() for cell in grid.cells)
+    if is_declared and one_size and len(grid.scales) == 1:
+        return Sensor(unit, grid, is_known=True)
+
+    unit = grid.typical_sd
+    if not isinstance(grid, ChannelNoise):
+        return Sensor(unit, grid, is_known=False)
+    if not likely:
+        rival, seed = rivals.rival(ModelKey()), derive_seed(rivals.seed, "spread")
+        u = rival.coordinates.sample(NUM_DRAWS, seed=seed)
+        likely = [best_fit(rival, u, unit, FitSettings())]
+    each = [SettledNoise(grid, model.residual * unit) for model in likely]
+    cells = [
+        replace(cell, log_weight=log_p)
+        for one in each
+        for cell, log_p in zip(one.cells, one.log_prior, strict=True)
+    ]
+    noise = NoiseGrid(cells, scales=each[0].scales)
+    return Sensor(unit, noise, is_known=False)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.errors import Posterior
-from sbi_active.criticism.linear.search import Search
+from sbi_active.criticism.misfit.linear_evidence import LinearEvidence
+from sbi_active.criticism.misfit.verdict import Misfit
 from sbi_active.criticism.results import UNEXPLAINED, Evaluation, ModelKey
 from sbi_active.criticism.rivals.error_models import LOG_2PI
 from sbi_active.criticism.steps.evaluation import joined, scores, summary
@@ -21,29 +21,9 @@ from sbi_active.seeding import derive_seed
 Array = NDArray[Any]
 
 
-class Fitted(Protocol):
-    """Linear models, of which one is chosen."""
-
-    @property
-    def search(self) -> Search:
-        """Search with its models."""
-        ...
-
-    @property
-    def rivals(self) -> RivalSet:
-        """Rivals that the models are made of."""
-        ...
-
-    def posterior(self, key: ModelKey, use: NDArray[np.bool_]) -> Posterior:
-        """Return the posterior of a model by some parts of the trials."""
-        ...
-
-    def selected_without(self, fold: int) -> ModelKey:
-        """Return the model that is chosen without one part of the trials."""
-        ...
-
-
-def evaluate_linear(misfit: Fitted, trials: Trials) -> Evaluation | None:
+def evaluate_linear(
+    misfit: LinearEvidence | Misfit, trials: Trials
+) -> Evaluation | None:
     """Return the error on each trial of models chosen and fitted without it.
 
     The linearizations are those of all trials; evidence, left-out errors, the choice
@@ -63,14 +43,17 @@ def evaluate_linear(misfit: Fitted, trials: Trials) -> Evaluation | None:
         key = misfit.selected_without(fold)
         for kept, model in ((before, ModelKey()), (after, key)):
             kept.append(scores(_prediction(misfit, model, fold, int(place)), one))
-        selected.append(str(key) if key.effects else UNEXPLAINED)
+        fits = key.effects or isinstance(misfit, LinearEvidence)
+        selected.append(str(key) if fits else UNEXPLAINED)
     names = tuple(trials.names[int(i)] for i in places)
     return summary(
         "leave one out", places, joined(before), joined(after), (*selected,), names
     )
 
 
-def _prediction(misfit: Fitted, key: ModelKey, fold: int, place: int) -> Prediction:
+def _prediction(
+    misfit: LinearEvidence | Misfit, key: ModelKey, fold: int, place: int
+) -> Prediction:
     """Return the prediction of a trial by a model that was fitted without it."""
     search, m = misfit.search, misfit.rivals.measurements
     candidate, errors = search.found[key], search.errors

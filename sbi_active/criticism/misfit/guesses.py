@@ -22,7 +22,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sbi_active.criticism.linear.errors import integrated
 from sbi_active.criticism.linear.left_out import leave_out
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
@@ -96,7 +95,7 @@ def _guess_of_numbers(search: Search) -> tuple[tuple[str, float], ...]:
     The simplest of those that it does not beat by the margin comes before it.
     """
     bare, errors, gains = search.found[ModelKey()].model, search.errors, {}
-    least = smooth_evidence(search)
+    least = search.beside_smooth(ModelKey()).log_evidence
     for name, term in _terms(search, of_all=True):
         model = _with_term(bare, term / search.unit)
         gains[name] = errors.posterior(model, errors.grams(model.rows)).log_sensor
@@ -104,21 +103,6 @@ def _guess_of_numbers(search: Search) -> tuple[tuple[str, float], ...]:
     best = sorted(gains, key=gains.__getitem__)[::-1]
     alike = [n for n in gains if gains[n] > gains[best[0]] - MARGIN]
     return tuple((n, gains[n]) for n in dict.fromkeys([*alike[:1], *best]))
-
-
-def smooth_evidence(search: Search) -> float:
-    """Return the log evidence of the bare model and the residual process, nats.
-
-    Args:
-        search: Search that has fitted the bare model.
-    """
-    bare = search.found[ModelKey()].model
-    shift = np.eye(1 + len(bare.u))
-    shift[1:, 0] = -bare.center
-    rows = search.unit[:, None] * (bare.rows @ shift)
-    grams, log_p = search.rivals.residual_process().grams(rows)
-    log_z = integrated(grams, bare, 1.0)[0] + log_p
-    return float(log_sum_exp(log_z) + np.log(search.unit).sum())  # of sensor deviations
 
 
 def gained_by_guesses(search: Search, key: ModelKey, name: str) -> float:

@@ -25,12 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from sbi_active.criticism.linear.errors import WIDTHS, Errors, Posterior, integrated
+from sbi_active.criticism.linear.errors import WIDTHS, Errors, Posterior, summed
 from sbi_active.criticism.linear.left_out import LeftOut
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.processes import Filter, Processes, alike
 from sbi_active.inference.sampling.eigen import eigh
-from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
 
@@ -108,29 +107,20 @@ def shared_process(
     channels = len(places) // num
     if len(places) != channels * num:
         return None
-    rows = model.rows.copy()
-    rows[:, 0] -= rows[:, 1:] @ model.center
-    blocks = rows[places].reshape(num, -1)
+    blocks = model.rows[places].reshape(num, -1)
     variance = errors.sizes[::THINNED] ** 2
     variances = np.stack([np.ones(len(variance)), variance], 1)
     own = Processes.grid(variances, errors.times, errors.kernels)
-    means, covs, logs = [], [], []
+    grams, logs = [], []
     for weights, basis in _between(action, num):
         # Along these directions trials have processes of their own, of other sizes.
         turned = (basis.T @ blocks).reshape(*places.shape, -1)
         each = own.process[:, None] * np.repeat(weights, channels)
         filters = Filter(replace(own, process=each), m.time[places[0]])
-        gram = filters.grams(turned).sum(1)
-        log_z, mean, cov = integrated(gram, model, 1.0)
-        logs.append(log_z - 0.5 * filters.log_det.sum(1))
-        means.append(mean)
-        covs.append(cov)
-    log_p, mean = np.concatenate(logs), np.concatenate(means)
-    p = np.exp(log_p - log_sum_exp(log_p))
-    center = p @ mean
-    off = mean - center
-    cov = np.einsum("h,hij->ij", p, np.concatenate(covs)) + (p[:, None] * off).T @ off
-    return center + model.center, cov
+        grams.append(filters.grams(turned).sum(1))
+        logs.append(-0.5 * filters.log_det.sum(1))
+    found = summed(np.concatenate(grams), np.concatenate(logs), model)
+    return found.mean, found.cov
 
 
 def _between(action: Array, num: int) -> list[tuple[Array, Array]]:

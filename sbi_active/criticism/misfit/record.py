@@ -12,7 +12,7 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.rival_set import NUM_DRAWS, RivalSet
-from sbi_active.criticism.linear.candidate import Candidate
+from sbi_active.criticism.linear.left_out import Candidate
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.guesses import guess_residual
@@ -25,6 +25,7 @@ from sbi_active.criticism.results import (
     ModelKey,
     Tracing,
 )
+from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.steps.detection import LEVEL, THRESHOLD
 from sbi_active.criticism.steps.predictive import predict
 from sbi_active.criticism.steps.tracing import (
@@ -150,34 +151,47 @@ def _record(misfit: Misfit, key: ModelKey) -> Evidence:
     cov = misfit.covariance(key)
     # Draws as wide as misfit asks leave the valleys of what bends: left-out trials are
     # predicted from the best fit, and so are others.
-    return keep_draws(misfit.rivals, model, model.u, cov, log_z, best=model.u)
+    return keep_draws(misfit.rivals, key, model, model.u, cov, log_z, best=model.u)
 
 
 def keep_draws(
     rivals: RivalSet,
+    key: ModelKey,
     model: LinearModel,
     center: Array,
     cov: Array,
     log_z: float,
     *,
     best: Array | None = None,
+    louder: Array | None = None,
+    unit: Array | None = None,
 ) -> Evidence:
     """Return a linear model's record, and keep its draws as its posterior sample.
 
     Args:
         rivals: Rivals that keep them.
-        model: Fitted model.
+        key: Key of the model, with an error or with effects on the noise.
+        model: Fitted model of its effects on the prediction.
         center: Center of its posterior, shape (d,).
         cov: Covariance of its posterior, shape (d, d).
         log_z: Log evidence of the model, nats.
         best: Point from which other trials are predicted, shape (d,); None takes the
             draws.
+        louder: Draws of effects on the noise, natural values, shape (n, k).
+        unit: Unit of the model's residuals, shape (N,), where draws are to be weighed
+            by the simulator; None leaves them.
     """
-    key = model.key
+
+    def linear(u: Array) -> Array:
+        return unit * (model.residual + (u - model.u) @ model.jacobian.T)
+
     if key in rivals.fits:
         return rivals.fits[key].evidence
     before = rivals.simulator.num_simulations if key.effects else 0
-    u = _drawn(rivals, model, center, cov)
+    rival = rivals.rival(key)
+    u, at, mode = _drawn(rivals, model, center, cov), best, model.u
+    if louder is not None:
+        u, mode = _with_louder(rival, model, u, louder), None
     equal = np.full(NUM_DRAWS, 1 / NUM_DRAWS)
     sample = WeightedDraws(
         u=u,
@@ -187,7 +201,7 @@ def keep_draws(
         effective_sample_size=float(NUM_DRAWS),
         method="linear",
     )
-    rival = rivals.rival(key)
+    own = sum(rival.coordinates.joint.sizes)
     evidence = Evidence(
         key=key,
         log_evidence=log_z,
@@ -196,14 +210,33 @@ def keep_draws(
         engine="linear",
         num_simulations=rivals.simulator.num_simulations - before,
         names=rivals.names_of(rival),
-        draws=rival.coordinates.to_z(u)[:, : model.own],
+        draws=rival.coordinates.to_z(u)[:, :own],
         best_chi_square=model.chi_square[0],
-        best=None
-        if best is None
-        else rival.coordinates.to_z(best[None])[0, : model.own],
+        best=None if at is None else rival.coordinates.to_z(at[None])[0, :own],
     )
-    rivals.fits[key] = Fit(rival, sample, evidence, best, model.u)
+    weighs = linear if unit is not None and louder is None else None
+    rivals.fits[key] = Fit(rival, sample, evidence, at, mode, weighs)
     return evidence
+
+
+def _with_louder(rival: Rival, model: LinearModel, u: Array, phi: Array) -> Array:
+    """Return draws of a model with draws of effects on the noise, shape (n, d).
+
+    Args:
+        rival: Rival with these effects.
+        model: Model without them.
+        u: Draws of its coordinates, shape (n, d').
+        phi: Draws of theirs, natural values, shape (m, k), repeated as needed.
+    """
+    c, noisy = rival.coordinates, np.zeros(rival.dim, dtype=bool)
+    for effect in rival.effects:
+        noisy[rival.columns()[effect.name]] = effect.hook == "noise"
+    drawn = np.empty((len(u), rival.dim))
+    drawn[:, ~noisy] = u
+    z = c.to_z(np.where(noisy, 0.0, drawn))
+    z[:, noisy] = phi[np.arange(len(u)) % len(phi)]
+    drawn[:, noisy] = c.from_z(z)[:, noisy]
+    return np.clip(drawn, c.low, c.high)
 
 
 def _drawn(rivals: RivalSet, model: LinearModel, center: Array, cov: Array) -> Array:

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from sbi_active.criticism.contradictions import OutlyingTrial
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.linear.candidate import Candidate
 from sbi_active.criticism.linear.errors import Posterior
-from sbi_active.criticism.linear.left_out import leave_out
+from sbi_active.criticism.linear.left_out import Candidate, leave_out
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.guesses import gained_by_guesses
@@ -246,13 +245,15 @@ def find_misfit(
     of its effects.
 
     Args:
-        search: Fits the models; None if the error of the sensor is not known.
+        search: Fits the models; None if no linear model has the error.
         equivalent: Groups of effects that no permitted action separates.
         is_known: No model fits: what remains was found to be no error of a sensor.
             Without a time axis nothing else tells.
         rule: What decides which effects help.
     """
-    if search is None or not (is_known or search.rivals.measurements.is_sequence):
+    if search is None or not search.sensor.is_known:
+        return None
+    if not (is_known or search.rivals.measurements.is_sequence):
         return None
     rivals = search.rivals
     search.fit_singles()

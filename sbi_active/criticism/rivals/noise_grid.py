@@ -135,12 +135,16 @@ def measurement_sds(noise: NoiseModel | None, measurements: Measurements) -> Any
 
 
 def scattered(noise: NoiseGrid) -> NoiseGrid:
-    """Return the noise inflated by 1 + |N(0, 2.5^2)|, summed out by its quantiles."""
+    """Return the noise inflated by an unknown factor, summed out."""
+    weights = np.full(NUM_INFLATIONS, -np.log(NUM_INFLATIONS))
+    return noise.scaled(inflations(), weights)
+
+
+def inflations() -> Array:
+    """Return quantiles of 1 + |N(0, 2.5^2)|, equally likely factors on the noise."""
     levels = torch.arange(0.5, NUM_INFLATIONS) / NUM_INFLATIONS
     half_normal = torch.distributions.Normal(0.0, 1.0).icdf(0.5 + 0.5 * levels)
-    scales = 1 + INFLATION_SD * half_normal.double().numpy()
-    weights = np.full(NUM_INFLATIONS, -np.log(NUM_INFLATIONS))
-    return noise.scaled(scales, weights)
+    return 1 + INFLATION_SD * half_normal.double().numpy()
 
 
 def _correlated(

@@ -285,17 +285,6 @@ def _kernel(rows: tuple[Array, Array], columns: tuple[Array, Array]) -> Array:
     return np.exp(-0.5 * distance) * (rows[1][:, None] == columns[1][None])
 
 
-def smooth_features(m: Measurements, at: Array) -> Array:
-    """Return features of a smooth function along one trial alone, shape (n, m).
-
-    Args:
-        m: The measurements of all trials.
-        at: Mask of the trial's n among them, bool, shape (N,).
-    """
-    points, channel = _coordinates(m, np.zeros((m.shape[0], 0)), m.span)
-    return _features(points[at], channel[at])
-
-
 def _features(points: Array, channel: Array) -> Array:
     """Return F, shape (N, m), with F F^T the process's covariance at unit amplitude."""
     some = np.unique(np.linspace(0, len(points) - 1, MAX_POINTS).astype(int))

@@ -3,12 +3,7 @@ r"""Influence of trials on a verdict: its Bayes factor with each one left out.
 .. math::
     Z(x_{-k}) = Z(x)\, E_{p(z | x)}\left[\frac{p(x_{-k} | z)}{p(x | z)}\right],
 
-from the weighted sample behind the evidence, which costs no simulation. Where a trial
-decides so much of the posterior that few draws are left, the posterior under a gross
-error of any one trial takes its place, since it reaches all of those without one; but
-not where the few draws already say enough: such an average exceeds what it estimates by
-a factor of e^5 with a probability of e^-5 at most (Markov's inequality), and a Bayes
-factor is most often hundreds of nats.
+from the weighted sample behind the evidence, which costs no simulation.
 """
 
 from __future__ import annotations
@@ -36,10 +31,6 @@ from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
 
-#: Effective draws below which an evidence without a trial is computed anew.
-FEWEST = 20.0
-#: Nats by which few draws may overestimate an evidence without a trial.
-OVERESTIMATED = 5.0
 #: Odds against a gross error from which one trial may speak for an effect alone.
 DECISIVE = 50.0
 #: Score of trials that speaks against effects.
@@ -64,8 +55,7 @@ def needed_trials(rivals: RivalSet, key: ModelKey) -> tuple[float, ...]:
     log_b = log_evidence(rivals, key)[0] - log_evidence(rivals)[0]
     if not own.searched.all() or rivals.simulator.is_stochastic or log_b < THRESHOLD:
         return ()
-    bare = _change(rivals, ModelKey())
-    without = log_b + _change(rivals, key, enough=bare - log_b + THRESHOLD) - bare
+    without = log_b + _change(rivals, key) - _change(rivals, ModelKey())
     index = rivals.trials.index.numpy()[rivals.one_outlier().trials]
     return (*index[without < THRESHOLD].tolist(),)
 
@@ -177,31 +167,10 @@ def withdrawn(tracing: Tracing) -> Tracing:
     )
 
 
-def _change(
-    rivals: RivalSet, key: ModelKey, *, enough: Array | float = np.inf
-) -> Array:
-    """Return the log evidence without each trial less that of all, shape (k,).
-
-    Args:
-        rivals: The models.
-        key: Key of one model.
-        enough: Value beyond which it need not be precise, shape (k,).
-    """
-    change, effective = _reweighted(rivals, key)
-    least = change - rivals.fit(key).evidence.log_evidence - OVERESTIMATED
-    if ((effective < FEWEST) & (least < enough)).any():
-        other, number = _reweighted(rivals, replace(key, error=OUTLIER))
-        change = np.where(number > effective, other, change)
-    return change - rivals.fit(key).evidence.log_evidence
-
-
-def _reweighted(rivals: RivalSet, key: ModelKey) -> tuple[Array, Array]:
-    """Return these evidences by one sample, and how many draws are left, (k,) each."""
+def _change(rivals: RivalSet, key: ModelKey) -> Array:
+    """Return the log evidence without each trial less that of all, shape (k,)."""
     fit = rivals.fit(key)
     _, weights, residual = fit.weighted()
     rest = rivals.one_outlier().without_each(residual)
     full = fit.rival.error.log_likelihood(residual)
-    log_w = np.log(weights)[:, None] + rest - full[:, None]
-    total = log_sum_exp(log_w, axis=0)
-    effective = np.exp(2 * total - log_sum_exp(2 * log_w, axis=0))
-    return fit.evidence.log_evidence + total, effective
+    return log_sum_exp(np.log(weights)[:, None] + rest - full[:, None], axis=0)

@@ -96,7 +96,7 @@ def predict(
     seed = rivals.seed if seed is None else seed
     rng = np.random.default_rng(derive_seed(seed, "predictive", str(key)))
     u = sample.draws(num_draws, rng)
-    own_residual = rival.residual(u, penalized=False)[0]
+    u, own_residual = fit.weighed(u, rival.residual(u, penalized=False)[0], rng)
     target = rivals.trials if trials is None else trials
     simulator = TrialSimulator(
         rivals.simulator.model, target, seed=derive_seed(rivals.seed, "predicted")

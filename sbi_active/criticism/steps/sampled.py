@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,54 +19,24 @@ from sbi_active.criticism.results import (
     Evidence,
     ModelKey,
 )
-from sbi_active.criticism.steps.combinations import grow, log_prior
-from sbi_active.criticism.steps.detection import REFUTED, THRESHOLD, detect
+from sbi_active.criticism.steps.combinations import grow
+from sbi_active.criticism.steps.detection import REFUTED, detect
 from sbi_active.criticism.steps.influence import needed_trials
 
 Array = NDArray[Any]
-
-
-class LinearFits(Protocol):
-    """Models linear at their best fits."""
-
-    def fit_singles(self) -> None:
-        """Fit each effect alone."""
-        ...
-
-    def fit_larger(self) -> None:
-        """Fit sets of several effects."""
-        ...
-
-    def best_fits(self) -> dict[ModelKey, Array]:
-        """Return the coordinates of the best fits."""
-        ...
-
-    def worthy(self) -> list[ModelKey]:
-        """Return sets of several effects worth a sample, smaller ones first."""
-        ...
 
 
 @dataclass
 class Sampled:
     """Models of any simulator, each fitted and sampled once it is asked for.
 
-    Where derivatives mean something, linear models say where a posterior is and which
-    sets of effects are worth a sample, and samples what their evidence is.
-
     Attributes:
         rivals: The models.
         equivalent: Groups of effects that no permitted action separates.
-        linear: Linear models; None if there are none.
     """
 
     rivals: RivalSet
     equivalent: Sequence[frozenset[str]] = ()
-    linear: LinearFits | None = None
-
-    def __post_init__(self) -> None:
-        if self.linear is not None:
-            self.linear.fit_singles()
-            self.rivals.best_fits |= self.linear.best_fits()
 
     @property
     def catch_alls(self) -> tuple[str, ...]:
@@ -85,27 +55,7 @@ class Sampled:
         self, singles: Mapping[str, float], prior: Mapping[str, float]
     ) -> dict[ModelKey, float]:
         """Return log posteriors of sets of several effects, where they gain enough."""
-        if self.linear is None:
-            return grow(self.rivals, dict(singles), dict(prior))
-        self.linear.fit_larger()
-        self.rivals.best_fits |= self.linear.best_fits()
-        found: dict[ModelKey, float] = {}
-        for key in [*self.linear.worthy(), *self._noisy(singles)]:
-            value = self.log_evidence(key)
-            if value > max(map(self.log_evidence, key.parts)) + THRESHOLD:
-                found[key] = value + log_prior(key.effects, prior)
-        return found
-
-    def _noisy(self, singles: Mapping[str, float]) -> list[ModelKey]:
-        """Return the best effect with each on the noise, of which no column tells."""
-        effects = self.rivals.effects
-        noisy = [n for n, e in effects.items() if e.hook == "noise"]
-        others = [n for n in singles if n not in noisy]
-        if not others:
-            return []
-        best = max(others, key=singles.__getitem__)
-        pairs = ({best, name} for name in noisy)
-        return [ModelKey(tuple(n for n in effects if n in pair)) for pair in pairs]
+        return grow(self.rivals, dict(singles), dict(prior))
 
     def is_refuted(self, key: ModelKey, detection: Detection) -> bool:
         """Return whether known noise leaves no room for what a model leaves over."""

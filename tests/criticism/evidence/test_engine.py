@@ -39,17 +39,6 @@ def test_the_standard_error_claims_what_repeated_runs_show():
     assert 0.5 * claimed < np.sqrt((gap**2).mean()) < 1.7 * claimed
 
 
-def test_the_bare_model_s_posterior_is_the_exact_one():
-    settings = settings_of(8, is_bare=True, is_smooth=True)
-    rival, found = fit(settings=settings)
-    z, closed = rival.coordinates.to_z(found.u), exact()
-    mean = found.weight @ z
-    deviation = np.sqrt(np.diag(closed.covariance))
-    assert (abs(mean - closed.mean) < 0.15 * deviation).all()
-    covariance = ((z - mean) * found.weight[:, None]).T @ (z - mean)
-    assert covariance == pytest.approx(closed.covariance, abs=0.01)
-
-
 def test_a_model_behind_another_ends_with_fewer_draws_and_far_behind_with_none():
     closed = exact().log_evidence
     first = fit()[1]

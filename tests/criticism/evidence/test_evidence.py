@@ -5,7 +5,7 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 from scipy.stats import multivariate_normal
-from torch.distributions import HalfNormal, Independent, Normal, Uniform
+from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials
@@ -76,55 +76,6 @@ def test_an_unknown_scale_of_the_prior_is_summed_out(factor):
     assert value == pytest.approx(expected, abs=4 * error)
 
 
-def test_without_effects_there_is_no_scale():
-    some = rivals()
-    for error in (None, "scatter", "unexplained"):
-        evidence = some.fit(ModelKey(error=error)).evidence
-        expected = evidence.log_evidence, evidence.standard_error
-        assert log_evidence(some, ModelKey(error=error), factor=3.0) == expected
-
-
-def test_a_bounded_prior_says_what_is_possible():
-    low, high = torch.full((1,), -2.0), torch.full((1,), 2.0)
-    prior = Independent(Uniform(low, high), 1)
-    own = {f: getattr(CURVE, f) for f in ("hook", "null", "apply")}
-    some = RivalSet(
-        SimulatorModel(line, noise=GaussianNoise(0.5)),
-        PRIOR,
-        Trials(ACTION, X),
-        [Effect("curve", prior=prior, **own)],
-    )
-    value, _ = log_evidence(some, ModelKey(("curve",)), factor=3.0)
-    assert value == pytest.approx(
-        some.fit(ModelKey(("curve",))).evidence.log_evidence, abs=1e-9
-    )
-
-
-def test_a_draw_that_rounds_to_beyond_its_prior_takes_no_evidence_away():
-    own = {f: getattr(CURVE, f) for f in ("hook", "null", "apply")}
-    prior = Independent(HalfNormal(torch.tensor([0.7])), 1)
-    key, some = ModelKey(("curve",)), rivals()
-    some.effects["curve"] = Effect("curve", prior=prior, **own)
-    fit = some.fit(key)
-    before, _ = log_evidence(some, key)
-    weights = fit.sample.weight
-    least = np.where(weights > 0, weights, np.inf).argmin()
-    fit.sample.u[least, -1] = fit.rival.coordinates.low[-1] - 1e-9
-    after, _ = log_evidence(some, key)
-    assert after == pytest.approx(before, abs=0.2)
-
-
-@pytest.mark.parametrize("names", MODELS)
-def test_another_search_gives_the_same_evidence(names):
-    sets = rivals()
-    first = sets.fit(ModelKey(names)).evidence
-    again = rivals(seed=3).fit(ModelKey(names)).evidence
-    for evidence in (first, again):
-        assert evidence.log_evidence == pytest.approx(
-            MODELS[names], abs=4 * evidence.standard_error
-        )
-
-
 def test_the_bare_model_is_kept_where_other_starts_find_no_more():
     sets = rivals()
     own = sets.fit().evidence
@@ -133,19 +84,6 @@ def test_the_bare_model_is_kept_where_other_starts_find_no_more():
         own.log_evidence, abs=4 * np.hypot(own.standard_error, again.standard_error)
     )
     assert sets.fit().evidence is own
-
-
-def test_the_posterior_is_the_exact_one():
-    evidence = rivals().fit().evidence
-    design = np.stack([XI**0, XI], 1)
-    precision = design.T @ design / 0.25 + np.diag([0.25, 1.0])
-    mean = np.linalg.solve(precision, design.T @ X[:, 0].double().numpy() / 0.25)
-    sd = np.sqrt(np.diag(np.linalg.inv(precision)))
-    assert evidence.effective_sample_size >= 60
-    # Four hundred are drawn from these with replacement, which adds to the variance.
-    error = 4 * sd * np.sqrt(1 / 100 + 1 / 400)
-    assert np.all(np.abs(evidence.draws.mean(0) - mean) < error)
-    assert np.all(np.abs(evidence.draws.std(0) - sd) < error)
 
 
 def test_no_parameters_are_simulated_twice():
@@ -157,24 +95,6 @@ def test_no_parameters_are_simulated_twice():
     again = scattered.residual(np.concatenate([u[::-1], u[:2]]))[0]
     assert sets.simulator.num_simulations == before + 7 * len(X)
     np.testing.assert_array_equal(again, first[[6, 5, 4, 3, 2, 1, 0, 0, 1]])
-
-
-def test_a_smooth_rival_costs_few_simulations():
-    sets = rivals()
-    # The bare model, on which all comparisons rest, is sampled to the last percent.
-    for names, error, most in [
-        ((), None, 12_000),
-        (("curve",), None, 4_000),
-        ((), "unexplained", 6_000),
-    ]:
-        spent = sets.fit(ModelKey(names, error)).evidence.num_simulations
-        assert spent < most
-
-
-def test_the_same_seed_gives_the_same_evidence():
-    a, b, c = (rivals(seed=s).fit().evidence.log_evidence for s in (1, 1, 2))
-    assert a == b
-    assert a != c
 
 
 def test_scatter_sums_out_the_inflation():

@@ -9,9 +9,7 @@ from torch.distributions import Independent, Normal
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import AugmentedSimulator, Effect, Trials
 from sbi_active.criticism.evidence import RivalSet
-from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals import TrialSimulator
-from sbi_active.inference.sampling import log_sum_exp
 
 NOISE, JUMP = 0.1, 0.2
 PRIOR = BoxUniform(-2 * torch.ones(2), 2 * torch.ones(2))
@@ -92,23 +90,6 @@ def test_a_response_that_bends_does_not_jump(seed):
     assert found.is_smooth
     assert found.step < 1e-2
     assert not found.roughness.any()
-
-
-@pytest.mark.parametrize("names", [(), ("bias",)])
-def test_its_evidence_is_that_of_draws_from_the_prior(names):
-    found = rivals(jumping, missing=0.5)
-    evidence = found.fit(ModelKey(names)).evidence
-    rival = found.rival(ModelKey(names))
-    parts = [
-        rival.log_likelihood(rival.coordinates.sample(100_000, seed=k)) for k in (1, 2)
-    ]
-    log_l = np.concatenate(parts)
-    expected = log_sum_exp(log_l) - np.log(len(log_l))
-    effective = np.exp(2 * log_sum_exp(log_l) - log_sum_exp(2 * log_l))
-    error = np.hypot(evidence.standard_error, effective**-0.5)
-    assert effective > 30
-    assert abs(evidence.log_evidence - expected) < 4 * error
-    assert evidence.effective_sample_size > 20
 
 
 def test_repeated_actions_are_simulated_once_and_predict_the_same():

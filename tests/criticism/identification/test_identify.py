@@ -81,17 +81,6 @@ def test_residuals_far_beyond_the_declared_error_are_told():
     assert not any("declared error" in w for w in right.diagnostics.warnings)
 
 
-def test_declared_white_errors_have_their_size():
-    """Three times what it is in truth: intervals are three times as wide."""
-    trials = Trials(ACTION, recorded())
-    sizes = [torch.tensor([0.02, 1.0]), torch.tensor([0.06, 3.0])]
-    widths = []
-    for sd in sizes:
-        found = identify(model(GaussianNoise(sd)), PRIOR, trials).interval()
-        widths.append([high - low for low, high in found.values()])
-    assert np.divide(widths[1], widths[0]) == pytest.approx(3.0, rel=0.2)
-
-
 def test_gaps_and_a_single_log_will_do():
     x = recorded()[2:3]
     x[0, 30:50, 0] = torch.nan
@@ -99,27 +88,6 @@ def test_gaps_and_a_single_log_will_do():
     for (low, high), truth in zip(belief.interval(0.999).values(), TRUTH, strict=True):
         assert low < truth < high
         assert high - low < 0.2
-
-
-def test_what_nothing_tells_keeps_its_prior():
-    def deaf(theta, action):
-        return mean(
-            torch.cat([theta[:, :2], TRUTH[2].expand(len(theta), 1)], 1), action
-        )
-
-    belief = identify(model(fn=deaf), PRIOR, Trials(ACTION, recorded()))
-    low, high = belief.interval()["gain"]
-    assert low == pytest.approx(0.5 + 0.025 * 1.5, abs=0.05)
-    assert high == pytest.approx(2.0 - 0.025 * 1.5, abs=0.05)
-    low, high = belief.interval()["frequency"]
-    assert high - low < 0.05
-
-
-def test_a_bound_is_kept_and_told():
-    prior = BoxUniform(torch.tensor([1.0, 0.25, 0.5]), torch.tensor([6.0, 1.0, 2.0]))
-    belief = identify(model(), prior, Trials(ACTION, recorded()))
-    assert belief.draws[:, 1].min() >= 0.25
-    assert any("decay is at a bound" in w for w in belief.diagnostics.warnings)
 
 
 @pytest.mark.parametrize(("low", "high", "side"), [(0.6, 1.0, -1), (0.0, 0.05, 1)])
@@ -144,7 +112,7 @@ def test_an_interval_at_a_bound_is_one_sided_and_has_a_width(low, high, side):
     assert two - one == pytest.approx(np.quantile(inside, 0.95), abs=1e-3)
 
 
-@pytest.mark.parametrize("times", [30.0, 300.0, 1e4])
+@pytest.mark.parametrize("times", [30.0, 1e4])
 def test_errors_far_beyond_the_declared_one_have_their_size(times):
     """Of any size: not as many times as some largest shape of the error allows."""
     bend = 0.3 * torch.stack([torch.sin(3 * TIMES), 50 * torch.cos(TIMES)], -1)

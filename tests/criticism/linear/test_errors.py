@@ -1,7 +1,5 @@
 """The evidence under a residual process, against dense Gaussian integrals."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal, norm
@@ -13,7 +11,7 @@ from sbi_active.criticism.linear.left_out import leave_out
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.misfit.intervals import shared_process
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.rivals.error_models import NoiseCell
+from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 
 NUM, SAMPLES = 7, 5
 KERNELS = (
@@ -44,7 +42,7 @@ def problem(*, low=-np.inf, ragged=False, num=NUM):
         trial_of=np.array([-1, -1]),
     )
     unit = np.full(len(m), 0.5)
-    errors = Errors(m, unit, [NoiseCell.of(m, sd=unit)], largest=2.0)
+    errors = Errors(m, unit, NoiseGrid([NoiseCell.of(m, sd=unit)]), largest=2.0)
     return model, errors
 
 
@@ -89,7 +87,7 @@ def test_a_parameter_that_differs_from_trial_to_trial_is_a_dense_integral_too():
     m, rows = plain.measurements, model.rows
     varying = np.stack([3 * model.jacobian[:, 0], np.zeros(len(m))], 1)
     cells = [NoiseCell.of(m, sd=plain.unit)]
-    errors = Errors(m, plain.unit, cells, largest=2.0, varying=varying)
+    errors = Errors(m, plain.unit, NoiseGrid(cells), largest=2.0, varying=varying)
     found = errors.posterior(model, errors.grams(rows))
     without = plain.posterior(model, plain.grams(rows))
     j = model.jacobian[:, 0] / np.sqrt(np.mean(model.jacobian[:, 0] ** 2))
@@ -113,57 +111,12 @@ def test_a_parameter_that_differs_from_trial_to_trial_is_a_dense_integral_too():
     assert part.log_sensor == plain.posterior(model, plain.grams(rows), use).log_sensor
 
 
-def test_trials_that_depend_on_what_differs_between_them_count_less():
-    model, plain = problem()
-    m = plain.measurements
-    j = np.where(m.trial == 0, 5.0, 0.1)
-    cells = [NoiseCell.of(m, sd=plain.unit)]
-    errors = Errors(m, plain.unit, cells, largest=2.0, varying=j[:, None])
-    found = errors.posterior(model, errors.grams(model.rows))
-    assert found.variances.shape == (2,)
-    of = replace(found, variances=np.array([3.0, 10.0]))
-    variance = 1 + 3 + 10 * j**2 / np.mean(j**2)
-    weight = errors.weight(of)
-    assert weight * variance == pytest.approx(np.full(len(m), weight[0] * variance[0]))
-    assert weight.mean() == pytest.approx(1.0)
-    alike = replace(found, variances=np.array([3.0, 0.0]))
-    assert errors.weight(alike) == pytest.approx(np.ones(len(m)))
-
-
-def test_variances_say_what_differs():
-    """Residuals in proportion to the derivative, by another factor in each trial."""
-    model, plain = problem()
-    m, rng = plain.measurements, np.random.default_rng(5)
-    j = rng.normal(size=(len(m), 2))
-    factor = 10 * rng.normal(size=NUM)
-    residual = factor[m.trial] * j[:, 1] + rng.normal(size=len(m))
-    cells = [NoiseCell.of(m, sd=plain.unit)]
-    errors = Errors(m, plain.unit, cells, largest=2.0, varying=j)
-    off = replace(model, residual=residual)
-    _, first, second = errors.posterior(off, errors.grams(off.rows)).variances
-    # The posterior mean of a variance known by as many factors; sizes are of a grid.
-    mean = np.sum(factor**2) / (NUM - 2) * np.mean(j[:, 1] ** 2)
-    assert second == pytest.approx(mean, rel=0.3)
-    assert first < 1e-3 * second
-
-
-def test_few_trials_do_not_tell_what_differs_between_them():
-    _, errors = problem(num=3)
-    m, unit = errors.measurements, errors.unit
-    one = np.ones((len(m), 1))
-    again = Errors(m, unit, [NoiseCell.of(m, sd=unit)], largest=2.0, varying=one)
-    assert again.varying.shape == (len(m), 0)
-
-
 def test_a_bound_of_phi_counts_by_the_posterior_within_it():
     free, errors = problem()
     bounded, _ = problem(low=0.0)
     grams = errors.grams(free.rows)
     use = np.ones(errors.num_folds, bool)
     gram = grams.gram[-1:, use].sum(1)
-    shift = np.eye(3)
-    shift[1:, 0] = -free.center
-    gram = shift.T @ gram @ shift
     log_z, mean, cov = integrated(gram, free, 1.0)
     within = integrated(gram, bounded, 1.0)[0]
     inside = norm.logsf(0.0, mean[0, 1], np.sqrt(cov[0, 1, 1]))

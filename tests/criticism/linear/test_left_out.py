@@ -32,16 +32,6 @@ def test_the_best_within_bounds_is_that_of_scipy(seed):
     assert square(x) == pytest.approx(square(best), abs=1e-9)
 
 
-def test_where_no_bound_matters_it_is_the_plain_solution():
-    rng = np.random.default_rng(0)
-    matrix = rng.normal(size=(3, 9, 4))
-    system = np.einsum("nij,nik->njk", matrix, matrix)
-    right = rng.normal(size=(3, 4))
-    far = np.full(4, 1e6)
-    plain = np.linalg.solve(system, right[..., None])[..., 0]
-    assert (bounded(system, right, -far, far) == plain).all()
-
-
 @pytest.fixture
 def line():
     """A line through trials of two numbers, the last of which is far away."""

@@ -10,7 +10,7 @@ from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.linear.fits import along_secants
 from sbi_active.criticism.linear.search import Search
-from sbi_active.criticism.linear.sensor import sensor_error
+from sbi_active.criticism.linear.sensor import sensor_of
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.tracing import log_priors
 from tests.criticism.misfit.oscillator import EFFECTS as OSCILLATOR
@@ -64,9 +64,9 @@ def test_parameters_beside_an_effect_without_a_null_are_looked_for_anew():
         seed=0,
         summaries=0,
     )
-    sensor = sensor_error(loop.rivals, needs_time=False)
+    sensor = sensor_of(loop.rivals)
     assert sensor is not None
-    search = Search(loop.rivals, sensor[0], log_priors(loop.effects, ()), sensor[1])
+    search = Search(loop.rivals, sensor, log_priors(loop.effects, ()))
     search.fit_singles()
     alone = search.found[ModelKey(("drift",))].model.rms
     both = search.fit_set(ModelKey(("limit", "drift"))).model.rms
@@ -77,9 +77,9 @@ def test_parameters_beside_an_effect_without_a_null_are_looked_for_anew():
 def test_a_set_whose_fit_was_lost_is_fitted_again_from_its_part(monkeypatch):
     """A friction that holds the machine still has no slope that leads back."""
     loop = Criticism(MODEL, PRIOR, trials(cubic=0.5), effects=OSCILLATOR, seed=0)
-    sensor = sensor_error(loop.rivals, needs_time=False)
+    sensor = sensor_of(loop.rivals)
     assert sensor is not None
-    search = Search(loop.rivals, sensor[0], log_priors(loop.effects, ()), sensor[1])
+    search = Search(loop.rivals, sensor, log_priors(loop.effects, ()))
     search.fit_singles()
     part = search.found[ModelKey(("cubic",))].model
     faint, again = search._faint, []

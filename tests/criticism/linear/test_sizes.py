@@ -1,7 +1,6 @@
 """A library of 24 effects, whose sets are all fitted, and one of 25 say the same."""
 
 import numpy as np
-import pytest
 import torch
 from sbi.utils import BoxUniform
 from torch.distributions import Normal
@@ -41,9 +40,7 @@ def verdict(number, strength):
     return loop.trace()
 
 
-@pytest.mark.parametrize("strength", [0.0, 0.2])
-def test_one_effect_more_does_not_change_the_verdict(strength):
-    few, many = (verdict(MANY + k, strength) for k in (0, 1))
-    assert few.verdict == many.verdict == ("wave 2" if strength else "none")
-    for name in {few.verdict} - {"none"}:
-        assert abs(few.inclusion[name] - many.inclusion[name]) < 0.1
+def test_one_effect_more_does_not_change_the_verdict():
+    few, many = (verdict(MANY + k, 0.2) for k in (0, 1))
+    assert few.verdict == many.verdict == "wave 2"
+    assert abs(few.inclusion["wave 2"] - many.inclusion["wave 2"]) < 0.1

@@ -11,7 +11,6 @@ from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit.guesses import (
     MARGIN,
     guess_residual,
-    smooth_evidence,
 )
 from sbi_active.criticism.results import ModelKey
 from sbi_active.simulation import GaussianNoise
@@ -55,17 +54,6 @@ def test_what_the_sensor_does_is_guessed(change, hidden, formula):
     text = " ".join(str(report).split())
     assert f"no declared effect helps, a guess, not declared: {formula}" in text
     assert f"What it leaves follows {formula}, with x the output" in text
-
-
-def test_a_force_that_no_formula_of_the_output_is_has_no_guess():
-    assert loop(trials(hidden=0.6)).trace().guesses == ()
-
-
-def test_where_an_effect_helps_nothing_is_guessed():
-    tracing = loop(trials(friction=0.3, hidden=0.3)).trace()
-    assert tracing.misfit is not None
-    assert "friction" in tracing.chosen
-    assert tracing.guesses == ()
 
 
 def test_a_guess_says_in_which_channel():
@@ -127,4 +115,6 @@ def test_the_evidence_of_the_residual_process_is_that_of_its_covariances():
     assert np.logaddexp.reduce(log_weight) == pytest.approx(0, abs=1e-6)
     exact = np.logaddexp.reduce(np.array(log_p) + log_weight)
     assert not np.isfinite(model.low).any()
-    assert smooth_evidence(search) == pytest.approx(exact, abs=1e-6)
+    assert search.beside_smooth(ModelKey()).log_evidence == pytest.approx(
+        exact, abs=1e-6
+    )

@@ -1,11 +1,9 @@
 """Draws of models that the trials refute."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from sbi_active.criticism.misfit.refuted import widened
+from sbi_active.criticism.misfit.second_look import widened
 from sbi_active.criticism.results import Estimate, Evidence, ModelKey, Tracing
 
 RNG = np.random.default_rng(0)
@@ -86,22 +84,3 @@ def test_draws_stay_within_the_prior_and_estimates_follow_them():
     assert told.mean == pytest.approx(draws[:, 1:].mean(0))
     assert told.sd == pytest.approx(draws[:, 1:].std(0))
     assert told.sd > 1.2 * estimate.sd
-
-
-def test_what_explains_about_as_well_keeps_its_draws():
-    close = replace(OTHER, log_evidence=-1.0)
-    assert widened(tracing(BEST, close), 0, anywhere).evidences["b"] is close
-
-
-def test_without_an_effect_nothing_explains():
-    before = tracing(BARE, BEST, chosen=())
-    assert widened(before, 0, anywhere) is before
-
-
-def test_the_seed_decides_the_draws():
-    one, same, other = (
-        widened(tracing(BARE, BEST), seed, anywhere).evidences["none"].draws
-        for seed in (1, 1, 2)
-    )
-    assert (one == same).all()
-    assert not (one == other).all()

@@ -139,12 +139,3 @@ def test_a_warm_up_that_cannot_be(options, message):
 def test_a_warm_up_needs_nuisances():
     with pytest.raises(ValueError, match="effects of scope 'trial' with warm_up = 0.5"):
         Criticism(MODEL, PRIOR, trials()[0], effects=[DRAG], warm_up=0.5)
-
-
-def test_without_misfit_linear_evidence_names_the_effect():
-    own, _ = trials(drag=1.2)
-    criticism = loop(own)
-    tracing = criticism.trace()
-    assert (tracing.verdict, tracing.misfit) == ("drag", None)
-    assert {e.engine for e in tracing.evidences.values()} == {"linear"}
-    assert criticism.rivals.simulator.num_simulations < 20_000

@@ -87,27 +87,6 @@ def test_the_report_says_the_bound_and_what_is_beyond(narrow):
     assert "No declared effect explains" not in first
 
 
-def test_errors_are_those_of_what_the_verdict_is(narrow):
-    assert narrow.evaluation.selected == (UNEXPLAINED,) * 4
-    assert "With a residual process, the RMSE on trials" in " ".join(
-        str(narrow).split()
-    )
-
-
-def test_of_a_model_that_misses_the_best_fit_is_printed(narrow):
-    row = narrow.parameters.set_index("parameter").loc["friction"]
-    assert row["before"] == pytest.approx(0.5, abs=0.002)
-    assert row["before_sd"] > 0.02  # as its draws know of the misfit
-    assert "the best fit stands here" in " ".join(str(narrow).split())
-
-
-def test_with_a_prior_that_holds_the_truth_nothing_is_said():
-    report = criticism(0.1).report(plan=False)
-    assert report.verdict == NONE
-    assert report.tracing.bounds.parameters == ()
-    assert "bound of its prior" not in str(report)
-
-
 def test_a_cause_that_no_bound_makes_up_for_stays_named():
     report = criticism(0.1, high=0.42, effect=DRAG, drag=0.3).report(plan=False)
     assert report.verdict == "drag"
@@ -126,12 +105,6 @@ def test_a_narrow_prior_without_bounds_names_nothing_either():
     assert report.verdict in (NONE, UNEXPLAINED)
     line = str(report).splitlines()[0]
     assert "gain: no permitted action tells it from the bare model" in line
-
-
-def test_nothing_declared_and_a_narrow_prior_is_told_too():
-    report = criticism(0.5, effect=DRAG).report(plan=False)
-    assert report.tracing.chosen == ()
-    assert "with a wider prior the model needs no effect" in str(report).splitlines()[0]
 
 
 def test_a_bare_model_that_explains_at_its_bound_says_so():

@@ -115,13 +115,6 @@ def test_a_cause_has_no_rival_among_formulas(beside):
     assert -4 < guessed < 0
 
 
-def test_a_model_that_fits_is_no_misfit():
-    found = loop(trials(quadratic=QUADRATIC))
-    assert found.trace().verdict == "quadratic"
-    assert found.misfit() is None
-    assert found.trace().misfit is None
-
-
 def test_several_effects_are_asked_what_left_out_trials_say_of_them():
     found = loop(trials(quadratic=QUADRATIC, step=1.0))
     tracing = found.trace()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.special import logsumexp
-from scipy.stats import multivariate_normal, norm
+from scipy.stats import multivariate_normal
 
 from sbi_active import AutocorrelatedNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials, close_loop
@@ -63,54 +63,6 @@ def test_evidence_is_the_sum_over_every_combination_of_sizes(gap):
     assert posterior.sum() == pytest.approx(1.0)
 
 
-def test_channels_of_one_unit_and_size_are_as_ever_where_both_sizes_are_known_well():
-    """With sizes in bounds too narrow to tell, one for all or one for each is alike."""
-    m = measured(unit=(1.0, 1.0))
-    bounds, times = (0.999, 1.001), (0.05, 2.0)
-    one, each = (
-        AutocorrelatedNoise.unknown(sd=sd, correlation_time=times)
-        for sd in (bounds, [bounds, bounds])
-    )
-    a, b = (declared_noise(n, m).log_likelihood(m.x[None])[0] for n in (one, each))
-    assert a == pytest.approx(b, abs=1e-3)
-
-
-def test_draws_have_the_size_of_their_channel():
-    m = measured(40, unit=(0.5, 40.0))
-    grid = declared_noise(noise_of(), m)
-    _, sizes = grid.noise_posterior(
-        np.repeat(m.x[None], 50, 0), np.random.default_rng(0)
-    )
-    assert sizes.shape == (50, 2)
-    sd = grid.by_number(sizes) * grid.cells[0].sd
-    for channel, true in enumerate((0.5, 40.0)):
-        assert sd[:, m.channel == channel].mean() == pytest.approx(true, rel=0.4)
-    white = grid.whitener(m.x)(m.x)
-    for channel in (0, 1):
-        assert np.std(white[m.channel == channel]) == pytest.approx(1.0, abs=0.5)
-
-
-def test_a_common_factor_is_summed_beside_the_sizes():
-    m = measured()
-    grid = declared_noise(noise_of(), m)
-    scales, p = np.array([1.0, 2.0, 5.0]), np.log([0.5, 0.3, 0.2])
-    wide = grid.scaled(scales, p)
-    each = [grid.log_likelihood(m.x[None] / s)[0] - len(m) * np.log(s) for s in scales]
-    assert wide.log_likelihood(m.x[None])[0] == pytest.approx(logsumexp(each + p))
-    some = m.trial > 0
-    later = Measurements.of(
-        Trials(
-            torch.arange(2.0),
-            m.x.reshape(3, 2, 4)[1:].transpose(0, 2, 1),
-            sample_times=TIMES,
-        )
-    )
-    expected = declared_noise(noise_of(), later).scaled(scales, p)
-    assert wide.part(some).log_likelihood(m.x[None, some])[0] == pytest.approx(
-        expected.log_likelihood(later.x[None])[0]
-    )
-
-
 def test_with_a_settled_ratio_it_is_as_probable_where_the_ratio_is_from():
     m = measured()
     grid = declared_noise(noise_of(), m)
@@ -124,14 +76,6 @@ def test_with_a_settled_ratio_it_is_as_probable_where_the_ratio_is_from():
     np.testing.assert_allclose(
         settled.cells[cell].sd, grid.by_number(best[None])[0] * (grid.cells[cell].sd)
     )
-
-
-def test_an_extra_error_is_added_to_each_size():
-    m = measured()
-    grid = declared_noise(noise_of(), m)
-    more = grid.with_extra(np.full(len(m), 2.0))
-    assert isinstance(more, ChannelNoise)
-    np.testing.assert_allclose(more.cells[0].sd, np.hypot(grid.cells[0].sd, 2.0))
 
 
 def gliding(theta, action, *, times, drag=0.0):
@@ -183,18 +127,3 @@ def test_a_size_of_each_channel_needs_as_many_channels():
     m = Measurements.of(Trials([0.0], torch.zeros(1, 4, 3), sample_times=times))
     with pytest.raises(ValueError, match="for each of 3 channels; got 2"):
         declared_noise(noise_of(), m)
-
-
-def test_predictions_have_the_density_of_each_channel():
-    """Of one trial given cells and sizes, as of independent numbers by channel."""
-    from sbi_active.criticism.steps.predictive import _log_density
-
-    m = measured(1)
-    noise = AutocorrelatedNoise.unknown(sd=SIZES, correlation_time=(1e-6, 2e-6))
-    grid = declared_noise(noise, m)
-    cells, sizes = np.zeros(2, dtype=int), np.array([[1.0, 2.0], [0.5, 1.5]])
-    each = grid.by_number(sizes)
-    at = np.ones(len(m), bool)
-    got = _log_density(grid, cells, each, np.repeat(m.x[None], 2, 0), at)
-    expected = norm(0, each * grid.cells[0].sd).logpdf(m.x).sum(1)
-    np.testing.assert_allclose(got, expected, rtol=1e-9)

@@ -63,30 +63,6 @@ def test_bounds_stay_bounds_and_count_as_within():
     assert c.from_z(c.to_z(u)) == pytest.approx(u)
 
 
-def test_a_search_takes_each_prior_for_its_gaussian():
-    c = coordinates()
-    assert c.precision[0] == 0  # between two bounds
-    assert c.precision[1:] == pytest.approx(1.0, rel=1e-6)
-    assert c.center == pytest.approx(0.0)
-    half = effect("half", torch.distributions.HalfNormal(torch.ones(1)))
-    one = SearchCoordinates(BOX, [half], (), 1)
-    assert one.to_z(one.center[None])[0, 1] == pytest.approx(0.0)
-    # A half Gaussian from there: E[z^2] = 1.
-    assert one.precision[1] == pytest.approx(one.scale[1] ** 2, rel=0.15)
-
-
-def test_nuisances_of_all_trials_move_together():
-    c = coordinates()
-    moved = [np.flatnonzero(group).tolist() for group in c.groups()]
-    assert moved == [[0], [1], [2, 4, 6], [3, 5, 7]]
-    assert c.trial_of().tolist() == [-1, -1, 0, 0, 1, 1, 2, 2]
-    theta, phi = c.split(c.from_z(np.arange(1.0, 9.0)[None]))
-    assert theta.tolist() == [[1.0]]
-    assert phi["wide"].numpy() == pytest.approx(2.0)
-    expected = np.arange(3.0, 9.0).reshape(1, 3, 2)
-    assert phi["start"].numpy() == pytest.approx(expected)
-
-
 def test_a_coordinate_is_at_the_bound_where_its_draws_pile_up():
     c, rng = coordinates(), np.random.default_rng(0)
     for z, side in (

@@ -9,7 +9,6 @@ from torch.distributions import Independent, Normal
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.forces import force_effects, total_force
-from sbi_active.criticism.rivals.coordinates import SearchCoordinates
 from sbi_active.criticism.rivals.energy import dissipative_bounds
 
 STEP, NUM = 0.02, 100
@@ -66,15 +65,6 @@ def test_only_what_outgrows_damping_and_drives_is_bounded(forces):
     assert rest == {"v|v| of hinge", "v^3 of hinge"}
 
 
-def test_bounds_are_those_of_the_search(forces):
-    one = forces["v|v| of hinge"]
-    coordinates = SearchCoordinates(PRIOR, [one], [], 3)
-    inside = coordinates.to_z(coordinates.high[None])
-    assert inside[0, 1] == pytest.approx(0.0, abs=1e-9)
-    beyond = coordinates.from_z(np.array([[0.5, 0.1]]))
-    assert coordinates.log_prob(beyond) == -np.inf
-
-
 def test_quadratic_damping_that_feeds_energy_is_never_adopted(pushed, forces):
     kinds = ["v|v| of hinge", "v of hinge", "sin 2q of hinge", "q^3 of hinge"]
     loop = Criticism(
@@ -86,18 +76,6 @@ def test_quadratic_damping_that_feeds_energy_is_never_adopted(pushed, forces):
         if "v|v| of hinge" in evidence.names:
             at = evidence.names.index("v|v| of hinge")
             assert (evidence.draws[:, at] <= 1e-9).all()
-
-
-def test_without_the_bound_it_would_be(pushed, forces, monkeypatch):
-    free = lambda e: (np.full(e.phi_dim, -np.inf), np.full(e.phi_dim, np.inf))  # noqa: E731
-    monkeypatch.setattr(
-        "sbi_active.criticism.rivals.coordinates.dissipative_bounds", free
-    )
-    kinds = ["v|v| of hinge", "v of hinge", "sin 2q of hinge", "q^3 of hinge"]
-    loop = Criticism(
-        model(0.003), PRIOR, pushed, effects=[forces[name] for name in kinds]
-    )
-    assert "v|v| of hinge" in loop.trace().chosen
 
 
 def test_what_is_no_force_has_no_bounds():

@@ -10,46 +10,16 @@ from sbi_active import (
     AutocorrelatedNoise,
     GaussianNoise,
     StudentTNoise,
-    estimate_noise,
 )
 from sbi_active.criticism import Trials
 from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import (
     INDEPENDENT,
-    NUM_DRAWS,
     declared_noise,
     measurement_sds,
-    scattered,
 )
 
 TIMES = np.array([0.0, 0.1, 0.3, 0.6, 1.0])
-
-
-def test_correlated_noise_is_a_gaussian_of_exponential_covariance():
-    x = torch.tensor([[0.1, 0.4, torch.nan, 0.2, -0.3], [1.0, 0.9, 0.5, 0.4, 0.2]])
-    m = Measurements.of(Trials([0.0, 1.0], x, sample_times=TIMES))
-    sd = np.full(len(m), 0.7)
-    cell = NoiseCell.of(m, sd=sd, correlation_time=0.4)
-    expected = 0.0
-    for t in range(2):
-        at = m.trial == t
-        gap = np.abs(m.time[at][:, None] - m.time[at])
-        cov = 0.49 * np.exp(-gap / 0.4)
-        expected += multivariate_normal(np.zeros(at.sum()), cov).logpdf(m.x[at])
-    got = NoiseGrid([cell]).log_likelihood(m.x[None])[0]
-    assert got == pytest.approx(expected, rel=1e-9)
-
-
-def test_a_time_axis_leaves_the_correlation_open():
-    x = torch.zeros(2, 5)
-    without = Measurements.of(Trials([0.0, 1.0], x))
-    with_times = Measurements.of(Trials([0.0, 1.0], x, sample_times=TIMES))
-    noise = GaussianNoise(1.0)
-    assert len(declared_noise(noise, without).cells) == 1
-    grid = declared_noise(noise, with_times)
-    assert len(grid.cells) > 10
-    assert np.exp(grid.log_prior).sum() == pytest.approx(1.0)
 
 
 def test_noise_without_size_is_refused():
@@ -85,12 +55,6 @@ def test_an_open_correlation_is_none_or_of_any_time():
     assert got == pytest.approx(expected, rel=1e-6)
 
 
-def test_a_simulator_that_is_the_draw_has_errors_of_unit_size():
-    m = Measurements.of(Trials([0.0, 1.0], [0.3, -1.2]))
-    got = declared_noise(None, m).log_likelihood(m.x[None])[0]
-    assert got == pytest.approx(stats.norm.logpdf([0.3, -1.2]).sum())
-
-
 def test_each_channel_has_its_own_deviation():
     x = torch.tensor([[1.0, torch.nan, 3.0], [0.5, -20.0, 10.0]])
     m = Measurements.of(Trials([0.0, 1.0], x))
@@ -106,18 +70,6 @@ def test_t_noise_has_the_deviation_that_was_declared():
     got = declared_noise(StudentTNoise(0.5, df=3.0), m).log_likelihood(m.x[None])[0]
     law = stats.t(3, scale=0.5 / np.sqrt(3))
     assert got == pytest.approx(law.logpdf([0.3, -4.0]).sum())
-
-
-def test_a_posterior_over_the_size_is_summed_out_by_draws():
-    repeats = 0.3 * torch.randn(60, 1, generator=torch.Generator().manual_seed(0))
-    m = Measurements.of(Trials([0.0, 1.0, 2.0], [0.3, -0.4, 0.5]))
-    grid = declared_noise(estimate_noise(repeats), m)
-    assert len(grid.cells) == NUM_DRAWS
-    # Numbers that share one unknown size are a multivariate t together.
-    scale = float(repeats.std()) ** 2 * np.eye(3)
-    expected = stats.multivariate_t(np.zeros(3), scale, df=59).logpdf(m.x)
-    # A size known to 9 % has a density known to .16 nats a draw, here.
-    assert grid.log_likelihood(m.x[None])[0] == pytest.approx(expected, abs=0.15)
 
 
 def test_unknown_size_and_correlation_are_summed_on_their_grid():
@@ -152,17 +104,3 @@ def test_errors_that_are_known_by_channel_have_their_units_along_a_trajectory():
     np.testing.assert_allclose(measurement_sds(noise, m), 0.1 * unit.numpy()[m.channel])
     assert measurement_sds(GaussianNoise(1.0), m) is None
     assert measurement_sds(AutocorrelatedNoise(1.0, 0.4, measurement_sd=0.2), m) == 0.2
-
-
-def test_scatter_is_a_half_normal_inflation():
-    m = Measurements.of(Trials([0.0, 1.0, 2.0, 3.0], [1.0, -3.0, 2.0, 0.5]))
-    noise = declared_noise(GaussianNoise(0.5), m)
-    inflated = scattered(noise)
-    assert (inflated.scales > 1).all()
-    factors = np.linspace(0, 15, 4_001)
-    each = [stats.norm(0, 0.5 * (1 + f)).logpdf(m.x).sum() for f in factors]
-    density = 2 * stats.norm(0, 2.5).pdf(factors)
-    expected = np.log(np.trapezoid(np.exp(each) * density, factors))
-    # Fourteen quantiles stand for the half-normal factor.
-    got = inflated.log_likelihood(m.x[None])[0]
-    assert got == pytest.approx(expected, abs=0.02)

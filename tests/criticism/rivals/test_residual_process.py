@@ -13,7 +13,6 @@ from sbi_active.criticism.rivals.noise_grid import declared_noise
 from sbi_active.criticism.rivals.residual_process import (
     TIME_LENGTH,
     ResidualProcess,
-    smooth_features,
 )
 
 ACTION = torch.linspace(-2, 2, 8)[:, None]
@@ -37,18 +36,6 @@ def test_the_residual_process_is_a_gaussian_of_the_stated_covariance():
     expected = np.logaddexp.reduce(each) - np.log(10)
     # Directions below 1e-5 of the variance are left out.
     assert process.log_likelihood(r[None])[0] == pytest.approx(expected, abs=1e-2)
-
-
-def test_the_process_interpolates_what_it_was_conditioned_on():
-    trials = Trials(ACTION, X)
-    m = Measurements.of(trials)
-    noise = declared_noise(GaussianNoise(0.05), m)
-    action = ACTION.double().numpy() / 4
-    process = ResidualProcess(noise, m, action=action, largest=100.0)
-    wave = np.sin(3 * action[:, 0])
-    mean, sd = process.condition(wave[None], m, np.concatenate([action, action]))
-    np.testing.assert_allclose(mean[0], wave, atol=0.1)
-    assert np.all(sd < 0.1)
 
 
 def test_one_process_follows_the_order_of_the_trials():
@@ -135,91 +122,6 @@ def test_the_best_process_is_interpolated_with_its_own_uncertainty():
     np.testing.assert_allclose(mean, np.stack([weight @ r, 2 * weight @ r]), rtol=1e-6)
     variance = 0.25 * best**2 - np.einsum("mi,mi->m", weight, across)
     np.testing.assert_allclose(sd**2, variance, rtol=1e-6)
-
-
-def test_what_it_whitens_has_the_chi_square_of_the_likeliest_process():
-    m = Measurements.of(Trials(ACTION, X))
-    noise = declared_noise(GaussianNoise(0.5), m)
-    place = ACTION.double().numpy() / 4
-    process = ResidualProcess(noise, m, action=place, largest=20.0)
-    r = X[:, 0].double().numpy()
-    rivals = {
-        (length, a): 0.25
-        * (a**2 * covariance(place[:, 0], place[:, 0], length) + np.eye(8))
-        for length in process.lengths
-        for a in process.amplitudes
-    }
-    best = max(
-        rivals.values(), key=lambda c: multivariate_normal(np.zeros(8), c).logpdf(r)
-    )
-    for other in (r, X[:, 0].double().numpy()[::-1].copy()):
-        square = (process.whitener(r)(other) ** 2).sum()
-        expected = other @ np.linalg.solve(best, other)
-        # Directions below 1e-5 of the variance are left out.
-        assert square == pytest.approx(expected, rel=1e-2)
-    squares = [(whiten(r) ** 2).sum() for whiten in process.regimes(r)]
-    expected = [
-        r @ np.linalg.solve(rivals[length, a], r)
-        for length in process.lengths
-        for a in process.amplitudes[::2]
-    ]
-    np.testing.assert_allclose(squares, expected, rtol=1e-2)
-
-
-def test_the_noise_beside_the_process_has_its_posterior():
-    m = Measurements.of(Trials(ACTION, X))
-    sds, weights = (0.2, 0.6), (0.3, 0.7)
-    noise = NoiseGrid(
-        [
-            NoiseCell.of(m, sd=np.full(8, sd), log_weight=np.log(weight))
-            for sd, weight in zip(sds, weights, strict=True)
-        ],
-        scales=np.array([1.0, 1.5]),
-    )
-    place = ACTION.double().numpy() / 4
-    process = ResidualProcess(noise, m, action=place, largest=5.0, lengths=(0.3,))
-    # Wild from trial to trial: noise rather than a smooth function.
-    r = 0.5 * np.array([1.0, -1.0] * 4) + 0.2 * XI
-    kernel = covariance(place[:, 0], place[:, 0], 0.3)
-    unit = np.sqrt(0.2 * 0.6)  # of the amplitude: the middle of the cells
-    log_p = np.array(
-        [
-            [
-                np.logaddexp.reduce(
-                    [
-                        multivariate_normal(
-                            np.zeros(8),
-                            s**2 * ((a * unit) ** 2 * kernel + sd**2 * np.eye(8)),
-                        ).logpdf(r)
-                        for a in process.amplitudes
-                    ]
-                )
-                + np.log(weight)
-                for s in (1.0, 1.5)
-            ]
-            for sd, weight in zip(sds, weights, strict=True)
-        ]
-    )
-    expected = np.exp(log_p - np.logaddexp.reduce(log_p.ravel()))
-    rng = np.random.default_rng(0)
-    cells, scales = process.noise_posterior(np.tile(r, (20_000, 1)), rng)
-    assert 0.05 < expected.max() < 0.95
-    for k, j in np.ndindex(2, 2):
-        share = ((cells == k) & (scales == (1.0, 1.5)[j])).mean()
-        assert share == pytest.approx(expected[k, j], abs=0.015)
-
-
-def test_channels_are_independent_and_times_near_each_other_are_not():
-    times = np.linspace(0, 2, 6)
-    x = np.random.default_rng(0).normal(size=(1, 6, 2))
-    x[0, 2, 0] = np.nan
-    m = Measurements.of(Trials([1.0], x, sample_times=times))
-    features = smooth_features(m, np.ones(11, dtype=bool))
-    expected = np.exp(
-        -0.5 * ((m.time[:, None] - m.time) / (TIME_LENGTH * 2.0)) ** 2
-    ) * (m.channel[:, None] == m.channel)
-    # Directions below 1e-5 of the variance are left out.
-    np.testing.assert_allclose(features @ features.T, expected, atol=1e-3)
 
 
 def test_trajectories_are_smooth_in_action_and_time():

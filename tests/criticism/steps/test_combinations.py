@@ -27,13 +27,6 @@ def test_sets_of_several_effects_have_together_a_third_of_the_next_smaller(size)
     assert total == pytest.approx(0.4 * 3.0 ** (1 - size))
 
 
-def test_a_set_has_the_mean_probability_of_its_effects():
-    log_p = {name: float(np.log(p)) for name, p in {"a": 0.1, "b": 0.3}.items()}
-    log_p["c"] = float(np.log(0.05))
-    few, many = log_prior(("a", "c"), log_p), log_prior(("a", "b"), log_p)
-    assert many - few == pytest.approx(np.log(0.4 / 0.15))
-
-
 def grown(x):
     """Return what is grown, the models, and the log priors of single effects."""
     some = rivals(x)
@@ -79,13 +72,6 @@ def test_what_grows_are_the_sets_that_pay_for_each_of_their_effects(phi):
         error = log_evidence(some, key)[1]
         assert error < 0.2
         assert value == pytest.approx(exact, abs=4 * error)
-
-
-@pytest.mark.parametrize("phi", [{}, {"curve": 0.5}, {"kink": 1.0}], ids=" ".join)
-def test_where_nothing_is_left_over_no_set_is_fitted(phi):
-    found, some, _ = grown(measured(**phi))
-    assert found == {}
-    assert not [key for key in some.fits if len(key.effects) > 1]
 
 
 def test_a_name_may_contain_what_joins_names():

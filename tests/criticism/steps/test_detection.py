@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import torch
 from sbi.utils import BoxUniform
-from scipy.stats import kstest
 from torch.distributions import Normal
 
 from sbi_active import GaussianNoise, SimulatorModel, StudentTNoise
@@ -35,24 +34,10 @@ def criticism(x, action, *, noise=None, fn=line, prior=PRIOR):
     return Criticism(model, prior, Trials(action, x), effects=[CUBIC])
 
 
-def draws(num_sets, *, seed, num=8):
-    gen = torch.Generator().manual_seed(seed)
-    for _ in range(num_sets):
-        theta = 2 * torch.rand(1, 2, generator=gen) - 1
-        action = 4 * torch.rand(num, 1, generator=gen) - 2
-        x = line(theta.expand(num, -1), action)
-        yield x + NOISE * torch.randn(x.shape, generator=gen), action
-
-
 def zigzag(size):
     """A residual that no declared effect takes up, along the actions."""
     action = torch.linspace(-2, 2, 8)[:, None]
     return size * NOISE * torch.tensor([1.0, -1.0] * 4)[:, None], action
-
-
-def test_the_chi_square_of_clean_data_is_one():
-    p = [criticism(x, action).detect().p_value for x, action in draws(24, seed=0)]
-    assert kstest(p, "uniform").pvalue > 0.01
 
 
 def test_the_chi_square_alone_raises_the_alarm_where_the_noise_is_known():
@@ -91,6 +76,7 @@ def test_a_mode_that_the_first_search_missed_is_no_alarm(monkeypatch):
     assert not is_found_again(rivals)
 
 
+<<<<<<< HEAD
 def test_the_report_says_what_raised_the_alarm():
     weak = str(criticism(*zigzag(1.7)).report())
     assert "rests on the chi-square alone" in " ".join(weak.split())
@@ -100,6 +86,8 @@ def test_the_report_says_what_raised_the_alarm():
     assert "chi-square alone" not in " ".join(str(strong.report()).split())
 
 
+=======
+>>>>>>> wt-verdict
 def test_a_parameter_that_changes_nothing_takes_up_no_residual():
     x, action = zigzag(1.0)
     both = criticism(x, action)
@@ -118,11 +106,3 @@ def test_what_an_effect_leaves_over_is_undeclared_beside_it():
     assert "cubic, probably the cause" in str(made).splitlines()[0]
     after = made.residuals_after.refitted
     assert np.nanstd(after) < np.nanstd(made.residuals.refitted)
-
-
-def test_nothing_is_unexplained_beside_an_effect_that_explains_all():
-    x, action = zigzag(0.0)
-    made = criticism(x + 3.0 * action**3, action).report(evaluate=False)
-    assert made.verdict == "cubic"
-    assert made.tracing.beside == ()
-    assert "something else is missing" not in " ".join(made.warnings)

@@ -63,24 +63,6 @@ def test_scores_before_and_after_are_those_of_the_normal_predictives(fitted):
     assert made.selected == 12 * ("curve",)
 
 
-def test_totals_are_roots_of_mean_squares_ratios_and_differences(fitted):
-    made = evaluate_held_out(*fitted, Trials(ACTION, OTHERS))
-    table = made.table.set_index("metric")
-    before, after = (
-        np.sqrt((scores["rmse"] ** 2).mean()) for scores in (made.before, made.after)
-    )
-    found = table.loc["rmse", ["before", "after", "ratio"]].tolist()
-    assert found == pytest.approx([before, after, after / before])
-    for metric in ("log predictive density", "coverage"):
-        first, second = (s[metric].mean() for s in (made.before, made.after))
-        found = table.loc[metric, ["before", "after", "ratio"]].tolist()
-        assert found == pytest.approx([first, second, second - first])
-    assert (table["low"] <= table["ratio"]).all()
-    assert (table["ratio"] <= table["high"]).all()
-    few = evaluate_held_out(*fitted, Trials(ACTION[:7], OTHERS[:7]))
-    assert few.table[["low", "high"]].isna().all(axis=None)
-
-
 def test_each_trial_is_left_out_of_its_own_fit(fitted):
     some, tracing = fitted
     trials = Trials(ACTION[:3], X[:3])
@@ -109,15 +91,3 @@ def test_residuals_are_standardized_by_the_normal_predictive(fitted, names):
     )
     assert made.noise == "declared"
     assert made.correlation == 0
-
-
-def test_each_trial_is_predicted_from_those_before_it():
-    x = measured()
-    made = find_residuals(rivals(x))
-    design, own = columns(()), x[:, 0].double().numpy()
-    for t in range(12):
-        precision = design[:t].T @ design[:t] / NOISE**2 + np.eye(2)
-        covariance = np.linalg.inv(precision)
-        mean = design[t] @ covariance @ design[:t].T @ own[:t] / NOISE**2
-        sd = np.sqrt(design[t] @ covariance @ design[t] + NOISE**2)
-        assert made.prequential[t, 0] == pytest.approx((own[t] - mean) / sd, abs=0.2)

@@ -25,13 +25,6 @@ def test_a_trial_that_is_off_holds_the_probability_under_its_index(at):
     assert shares[100 + at] > 0.99
 
 
-def test_of_trials_that_agree_none_stands_out():
-    shares = found(measured())
-    assert [*shares.values()] == sorted(shares.values(), reverse=True)
-    assert max(shares.values()) < 0.5
-    assert {*shares} == {*np.arange(12.0)}
-
-
 def test_a_trial_without_a_measurement_is_none_of_them():
     x = measured()
     x[3] = torch.nan

@@ -3,27 +3,9 @@
 import numpy as np
 import pytest
 
-from sbi_active.criticism.results import OUTLIER, ModelKey
-from sbi_active.criticism.steps import influence
-from sbi_active.criticism.steps.influence import needed_trials, unless_refuted
+from sbi_active.criticism.steps.influence import unless_refuted
 from sbi_active.criticism.under_misfit import Misfit, ModelError, Odds
 from tests.criticism.report.reports import flat, report, tracing
-from tests.criticism.steps.linear_world import measured, rivals
-
-CURVE = ModelKey(("curve",))
-REFIT = ModelKey(("curve",), OUTLIER)
-
-
-@pytest.mark.parametrize(("size", "is_refitted"), [(2.0, False), (0.06, True)])
-def test_few_draws_suffice_where_no_trial_can_be_decisive(
-    monkeypatch, size, is_refitted
-):
-    """All counts of draws are called few; only a weak effect asks for more."""
-    own = rivals(measured(curve=size))
-    exact = needed_trials(own, CURVE)
-    monkeypatch.setattr(influence, "FEWEST", 1e9)
-    assert needed_trials(own, CURVE) == exact
-    assert (REFIT in own.fits) == is_refitted
 
 
 def under_misfit(left_out, held_out=None, *, sensor=(0.005,)):
@@ -96,13 +78,3 @@ def test_what_raises_an_error_that_is_printed_does_not_help(left_out, held_out, 
     assert f"{told}." in text
     before, after = left_out if where.startswith("left") else held_out
     assert f"on {where}: RMSE {before} before and {after} after" in text
-
-
-def test_channels_count_in_sensor_deviations():
-    # Position in meters falls by half, a force in newtons rises by a tenth.
-    errors = np.array([0.2, 30.0]), np.array([0.1, 33.0])
-    fine, coarse = (0.001, 10.0), (0.1, 1.0)
-    assert unless_refuted(under_misfit(errors, sensor=fine), None).chosen
-    made = unless_refuted(under_misfit(errors, sensor=coarse), None)
-    assert not made.chosen
-    assert made.refuted_on == "left-out trials in sensor deviations"

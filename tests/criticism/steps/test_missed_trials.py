@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from scipy.stats import norm
 from torch.distributions import HalfNormal, Independent
 
 from sbi_active import AutocorrelatedNoise, GaussianNoise, SimulatorModel
@@ -21,7 +20,6 @@ from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR
 from tests.criticism.misfit.oscillator import trials as oscillations
 from tests.criticism.steps.linear_world import (
     ACTION,
-    NOISE,
     columns,
     measured,
     posterior,
@@ -83,37 +81,6 @@ def test_a_trial_in_another_unit_is_named_first(drag):
     assert "held-out-missed" in warning
     for page in (report.to_markdown(), report.to_html()):
         assert page.count("held-out trial 7 is far outside") >= 2
-
-
-def test_trials_that_agree_are_not_named():
-    told = [
-        report_of(slid(drag=d, seed=s)).evaluation for d in (0, 0.3) for s in (1, 2)
-    ]
-    assert not any(evaluation.missed for evaluation in told)
-
-
-def test_a_trial_whose_mask_hides_most_is_judged_by_the_rest():
-    every = oscillations()
-    role = ["fit"] * 5 + ["held out"] * 3
-    for shift, names in ((0.0, []), (0.2, ["6"])):
-        x = every.x.clone()
-        x[6, 2:] = torch.nan
-        x[6, 1] += shift
-        trials = Trials(every.action, x, role=role, sample_times=every.sample_times)
-        report = close_loop(MODEL, PRIOR, trials, effects=EFFECTS[:1], plan=False)
-        assert [trial.name for trial in report.evaluation.missed] == names
-
-
-def test_the_tail_is_that_of_the_normal_predictive(fitted):
-    some, tracing = fitted
-    x = measured(curve=0.5, seed=1)
-    x[5] = x[5] + 0.8
-    (missed,) = evaluate_held_out(some, tracing, Trials(ACTION, x)).missed
-    mean, covariance = posterior(measured(curve=0.5), ("curve",))
-    design = columns(("curve",))[5]
-    sd = np.sqrt(design @ covariance @ design + NOISE**2)
-    z = abs(float(x[5]) - design @ mean) / sd
-    assert np.log(missed.p_value) == pytest.approx(np.log(2 * norm.sf(z)), rel=0.2)
 
 
 def test_the_level_is_that_of_all_held_out_trials(fitted):
