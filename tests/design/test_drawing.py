@@ -110,13 +110,6 @@ def test_of_many_categories_the_best_and_the_chosen_have_panels():
     assert titles == ["place = 2", *[f"place = {k}" for k in range(19, 30)]]
 
 
-def test_a_product_of_lists_is_a_map():
-    actions = MixedActions(TOOLS, DiscreteActions([1.0, 5.0], names=["place"]))
-    made = design(actions, candidates=actions.listed())
-    assert made.categorical == (False, False)
-    np.testing.assert_allclose(offsets(map_marks(made.plot())), made.candidates)
-
-
 @pytest.mark.parametrize("dim", [3, 7])
 def test_more_entries_are_bars_in_order_with_the_chosen_one(dim):
     actions = BoxActions([0.0] * dim, [1.0] * dim)

@@ -16,7 +16,7 @@ from sbi_active.criticism.next_trial import (
     outside_candidates,
 )
 from sbi_active.criticism.results import ModelKey
-from sbi_active.information_gain import ModelIndexGain, RivalSampler
+from sbi_active.design.estimators.model_index import ModelIndexGain, RivalSampler
 
 NOISE = 0.1
 PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))

@@ -1,0 +1,19 @@
+"""Former home of the estimators of an information gain: ``sbi_active.design``."""
+
+from sbi_active.renamed import former_names
+
+__getattr__ = former_names(
+    __name__,
+    {
+        "CandidateSimulations": "sbi_active.design:CandidateSimulations",
+        "EntropyGain": "sbi_active.design:EntropyGain",
+        "InfoNCEGain": "sbi_active.design:InfoNCEGain",
+        "InformationGainEstimator": "sbi_active.design:InformationGainEstimator",
+        "LikelihoodGain": "sbi_active.design:LikelihoodGain",
+        "LinearGain": "sbi_active.design:LinearGain",
+        "ModelIndexGain": "sbi_active.design:ModelIndexGain",
+        "NestedGain": "sbi_active.design:NestedGain",
+        "PosteriorGain": "sbi_active.design:PosteriorGain",
+        "RatioGain": "sbi_active.design:RatioGain",
+    },
+)
