@@ -1,4 +1,4 @@
-r"""Outcomes of several actions at the same parameters, as one outcome.
+r"""Outcomes of several actions as one outcome, and summaries of long ones.
 
 .. math::
     I(\theta; x \mid \xi, \text{others}) = I(\theta; x, x_1, \ldots, x_p)
@@ -182,7 +182,17 @@ class _Directions:
 
 
 class LinearSummaries:
-    """Summaries of outcomes with many numbers, action by action.
+    r"""Summaries of outcomes with many numbers, action by action.
+
+    Around a noise-free outcome f with noise of covariance C, the likelihood of x given
+    any parameters depends on :math:`C^{-1/2} x` along the differences of
+    :math:`C^{-1/2} f(\theta)` alone. The summaries are these along the leading
+    principal directions of f over the belief, one set an action, with independent noise
+    of unit size. What the others tell is at most half their variance, in nats:
+
+    .. math::
+        I(\theta; x) - I(\theta; s) \le \tfrac12 \log |1 + \Lambda| \le
+        \tfrac12 \operatorname{tr} \Lambda .
 
     Args:
         noise: Gaussian noise of which nothing is unknown.

@@ -32,18 +32,6 @@ def simulated(action, theta, seed, noise=None, missing=None):
     return CandidateSimulations(theta, action, x, mean, noise, missing=missing)
 
 
-def test_the_candidate_s_outcome_comes_first_and_the_others_follow():
-    theta = torch.arange(5.0)[:, None]
-    candidates = simulated(torch.tensor([[1.0], [2.0]]), theta, 0)
-    others = simulated(torch.tensor([[3.0], [4.0], [5.0]]), theta, 1)
-    joint = join_outcomes(candidates, others)
-    assert joint.x.shape == (2, 5, 4, 1)
-    assert joint.action.tolist() == [[1, 3, 4, 5], [2, 3, 4, 5]]
-    assert torch.equal(joint.x[:, :, 0], candidates.x)
-    assert torch.equal(joint.x[1, :, 1:], others.x.transpose(0, 1))
-    assert torch.equal(joint.mean[0, :, 2], others.mean[1])
-
-
 def test_a_row_is_missing_where_any_of_its_outcomes_is():
     theta, action = torch.zeros(3, 1), torch.tensor([[1.0], [2.0]])
     lost = torch.tensor([[True, False, False], [False, False, False]])

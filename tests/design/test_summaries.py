@@ -1,7 +1,5 @@
 """Outcomes with many numbers, compared by a few summaries of them."""
 
-import math
-
 import pytest
 import torch
 from torch.distributions import MultivariateNormal
@@ -48,15 +46,6 @@ def test_a_linear_model_tells_what_it_tells_in_closed_form(num_samples: int):
     assert any(
         "32 linear summaries stand for the 300 numbers" in n for n in design.notes
     )
-
-
-def test_all_numbers_are_compared_where_that_is_asked_for():
-    model = SimulatorModel(line, noise=GaussianNoise(2.0))
-    designer = InformationGainDesigner(
-        DiscreteActions([0.2, 3.0]), num_samples=100, most_numbers=math.inf
-    )
-    design = designer.select(None, model, belief=BELIEF, seed=0)
-    assert not any("summaries" in n for n in design.notes)
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ class Evidence:
         degrees: Degrees of freedom of the Student-t proposals; even.
         wider: Width of the proposals, in those of the linearized posterior.
         enough: Effective draws of the belief that need no local ones.
-        defense: Every so many-th local draw is close to theta_i itself, lest all
+        defense: Period of the local draws that are close to theta_i itself, lest all
             others miss.
         closer: Width of these, in those of the proposals.
     """

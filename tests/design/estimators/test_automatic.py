@@ -11,7 +11,6 @@ from sbi_active.design import (
     CandidateSimulations,
     InfoNCEGain,
     LikelihoodGain,
-    NestedGain,
     PosteriorGain,
     RatioGain,
 )
@@ -159,13 +158,6 @@ def test_a_bound_that_has_reached_its_limit_contradicts_nothing():
     simulations = rows(FAR)
     gain = RatioGain()(ExactRatio(), simulations, PRIOR)
     assert disagreements(RatioGain(), ExactRatio(), simulations, PRIOR, gain) == []
-
-
-def test_estimators_that_know_no_limit_caution_of_none():
-    gain = torch.full((2, 8), 50.0)
-    for estimator in (PosteriorGain(), RatioGain(), NestedGain()):
-        assert estimator.cautions(gain) == []
-        assert estimator.bound_on(None) == estimator.bound
 
 
 def test_a_former_name_is_taken_for_one_version():

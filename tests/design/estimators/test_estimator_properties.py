@@ -167,12 +167,6 @@ def test_draws_of_the_belief_differ_by_simulations(rows):
     assert not torch.equal(LikelihoodGain(seed=1)._draw(PRIOR, rows)[:5], first)
 
 
-@pytest.mark.parametrize("estimator", [ContrastiveGain, InfoNCEGain, LikelihoodGain])
-def test_too_few_draws(estimator):
-    with pytest.raises(ValueError, match=r"expected num_contrastive >= 1; got 0"):
-        estimator(num_contrastive=0)
-
-
 def test_without_a_belief(rows):
     with pytest.raises(
         ValueError, match="expected a belief for LikelihoodGain to draw"

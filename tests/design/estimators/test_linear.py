@@ -184,9 +184,3 @@ def test_a_designer_asks_about_named_parameters():
     assert [float(chosen(t).action) for t in ("theta", "mass", "drag")] == [1, 1, 0]
     assert chosen("drag").estimator == "LinearGain"
     assert abs(float(chosen("drag").expected_information_gain[1])) < 0.2
-
-
-@pytest.mark.parametrize("index", [[], [1, 1]])
-def test_parameters_are_named_once(index):
-    with pytest.raises(ValueError, match="one or more different parameters; got"):
-        LinearGain(index)

@@ -60,16 +60,6 @@ def test_the_closed_form(index):
     assert mean.argsort().tolist() == exact.argsort().tolist()
 
 
-def test_nuisances_are_marginalized():
-    """Of x = theta_1 + theta_2 + noise, theta_1 alone is known less than their sum."""
-    index = [2]
-    part = information(index)
-    all_but = information([0, 1, 2]) - part
-    assert (all_but[1:] > part[1:]).all()
-    gain = ParameterGain(index)(None, simulations(), BELIEF).mean(1)
-    assert (gain[1:] < all_but[1:] - 0.05).all()
-
-
 def test_a_bounded_belief_and_a_curve():
     """x = theta_1^2 + noise under a uniform belief, by quadrature; theta_2 is idle."""
     torch.manual_seed(0)
