@@ -81,6 +81,11 @@ def test_small_samples_do_not_exceed_the_information():
     assert (gains.mean(0) < information(THREE) + 3 * error).all()
 
 
+def test_equal_models_cannot_be_told_apart():
+    gain, error = estimate([Gaussian(0.5, 1.0), Gaussian(0.5, 1.0)], 600)
+    assert (gain.abs() < 3 * error + 0.01).all()
+
+
 def test_distinct_models_give_the_entropy_of_their_probabilities():
     far = [Gaussian(0.8, 100.0), Gaussian(0.2, -100.0)]
     entropy = -(0.8 * math.log(0.8) + 0.2 * math.log(0.2))
