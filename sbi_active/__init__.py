@@ -5,8 +5,7 @@ neural posterior with the measurement, and go on. An extension of sbi.
 
 This module has the names that most programs need; each is imported when it is first
 used. All others are in the packages: ``actions``, ``simulation``, ``inference``,
-``information_gain``, ``search``, ``design``, ``diagnostics``, ``campaign``,
-``criticism`` and ``mujoco``.
+``design``, ``diagnostics``, ``campaign``, ``criticism`` and ``mujoco``.
 """
 
 from __future__ import annotations
@@ -78,9 +77,7 @@ _HOMES = {
     "diagnostics": "",
     "export": "to_datatree to_inference_data",
     "inference": "ALHI ASBI Belief MixtureDensity RefinementOptions SeqBED SeqBED_B",
-    "information_gain": "",
     "mujoco": "",
-    "search": "",
     "simulation": "AutocorrelatedNoise Bank GaussianNoise SimulatorModel StudentTNoise "
     "estimate_noise simulate",
 }

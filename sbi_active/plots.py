@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.design.designer import Design
+from sbi_active.design.design import Design
 from sbi_active.display.figures import legible
 
 if TYPE_CHECKING:

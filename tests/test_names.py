@@ -19,7 +19,7 @@ PACKAGES = [
 def former() -> list[tuple[str, str, str]]:
     """Return package, former name and where it is now, read from the sources."""
     found = []
-    for package in PACKAGES:
+    for package in [*PACKAGES, "sbi_active.information_gain", "sbi_active.search"]:
         path = importlib.import_module(package).__file__
         assert path is not None
         for node in ast.walk(ast.parse(Path(path).read_text())):

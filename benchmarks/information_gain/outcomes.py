@@ -13,14 +13,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from sbi_active.information_gain import (
+from sbi_active.design import (
     EntropyGain,
     InformationGainEstimator,
     NestedGain,
     PosteriorGain,
 )
-from sbi_active.information_gain.race import standard_error
-from tests.information_gain.fragile import PRIOR, Fragile
+from sbi_active.design.estimators.base import standard_error
+from tests.design.fragile import PRIOR, Fragile
 
 __all__ = ["ESTIMATORS", "WORLDS", "errors"]
 

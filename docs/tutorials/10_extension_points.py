@@ -102,7 +102,7 @@ print(ruler(theta, action, seeds=seeds)[:, 0], ruler(theta, action, seeds=seeds)
 # theta over the draws.
 
 # %%
-from sbi_active.information_gain import InformationGainEstimator
+from sbi_active.design import InformationGainEstimator
 
 
 class CorrelationGain(InformationGainEstimator):
@@ -130,7 +130,7 @@ print(design)
 # draws at random in a continuous space.
 
 # %%
-from sbi_active.search import Search
+from sbi_active.design import Search
 
 
 class RandomSearch(Search):

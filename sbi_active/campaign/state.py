@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sbi_active.campaign.cards import trial_html
 from sbi_active.campaign.options import CampaignOptions
-from sbi_active.design.designer import Design
+from sbi_active.design.design import Design
 from sbi_active.inference.emulation.pool import Batch
 from sbi_active.simulation.workers.meter import Meter
 

@@ -1,12 +1,42 @@
-"""Design: which action to take next.
+"""Design: which action to take next, by what its outcome is expected to tell.
 
-This package contains the designers and the steps between a belief and a choice. The
-estimators of an information gain are in ``information_gain``, and the searches for
-candidates in ``search``.
+This package contains the designers, and the steps between a belief and a choice:
+outcomes of candidates, searches for candidates, and in ``estimators`` what an outcome
+tells, in nats. It contains no inference of parameters.
 """
 
 from sbi_active.design.design import Design
 from sbi_active.design.designer import InformationGainDesigner
+from sbi_active.design.estimators.base import (
+    CandidateSimulations,
+    InformationGainEstimator,
+)
+from sbi_active.design.estimators.entropy import EntropyGain
+from sbi_active.design.estimators.likelihood import LikelihoodGain
+from sbi_active.design.estimators.linear import LinearGain
+from sbi_active.design.estimators.model_index import ModelIndexGain
+from sbi_active.design.estimators.nested import NestedGain
+from sbi_active.design.estimators.posterior import PosteriorGain
+from sbi_active.design.estimators.ratio import InfoNCEGain, RatioGain
 from sbi_active.design.random_designer import RandomDesigner
+from sbi_active.design.search import Evaluations, GradientSearch, Objective, Search
 
-__all__ = ["Design", "InformationGainDesigner", "RandomDesigner"]
+__all__ = [
+    "CandidateSimulations",
+    "Design",
+    "EntropyGain",
+    "Evaluations",
+    "GradientSearch",
+    "InfoNCEGain",
+    "InformationGainDesigner",
+    "InformationGainEstimator",
+    "LikelihoodGain",
+    "LinearGain",
+    "ModelIndexGain",
+    "NestedGain",
+    "Objective",
+    "PosteriorGain",
+    "RandomDesigner",
+    "RatioGain",
+    "Search",
+]

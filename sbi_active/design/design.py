@@ -10,15 +10,13 @@ from torch import Tensor
 
 from sbi_active.actions import ActionSpace
 from sbi_active.design.drawing import draw, labels_of
+from sbi_active.design.estimators.base import Bound
 from sbi_active.display.figures import legible
 from sbi_active.display.notebook import card, facts, items, table
 from sbi_active.display.table import Table, number
-from sbi_active.information_gain.base import Bound
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-MOST_SHOWN = 5  # candidates in a notebook, the best ones
 
 
 @dataclass(frozen=True)
@@ -118,7 +116,7 @@ class Design:
                 number(float(error[k])),
                 number(float(self.probability_best[k])),
             ]
-            for k in dict.fromkeys([self.index, *best[:MOST_SHOWN].tolist()])
+            for k in dict.fromkeys([self.index, *best[:5].tolist()])
         ]
         ends = ("EIG [nats]", "standard error", "probability best")
         header = ["", *labels_of(self), *ends]

@@ -12,19 +12,26 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
-from sbi_active.design.choice import as_batch, pricing
+from sbi_active.callers import stack_level
 from sbi_active.design.design import Design
-from sbi_active.design.eligibility import DesignLimits, rows_of, warn_missing
-from sbi_active.design.selection import Selection
-from sbi_active.design.target import Target
-from sbi_active.information_gain import InformationGainEstimator
-from sbi_active.information_gain.estimators.automatic import find_estimator
-from sbi_active.search import (
-    BayesianOptimization,
+from sbi_active.design.elimination import as_batch, choose, eliminate
+from sbi_active.design.estimators.automatic import find_estimator
+from sbi_active.design.estimators.base import (
+    InformationGainEstimator,
+    at_least,
+    standard_error,
+)
+from sbi_active.design.given import GivenGains
+from sbi_active.design.limits import DesignLimits, pricing, rows_of, warn_missing
+from sbi_active.design.problem import DesignProblem, GainEvaluator
+from sbi_active.design.search import (
+    Evaluations,
     ExhaustiveSearch,
     GradientSearch,
+    Objective,
     Search,
 )
+from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import Simulations
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
@@ -33,7 +40,6 @@ from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 SEARCHES: dict[str, type[Search]] = {
     "exhaustive": ExhaustiveSearch,
     "gradient": GradientSearch,
-    "bayesopt": BayesianOptimization,
 }
 
 
@@ -57,12 +63,12 @@ class InformationGainDesigner:
             many as for four candidates, four more each entry, and four more each
             category after the first; half of them on comparing its finalists.
         estimator: Estimator of the information gain; the name of one (see
-            :mod:`sbi_active.information_gain`); or "auto". That takes declared noise
+            :mod:`sbi_active.design`); or "auto". That takes declared noise
             first (entropies by nearest neighbors where x is one number, nested Monte
             Carlo where it is more), then the same with noise from replicates that pass
             a test of normality, else what the model can say.
-        search: A search; "exhaustive", "gradient" or "bayesopt" (see
-            :mod:`sbi_active.search`); or "auto", exhaustive for lists, else gradient.
+        search: A search; "exhaustive" or "gradient"; or "auto", exhaustive for lists,
+            else gradient.
         eliminate: Start with half of the samples and spend the rest on the candidates
             still in reach of the leader; without it every candidate gets all of them.
         workers: Workers that run the simulations.
@@ -102,13 +108,8 @@ class InformationGainDesigner:
         workers: Workers = IN_PROCESS,
         most_numbers: float = 200,
     ) -> None:
-        if num_samples < 8:
-            raise ValueError(
-                f"expected num_samples >= 8, half to choose and half to report; got "
-                f"{num_samples}; use about 1000"
-            )
+        self.num_samples = at_least(num_samples, 8, "num_samples", 1_000)
         self.actions = actions = action_space(actions)
-        self.num_samples = num_samples
         self.estimator, self.eliminate = estimator, eliminate
         self.search = _find_search(search, actions)
         self.search.size(actions)  # a search that does not apply is an error here
@@ -177,10 +178,7 @@ class InformationGainDesigner:
                 the target is unknown, or no candidate is permitted or valid often
                 enough.
         """
-        if num_actions < 1:
-            raise ValueError(
-                f"expected num_actions >= 1; got {num_actions}; ask for one or more"
-            )
+        at_least(num_actions, 1, "num_actions", 1)
         others = rows_of(self.actions, pending, "pending")
         limits = DesignLimits(
             self.actions,
@@ -189,24 +187,22 @@ class InformationGainDesigner:
             pricing(cost, self.actions),
             min_probability_valid,
         )
-        seed = int(torch.randint(2**62, ())) if seed is None else seed
-        about = Target.of(
-            target,
-            self.estimator,
-            model,
-            simulator,
-            belief,
-            simulates=simulations is None,
-        )
-        selection = Selection(
-            target=about,
+        problem = DesignProblem(
+            target=target,
+            given_estimator=self.estimator,
+            model=model,
+            simulator=simulator,
+            belief=getattr(model, "belief", None) if belief is None else belief,
             limits=limits,
             search=self.search,
             num_samples=self.num_samples,
-            early=self.eliminate,
+            eliminate=self.eliminate,
             workers=self.workers,
-            seed=seed,
             most_numbers=self.most_numbers,
+            others=others,
+            simulations=simulations,
+            budget=budget,
+            seed=int(torch.randint(2**62, ())) if seed is None else seed,
         )
         if simulations is not None:
             if num_actions > 1 or len(others):
@@ -215,21 +211,99 @@ class InformationGainDesigner:
                     f"single outcomes; got {num_actions} and {len(others)} pending; "
                     "leave out simulations="
                 )
-            return selection.by_given(simulations)
-        steps: list[Design] = []
-        for k in range(num_actions):
-            if k:
-                selection = replace(selection, seed=derive_seed(seed, "action", k))
-            steps.append(selection.by_simulation(others, budget))
+            return _by_given(problem)
+        steps = [_by_simulation(problem)]
+        for k in range(1, num_actions):
             others = torch.cat([others, steps[-1].action[None]])
+            own = derive_seed(problem.seed, "action", k)
+            steps.append(_by_simulation(replace(problem, others=others, seed=own)))
         design = as_batch(steps)
         warn_missing(design.num_missing, design.num_simulations)
         return design
 
 
+def _by_simulation(problem: DesignProblem, *, search_share: int = 12) -> Design:
+    """Return the design of one action.
+
+    An action that a search evaluates gets one of so many shares of ``num_samples``.
+
+    Raises:
+        ValueError: If the budget is too small.
+    """
+    limits, search, seed = problem.limits, problem.search, problem.seed
+    listed, notes = limits.listed()
+    budget, probed = problem.budget, listed
+    if budget is None:
+        size = search.size(limits.actions) if listed is None else len(listed)
+        budget = problem.num_samples * size
+    if listed is not None and budget < 8 * len(listed):
+        raise ValueError(
+            f"expected a budget >= {8 * len(listed)}, 8 a candidate; got {budget}; "
+            "allow more simulations or fewer candidates"
+        )
+    if probed is None:
+        probed = limits.actions.sample((16,), seed=derive_seed(seed, "probed"))
+    evaluator = GainEvaluator(problem, probed)
+    num_samples = max(8, problem.num_samples // search_share // 4 * 4)
+
+    def evaluate(action: Tensor) -> Evaluations:
+        """Estimate the utility at parameters that are the same from call to call."""
+        evaluator.sampler.rewind()
+        drawn = evaluator.draw(num_samples, evaluator.add(action))
+        gain, cost = evaluator(drawn), limits.cost(action)
+        valid, counted = drawn.num_valid()
+        error = torch.stack([standard_error(row) for row in gain])
+        return Evaluations(
+            action, gain.nanmean(1) / cost, error / cost, valid / counted.double()
+        )
+
+    action = search.finalists(
+        Objective(
+            actions=limits.actions,
+            permitted=limits,
+            evaluate=evaluate,
+            num_evaluations=search.num_evaluations(budget, num_samples),
+            seed=derive_seed(seed, "search"),
+            min_probability_valid=limits.least,
+        )
+    )
+    estimates = eliminate(evaluator, action, budget)
+    return choose(
+        replace(estimates, notes=(*estimates.notes, *notes)),
+        limits,
+        estimator=type(evaluator.estimator).__name__,
+        bound=evaluator.bound,
+        num_simulations=evaluator.sampler.num_drawn,
+        num_missing=evaluator.sampler.num_missing,
+        seed=seed,
+    )
+
+
+def _by_given(problem: DesignProblem) -> Design:
+    """Return the design by rows at hand; nothing is simulated."""
+    listed, notes = problem.limits.listed()
+    given = GivenGains(problem)
+    estimates = given.of_space() if listed is None else given.of_list(listed)
+    return choose(
+        replace(estimates, notes=(*estimates.notes, *notes)),
+        problem.limits,
+        estimator=type(given.estimator).__name__,
+        bound="none",  # the model may have seen the rows
+        num_simulations=0,
+        num_missing=0,
+        seed=problem.seed,
+    )
+
+
 def _find_search(search: str | Search, actions: ActionSpace) -> Search:
     if isinstance(search, Search):
         return search
+    if search == "bayesopt":
+        warn(
+            'SA701 search="bayesopt" goes in the next version: use search="gradient"',
+            stacklevel=stack_level(),
+        )
+        search = "gradient"
     if search == "auto":
         return GradientSearch() if actions.listed() is None else ExhaustiveSearch()
     if search not in SEARCHES:

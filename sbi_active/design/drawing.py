@@ -12,9 +12,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 
-MOST_PANELS = 12  # of categories, those with the most information first
-MOST_BARS = 15  # a choice: labels of more run into each other
-FEWEST_FILLED = 12  # candidates from which the map is filled in between
 CHOSEN = "#c1432e"
 NOTES = {"lower": " (lower bound)", "upper": " (upper bound)", "none": ""}
 
@@ -77,8 +74,11 @@ def _categories(design: Any) -> tuple[bool, ...]:
     return design.categorical or (False,) * design.candidates.shape[1]
 
 
-def _panels(design: Any) -> list[tuple[str, Array]]:
-    """Return title and members of each panel, the chosen one's among them."""
+def _panels(design: Any, most: int = 12) -> list[tuple[str, Array]]:
+    """Return title and members of each panel, the chosen one's among them.
+
+    Of many categories, those with the most information.
+    """
     everything = np.arange(len(design.candidates))
     category = [j for j, is_one in enumerate(_categories(design)) if is_one]
     if not category or len(_categories(design)) - len(category) > 2:
@@ -89,7 +89,7 @@ def _panels(design: Any) -> list[tuple[str, Array]]:
     gain = design.expected_information_gain.nan_to_num(nan=0.0).numpy()
     best = [gain[which == k].max() for k in range(len(values))]
     best[which[design.index]] = np.inf
-    shown = sorted(np.argsort(best)[::-1][:MOST_PANELS])
+    shown = sorted(np.argsort(best)[::-1][:most])
     names = [labels_of(design)[j] for j in category]
     return [(_setting(names, values[k]), everything[which == k]) for k in shown]
 
@@ -170,7 +170,7 @@ def _map(ax: Axes, design: Any, own: list[int], members: Array) -> Any:
     if np.isfinite(gain).any():
         ends = {"vmin": np.nanmin(gain), "vmax": np.nanmax(gain)}
         known = np.isfinite(gain[members])
-        if known.sum() >= FEWEST_FILLED:
+        if known.sum() >= 12:
             _fill(ax, x[known], y[known], gain[members][known], ends)
         marks = ax.scatter(
             *(x, y), c=gain[members], s=26, lw=0.6, edgecolors="w", zorder=3, **ends
@@ -213,13 +213,16 @@ def _bar_of_colors(ax: Axes, design: Any, marks: Any, num_panels: int) -> None:
     bar.set_label(_gain_label(design))
 
 
-def _bars(ax: Axes, design: Any) -> None:
-    """Draw the best candidates in order, the chosen one among them."""
+def _bars(ax: Axes, design: Any, most: int = 15) -> None:
+    """Draw the best candidates in order, the chosen one among them.
+
+    Labels of more run into each other.
+    """
     gain, error = (
         part.double().numpy()
         for part in (design.expected_information_gain, design.standard_error)
     )
-    order = np.argsort(-np.nan_to_num(gain, nan=-np.inf), kind="stable")[:MOST_BARS]
+    order = np.argsort(-np.nan_to_num(gain, nan=-np.inf), kind="stable")[:most]
     if design.index not in order:
         order = np.append(order[:-1], design.index)
     order = order[::-1]

@@ -1,18 +1,21 @@
-"""Successive elimination of candidates on common random numbers."""
+"""Successive elimination of candidates on common random numbers, and the choice."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from sbi_active.design.eligibility import DesignLimits
-from sbi_active.design.evaluator import GainEvaluator
-from sbi_active.information_gain import CandidateSimulations
-from sbi_active.information_gain.race import Race
-
-MOST = 4  # times num_samples that a candidate may get
+from sbi_active.design.design import Design, naming
+from sbi_active.design.estimators.base import (
+    Bound,
+    CandidateSimulations,
+    standard_error,
+)
+from sbi_active.design.limits import DesignLimits
+from sbi_active.design.problem import GainEvaluator
+from sbi_active.seeding import derive_seed
 
 
 @dataclass(frozen=True)
@@ -44,32 +47,105 @@ class Estimates:
     notes: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class Race:
+    r"""The leading candidate and its probability, under the central limit.
+
+    The means of the candidates are jointly Gaussian with the covariance of the paired
+    contributions over n. It is applied through the contributions themselves,
+    :math:`\sum_i w_i (g_i - \bar g) / n` with standard normal weights, which needs no
+    factor of an almost singular matrix and lets candidates differ in n.
+
+    Attributes:
+        leader: Index of the largest mean.
+        probability_best: Probability of being the best, shape (a,).
+        regret: Expected loss by choosing the leader, nats.
+        in_reach: Mask of those within some standard errors of the leader, shape (a,),
+            bool.
+    """
+
+    leader: int
+    probability_best: Tensor
+    regret: float
+    in_reach: Tensor
+
+    @staticmethod
+    def run(
+        contributions: list[Tensor],
+        seed: int,
+        *,
+        num_draws: int = 1_000,
+        reach: float = 3.0,
+    ) -> Race:
+        """Compare candidates by contributions (n,) each, NaN where a row is missing.
+
+        Their first rows are common.
+
+        Args:
+            contributions: Contributions of each candidate.
+            seed: Seed of the draws behind probabilities.
+            num_draws: Number of these draws; with a thousand the standard error of a
+                probability is at most .016.
+            reach: Standard errors within which a candidate stays; with half as many
+                the best of several is dropped now and then.
+        """
+        longest = max(map(len, contributions))
+        generator = torch.Generator().manual_seed(derive_seed(seed, "best"))
+        weights = torch.randn(
+            longest, num_draws, generator=generator, dtype=torch.float64
+        )
+        mean = torch.stack([row.nanmean() for row in contributions])
+        draws = torch.stack(
+            [
+                m
+                + (row - m).nan_to_num(0.0)
+                @ weights[: len(row)]
+                / int(row.isfinite().sum())
+                for m, row in zip(mean, contributions, strict=True)
+            ]
+        )
+        best = torch.bincount(draws.argmax(0), minlength=len(contributions))
+        leader = int(mean.argmax())
+        regret = float((draws.amax(0) - draws[leader]).mean())
+        in_reach = mean + reach * paired_errors(contributions, leader) >= mean[leader]
+        return Race(leader, best.double() / num_draws, regret, in_reach)
+
+    def reason(self, *, sure: float = 0.95, negligible: float = 0.05) -> str | None:
+        """Return why no further simulations are needed; None if they are.
+
+        Args:
+            sure: Probability that the leader is the best, at which to stop.
+            negligible: Expected loss at which to stop, nats.
+        """
+        if float(self.probability_best[self.leader]) > sure:
+            return "leader separated"
+        return "difference negligible" if self.regret < negligible else None
+
+
+def paired_errors(contributions: list[Tensor], chosen: int) -> Tensor:
+    """Return standard errors of the differences to one candidate, on shared rows."""
+    other = contributions[chosen]
+    return torch.stack(
+        [standard_error(row[: len(other)] - other[: len(row)]) for row in contributions]
+    )
+
+
 def eliminate(
-    evaluator: GainEvaluator,
-    action: Tensor,
-    *,
-    num_samples: int,
-    early: bool,
-    budget: int,
-    limits: DesignLimits,
-    seed: int,
+    evaluator: GainEvaluator, action: Tensor, budget: int, *, most: int = 4
 ) -> Estimates:
     """Simulate candidates until one leads, in ever smaller groups.
 
     Args:
         evaluator: Evaluator that simulates and estimates.
         action: Candidates, shape (a, action_dim).
-        num_samples: Simulations a candidate on average.
-        early: Whether to begin with half of them.
-        budget: Simulations in all, those of the sampler so far included.
-        limits: Limits of the choice.
-        seed: Seed of the draws behind probabilities.
+        budget: Simulations in all, those of the evaluator so far included.
+        most: Times ``num_samples`` that a candidate may get at most.
     """
-    num_actions = len(action)
-    sampler = evaluator.sampler
+    problem, sampler = evaluator.problem, evaluator.sampler
+    limits, num_samples = problem.limits, problem.num_samples
+    num_actions, others = len(action), evaluator.num_others
     place = evaluator.add(action)
-    size = max(8, num_samples // (2 if early else 1))
-    others = evaluator.num_others
+    size = max(8, num_samples // (2 if problem.eliminate else 1))
     size = min(size, (budget - sampler.num_drawn) // (num_actions + others)) // 4 * 4
     first = evaluator.draw(size, place)
     notes = [*evaluator.notes, *evaluator.estimator.remarks(first)]
@@ -79,7 +155,6 @@ def eliminate(
     notes += limits.excluded_note(eligible)
     cost = limits.cost(action)
     weight = cost.mean() / cost
-
     gains = [[torch.empty(0)] * num_actions for _ in range(2)]
 
     def estimate(index: Tensor, halves: list[CandidateSimulations]) -> None:
@@ -94,17 +169,15 @@ def eliminate(
     runs = 2 if evaluator.replicates else 1
     while True:
         estimate(active, halves)
-        race = Race.run([weight[a] * gains[0][a] for a in active], seed)
+        race = Race.run([weight[a] * gains[0][a] for a in active], problem.seed)
         keep = race.in_reach
         spent = 2 * len(halves[0].theta) * runs
         more = min(
             spent,
-            MOST * num_samples - spent,
+            most * num_samples - spent,
             (budget - sampler.num_drawn) // (int(keep.sum()) + others) // 4 * 4,
         )
-        stopped = race.reason()
-        if stopped is None and more < 8:
-            stopped = "budget spent"
+        stopped = race.reason() or ("budget spent" if more < 8 else None)
         if stopped is not None:
             break
         active = active[keep]
@@ -117,7 +190,7 @@ def eliminate(
         ]
     contributions = torch.stack([gains[0][a] for a in active])
     notes += evaluator.disagreements(halves[0], contributions)
-    notes += getattr(sampler, "notes", [])
+    notes += sampler.notes
     return Estimates(
         action=action,
         choosing=gains[0],
@@ -135,7 +208,57 @@ def eliminate(
 
 def _halves(simulations: CandidateSimulations) -> list[CandidateSimulations]:
     half = len(simulations.theta) // 2
-    return [
-        simulations.samples(slice(half)),
-        simulations.samples(slice(half, 2 * half)),
-    ]
+    return [simulations.samples(slice(k * half, (k + 1) * half)) for k in range(2)]
+
+
+def choose(
+    estimates: Estimates,
+    limits: DesignLimits,
+    *,
+    estimator: str,
+    bound: Bound,
+    num_simulations: int,
+    num_missing: int,
+    seed: int,
+) -> Design:
+    """Return the design of the leader; the seed is that behind probabilities."""
+    price = limits.cost(estimates.action)
+    chosen, report = estimates.leader, estimates.reporting
+    both = zip(estimates.choosing, report, estimates.eligible, price, strict=True)
+    probability_best = torch.zeros(len(price), dtype=torch.float64)
+    probability_best[estimates.eligible] = Race.run(
+        [torch.cat([a, b]) / c for a, b, e, c in both if e], seed
+    ).probability_best
+    return Design(
+        action=estimates.action[chosen],
+        candidates=estimates.action,
+        expected_information_gain=torch.stack([row.nanmean() for row in report]),
+        standard_error=torch.stack([standard_error(row) for row in report]),
+        difference_standard_error=paired_errors(report, chosen),
+        probability_best=probability_best,
+        probability_valid=estimates.probability_valid,
+        bound=bound,
+        index=chosen,
+        num_simulations=num_simulations,
+        estimator=estimator,
+        num_samples=estimates.num_samples,
+        stopped=estimates.stopped,
+        num_missing=num_missing,
+        notes=estimates.notes,
+        cost=None if limits.price is None else price,
+        **naming(limits.actions),
+    )
+
+
+def as_batch(steps: list[Design]) -> Design:
+    """Return the design of several actions, or the only step itself."""
+    if len(steps) == 1:
+        return steps[0]
+    return replace(
+        steps[-1],
+        action=torch.stack([step.action for step in steps]),
+        num_simulations=sum(step.num_simulations for step in steps),
+        num_missing=sum(step.num_missing for step in steps),
+        notes=tuple(dict.fromkeys(note for step in steps for note in step.notes)),
+        steps=tuple(steps),
+    )

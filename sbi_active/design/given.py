@@ -1,39 +1,32 @@
-"""Estimates from simulations at hand, such as those that the model was trained on."""
+"""Designs from simulations at hand, such as those that the model was trained on."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution
 
-from sbi_active.design.cells import cells
-from sbi_active.design.eligibility import DesignLimits
-from sbi_active.design.elimination import Estimates
-from sbi_active.inference.regression.process import GaussianProcess
-from sbi_active.information_gain import (
+from sbi_active.design.coordinates import Coordinates, cells
+from sbi_active.design.elimination import Estimates, Race
+from sbi_active.design.estimators.automatic import choose_estimator
+from sbi_active.design.estimators.base import (
     CandidateSimulations,
     InformationGainEstimator,
 )
-from sbi_active.information_gain.race import Race
-from sbi_active.search.base import Evaluations, Objective, Search
-from sbi_active.search.cube import Coordinates
-from sbi_active.search.gradient import regression
+from sbi_active.design.problem import DesignProblem
+from sbi_active.design.search import Evaluations, Objective
+from sbi_active.inference.regression.process import GaussianProcess
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import Outcome, Simulations
 from sbi_active.threads import single_thread
 
-FEWEST = 16  # rows of a candidate
 IN_SAMPLE = (
     "estimated on the given simulations: too high where the model was trained on them, "
     "and more so for actions that it overfits"
 )
-NUM_CELLS = 128  # into which the rows of a continuous space are averaged
 
 
-@dataclass(frozen=True)
 class GivenGains:
     """Estimates without further simulations: half of the rows choose, half report.
 
@@ -42,21 +35,47 @@ class GivenGains:
     regression of the averages gives the estimates, which takes an estimator that scores
     rows one by one.
 
+    Args:
+        problem: Problem of the design, with the rows.
+        fewest: Number of rows that a candidate needs.
+        num_cells: Number of cells into which the rows of a continuous space are
+            averaged.
+
     Attributes:
-        simulations: The rows.
         estimator: Estimator of the information.
-        model: Model that the estimator needs.
-        belief: Belief over the parameters in the rows.
-        limits: Limits of the choice.
-        seed: Seed of the split.
+
+    Raises:
+        TypeError: If the rows are no simulations.
+        ValueError: If they are of other actions, or there is no model.
     """
 
-    simulations: Simulations
-    estimator: InformationGainEstimator
-    model: Any
-    belief: Distribution
-    limits: DesignLimits
-    seed: int
+    def __init__(
+        self, problem: DesignProblem, *, fewest: int = 16, num_cells: int = 128
+    ) -> None:
+        rows, dim = problem.simulations, problem.limits.actions.action_dim
+        if not isinstance(rows, Simulations):
+            raise TypeError(
+                "expected Simulations(theta, action, x) for simulations=; got "
+                f"{type(rows).__name__}; wrap the rows in it"
+            )
+        if rows.action.shape[1] != dim:
+            raise ValueError(
+                f"expected simulations of actions (n, {dim}); got "
+                f"{tuple(rows.action.shape)}; pass those of this space"
+            )
+        self.problem, self.rows = problem, rows
+        self.fewest, self.num_cells = fewest, num_cells
+        self.estimator = problem.estimator() or self._by_model()
+
+    def _by_model(self, num_rows: int = 256) -> InformationGainEstimator:
+        """Return the estimator by what the model can say of some rows."""
+        if self.problem.model is None:
+            raise ValueError(
+                "expected a model with simulations=; got None; pass the trained model, "
+                "or leave out simulations="
+            )
+        rows = torch.arange(len(self.rows))[:num_rows]
+        return choose_estimator(self.problem.model, self._simulations(rows))[0]
 
     def of_list(self, action: Tensor) -> Estimates:
         """Return estimates of candidates on their own rows.
@@ -67,25 +86,26 @@ class GivenGains:
         halves: list[list[Tensor]] = [[], []]
         share = torch.full((len(action),), torch.nan, dtype=torch.float64)
         for a, own in enumerate(action):
-            near = torch.isclose(self.simulations.action, own, rtol=1e-5, atol=1e-7)
+            near = torch.isclose(self.rows.action, own, rtol=1e-5, atol=1e-7)
             rows = torch.nonzero(near.all(1))[:, 0]
-            enough = len(rows) >= FEWEST
+            enough = len(rows) >= self.fewest
             if enough:
-                status = self.simulations.status[rows]
+                status = self.rows.status[rows]
                 known = (status != Outcome.MISSING).sum()
                 share[a] = (status == Outcome.OK).sum() / known
             for gains, half in zip(halves, self._split(rows), strict=True):
                 gains.append(
-                    self._gain(own, half) if enough else torch.full((2,), torch.nan)
+                    self._gain(half) if enough else torch.full((2,), torch.nan)
                 )
         if bool(share.isnan().all()):
             raise ValueError(
-                f"expected simulations with at least {FEWEST} rows of a candidate; got "
-                "fewer of every one; pass rows at the actions of the list"
+                f"expected simulations with at least {self.fewest} rows of a "
+                "candidate; got fewer of every one; pass rows at the actions of the "
+                "list"
             )
         return self._estimates(action, halves, share)
 
-    def of_space(self, search: Search) -> Estimates:
+    def of_space(self) -> Estimates:
         """Search a continuous space; return the estimates of the finalists.
 
         Raises:
@@ -97,107 +117,95 @@ class GivenGains:
                 f"and continuous actions; got {type(self.estimator).__name__}; use "
                 "estimator='posterior', or leave out simulations="
             )
-        coordinates = Coordinates(self.limits.actions)
-        everything = torch.arange(len(self.simulations))
-        averages = [
-            self._averages(coordinates, half) for half in self._split(everything)
-        ]
-        first = averages[0]
-        price = self.limits.cost(first.action)
-        known = Evaluations(
-            first.action,
-            first.gain / price,
-            first.error / price,
-            first.probability_valid,
-        )
-        action = search.finalists(
+        limits = self.problem.limits
+        space = Coordinates(limits.actions)
+        everything = torch.arange(len(self.rows))
+        averages = [self._averages(space, half) for half in self._split(everything)]
+        first, _ = averages[0]
+        price = limits.cost(first.action)
+        action = self.problem.search.finalists(
             Objective(
-                actions=self.limits.actions,
-                permitted=self.limits,
+                actions=limits.actions,
+                permitted=limits,
                 evaluate=_nothing,
                 num_evaluations=0,
-                seed=derive_seed(self.seed, "search"),
-                min_probability_valid=self.limits.least,
-                known=known,
+                seed=derive_seed(self.problem.seed, "search"),
+                min_probability_valid=limits.least,
+                known=replace(
+                    first,
+                    utility=first.utility / price,
+                    standard_error=first.standard_error / price,
+                ),
             )
         )
-        point = coordinates.points(action)
+        point = space.points(action)
         halves, shares = [], []
-        for part in averages:
-            knots = coordinates.points(part.action)
-            c = coordinates.num_continuous
-            gain = regression(knots, part.gain, part.error, num_continuous=c)
+        for part, num in averages:
+            knots = space.points(part.action)
+            gain = space.regression(knots, part.utility, part.standard_error)
             halves.append([*_as_contributions(gain, point)])
             valid = part.probability_valid
+            share = torch.ones(len(point)).double()
             if bool((valid < 1).any()):
-                error = (valid * (1 - valid) / part.num + 1e-4).sqrt()
-                share = regression(knots, valid, error, num_continuous=c)
-                shares.append(share(point)[0][:, 0].clamp(0, 1))
-            else:
-                shares.append(torch.ones(len(point)).double())
+                error = (valid * (1 - valid) / num + 1e-4).sqrt()
+                share = space.regression(knots, valid, error)(point)[0][:, 0]
+            shares.append(share.clamp(0, 1))
         return self._estimates(action, halves, torch.stack(shares).mean(0))
 
     def _split(self, rows: Tensor) -> list[Tensor]:
-        generator = torch.Generator().manual_seed(derive_seed(self.seed, "split"))
+        seed = derive_seed(self.problem.seed, "split")
+        generator = torch.Generator().manual_seed(seed)
         shuffled = rows[torch.randperm(len(rows), generator=generator)]
         return [*shuffled.tensor_split(2)]
 
-    def _gain(self, action: Tensor, rows: Tensor) -> Tensor:
-        """Contributions of rows of one action, shape (n,)."""
-        given = self.simulations
+    def _simulations(self, rows: Tensor) -> RowSimulations:
+        given = self.rows
         lost = given.status[rows] == Outcome.MISSING
+        return RowSimulations(
+            given.theta[rows],
+            given.action[rows][:1],
+            given.x[rows][None],
+            missing=lost[None],
+            each=given.action[rows],
+        )
+
+    def _gain(self, rows: Tensor) -> Tensor:
+        """Return contributions of rows, shape (n,)."""
+        problem = self.problem
         with single_thread():
             return self.estimator(
-                self.model,
-                CandidateSimulations(
-                    given.theta[rows],
-                    action[None],
-                    given.x[rows][None],
-                    missing=lost[None],
-                ),
-                self.belief,
+                problem.model, self._simulations(rows), problem.belief
             )[0]
 
-    def _averages(self, coordinates: Coordinates, rows: Tensor) -> _Averages:
-        given = self.simulations
-        status = given.status[rows]
-        rows = rows[status != Outcome.MISSING]
-        with single_thread():
-            gain = self.estimator(
-                self.model,
-                RowSimulations(
-                    given.theta[rows],
-                    given.action[rows][:1],
-                    given.x[rows][None],
-                    each=given.action[rows],
-                ),
-                self.belief,
-            )[0]
-        valid = (given.status[rows] == Outcome.OK).double()
-        point = coordinates.points(given.action[rows])
-        groups = cells(point, NUM_CELLS, num_continuous=coordinates.num_continuous)
-        return _Averages(
-            coordinates.actions(torch.stack([point[g].mean(0) for g in groups])),
+    def _averages(self, space: Coordinates, rows: Tensor) -> tuple[Evaluations, Tensor]:
+        """Return averages of rows over cells, and the number of rows in each."""
+        rows = rows[self.rows.status[rows] != Outcome.MISSING]
+        gain = self._gain(rows)
+        valid = (self.rows.status[rows] == Outcome.OK).double()
+        point = space.points(self.rows.action[rows])
+        groups = cells(point, self.num_cells, num_continuous=space.num_continuous)
+        averages = Evaluations(
+            space.actions(torch.stack([point[g].mean(0) for g in groups])),
             torch.stack([gain[g].mean() for g in groups]),
             torch.stack([gain[g].std() / len(g) ** 0.5 for g in groups]),
             torch.stack([valid[g].mean() for g in groups]),
-            torch.tensor([len(g) for g in groups]),
         )
+        return averages, torch.tensor([len(g) for g in groups])
 
     def _estimates(
-        self,
-        action: Tensor,
-        halves: list[list[Tensor]],
-        share: Tensor,
+        self, action: Tensor, halves: list[list[Tensor]], share: Tensor
     ) -> Estimates:
+        limits = self.problem.limits
         known = torch.tensor([bool(g.isfinite().any()) for g in halves[0]])
-        eligible, cost = known & self.limits.reached_by(share), self.limits.cost(action)
+        eligible, cost = known & limits.reached_by(share), limits.cost(action)
         index = torch.nonzero(eligible)[:, 0]
-        race = Race.run([halves[0][a] / cost[a] for a in index], self.seed)
+        race = Race.run([halves[0][a] / cost[a] for a in index], self.problem.seed)
         few = int((~known).sum())
-        notes = [IN_SAMPLE, *self.limits.excluded_note(eligible | ~known)]
+        notes = [IN_SAMPLE, *limits.excluded_note(eligible | ~known)]
         if few:
-            notes.append(f"{few} candidates with fewer than {FEWEST} rows excluded")
+            notes.append(
+                f"{few} candidates with fewer than {self.fewest} rows excluded"
+            )
         return Estimates(
             action=action,
             choosing=halves[0],
@@ -217,8 +225,8 @@ class GivenGains:
 class RowSimulations(CandidateSimulations):
     """Rows of which each has an action of its own, for estimators that score rows.
 
-    x has shape (1, n, *x_shape), ``each`` (n, action_dim), and ``action`` is of no
-    meaning.
+    x has shape (1, n, *x_shape), ``each`` (n, action_dim), and ``action`` is the
+    first's.
     """
 
     each: Tensor = field(default_factory=lambda: torch.empty(0))
@@ -226,17 +234,6 @@ class RowSimulations(CandidateSimulations):
     def rows(self) -> tuple[Tensor, Tensor]:
         """Return the parameters, and what was drawn at each."""
         return self.theta, self.each
-
-
-@dataclass(frozen=True)
-class _Averages:
-    """Of cells: mean action, contributions, their standard error, share of valid."""
-
-    action: Tensor
-    gain: Tensor
-    error: Tensor
-    probability_valid: Tensor
-    num: Tensor
 
 
 def _as_contributions(process: GaussianProcess, point: Tensor) -> Tensor:
@@ -250,11 +247,9 @@ def _as_contributions(process: GaussianProcess, point: Tensor) -> Tensor:
         mean, variance = process(point)
         influence = process.influence(point)
         influence = influence - influence.mean(1, keepdim=True)
-        ratio = variance[:, 0].sqrt() / influence.square().sum(1).sqrt().clamp_min(
-            1e-30
-        )
-        influence = influence * ratio.clamp_min(1.0)[:, None]
-        return mean + influence.shape[1] * influence
+        size = influence.square().sum(1).sqrt().clamp_min(1e-30)
+        ratio = (variance[:, 0].sqrt() / size).clamp_min(1.0)
+        return mean + influence.shape[1] * ratio[:, None] * influence
 
 
 def _nothing(action: Tensor) -> Evaluations:

@@ -12,12 +12,10 @@ from torch.distributions import Distribution
 
 from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.design.design import Design, equal_errors, naming
-from sbi_active.design.eligibility import DesignLimits, rows_of, warn_missing
+from sbi_active.design.limits import DesignLimits, rows_of, warn_missing
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import MissingRowsWarning, Outcome, simulate
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
-
-FEW = 32  # draws that are simulated for their share of measurements
 
 
 class RandomDesigner:
@@ -86,7 +84,7 @@ class RandomDesigner:
         candidates, notes = limits.listed()
         if candidates is None:
             own = None if seed is None else derive_seed(seed, "candidates")
-            candidates = limits.drawn(own)[: FEW if min_probability_valid > 0 else 1]
+            candidates = limits.drawn(own)[: 32 if min_probability_valid > 0 else 1]
         num = len(candidates)
         unknown = torch.full((num,), torch.nan, dtype=torch.float64)
         valid, num_simulations, num_missing = unknown, 0, 0

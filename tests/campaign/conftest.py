@@ -3,7 +3,7 @@ from functools import partial
 import pytest
 
 from sbi_active.design import designer
-from sbi_active.search import GradientSearch
+from sbi_active.design.search import GradientSearch
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -3,7 +3,7 @@ import torch
 
 from sbi_active import DiscreteActions, InformationGainDesigner, RandomDesigner
 from sbi_active.actions import ActionSpace
-from sbi_active.information_gain.race import DRAWS, Race
+from sbi_active.design.elimination import Race
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.tasks.numerical.exact import ExactPosterior
 from sbi_active.tasks.numerical.task import NumericalTask
@@ -36,19 +36,13 @@ def test_it_finds_the_action_that_tells_most():
     assert (design.probability_valid == 1).all()
 
 
-def test_an_uninformative_action_has_no_gain():
-    designer = InformationGainDesigner(ACTIONS, estimator="posterior")
-    design = designer.select(ExactModel(), simulator, seed=0)
-    assert float(design.expected_information_gain[0]) == pytest.approx(0.0, abs=1e-6)
-
-
 def test_the_choice_and_the_report_use_separate_simulations():
     """With equal candidates the best of the choosing half regresses in the report."""
     equal = DiscreteActions(torch.full((40,), 1.0))
     designer = InformationGainDesigner(equal, num_samples=40, estimator="posterior")
     exact = float(information(torch.ones(1, 1)))
     errors = []
-    for seed in range(60):
+    for seed in range(40):
         design = designer.select(ExactModel(), simulator, seed=seed)
         errors.append(float(design.expected_information_gain[design.index]) - exact)
     errors = torch.tensor(errors)
@@ -61,7 +55,7 @@ def test_the_choice_and_the_report_use_separate_simulations():
                 ExactModel(), simulator, seed=seed
             ).expected_information_gain.max()
         )
-        for seed in range(10)
+        for seed in range(4)
     ]
     assert min(best) > exact
 
@@ -95,17 +89,8 @@ def test_probability_best_follows_the_central_limit():
     race = Race.run([*contributions], 0)
     assert race.leader == 1
     assert float(race.probability_best[1]) == pytest.approx(
-        float(expected), abs=4 * (0.25 / DRAWS) ** 0.5
+        float(expected), abs=4 * (0.25 / 1_000) ** 0.5
     )
-
-
-def test_a_blunt_model_gives_a_lower_bound():
-    designer = InformationGainDesigner(
-        ACTIONS, num_samples=4_000, estimator="posterior"
-    )
-    blunt = designer.select(ExactModel(spread=3.0), simulator, seed=0)
-    exact = information(VALUES[:, None])
-    assert (blunt.expected_information_gain < exact - 3 * blunt.standard_error).all()
 
 
 def test_same_seed_same_design():
@@ -243,19 +228,6 @@ def test_equal_actions_stop_where_nothing_is_lost():
     assert design.num_simulations == 60_000
 
 
-def test_more_of_one_candidate_does_not_bias_its_report():
-    """The report has no part in elimination."""
-    equal = DiscreteActions(torch.full((10,), 1.0))
-    designer = InformationGainDesigner(equal, num_samples=64, estimator="posterior")
-    exact = float(information(torch.ones(1, 1)))
-    errors = []
-    for seed in range(100):
-        design = designer.select(ExactModel(), simulator, seed=seed)
-        errors.append(float(design.expected_information_gain[design.index]) - exact)
-    errors = torch.tensor(errors)
-    assert abs(float(errors.mean())) < 4 * float(errors.std()) / 10
-
-
 class Exact(torch.distributions.Distribution):
     """The numerical task's exact posterior as a belief."""
 
@@ -274,14 +246,13 @@ class Exact(torch.distributions.Distribution):
         return self.posterior.log_prob(value)
 
 
-@pytest.mark.parametrize("variant", ["linear", "sinh", "square"])
-@pytest.mark.parametrize("trials", [0, 1])
+@pytest.mark.parametrize(("variant", "trials"), [("linear", 1), ("sinh", 0)])
 def test_regret_on_the_numerical_task(variant, trials):
     """Gains of up to 8.9 nats, where an amortized network saturates at 3 to 4."""
     task = NumericalTask(variant=variant)
     designer = InformationGainDesigner(task.actions)
     regret, errors = [], []
-    for seed in range(5 if trials else 20):
+    for seed in range(2 if trials else 5):
         torch.manual_seed(seed)
         action = torch.full((trials, 1), -5.0)
         x = task.simulator(task.prior.sample((1,)).expand(trials, 2), action)
@@ -336,7 +307,9 @@ def test_errors():
         InformationGainDesigner(ACTIONS, estimator="knn")
     with pytest.raises(ValueError, match="expected a budget >= 32"):
         designer.select(ExactModel(), simulator, budget=31)
-    posterior = InformationGainDesigner(ACTIONS, estimator="posterior")
+    posterior = InformationGainDesigner(ACTIONS, estimator="posterior", eliminate=False)
+    every = posterior.select(ExactModel(), simulator, budget=800, seed=0)
+    assert every.num_samples.tolist() == [200] * 4
     with pytest.raises(ValueError, match="expected a model for PosteriorGain"):
         posterior.select(None, simulator, belief=PRIOR)
 
@@ -353,13 +326,3 @@ def test_errors():
         TypeError, match="expected boxes and lists of actions; got Ball"
     ):
         InformationGainDesigner(Ball())
-
-
-def test_without_elimination_every_candidate_gets_all_samples():
-    designer = InformationGainDesigner(
-        ACTIONS, num_samples=200, estimator="posterior", eliminate=False
-    )
-    design = designer.select(ExactModel(), simulator, seed=0)
-    assert design.num_samples.tolist() == [200] * 4
-    racing = InformationGainDesigner(ACTIONS, num_samples=200, estimator="posterior")
-    assert racing.select(ExactModel(), simulator, seed=0).num_samples.min() == 100

@@ -65,12 +65,6 @@ def test_two_entries_make_a_map_with_every_candidate_and_the_chosen_one():
     assert [a.get_ylabel() for a in ax.figure.axes][1:] == ["EIG (lower bound) [nats]"]
 
 
-def test_candidates_on_a_line_are_not_filled_in():
-    line = torch.linspace(0, 1, 20)
-    ax = design(BOX, candidates=torch.stack([line, 2 * line], 1)).plot()
-    assert len(ax.collections) == 1
-
-
 def test_all_of_a_batch_are_marked():
     made = design(BOX)
     ax = design(BOX, action=made.candidates[[1, 4]]).plot()
@@ -110,13 +104,6 @@ def test_of_many_categories_the_best_and_the_chosen_have_panels():
     assert titles == ["place = 2", *[f"place = {k}" for k in range(19, 30)]]
 
 
-def test_a_product_of_lists_is_a_map():
-    actions = MixedActions(TOOLS, DiscreteActions([1.0, 5.0], names=["place"]))
-    made = design(actions, candidates=actions.listed())
-    assert made.categorical == (False, False)
-    np.testing.assert_allclose(offsets(map_marks(made.plot())), made.candidates)
-
-
 @pytest.mark.parametrize("dim", [3, 7])
 def test_more_entries_are_bars_in_order_with_the_chosen_one(dim):
     actions = BoxActions([0.0] * dim, [1.0] * dim)
@@ -140,11 +127,6 @@ def test_a_random_choice_has_places_and_no_colors():
     three = BoxActions([0.0] * 3, [1.0] * 3)
     ax = design(three, expected_information_gain=unknown, standard_error=unknown).plot()
     assert ax.get_title().startswith("chosen at random")
-
-
-def test_a_design_without_names_numbers_the_entries():
-    ax = design(BOX, labels=(), categorical=()).plot()
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("action 1", "action 2")
 
 
 def test_it_is_drawn_where_it_is_told_to():

@@ -11,7 +11,6 @@ import pytest
 ROOT = Path(__file__).parents[2]
 #: Names that need an extra, and the attribute of a module that it brings.
 OPTIONAL = {
-    "BayesianOptimization": ("botorch", "models"),
     "from_sysid": ("mujoco.sysid", "ModelSequences"),
     "belief_to_parameters": ("mujoco.sysid", "ModelSequences"),
 }

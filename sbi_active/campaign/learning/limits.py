@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, DiscreteActions
-from sbi_active.design.choice import pricing
-from sbi_active.design.eligibility import DesignLimits
+from sbi_active.design.limits import DesignLimits, pricing
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from sbi_active.campaign.learning.revision import compare
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.design.design import Design, equal_errors, naming
 from sbi_active.design.designer import InformationGainDesigner
+from sbi_active.design.estimators.automatic import ESTIMATORS
 from sbi_active.design.random_designer import RandomDesigner
-from sbi_active.information_gain.estimators.automatic import ESTIMATORS
 from sbi_active.seeding import derive_seed
 
 if TYPE_CHECKING:

@@ -19,10 +19,9 @@ from sbi_active.campaign.checks.score import compared
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.state import CampaignState, Trial
-from sbi_active.design.choice import choose
 from sbi_active.design.design import Design
-from sbi_active.design.eligibility import DesignLimits
-from sbi_active.design.elimination import Estimates
+from sbi_active.design.elimination import Estimates, choose
+from sbi_active.design.limits import DesignLimits
 from sbi_active.inference.beliefs.belief import information_gained
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.identifiability import note_combinations

@@ -13,7 +13,7 @@ from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.next_trial.candidates import outside_candidates, simulated
 from sbi_active.criticism.next_trial.next_action import PredictedRival, choose_action
 from sbi_active.criticism.results import ModelKey
-from sbi_active.information_gain import ModelIndexGain, RivalSampler
+from sbi_active.design.estimators.model_index import ModelIndexGain, RivalSampler
 
 NOISE = 0.1
 PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))

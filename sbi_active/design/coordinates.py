@@ -1,0 +1,177 @@
+"""Actions as points of a unit cube and categories."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import torch
+from torch import Tensor
+
+from sbi_active.actions import ActionSpace, BoxActions
+from sbi_active.inference.regression.process import IN_CUBE, GaussianProcess
+from sbi_active.seeding import derive_seed
+
+
+class Coordinates:
+    r"""Map actions to points :math:`z = (u, k)` and back.
+
+    :math:`u \in [0, 1]^c` are the entries of the boxes, :math:`k` the index of the
+    action of each part that lists its actions.
+
+    Args:
+        actions: The space.
+
+    Attributes:
+        num_continuous: c.
+        sizes: Number of actions of each listed part.
+        dim: Dimension of a point.
+
+    Raises:
+        TypeError: If a part is neither a box nor listed.
+
+    Example:
+        >>> from sbi_active import BoxActions, DiscreteActions, MixedActions
+        >>> space = MixedActions(DiscreteActions([3.0, 7.0]), BoxActions(0.0, 2.0))
+        >>> Coordinates(space).points(torch.tensor([[7.0, 0.5]]))
+        tensor([[0.2500, 1.0000]], dtype=torch.float64)
+    """
+
+    def __init__(self, actions: ActionSpace) -> None:
+        self.action_dim = actions.action_dim
+        self._boxes: list[tuple[slice, BoxActions]] = []
+        self._lists: list[tuple[slice, Tensor]] = []
+        start = 0
+        for part in actions.parts():
+            columns = slice(start, start + part.action_dim)
+            start = columns.stop
+            values = part.listed()
+            if values is not None:
+                self._lists.append((columns, values))
+            elif isinstance(part, BoxActions):
+                self._boxes.append((columns, part))
+            else:
+                raise TypeError(
+                    f"expected boxes and lists of actions; got {type(part).__name__}; "
+                    "use BoxActions, DiscreteActions or MixedActions of them"
+                )
+        self.num_continuous = sum(box.action_dim for _, box in self._boxes)
+        self.sizes = [len(values) for _, values in self._lists]
+        self.dim = self.num_continuous + len(self.sizes)
+
+    def points(self, action: Tensor) -> Tensor:
+        """Return points, shape (n, dim), float64, of actions (n, action_dim)."""
+        parts = [torch.empty(len(action), 0).double()]
+        for columns, box in self._boxes:
+            share = (action[:, columns] - box.low) / (box.high - box.low)
+            parts.append(share.double().clamp(0, 1))
+        for columns, values in self._lists:
+            nearest = torch.cdist(action[:, columns].float(), values).argmin(1)
+            parts.append(nearest.double()[:, None])
+        return torch.cat(parts, 1)
+
+    def actions(self, point: Tensor) -> Tensor:
+        """Return actions, shape (n, action_dim), float32, of points (n, dim)."""
+        action = torch.empty(len(point), self.action_dim)
+        start = 0
+        for columns, box in self._boxes:
+            share = point[:, start : start + box.action_dim]
+            start += box.action_dim
+            action[:, columns] = (box.low + share * (box.high - box.low)).float()
+        for columns, values in self._lists:
+            action[:, columns] = values[point[:, start].long()]
+            start += 1
+        return action
+
+    def distance(self, point: Tensor, other: Tensor) -> Tensor:
+        """Return distances of points (n, dim) to one, infinite to other categories."""
+        c = self.num_continuous
+        apart = (point[:, :c] - other[:c]).square().sum(1).sqrt()
+        same = (point[:, c:] == other[c:]).all(1)
+        return apart.masked_fill(~same, torch.inf)
+
+    def regression(
+        self, point: Tensor, value: Tensor, error: Tensor
+    ) -> GaussianProcess:
+        """Return a regression of values (n,) with errors (n,) on points (n, dim)."""
+        return GaussianProcess.fit(
+            point,
+            value[:, None],
+            noise=error,
+            num_categories=len(self.sizes),
+            settings=IN_CUBE,
+        )
+
+    def spaced(self, point: Tensor, score: Tensor, num: int, apart: float) -> Tensor:
+        """Return indices of the best points (n, dim) not close to better ones."""
+        chosen: list[int] = []
+        for i in score.argsort(descending=True).tolist():
+            if len(chosen) == num:
+                break
+            if not bool((self.distance(point[chosen], point[i]) < apart).any()):
+                chosen.append(i)
+        return torch.tensor(chosen).long()
+
+    def spread(self, num: int, seed: int) -> Tensor:
+        """Return points that fill the space, shape (num, dim).
+
+        Every combination of categories has about as many, scrambled Sobol points of its
+        own; where there are more combinations than points they are drawn at random.
+        """
+        total = 1
+        for size in self.sizes:
+            total *= size
+        generator = torch.Generator().manual_seed(derive_seed(seed, "categories"))
+        if total > num:
+            columns = [
+                torch.randint(k, (num, 1), generator=generator) for k in self.sizes
+            ]
+            return torch.cat([self._sobol(num, derive_seed(seed, 0)), *columns], 1)
+        each = -(-num // total)
+        order = torch.randperm(total, generator=generator).tolist()
+        every = [*product(*map(range, self.sizes))]
+        points = []
+        for k in order:
+            category = torch.tensor(every[k]).double().expand(each, -1)
+            points.append(
+                torch.cat([self._sobol(each, derive_seed(seed, k)), category], 1)
+            )
+        return torch.stack(points, 1).flatten(0, 1)[:num]
+
+    def _sobol(self, num: int, seed: int) -> Tensor:
+        if not self.num_continuous:
+            return torch.empty(num, 0).double()
+        engine = torch.quasirandom.SobolEngine(
+            self.num_continuous, scramble=True, seed=seed % 2**31
+        )
+        return engine.draw(num, dtype=torch.float64)
+
+
+def cells(
+    point: Tensor, num: int, *, num_continuous: int, fewest: int = 8
+) -> list[Tensor]:
+    """Halve groups of points across their widest side until they are small enough.
+
+    About ``num`` cells of points (n, dim), whose first entries are in a unit cube and
+    are halved by; points of a cell agree in the others, and are ``fewest`` or more.
+
+    Example:
+        >>> point = torch.tensor([[0.0], [1.0], [0.25], [0.75]] * 8)
+        >>> [point[c, 0].unique().tolist() for c in cells(point, 2, num_continuous=1)]
+        [[0.0, 0.25], [0.75, 1.0]]
+    """
+    largest = max(-(-len(point) // num), 2 * fewest - 1)
+    constant = torch.zeros(len(point), 1, dtype=point.dtype)
+    category = torch.cat([constant, point[:, num_continuous:]], 1)
+    _, label = category.unique(dim=0, return_inverse=True)
+    groups = [torch.nonzero(label == k)[:, 0] for k in range(int(label.max()) + 1)]
+    done: list[Tensor] = []
+    while groups:
+        group = groups.pop()
+        inside = point[group, :num_continuous]
+        if len(group) <= largest or not inside.numel():
+            done.append(group.sort().values)
+            continue
+        side = int((inside.amax(0) - inside.amin(0)).argmax())
+        order = inside[:, side].argsort(stable=True)
+        groups += [group[half] for half in order.tensor_split(2)][::-1]
+    return [group for group in done if len(group) > 1]

@@ -1,0 +1,149 @@
+"""The choice of an estimator by what can be checked."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.callers import stack_level
+from sbi_active.design.estimators.base import (
+    CandidateSimulations,
+    InformationGainEstimator,
+    standard_error,
+)
+from sbi_active.design.estimators.entropy import EntropyGain
+from sbi_active.design.estimators.likelihood import ContrastiveGain, LikelihoodGain
+from sbi_active.design.estimators.linear import LinearGain
+from sbi_active.design.estimators.nested import NestedGain
+from sbi_active.design.estimators.posterior import PosteriorGain
+from sbi_active.design.estimators.ratio import InfoNCEGain, RatioGain
+from sbi_active.messages import warn
+
+#: Name of an estimator: its class.
+ESTIMATORS: dict[str, type[InformationGainEstimator]] = {
+    "contrastive": ContrastiveGain,
+    "entropy": EntropyGain,
+    "info_nce": InfoNCEGain,
+    "likelihood": LikelihoodGain,
+    "linear": LinearGain,
+    "nested": NestedGain,
+    "posterior": PosteriorGain,
+    "ratio": RatioGain,
+}
+#: Numbers of x up to which nearest neighbors are trusted.
+MAX_NEIGHBOR_OUTCOMES = 2
+
+
+def find_estimator(
+    estimator: str | InformationGainEstimator,
+) -> InformationGainEstimator | None:
+    """Return an estimator by name; None for "auto".
+
+    Raises:
+        ValueError: If the name is unknown; it lists the valid ones.
+    """
+    if isinstance(estimator, InformationGainEstimator):
+        return estimator
+    if estimator == "auto":
+        return None
+    if estimator == "variational_nested":
+        text = 'use estimator="likelihood", or "auto"'
+        warn(
+            f"SA701 estimator={estimator!r} goes in the next version: {text}",
+            stacklevel=stack_level(),
+        )
+        return LikelihoodGain()
+    if estimator not in ESTIMATORS:
+        raise ValueError(
+            f"expected estimator among 'auto', {', '.join(map(repr, ESTIMATORS))}; got "
+            f"{estimator!r}; choose one of these or pass an estimator"
+        )
+    return ESTIMATORS[estimator]()
+
+
+def choose_estimator(
+    model: Any, simulations: CandidateSimulations
+) -> tuple[InformationGainEstimator, list[str]]:
+    """Return the first estimator whose assumptions pass their checks.
+
+    With declared noise it is entropies if x is one number, else nested Monte Carlo.
+    With replicates it is entropies for one or two numbers, else nested Monte Carlo on
+    the smoothed outcomes. If checks fail, it depends on the model: the bound of a
+    posterior, nested Monte Carlo on a likelihood, or InfoNCE on a ratio, which no
+    normalization of it can fool, but the mean log ratio where that is near its largest
+    value. Beside it, why others were not taken.
+    """
+    options: list[InformationGainEstimator] = []
+    num_outcomes = simulations.x[0, 0].numel()
+    if simulations.mean is not None and simulations.noise is not None:
+        options.append(EntropyGain() if num_outcomes == 1 else NestedGain())
+    elif simulations.replicate is not None:
+        few = num_outcomes <= MAX_NEIGHBOR_OUTCOMES
+        options.append(EntropyGain() if few else NestedGain())
+    notes = []
+    for option in options:
+        problems = option.problems(simulations)
+        if not problems:
+            return option, notes
+        notes += [f"{type(option).__name__} not used: {text}" for text in problems]
+    if hasattr(model, "log_posterior"):
+        return PosteriorGain(), notes
+    if hasattr(model, "log_likelihood"):
+        return LikelihoodGain(), notes
+    if hasattr(model, "log_ratio"):
+        bound, few = InfoNCEGain(), simulations.samples(slice(256))
+        cautions = bound.cautions(bound(model, few, None))
+        if not cautions:
+            return bound, notes
+        return RatioGain(), [*notes, *(f"not used: {text}" for text in cautions)]
+    return options[0], [*notes, "used all the same: there is no model"]
+
+
+def disagreements(
+    estimator: InformationGainEstimator,
+    model: Any,
+    simulations: CandidateSimulations,
+    belief: Distribution | None,
+    gain: Tensor,
+    *,
+    negligible: float = 0.3,
+) -> list[str]:
+    """Return cautions about an estimate, which is compared with others that apply.
+
+    There is one short sentence for each disagreement, by the contributions (a, n):
+    four standard errors beyond ``negligible`` nats.
+    """
+    others: list[InformationGainEstimator] = []
+    num_outcomes = simulations.x[0, 0].numel()
+    if isinstance(estimator, NestedGain) and num_outcomes <= MAX_NEIGHBOR_OUTCOMES:
+        others.append(EntropyGain())
+    # A model that is trained on demand is not trained for a note.
+    at_hand = estimator.bound == "none" and getattr(model, "is_trained", True)
+    if at_hand and hasattr(model, "log_posterior"):
+        others.append(PosteriorGain())
+    if isinstance(estimator, RatioGain):
+        others.append(InfoNCEGain())
+    notes = estimator.cautions(gain)
+    for other in others:
+        estimate = other(model, simulations, belief)
+        difference = estimate - gain
+        error = torch.stack([standard_error(row) for row in difference])
+        mean = difference.nanmean(1)
+        apart = mean.abs() > negligible + 4 * error
+        for a in torch.nonzero(apart)[:, 0].tolist():
+            apart[a] = not other.cautions(estimate[a : a + 1])
+        if not bool(apart.any()):
+            continue
+        worst = int(torch.where(apart, mean.abs(), 0.0).argmax())
+        side = "below" if float(mean[worst]) < 0 else "above"
+        blunt = other.bound == "lower" and side == "below"
+        notes.append(
+            f"{type(other).__name__} is {abs(float(mean[worst])):.1f} nats {side} at "
+            f"action {simulations.action[worst].tolist()}, apart at "
+            f"{int(apart.sum())} of {len(apart)}"
+            + (" (a lower bound: the network is blunt)" if blunt else "")
+        )
+    return notes

@@ -1,0 +1,221 @@
+"""Interface of an estimator of the expected information gain."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.simulation import NoiseModel
+
+Bound = Literal["lower", "upper", "none"]
+
+
+@dataclass(frozen=True)
+class CandidateSimulations:
+    """Outcomes of every candidate action at the same parameters.
+
+    Attributes:
+        theta: Draws from the belief, shape (n, theta_dim), common to all candidates.
+        action: Candidates, shape (a, action_dim).
+        x: Outcomes, shape (a, n, *x_shape); NaN where there was no measurement.
+        mean: Noise-free outcomes, as x; None if the noise is not declared.
+        noise: The declared noise around the mean.
+        replicate: Second outcomes at the same parameters, as x; None for none.
+        missing: Rows lost to a fault that has nothing to do with the parameters, shape
+            (a, n), bool, the replicate's included; None for none. They are ignored,
+            unlike outcomes without a measurement, whose NaN is information.
+    """
+
+    theta: Tensor
+    action: Tensor
+    x: Tensor
+    mean: Tensor | None = None
+    noise: NoiseModel | None = None
+    replicate: Tensor | None = None
+    missing: Tensor | None = None
+
+    @property
+    def counted(self) -> Tensor:
+        """Rows that are not missing, shape (a, n), bool."""
+        if self.missing is None:
+            return torch.ones(self.x.shape[:2]).bool()
+        return ~self.missing
+
+    @property
+    def complete(self) -> Tensor:
+        """Outcomes without any NaN, shape (a, n), bool; their replicates as well."""
+        return self.completeness == 1
+
+    @property
+    def completeness(self) -> Tensor:
+        """Share of a row's outcomes, x and replicate, without NaN, shape (a, n)."""
+        parts = [part.flatten(2).isfinite().all(-1) for part in self.outcomes()]
+        return torch.stack(parts).double().mean(0) * self.counted
+
+    @property
+    def partly_observed(self) -> Tensor:
+        """Outcomes of which some numbers are present, shape (a, n), bool."""
+        present = [part.flatten(2).isfinite() for part in self.outcomes()]
+        partly = [part.any(-1) & ~part.all(-1) for part in present]
+        return torch.stack(partly).any(0) & self.counted
+
+    def num_valid(self) -> tuple[Tensor, Tensor]:
+        """Return the numbers of outcomes with a measurement, and of all, both (a,).
+
+        A partly observed outcome has one; missing rows are not counted.
+        """
+        parts = [part.flatten(2).isfinite().any(-1) for part in self.outcomes()]
+        valid = (torch.stack(parts) & self.counted).sum((0, 2))
+        return valid, len(parts) * self.counted.sum(1)
+
+    def outcomes(self) -> list[Tensor]:
+        """Return x and, where there are any, replicates."""
+        return [self.x] if self.replicate is None else [self.x, self.replicate]
+
+    def rows(self) -> tuple[Tensor, Tensor]:
+        """Return theta and action of every outcome in turn, a * n rows each."""
+        num_actions, num_samples = self.x.shape[:2]
+        return (
+            self.theta.repeat(num_actions, 1),
+            self.action.repeat_interleave(num_samples, 0),
+        )
+
+    def candidates(self, index: Tensor) -> CandidateSimulations:
+        """Return some candidates, index (k,)."""
+        parts = {name: part[index] for name, part in self._parts().items()}
+        return replace(self, action=self.action[index], **parts)
+
+    def samples(self, rows: slice) -> CandidateSimulations:
+        """Return some of the simulations of every candidate."""
+        parts = {name: part[:, rows] for name, part in self._parts().items()}
+        return replace(self, theta=self.theta[rows], **parts)
+
+    def join(self, other: CandidateSimulations) -> CandidateSimulations:
+        """Return these and further simulations of the same candidates."""
+        more = other._parts()
+        parts = {
+            name: torch.cat([part, more[name]], 1)
+            for name, part in self._parts().items()
+        }
+        return replace(self, theta=torch.cat([self.theta, other.theta]), **parts)
+
+    def _parts(self) -> dict[str, Tensor]:
+        names = ("x", "mean", "replicate", "missing")
+        parts = {name: getattr(self, name) for name in names}
+        return {name: part for name, part in parts.items() if part is not None}
+
+
+class InformationGainEstimator(ABC):
+    r"""Estimator of :math:`I(\theta; x | \xi)` in nats for a set of candidates.
+
+    Attributes:
+        bound: Side of the information that the estimate's expectation lies on, whatever
+            the model.
+        needs_noise: Whether it uses the declared noise, or else replicates.
+        needs_model: Whether it uses something learned.
+        rowwise: Whether a contribution depends on its own row alone, as given by
+            :meth:`CandidateSimulations.rows`.
+    """
+
+    bound: Bound = "none"
+    needs_noise: bool = False
+    needs_model: bool = True
+    rowwise: bool = False
+
+    def __call__(
+        self,
+        model: Any,
+        simulations: CandidateSimulations,
+        belief: Distribution | None,
+    ) -> Tensor:
+        """Return the contribution of every simulation; their mean is the estimate.
+
+        Args:
+            model: Model that was learned, see the estimator.
+            simulations: Fresh simulations, not those the model was trained on.
+            belief: Density of theta in the simulations; None if an estimator has no
+                use for it.
+
+        Returns:
+            Shape (a, n), nats, float64; NaN for missing rows.
+
+        Raises:
+            ValueError: If shapes do not fit, or the noise is neither declared nor
+                replicated where it is needed.
+        """
+        theta, action, x = simulations.theta, simulations.action, simulations.x
+        if x.ndim < 3 or x.shape[:2] != (len(action), len(theta)):
+            raise ValueError(
+                f"expected x of shape ({len(action)}, {len(theta)}, *x_shape), one "
+                f"outcome a candidate and parameter set; got {tuple(x.shape)}; "
+                "simulate every candidate at the same parameters"
+            )
+        unknown = simulations.mean is None or simulations.noise is None
+        if self.needs_noise and unknown and simulations.replicate is None:
+            raise ValueError(
+                f"expected declared noise or replicates for {type(self).__name__}; got "
+                "neither; build SimulatorModel(fn, noise=...) around a noise-free "
+                "fn, or simulate every theta twice"
+            )
+        with torch.no_grad():
+            gain = self._contributions(model, simulations, belief).double()
+        return gain.masked_fill(~simulations.counted, torch.nan)
+
+    def bound_on(self, model: Any) -> Bound:
+        """Return the side of the information that the estimate's expectation lies on.
+
+        A model with ``exact_likelihood = True`` has an exact likelihood, others a
+        learned one.
+        """
+        return self.bound
+
+    def cautions(self, gain: Tensor) -> list[str]:
+        """Return cautions about contributions (a, n), as a limit that is near."""
+        return []
+
+    def problems(self, simulations: CandidateSimulations) -> list[str]:
+        """Say in short sentences what speaks against the estimator here."""
+        return []
+
+    def remarks(self, simulations: CandidateSimulations) -> list[str]:
+        """Return remarks on an estimate from simulations."""
+        return []
+
+    @abstractmethod
+    def _contributions(
+        self, model: Any, simulations: CandidateSimulations, belief: Any
+    ) -> Tensor:
+        """Return the contributions, shape (a, n)."""
+
+
+def standard_error(contributions: Tensor) -> Tensor:
+    """Return the standard error of a mean of contributions (n,), NaN where missing."""
+    known = contributions[contributions.isfinite()]
+    return known.std() / len(known) ** 0.5
+
+
+def at_least(value: int, least: int, name: str, usual: int) -> int:
+    """Return a count, or raise a ValueError where it is too small."""
+    if value < least:
+        raise ValueError(f"expected {name} >= {least}; got {value}; use about {usual}")
+    return value
+
+
+def distinct(index: Sequence[int]) -> list[int]:
+    """Return the places of some parameters.
+
+    Raises:
+        ValueError: If there is none, or one twice.
+    """
+    if not index or len(set(index)) < len(index):
+        raise ValueError(
+            f"expected one or more different parameters; got {list(index)}; "
+            "name each once"
+        )
+    return list(index)

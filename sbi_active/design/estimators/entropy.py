@@ -1,0 +1,260 @@
+"""Information gain as a difference of entropies, from nearest neighbors."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from scipy.spatial import KDTree
+from scipy.special import digamma
+from torch import Tensor
+from torch.distributions import Distribution
+from typing_extensions import override
+
+from sbi_active.design.estimators.base import (
+    CandidateSimulations,
+    InformationGainEstimator,
+    at_least,
+)
+from sbi_active.design.estimators.presence import (
+    presence_information,
+    presence_notes,
+    presence_problems,
+)
+from sbi_active.seeding import forked_generators
+
+
+class EntropyGain(InformationGainEstimator):
+    r"""Entropy of the outcome less that of its noise.
+
+    .. math::
+        I(\theta; x | \xi) = H(x | \xi) - E_{\theta}\, H(x | \theta, \xi), \qquad
+        \hat H(x) = \frac1n \sum_i \psi(n) - \psi(k) + \log V_d
+        + d \log \rho_{k}(i) + \log \det L
+
+    with :math:`\rho_k(i)` the distance from the whitened :math:`L^{-1} x_i` to its k-th
+    neighbour and :math:`V_d` the volume of the unit ball (Kozachenko-Leonenko). No
+    network, so nothing saturates; the error grows with the dimension of x, which
+    should be at most three.
+
+    The second entropy is that of the declared noise at the noise-free outcome. Without
+    a declaration it is that of a Gaussian, its correlation common to all
+    parameters and the log of its variances quadratic in them, fitted to pairs of
+    outcomes at the same theta; :meth:`problems` tests normality.
+
+    Where outcomes lack numbers,
+
+    .. math::
+        I(\theta; x) \ge I(\theta; v) + P(\text{complete})\,
+        I(\theta; x \mid \text{complete}),
+
+    with v what is present, see
+    :func:`.presence_information`; equal where
+    outcomes are complete or empty, as only the numbers of partly observed ones are left
+    out. Given completeness, theta follows the belief conditioned on it, and the noise
+    is taken to be what it is without.
+
+    Args:
+        num_neighbors: k; more have less variance and more bias at edges.
+
+    References:
+        Kozachenko & Leonenko, Problems of Information Transmission 1987; Kraskov,
+        Stogbauer & Grassberger, Physical Review E 2004.
+    """
+
+    needs_noise = True
+    needs_model = False
+
+    def __init__(self, *, num_neighbors: int = 4) -> None:
+        self.num_neighbors = at_least(num_neighbors, 1, "num_neighbors", 4)
+
+    def _contributions(
+        self, model: Any, simulations: CandidateSimulations, belief: Distribution
+    ) -> Tensor:
+        gain = presence_information(simulations)
+        entropy, surprise = conditional_entropy(simulations)
+        outcomes = simulations.outcomes()
+        for x in outcomes:
+            complete = x.flatten(2).isfinite().all(-1) & simulations.counted
+            for a, rows in enumerate(complete):
+                few = int(rows.sum()) <= max(self.num_neighbors, x[a, 0].numel())
+                if few or bool(entropy[a, rows].isnan().any()):
+                    continue  # too few measurements: what is present still counts
+                log_density = -nearest_neighbor_entropy(
+                    x[a, rows].flatten(1).double(), self.num_neighbors
+                )
+                gain[a, rows] += with_control(
+                    -log_density - entropy[a, rows],
+                    surprise[a, rows] - entropy[a, rows],
+                ) / len(outcomes)
+        return gain
+
+    @override
+    def remarks(self, simulations: CandidateSimulations) -> list[str]:
+        return presence_notes(simulations)
+
+    def problems(
+        self,
+        simulations: CandidateSimulations,
+        *,
+        few: int = 20,
+        significant: float = 4.0,
+        max_kurtosis: float = 0.3,
+    ) -> list[str]:
+        r"""Test by pairs whether undeclared noise is Gaussian.
+
+        Standardized differences of pairs have an excess kurtosis of zero, with a
+        standard error of :math:`\sqrt{24 / n}`, under Gaussian noise.
+
+        Args:
+            simulations: Simulations to look at.
+            few: Complete outcomes that are too few for either entropy.
+            significant: Number of standard errors of a kurtosis that is significant.
+            max_kurtosis: Excess below which the error of the entropy is negligible.
+        """
+        if int(simulations.complete.sum(1).max()) < few:
+            return [f"fewer than {few} complete outcomes a candidate"]
+        problems = presence_problems(simulations)
+        if simulations.noise is not None or simulations.replicate is None:
+            return problems
+        pooled = [
+            standardized_pairs(simulations, a, rows)[0].T.flatten()
+            for a, rows in enumerate(simulations.complete)
+            if int(rows.sum()) >= few
+        ]
+        z = torch.cat(pooled)
+        excess = float((z**4).mean() / (z**2).mean() ** 2 - 3)
+        limit = max(significant * (24 / len(z)) ** 0.5, max_kurtosis)
+        if abs(excess) <= limit:
+            return problems
+        return [
+            *problems,
+            f"noise is not Gaussian, excess kurtosis of pairs {excess:.1f}",
+        ]
+
+
+def conditional_entropy(
+    simulations: CandidateSimulations, *, num_draws: int = 16
+) -> tuple[Tensor, Tensor]:
+    r"""Return the noise's entropy and surprise, :math:`-\log p(x_i | \theta_i)`.
+
+    Without declared noise both are the entropy, :math:`H(x | \theta_i)`, with what the
+    pair i adds to its estimate; NaN where pairs are too few. Both have shape (a, n), in
+    nats, and a meaning where outcomes are complete. ``num_draws`` are those of declared
+    noise.
+    """
+    mean, noise = simulations.mean, simulations.noise
+    shape = simulations.x.shape[:2]
+    if mean is None or noise is None:
+        entropy = torch.full(shape, torch.nan, dtype=torch.float64)
+        share = simulations.completeness.mean(1)
+        for a, rows in enumerate(simulations.complete):
+            if int(rows.sum()) > simulations.x[a, 0].numel() + 1:
+                z, entropy[a] = standardized_pairs(simulations, a, rows)
+                # the noise is estimated: of mean zero, so that errors include it
+                square = torch.linalg.solve(z.T @ z / len(z), z.T)
+                influence = 0.5 * ((z.T * square).sum(0) - z.shape[1])
+                entropy[a, rows] += share[a] / rows.double().mean() * influence
+        return entropy, entropy
+    mean = mean.flatten(0, 1).double()
+    surprise = -noise.log_prob(simulations.x.flatten(0, 1), mean)
+    entropy = torch.zeros(len(mean), dtype=torch.float64)
+    with forked_generators(0):
+        for _ in range(num_draws):
+            entropy -= noise.log_prob(noise.sample(mean), mean) / num_draws
+    return entropy.reshape(shape), surprise.reshape(shape)
+
+
+def standardized_pairs(
+    simulations: CandidateSimulations, index: int, rows: Tensor
+) -> tuple[Tensor, Tensor]:
+    r"""Fit Gaussian noise to pairs of outcomes of one candidate, those of rows (n,).
+
+    :math:`\log \sigma_c^2(\theta)` is quadratic where a regression of the log squares
+    on theta is significant (the variance of :math:`\log z^2` is :math:`\pi^2 / 2`),
+    else constant. Returns standardized differences of the
+    pairs, and the entropies at all parameters, shape (n,).
+    """
+    assert simulations.replicate is not None
+    difference = simulations.x[index, rows] - simulations.replicate[index, rows]
+    difference = difference.flatten(1).double() / 2**0.5
+    n, d = difference.shape
+    theta = simulations.theta.double()
+    z = (theta - theta[rows].mean(0)) / theta[rows].std(0).clamp_min(1e-30)
+    everywhere = torch.cat([torch.ones(len(z), 1).double(), z, z**2], 1)
+    features = everywhere[rows]
+    scale = difference.square().mean(0).clamp_min(1e-60).sqrt()
+    log_square = (difference / scale).square().clamp_min(1e-12).log()
+    log_square = log_square - log_square.mean(0)
+    half = torch.zeros(len(theta), d, dtype=torch.float64)
+    freedom = features.shape[1] - 1
+    if n > 5 * freedom:
+        slope = torch.linalg.lstsq(features, log_square).solution
+        chi_square = (features @ slope).square().sum(0) / (math.pi**2 / 2)
+        limit = freedom + 5 * math.sqrt(2 * freedom)  # homogeneous unless it is clear
+        half = 0.5 * torch.where(chi_square > limit, everywhere @ slope, 0.0)
+    standardized = difference / half[rows].exp()
+    scale = standardized.square().mean(0).clamp_min(1e-60).sqrt()
+    standardized = standardized / scale
+    correlation = standardized.T @ standardized / n
+    log_det = torch.linalg.slogdet(correlation).logabsdet
+    entropy = (
+        0.5 * d * (math.log(2 * math.pi) + 1)
+        + (half + scale.log()).sum(1)
+        + 0.5 * log_det
+    )
+    return standardized, entropy
+
+
+def with_control(gain: Tensor, excess: Tensor) -> Tensor:
+    """Return contributions (n,) less their regression on an excess (n,) of mean zero.
+
+    The excess is the surprise of the noise less its entropy.
+    """
+    variance = excess.var()
+    if len(gain) < 10 or not float(variance) > 1e-12:
+        return gain
+    covariance = ((gain - gain.mean()) * (excess - excess.mean())).mean()
+    return gain - covariance / variance * excess
+
+
+def nearest_neighbor_entropy(
+    x: Tensor, num_neighbors: int, *, shared: float = 0.27
+) -> Tensor:
+    """Return each outcome's contribution to the entropy, (n, d) -> (n,), nats.
+
+    Args:
+        x: Outcomes.
+        num_neighbors: Number of the neighbor whose distance counts.
+        shared: Share of the jackknife's estimate of an outcome's effect on its
+            neighbors. All of it is too much, as distances are not smooth in the
+            outcomes; with .27 the variance of the mean was right for uniform outcomes,
+            one to three dimensions, k = 1 to 10.
+    """
+    n, d = x.shape
+    center = x.mean(0)
+    scale = x.std(0).clamp_min(1e-30)
+    z = (x - center) / scale
+    covariance = torch.cov(z.T).reshape(d, d) + 1e-12 * torch.eye(d).double()
+    factor = torch.linalg.cholesky(covariance)
+    z = torch.linalg.solve_triangular(factor, z.T, upper=False).T
+    tree = KDTree(z.numpy())
+    k = min(num_neighbors + 1, n - 1)
+    found, index = tree.query(z.numpy(), k=k + 1)
+    # outcomes are float32: no two are closer than their rounding
+    rounding = torch.finfo(torch.float32).eps
+    floor = rounding * float((x.abs().amax(0) / scale).max())
+    log_distance = d * torch.from_numpy(found).clamp_min(floor + 1e-300).log()
+    log_ball = 0.5 * d * math.log(math.pi) - math.lgamma(0.5 * d + 1)
+    log_det = factor.diagonal().log().sum() + scale.log().sum()
+    constant = float(digamma(n) - digamma(num_neighbors)) + log_ball + log_det
+    # a row shortens the distances of those that it is a neighbor of, an error that they
+    # share: the balls around them would be larger without it
+    larger = (log_distance[:, k] - log_distance[:, num_neighbors])[:, None]
+    neighbor = torch.from_numpy(index)[:, 1 : num_neighbors + 1]
+    effect = torch.zeros(n, dtype=torch.float64).index_add(
+        0, neighbor.flatten(), larger.expand(neighbor.shape).flatten()
+    )
+    own = shared * (effect - effect.mean())
+    return constant + log_distance[:, num_neighbors] - own

@@ -1,0 +1,219 @@
+"""The log evidence of outcomes: simulations, and local draws through an emulator."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.design.estimators.emulator import MeanEmulator
+from sbi_active.design.estimators.presence import Completeness
+from sbi_active.seeding import forked_generators
+from sbi_active.simulation import GaussianNoise, NoiseModel
+from sbi_active.support import support_of
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evidence:
+    """The log evidence of outcomes of one candidate, log p(x_i).
+
+    Attributes:
+        emulator: Emulator of the noise-free outcomes.
+        columns: Columns of the candidate in it.
+        mean: Noise-free outcomes of the simulations.
+        scale: Scale of the noise of each number.
+        complete: Probability of a complete outcome.
+        noise: Noise around the mean.
+        belief: Belief over the parameters.
+        log_belief: Log density of the belief at the simulations.
+        num_local: Number of local draws.
+        degrees: Degrees of freedom of the Student-t proposals; even.
+        wider: Width of the proposals, in those of the linearized posterior.
+        enough: Effective draws of the belief that need no local ones.
+        defense: Period of the local draws that are close to theta_i itself, lest all
+            others miss.
+        closer: Width of these, in those of the proposals.
+    """
+
+    emulator: MeanEmulator
+    columns: slice
+    mean: Tensor
+    scale: Tensor
+    complete: Completeness
+    noise: NoiseModel
+    belief: Distribution
+    log_belief: Tensor
+    num_local: int
+    degrees: int = 6
+    wider: float = 1.2
+    enough: int = 50
+    defense: int = 4
+    closer: float = 0.2
+
+    @property
+    def knots(self) -> Tensor:
+        """Coordinates of the simulations, shape (n, d)."""
+        return self.emulator.knots
+
+    def __call__(self, x: Tensor, slope: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Return log evidences without Jensen's bias, and what they rest on.
+
+        That is the share of each simulation in them, summed over the outcomes, shape
+        (n,); local draws have the rest.
+        """
+        m, num_local = int(self.complete.counted.sum()) - 1, self.num_local
+        parts = []
+        influence = torch.zeros(len(self.knots), dtype=torch.float64)
+        with forked_generators(0):  # the same base draws for all candidates
+            for some in rows.split(256):
+                shared = self._shared(x, some)
+                weight = shared.softmax(1)
+                log_p, variance = _log_mean(shared, m, m)
+                poor = torch.nonzero(~(variance + 1 / m <= 1 / self.enough))[:, 0]
+                if len(poor):
+                    i = some[poor]
+                    terms = self._with_local(x[i], slope[i], i, shared[poor])
+                    log_p[poor], variance[poor] = _log_mean(terms, m, m + num_local)
+                    weight[poor] = terms.softmax(1)[:, :-num_local]
+                parts.append(log_p + 0.5 * variance)
+                influence += self.complete.share[some] @ weight.nan_to_num()
+        return torch.cat(parts), influence
+
+    def _shared(self, x: Tensor, rows: Tensor) -> Tensor:
+        """Log density p(x_i | theta_j), -inf for j = i, shape (rows, n)."""
+        share = self.complete.share
+        known = (share > 0).reshape(-1, *[1] * (x.ndim - 1))
+        mean = torch.where(known, self.mean, 0)
+        log_term = _pairwise(self.noise, x[rows], mean)
+        log_term += share.log()
+        log_term[torch.arange(len(rows)), rows] = -torch.inf
+        return log_term
+
+    def _with_local(
+        self, x: Tensor, slope: Tensor, i: Tensor, shared: Tensor
+    ) -> Tensor:
+        """Log terms of the sum of simulations and local draws, shape (i, n + l)."""
+        location, factor = self._linearized(x, slope, i)
+        (n, d), num_local = location.shape, self.num_local
+        ratio = math.log(num_local / (len(self.knots) - 1))
+        step = _student((n, num_local, d), self.degrees) @ factor.mT
+        near = (torch.arange(num_local) % self.defense == 0)[:, None]
+        start = self.knots[i][:, None]
+        z = torch.where(near, start + self.closer * step, location[:, None] + step)
+        flat = z.flatten(0, 1)
+        log_b = log_belief(self.belief, self.emulator, flat).reshape(n, num_local)
+        inside = torch.nonzero(log_b.flatten().isfinite())[:, 0]
+        mean = self.emulator(flat[inside], self.columns) * self.scale
+        outcome = x.repeat_interleave(num_local, 0)[inside]
+        local = torch.full((n * num_local,), -torch.inf).double()
+        local[inside] = self.noise.log_prob(outcome, mean.reshape(outcome.shape))
+        log_t = self._log_proposal(z, location, i, factor)
+        local[inside] += self.complete(flat[inside], self.emulator)
+        local = local.reshape(n, num_local) - torch.nn.functional.softplus(
+            ratio + torch.where(log_b.isfinite(), log_t - log_b, 0.0)
+        )
+        log_t = self._log_proposal(self.knots, location, i, factor)
+        shared = shared - torch.nn.functional.softplus(ratio + log_t - self.log_belief)
+        return torch.cat([shared, local], 1)
+
+    def _log_proposal(
+        self, z: Tensor, location: Tensor, i: Tensor, factor: Tensor
+    ) -> Tensor:
+        """Log density of the local draws, shape (i, k)."""
+        mode = _log_student(z - location[:, None], factor, self.degrees)
+        near = _log_student(
+            z - self.knots[i][:, None], self.closer * factor, self.degrees
+        )
+        return torch.logaddexp(
+            mode + math.log(1 - 1 / self.defense), near - math.log(self.defense)
+        )
+
+    def _linearized(self, x: Tensor, slope: Tensor, i: Tensor) -> tuple[Tensor, Tensor]:
+        """Location and lower factor of the posterior given x, one step from theta_i.
+
+        The belief enters as the Gaussian of its draws' moments. A step is kept where
+        it does not raise the misfit.
+        """
+        z, d = self.knots[i], self.knots.shape[1]
+        center = self.knots.mean(0)
+        spread = torch.cov(self.knots.T).reshape(d, d) + 1e-9 * torch.eye(d)
+        prior = torch.linalg.inv(spread)
+
+        def misfit(z: Tensor, residual: Tensor) -> Tensor:
+            offset = z - center
+            return residual.square().sum(1) + (offset @ prior * offset).sum(1)
+
+        residual = (x - self.mean[i]).flatten(1) / self.scale
+        precision = slope.mT @ slope + prior
+        gradient = (slope.mT @ residual[..., None])[..., 0] - (z - center) @ prior
+        moved = z + torch.linalg.solve(precision, gradient[..., None])[..., 0]
+        after = x.flatten(1) / self.scale - self.emulator(moved, self.columns)
+        better = misfit(moved, after) < misfit(z, residual)
+        location = torch.where(better[:, None], moved, z)
+        covariance = torch.linalg.inv(precision)
+        return location, self.wider * torch.linalg.cholesky(
+            0.5 * (covariance + covariance.mT)
+        )
+
+
+def _pairwise(noise: NoiseModel, x: Tensor, mean: Tensor) -> Tensor:
+    """Log density of every x (n, ...) at every mean (k, ...), shape (n, k)."""
+    if isinstance(noise, GaussianNoise) and noise.posterior is None:  # one product
+        sd = noise.sd.expand(x.shape[1:]).flatten()
+        log_peak = -(sd.log() + 0.5 * math.log(2 * math.pi)).sum()
+        square = torch.cdist(x.flatten(1) / sd, mean.flatten(1) / sd).square_()
+        return log_peak - 0.5 * square
+    n, k = len(x), len(mean)
+    paired = noise.log_prob(
+        x.repeat_interleave(k, 0), mean.repeat(n, *[1] * (x.ndim - 1))
+    )
+    return paired.reshape(n, k)
+
+
+def log_belief(belief: Distribution, emulator: MeanEmulator, z: Tensor) -> Tensor:
+    """Log density of the belief in the emulator's coordinates, shape (n,)."""
+    log_b = log_density(belief, emulator.parameters(z).float())
+    return log_b - torch.linalg.slogdet(emulator.transform).logabsdet
+
+
+def log_density(belief: Distribution, theta: Tensor) -> Tensor:
+    """Log density of the belief, -inf outside its support, shape (n,), float64."""
+    try:
+        inside = support_of(belief).check(theta)
+    except NotImplementedError:
+        inside = torch.ones(len(theta)).bool()
+    log_b = torch.full((len(theta),), -torch.inf).double()
+    if bool(inside.any()):
+        density = getattr(belief, "smooth_log_prob", belief.log_prob)
+        log_b[inside] = density(theta[inside]).double()
+    return log_b
+
+
+def _log_mean(log_term: Tensor, m: int, num: int) -> tuple[Tensor, Tensor]:
+    """Log of the sum over m, and its variance from num draws; over the last axis."""
+    top = log_term.amax(-1, keepdim=True)
+    top = torch.where(top.isfinite(), top, 0.0)
+    weight = (log_term - top).exp_()
+    first, second = weight.sum(-1), torch.linalg.vecdot(weight, weight)
+    return top[:, 0] + first.log() - math.log(m), second / first.square() - 1 / num
+
+
+def _student(shape: tuple[int, ...], degrees: int) -> Tensor:
+    uniform = torch.rand(*shape[:-1], degrees // 2, dtype=torch.float64)
+    chi_square = -2 * torch.log1p(-uniform).sum(-1, keepdim=True)
+    normal = torch.randn(shape, dtype=torch.float64)
+    return normal * (degrees / chi_square).sqrt()
+
+
+def _log_student(offset: Tensor, factor: Tensor, degrees: int) -> Tensor:
+    """Log density at offsets (n, k, d) with lower factors (n, d, d)."""
+    d = offset.shape[-1]
+    inverse = torch.linalg.inv(factor)
+    square = (offset @ inverse.mT).square().sum(-1)
+    norm = math.lgamma((degrees + d) / 2) - math.lgamma(degrees / 2)
+    norm -= 0.5 * d * math.log(degrees * math.pi)
+    log_det = inverse.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
+    return norm + log_det - 0.5 * (degrees + d) * torch.log1p(square / degrees)

@@ -1,0 +1,291 @@
+r"""Information gain by nested Monte Carlo, local draws through an emulator."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+from typing_extensions import override
+
+from sbi_active.design.estimators.base import (
+    CandidateSimulations,
+    InformationGainEstimator,
+    at_least,
+)
+from sbi_active.design.estimators.emulator import MeanEmulator, declare, fill
+from sbi_active.design.estimators.entropy import (
+    EntropyGain,
+    conditional_entropy,
+    with_control,
+)
+from sbi_active.design.estimators.evidence import Evidence, log_belief
+from sbi_active.design.estimators.presence import (
+    completeness,
+    presence_information,
+    presence_notes,
+    presence_problems,
+)
+from sbi_active.simulation import NoiseModel
+
+
+class NestedGain(InformationGainEstimator):
+    r"""Log likelihood less an importance-sampled log evidence.
+
+    .. math::
+        I(\theta; x | \xi) = E \left[ \log p(x_i | \theta_i) - \log p(x_i) \right],
+        \qquad
+        \hat p(x_i) = \frac1m \left[ \sum_{j \ne i} \frac{p(x_i | \theta_j)}
+        {1 + \frac lm \frac{t_i(\theta_j)}{b(\theta_j)}}
+        + \sum_{k=1}^{l} \frac{p(x_i | \theta_{ik})}
+        {1 + \frac lm \frac{t_i(\theta_{ik})}{b(\theta_{ik})}} \right]
+
+    The m = n - 1 other simulations are draws of the belief b with their exact
+    noise-free outcomes. Where fewer than 50 of them are effective, l draws of a
+    Student-t :math:`t_i` around the linearized posterior given :math:`x_i` join, every
+    fourth of them close to :math:`\theta_i` instead, where the outcome is known. Their
+    outcomes come from a :class:`.MeanEmulator` of
+    the noise-free outcomes of all simulations, so no further ones are run.
+
+    Jensen's bias, half the relative variance of :math:`\hat p`, is subtracted. The
+    estimate is too large where the posterior has modes that neither the simulations
+    nor the local draws find, and is off by the emulator's error, for which
+    :meth:`problems` looks.
+
+    Where noise is not declared, mean and noise are first learned from pairs of outcomes
+    at the same parameters (:func:`.declare`):
+    Gaussian noise of one covariance a candidate, and an outcome smooth in theta. The
+    estimate is then the information of the learned model, and its contributions include
+    the error of learning.
+
+    Where outcomes lack numbers, those that are complete are compared under the belief
+    given completeness. The noise-free outcomes decide which parameters give complete
+    ones, and elsewhere the nearest simulation does; where completeness is random given
+    the parameters, its probability is a logistic function fitted to all simulations.
+
+    Args:
+        num_local: l.
+
+    References:
+        Rainforth et al., ICML 2018 (nested estimators); Owen & Zhou, JASA 2000 (the
+        mixture weights); Ryan, JCGS 2003 (the expected information gain).
+    """
+
+    needs_noise = True
+    needs_model = False
+
+    def __init__(self, *, num_local: int = 16) -> None:
+        self.num_local = at_least(num_local, 2, "num_local", 16)
+
+    def _contributions(
+        self, model: Any, simulations: CandidateSimulations, belief: Distribution
+    ) -> Tensor:
+        gain = presence_information(simulations)
+        enough = _enough(simulations).tolist()
+        chances = completeness(simulations)
+        learned = declare(simulations) if simulations.noise is None else None
+        if learned is not None:
+            simulations = learned.simulations
+        mean, noise = _declared(simulations)
+        entropy, surprise = conditional_entropy(simulations)
+        theta = simulations.theta.double()
+        scale = noise_scale(simulations)
+        filled = fill(theta, mean.flatten(2).double())
+        emulator = MeanEmulator.fit(
+            theta, (filled / scale[:, None]).transpose(0, 1).flatten(1)
+        )
+        slopes = emulator.slope(emulator.knots)
+        q = filled.shape[-1]
+        for a, complete in enumerate(chances):
+            rows, counted = complete.share > 0, complete.counted
+            if not enough[a]:
+                continue  # too few measurements: what is present still counts
+            evidence = Evidence(
+                emulator=emulator,
+                columns=slice(a * q, (a + 1) * q),
+                mean=mean[a].double(),
+                scale=scale[a],
+                complete=complete,
+                noise=noise,
+                belief=belief,
+                log_belief=log_belief(belief, emulator, emulator.knots),
+                num_local=self.num_local,
+            )
+            log_p, influence = evidence(
+                simulations.x[a].double(),
+                slopes[:, evidence.columns],
+                torch.nonzero(rows)[:, 0],
+            )
+            log_p -= complete.log_probability
+            gain[a, rows] += complete.share[rows] * with_control(
+                -log_p - entropy[a, rows], surprise[a, rows] - entropy[a, rows]
+            )
+            chance = complete(emulator.knots, emulator).exp()
+            gain[a] += _of_sharing(influence, complete.share, chance, counted)
+            if learned is not None:
+                gain[a, counted] += learning_error(
+                    slopes[counted, evidence.columns],
+                    emulator.knots[counted],
+                    learned.difference[a, counted],
+                    learned.residual[a, counted],
+                    complete.share[counted],
+                )
+        return gain
+
+    @override
+    def remarks(self, simulations: CandidateSimulations) -> list[str]:
+        notes = presence_notes(simulations)
+        few = int((~_enough(simulations)).sum())
+        if few:
+            notes.append(
+                f"too few complete outcomes at {few} of {len(simulations.action)} "
+                "actions: only which numbers are present counts, a lower bound"
+            )
+        if simulations.noise is None:
+            notes.append(
+                "noise not declared: it and the mean are learned from pairs, which can "
+                "be off by 1 nat where x varies fast with theta"
+            )
+        return notes
+
+    def problems(
+        self, simulations: CandidateSimulations, *, few: int = 20, num_rows: int = 256
+    ) -> list[str]:
+        """Compare leave-one-out errors of emulator or smoothing with the noise.
+
+        At most a quarter of the outcomes may be off by more than the noise's standard
+        deviation, or half of their numbers by smoothing. Without declared noise, test
+        as well whether it is Gaussian.
+
+        Args:
+            simulations: Simulations to look at.
+            few: Complete outcomes that are too few for an emulator; five pairs for each
+                number of x are needed to estimate its noise.
+            num_rows: Number of rows to fit the emulator to.
+        """
+        needed = few
+        if simulations.noise is None:
+            needed = max(few, 5 * simulations.x[0, 0].numel())
+        if int(simulations.complete.sum(1).max()) < needed:
+            return [f"fewer than {needed} complete outcomes a candidate"]
+        if simulations.noise is None:
+            problems = EntropyGain().problems(simulations)
+            missed = declare(simulations).score > 2
+            share = float(missed.double().mean())
+            if share > 0.5:
+                problems.append(f"smoothing misses {share:.0%} of the numbers of x")
+            return problems
+        mean, _ = _declared(simulations)
+        theta = simulations.theta.double()[:num_rows]
+        filled = fill(theta, mean[:, :num_rows].flatten(2).double())
+        f = filled / noise_scale(simulations)[:, None]
+        error = MeanEmulator.fit(theta, f.transpose(0, 1).flatten(1)).error
+        share = float((error.abs() > 1).double().mean())
+        problems = presence_problems(simulations)
+        if share <= 0.25:
+            return problems
+        return [
+            *problems,
+            f"the emulator misses {share:.0%} of outcomes by more than the noise",
+        ]
+
+
+def noise_scale(simulations: CandidateSimulations) -> Tensor:
+    """Root mean square of the noise, shape (a, numbers of x)."""
+    mean, _ = _declared(simulations)
+    square = (simulations.x - mean).flatten(2).double().square()
+    finite = square.isfinite()
+    square = torch.where(finite, square, 0.0).sum(1) / finite.sum(1).clamp_min(1)
+    return torch.where(square > 0, square, 1.0).sqrt()
+
+
+def _enough(simulations: CandidateSimulations, fewest: int = 8) -> Tensor:
+    """Whether complete outcomes suffice to compare, or to learn from, shape (a,)."""
+    needed = fewest
+    if simulations.noise is None:
+        needed = max(fewest, simulations.x[0, 0].numel() + 2)
+    return simulations.complete.sum(1) >= needed
+
+
+def _of_sharing(
+    influence: Tensor, share: Tensor, chance: Tensor, counted: Tensor
+) -> Tensor:
+    r"""Return the error that simulations add by being in others' evidence, (n,).
+
+    Simulation j, of completeness :math:`v_j`, changes :math:`- \sum_i \log \hat p(x_i)`
+    by minus its share in the evidences. Without local draws that is :math:`v_j` but for
+    noise, and the contributions of its own outcome and of validity are all. Local draws
+    take a share :math:`\lambda` and know the belief, so that only the chance
+    :math:`\pi(\theta_j)` of a complete outcome is learned from simulations:
+
+    .. math::
+        (1 - \lambda) v_j + \lambda \pi(\theta_j) - \sum_i v_i w_{ij}
+
+    with the last sum the influence. It is of mean zero over the rows that count: it
+    adds to errors and leaves the estimate.
+    """
+    local = 1 - influence.sum() / share.sum()
+    effect = (1 - local) * share + local * chance - influence
+    return torch.where(counted, effect - effect[counted].mean(), 0.0)
+
+
+def _declared(simulations: CandidateSimulations) -> tuple[Tensor, NoiseModel]:
+    assert simulations.mean is not None
+    assert simulations.noise is not None
+    return simulations.mean, simulations.noise
+
+
+def learning_error(
+    slope: Tensor, z: Tensor, difference: Tensor, residual: Tensor, share: Tensor
+) -> Tensor:
+    r"""Return the effect of each pair's noise on the information, to first order.
+
+    With :math:`x = f(\theta) + \epsilon`, standard normal noise, and errors
+    :math:`\delta f` of the mean and :math:`\delta S` of the covariance,
+
+    .. math::
+        \delta I = E[(x - E[f | x])^\top \delta f(\theta)]
+        - \tfrac12 \mathrm{tr}\, E[\mathrm{Cov}(f | x)]\, \delta S.
+
+    Both expectations are those of a linear f around each :math:`\theta_i` and a
+    Gaussian belief of precision P, with J the slope,
+
+    .. math::
+        E[f - E[f | x]] = G_i P (z_i - \bar z), \qquad
+        \mathrm{Cov}(f | x) = G_i J_i^\top, \qquad
+        G_i = J_i (J_i^\top J_i + P)^{-1}.
+
+    :math:`\delta f` is the smoothed residual, :math:`\delta S` the mean of
+    :math:`d d^\top - 1` over the pairs' differences d.
+
+    Args:
+        slope: J, shape (n, q, d).
+        z: Coordinates of the parameters, shape (n, d).
+        difference: d, shape (n, q); zero for incomplete pairs.
+        residual: Residual of the pairs' averages, shape (n, q); zero if there is
+            none.
+        share: Share of a pair that is complete, shape (n,).
+
+    Returns:
+        Shape (n,), nats, of mean zero; it adds to errors and leaves the estimate.
+
+    References:
+        Palomar & Verdu, IEEE Transactions on Information Theory 2006 (the gradient of
+        mutual information).
+    """
+    d = z.shape[1]
+    spread = torch.cov(z.T).reshape(d, d) + 1e-9 * torch.eye(d)
+    precision = torch.linalg.inv(spread)
+    gain = torch.linalg.solve(slope.mT @ slope + precision, slope.mT).mT  # (n, q, d)
+    pull = (gain @ ((z - z.mean(0)) @ precision)[..., None])[..., 0]
+    by_mean = share * (pull * residual).sum(1)
+    weight = (share / share.sum())[:, None, None]
+    moment = ((gain * weight).transpose(0, 1).flatten(1)) @ (
+        slope.transpose(0, 1).flatten(1).T
+    )
+    pairs = (share == 1).double()
+    square = ((difference @ moment) * difference).sum(1) - moment.trace() * pairs
+    by_noise = -0.5 * square * share.mean() / pairs.mean().clamp_min(1 / len(pairs))
+    effect = by_mean + by_noise
+    return effect - effect.mean()

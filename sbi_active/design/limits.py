@@ -1,0 +1,197 @@
+"""Actions that a designer may choose, and what they cost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from sbi_active.actions import ActionSpace, BoxActions
+from sbi_active.messages import warn
+from sbi_active.simulation import MissingRowsWarning
+
+
+@dataclass(frozen=True)
+class DesignLimits:
+    """Limits and costs of the actions that may be chosen.
+
+    Attributes:
+        actions: The space.
+        constraint: Function of actions (n, action_dim) that says which are permitted,
+            shape (n,), bool; None permits all.
+        exclude: Actions that are not to be repeated, shape (t, action_dim); in a box
+            nor others within a hundredth of its width in every entry.
+        price: Cost of actions (n, action_dim), shape (n,); None for none.
+        least: Share of measurements that a choice needs.
+    """
+
+    actions: ActionSpace
+    constraint: Callable[[Tensor], Tensor] | None
+    exclude: Tensor
+    price: Callable[[Tensor], Tensor] | None = None
+    least: float = 0.0
+
+    def __call__(self, action: Tensor) -> Tensor:
+        """Return a mask of permitted actions (n, action_dim), shape (n,), bool."""
+        inside = self.actions.permits(action)
+        if self.constraint is not None:
+            answer = torch.as_tensor(self.constraint(action))
+            if answer.shape != inside.shape:
+                raise ValueError(
+                    f"expected a constraint that maps actions {tuple(action.shape)} to "
+                    f"({len(action)},), bool; got shape {tuple(answer.shape)}; "
+                    "return one answer a row"
+                )
+            inside = answer.bool()
+        if len(self.exclude):
+            offset = (action[:, None].float() - self.exclude).abs()
+            inside = inside & ~(offset <= self._tolerance()).all(-1).any(1)
+        return inside
+
+    def listed(self) -> tuple[Tensor | None, tuple[str, ...]]:
+        """Return the permitted actions of a list, and how many are not.
+
+        Raises:
+            ValueError: If none is.
+        """
+        values = self.actions.listed()
+        if values is None:
+            return None, ()
+        inside = self(values)
+        if not bool(inside.any()):
+            raise ValueError(
+                f"expected a permitted action; got none of {len(values)}; loosen "
+                "constraint= or exclude="
+            )
+        out = int((~inside).sum())
+        note = f"{out} of {len(values)} candidates not permitted"
+        return values[inside], (note,) if out else ()
+
+    def drawn(self, seed: int | None, num_draws: int = 1_024) -> Tensor:
+        """Return the permitted among draws of a space without end.
+
+        Without a seed they go on with torch's global generator.
+        """
+        drawn = self.actions.sample((num_draws,), seed=seed)
+        drawn = drawn[self(drawn)]
+        if len(drawn) == 0:
+            raise ValueError(
+                f"expected a constraint that permits a part of {self.actions!r}; got "
+                f"none of {num_draws} actions; narrow the space to about what is "
+                "permitted"
+            )
+        return drawn
+
+    def cost(self, action: Tensor) -> Tensor:
+        """Return the cost of actions (n, action_dim), shape (n,); 1 for none."""
+        if self.price is None:
+            return torch.ones(len(action)).double()
+        return self.price(action)
+
+    def reached_by(self, valid: Tensor) -> Tensor:
+        """Return a mask of sufficient shares of measurements, shape (a,).
+
+        They are NaN where every simulation was lost.
+
+        Raises:
+            ValueError: If none does; it names the largest share.
+        """
+        eligible = valid >= self.least
+        if bool(eligible.any()):
+            return eligible
+        if bool(valid.isnan().all()):
+            raise ValueError(
+                "expected simulations; got none, all rows of all candidates were lost "
+                "to faults; look at the simulator's tracebacks"
+            )
+        raise ValueError(
+            f"expected a candidate that gives a measurement with a probability of at "
+            f"least {self.least:g}; got {float(valid.nan_to_num(0.0).max()):.3g} at "
+            "most; lower min_probability_valid or add gentler candidates"
+        )
+
+    def excluded_note(self, eligible: Tensor) -> tuple[str, ...]:
+        """Return a note on the number of excluded candidates; empty if none is."""
+        num = int((~eligible).sum())
+        if num == 0:
+            return ()
+        return (
+            f"{num} of {len(eligible)} candidates excluded: a measurement is less "
+            f"probable than {self.least:g}, or every simulation was lost",
+        )
+
+    def _tolerance(self, same: float = 0.01) -> Tensor:
+        """Return differences within which two actions are the same, (action_dim,)."""
+        parts = []
+        for part in self.actions.parts():
+            if isinstance(part, BoxActions):
+                parts.append(same * (part.high - part.low))
+            else:
+                parts.append(torch.full((part.action_dim,), 1e-6))
+        return torch.cat(parts)
+
+
+def pricing(
+    cost: Callable[[Tensor], Tensor] | Tensor | None, actions: ActionSpace
+) -> Callable[[Tensor], Tensor] | None:
+    """Return the cost as a function of actions (n, action_dim) -> (n,), float64.
+
+    The cost may be given as one number for each action of a list, shape (a,).
+
+    Raises:
+        ValueError: If the shape is another, or when called if a cost is not positive.
+    """
+    if cost is None:
+        return None
+    of = cost if callable(cost) else _listed_cost(torch.as_tensor(cost), actions)
+
+    def price(action: Tensor) -> Tensor:
+        given = torch.as_tensor(of(action)).double()
+        if given.shape != (len(action),) or not bool((given > 0).all()):
+            raise ValueError(
+                f"expected positive costs of shape ({len(action)},); got shape "
+                f"{tuple(given.shape)}, {given.flatten()[:4].tolist()}, ...; return "
+                "one positive number an action"
+            )
+        return given
+
+    return price
+
+
+def _listed_cost(table: Tensor, actions: ActionSpace) -> Callable[[Tensor], Tensor]:
+    values = actions.listed()
+    if values is None or table.shape != (len(values),):
+        raise ValueError(
+            "expected a cost of shape (a,), one number an action of a list; got "
+            f"shape {tuple(table.shape)} for {actions!r}; pass a function of "
+            "actions (n, action_dim)"
+        )
+    return lambda action: table[torch.cdist(action, values).argmin(1)]
+
+
+def rows_of(actions: ActionSpace, given: Tensor | None, name: str) -> Tensor:
+    """Return actions as rows (t, action_dim); none for None."""
+    dim = actions.action_dim
+    if given is None:
+        return torch.empty(0, dim)
+    rows = torch.as_tensor(given, dtype=torch.float32)
+    rows = rows[None] if rows.shape == (dim,) else rows
+    if rows.ndim != 2 or rows.shape[1] != dim:
+        raise ValueError(
+            f"expected {name} of shape (t, {dim}); got {tuple(rows.shape)}; give "
+            "one row an action"
+        )
+    return rows
+
+
+def warn_missing(num_missing: int, num_simulations: int) -> None:
+    """Warn once a design of simulations lost to faults."""
+    if num_missing:
+        warn(
+            f"SA301 {num_missing} of {num_simulations} simulations of the design are "
+            "missing, by faults of the simulator; they were left out",
+            MissingRowsWarning,
+            stacklevel=3,
+        )

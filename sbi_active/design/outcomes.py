@@ -1,0 +1,257 @@
+r"""Outcomes of several actions as one outcome, and summaries of long ones.
+
+.. math::
+    I(\theta; x \mid \xi, \text{others}) = I(\theta; x, x_1, \ldots, x_p)
+    - I(\theta; x_1, \ldots, x_p)
+
+is what an action tells beyond p others that are under way or chosen. Estimators from
+outcomes and their noise take the joint outcome as any other. A likelihood is a product
+over the actions. A posterior or a ratio learned for single outcomes says nothing of
+joint ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.design.estimators.base import (
+    CandidateSimulations,
+    InformationGainEstimator,
+)
+from sbi_active.simulation import GaussianNoise, NoiseModel
+from sbi_active.simulation.noise.whitening import whitened
+
+
+def join_outcomes(
+    candidates: CandidateSimulations, others: CandidateSimulations
+) -> CandidateSimulations:
+    """Return candidates' outcomes with those of p others.
+
+    Args:
+        candidates: x of shape (a, n, *x_shape).
+        others: Simulations of p actions at the same parameters, with noise of their
+            own.
+
+    Returns:
+        x of shape (a, n, 1 + p, *x_shape), the candidate's first; actions of shape
+        (a, (1 + p) * action_dim).
+    """
+    a, p = len(candidates.action), len(others.action)
+    beside = others.action.flatten().expand(a, -1)
+
+    def together(name: str) -> Tensor | None:
+        own, other = getattr(candidates, name), getattr(others, name)
+        if own is None or other is None:
+            return None
+        other = other.transpose(0, 1).expand(a, -1, p, *other.shape[2:])
+        return torch.cat([own[:, :, None], other], 2)
+
+    missing = None
+    if candidates.missing is not None or others.missing is not None:
+        missing = ~candidates.counted | ~others.counted.all(0)
+    x = together("x")
+    assert x is not None
+    return replace(
+        candidates,
+        action=torch.cat([candidates.action, beside], 1),
+        x=x,
+        mean=together("mean"),
+        replicate=together("replicate"),
+        missing=missing,
+        noise=None if candidates.noise is None else _joint(candidates.noise),
+    )
+
+
+def conditional_gain(
+    estimator: InformationGainEstimator,
+    model: Any,
+    simulations: CandidateSimulations,
+    belief: Distribution | None,
+    *,
+    action_dim: int,
+) -> Tensor:
+    """Return contributions to what candidates tell beyond the others, (a, n).
+
+    The simulations come from :func:`join_outcomes`; the model is for single outcomes,
+    of actions of ``action_dim`` numbers.
+    """
+    joint = None if model is None else JointLikelihood(model, action_dim)
+    others = replace(
+        simulations,
+        action=simulations.action[:1, action_dim:],
+        **{
+            name: part[:1, :, 1:] if name != "missing" else part[:1]
+            for name in ("x", "mean", "replicate", "missing")
+            if (part := getattr(simulations, name)) is not None
+        },
+    )
+    known = estimator(joint, others, belief)
+    return estimator(joint, simulations, belief) - known
+
+
+class JointLikelihood:
+    r"""Likelihood of several outcomes, :math:`\prod_k q(x_k | \theta, \xi_k)`."""
+
+    def __init__(self, model: Any, action_dim: int) -> None:
+        self.model, self.action_dim = model, action_dim
+
+    @property
+    def exact_likelihood(self) -> bool:
+        """Whether the likelihood of one outcome is exact."""
+        return getattr(self.model, "exact_likelihood", False)
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "log_likelihood" and hasattr(self.model, name):
+            return self._log_likelihood
+        raise AttributeError(
+            f"expected an estimator by the noise or by log_likelihood, which joint "
+            f"outcomes of several actions have; got one that asks for {name}; use "
+            "estimator='auto', or choose one action at a time without pending ones"
+        )
+
+    def _log_likelihood(self, x: Tensor, theta: Tensor, action: Tensor) -> Tensor:
+        """Return log densities, shape (n,), of x (n, k, *x_shape), action (n, k d)."""
+        actions = action.split(self.action_dim, 1)
+        terms = [
+            self.model.log_likelihood(x[:, k], theta, part).double()
+            for k, part in enumerate(actions)
+        ]
+        return torch.stack(terms).sum(0)
+
+
+class _JointNoise(NoiseModel):
+    """Noise that is independent from outcome to outcome, each of the same model."""
+
+    def __init__(self, each: NoiseModel) -> None:
+        self.each = each
+
+    def sample(
+        self,
+        mean: Tensor,
+        seeds: Tensor | None = None,
+        *,
+        times: Tensor | None = None,
+        parameters: Tensor | None = None,
+    ) -> Tensor:
+        if seeds is not None:
+            raise ValueError(
+                "expected seeds=None for joint outcomes; got some; draw the noise "
+                "of each outcome by itself"
+            )
+        flat = self.each.sample(mean.flatten(0, 1), times=times, parameters=parameters)
+        return flat.reshape(mean.shape)
+
+    def log_prob(
+        self,
+        x: Tensor,
+        mean: Tensor,
+        *,
+        times: Tensor | None = None,
+        parameters: Tensor | None = None,
+    ) -> Tensor:
+        mean = mean.expand_as(x)
+        flat = self.each.log_prob(
+            x.flatten(0, 1), mean.flatten(0, 1), times=times, parameters=parameters
+        )
+        return flat.reshape(x.shape[:2]).sum(1)
+
+
+def _joint(noise: NoiseModel) -> NoiseModel:
+    """Return the noise of stacked outcomes; a declared Gaussian is the same on any."""
+    if isinstance(noise, GaussianNoise) and noise.posterior is None:
+        return noise
+    return _JointNoise(noise)
+
+
+@dataclass(frozen=True)
+class _Directions:
+    """Principal directions of the outcomes of one action.
+
+    Attributes:
+        center: Mean of the whitened outcomes, shape (N,).
+        rows: Orthonormal directions, shape (k, N).
+    """
+
+    center: Tensor
+    rows: Tensor
+
+
+class LinearSummaries:
+    r"""Summaries of outcomes with many numbers, action by action.
+
+    Around a noise-free outcome f with noise of covariance C, the likelihood of x given
+    any parameters depends on :math:`C^{-1/2} x` along the differences of
+    :math:`C^{-1/2} f(\theta)` alone. The summaries are these along the leading
+    principal directions of f over the belief, one set an action, with independent noise
+    of unit size. What the others tell is at most half their variance, in nats:
+
+    .. math::
+        I(\theta; x) - I(\theta; s) \le \tfrac12 \log |1 + \Lambda| \le
+        \tfrac12 \operatorname{tr} \Lambda .
+
+    Args:
+        noise: Gaussian noise of which nothing is unknown.
+        num_kept: Number of summaries, beyond the noise where an action has fewer
+            directions. Half suffices for most trajectories; twice cost as much more.
+        num_rows: Outcomes of an action behind its directions. As many directions can be
+            told at most.
+
+    Attributes:
+        left_out: Largest information that the summaries of an action leave out, nats,
+            by the outcomes so far: a few hundred that the directions were fitted to
+            among them, so that it is low where an action has few.
+    """
+
+    def __init__(
+        self, noise: NoiseModel, *, num_kept: int = 32, num_rows: int = 192
+    ) -> None:
+        self.left_out = 0.0
+        self._noise, self._num_kept, self._num_rows = noise, num_kept, num_rows
+        self._known: dict[bytes, _Directions] = {}
+
+    @property
+    def noise(self) -> GaussianNoise:
+        """The noise of the summaries."""
+        return GaussianNoise(1.0)
+
+    def __call__(self, action: Tensor, mean: Tensor) -> Tensor:
+        """Return summaries, shape (n, k), NaN of an outcome that lacks any number.
+
+        Args:
+            action: Action, shape (action_dim,).
+            mean: Noise-free outcomes at it, shape (n, *x_shape).
+        """
+        white = whitened(self._noise, mean).flatten(1)
+        whole = white.isfinite().all(1)
+        found = torch.full((len(white), self._num_kept), torch.nan).double()
+        key = action.numpy().tobytes()
+        if key not in self._known and bool(whole.any()):
+            self._known[key] = self._directions(white[whole][: self._num_rows])
+        if key not in self._known:
+            return found
+        own = self._known[key]
+        off = white[whole] - own.center
+        short = off @ own.rows.T
+        rest = off.square().sum(1) - short.square().sum(1)
+        self.left_out = max(self.left_out, 0.5 * float(rest.mean().clamp_min(0.0)))
+        found[whole] = torch.nn.functional.pad(
+            short, (0, self._num_kept - short.shape[1])
+        )
+        return found
+
+    def _directions(self, white: Tensor) -> _Directions:
+        center = white.mean(0)
+        rows = torch.linalg.svd(white - center, full_matrices=False)[2]
+        return _Directions(center, rows[: self._num_kept])
+
+    def note(self, num_numbers: int) -> str:
+        """Return a note on what is compared in place of how many numbers."""
+        return (
+            f"{self._num_kept} linear summaries stand for the {num_numbers} numbers of "
+            f"an outcome, and leave out about {self.left_out:.2g} nats"
+        )

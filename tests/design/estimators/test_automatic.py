@@ -1,0 +1,165 @@
+"""The estimator that is chosen by checks, and what is said of its estimate."""
+
+import math
+
+import pytest
+import torch
+from torch.distributions import Distribution
+
+from sbi_active import DiscreteActions, InformationGainDesigner
+from sbi_active.design import (
+    CandidateSimulations,
+    InfoNCEGain,
+    LikelihoodGain,
+    PosteriorGain,
+    RatioGain,
+)
+from sbi_active.design.estimators import choose_estimator
+from sbi_active.design.estimators.automatic import disagreements, find_estimator
+from sbi_active.design.estimators.likelihood import ContrastiveGain
+from tests.linear_gaussian import (
+    PRIOR,
+    ExactLikelihood,
+    ExactLikelihoodAndPosterior,
+    ExactRatio,
+    information,
+)
+
+GAUSSIAN = torch.distributions.Normal(0.0, 1.0)
+NEAR, FAR = torch.tensor([[0.5], [1.0]]), torch.tensor([[0.5], [40.0]])  # 7.4 nats
+
+
+def rows(actions=NEAR, n=512, noise: Distribution = GAUSSIAN, pairs=False):
+    theta = PRIOR.sample((n,))
+    x, again = (actions[:, None] * theta + noise.sample((2, n, 2)) for _ in "ab")
+    return CandidateSimulations(theta, actions, x, replicate=again if pairs else None)
+
+
+def unusable(actions=NEAR, n=512):
+    """Noise from heavy-tailed pairs, which fails the test of normality."""
+    return rows(actions, n, torch.distributions.StudentT(3.0), pairs=True)
+
+
+@pytest.mark.parametrize(
+    ("model", "estimator"),
+    [
+        (ExactLikelihoodAndPosterior(), PosteriorGain),
+        (ExactLikelihood(), LikelihoodGain),
+        (ExactRatio(), InfoNCEGain),
+        (None, "EntropyGain"),
+    ],
+)
+def test_what_the_model_can_say_is_used_where_the_noise_cannot(model, estimator):
+    chosen, notes = choose_estimator(model, unusable())
+    assert "noise is not Gaussian" in notes[0]
+    if model is None:
+        assert notes[-1] == "used all the same: there is no model"
+        estimator = type(choose_estimator(None, rows(pairs=True))[0])
+    assert type(chosen) is estimator
+
+
+def test_a_ratio_beyond_the_reach_of_info_nce_is_averaged():
+    chosen, notes = choose_estimator(ExactRatio(), unusable(FAR))
+    assert type(chosen) is RatioGain
+    assert "not used: InfoNCEGain is near its largest value, log K = 4.9" in notes[-1]
+    assert "at 1 of 2 actions" in notes[-1]
+
+
+@pytest.mark.parametrize("model", [ExactLikelihood(), ExactRatio()])
+def test_the_designer_without_a_posterior_or_usable_noise(model):
+    def simulator(theta, action):
+        noise = torch.distributions.StudentT(3.0).sample(theta.shape)
+        return action * theta + noise
+
+    designer = InformationGainDesigner(
+        DiscreteActions([0.0, 0.5, 2.0]), num_samples=600
+    )
+    design = designer.select(model, simulator, seed=0)
+    assert design.action.tolist() == [2.0]
+    assert design.estimator in ("LikelihoodGain", "InfoNCEGain")
+    assert any("noise is not Gaussian" in note for note in design.notes)
+    assert float(design.expected_information_gain[0]) == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "bound"),
+    [
+        ("likelihood", "upper"),
+        ("contrastive", "lower"),
+        ("info_nce", "lower"),
+        ("ratio", "none"),
+    ],
+)
+def test_the_designer_takes_them_by_name(name, bound):
+    class Model(ExactLikelihoodAndPosterior, ExactRatio):
+        offset, power = 0.0, 1.0
+
+    actions = DiscreteActions([0.0, 0.5, 1.0])
+    designer = InformationGainDesigner(actions, num_samples=2_000, estimator=name)
+    design = designer.select(Model(), lambda t, a: a * t + torch.randn_like(t), seed=0)
+    assert design.action.tolist() == [1.0]
+    assert design.bound == bound
+    exact = information(actions.values)
+    error = (design.expected_information_gain - exact).abs()
+    assert (error <= 3 * design.standard_error + 0.02).all()
+    assert design.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("estimator", "text"),
+    [
+        (
+            ContrastiveGain(num_contrastive=63),
+            "near its largest value, log(L + 1) = 4.2",
+        ),
+        (InfoNCEGain(num_contrastive=63), "near its largest value, log K = 4.2"),
+        (LikelihoodGain(num_contrastive=64), "near log L = 4.2 nats or above"),
+    ],
+)
+def test_an_estimate_near_its_limit_is_said_to_be(estimator, text):
+    model = ExactLikelihood()
+    far, near = rows(FAR), rows(NEAR)
+    gain = estimator(model, far, PRIOR)
+    notes = estimator.cautions(gain)
+    assert len(notes) == 1
+    assert text in notes[0]
+    assert "at 1 of 2 actions" in notes[0]
+    assert notes[0] in disagreements(estimator, model, far, PRIOR, gain)
+    # the estimate is indeed off by more than its error where it is warned of
+    wrong = (gain.mean(1) - information(FAR)).abs()
+    assert float(wrong[1]) > 0.5
+    assert float(wrong[0]) < 0.2
+    gain = estimator(model, near, PRIOR)
+    assert estimator.cautions(gain) == []
+    assert disagreements(estimator, model, near, PRIOR, gain) == []
+
+
+def test_a_limit_is_that_of_the_rows_that_are_left():
+    """Missing rows make blocks smaller."""
+    estimator = InfoNCEGain(num_contrastive=63)
+    gain = torch.full((1, 64), math.log(16) - 0.5)
+    assert estimator.cautions(gain) == []
+    gain[:, 16:] = torch.nan
+    assert "log K = 2.8 nats" in estimator.cautions(gain)[0]
+
+
+def test_a_ratio_whose_normalization_is_off_is_noticed():
+    simulations = rows()
+    for offset, expected in ((0.0, 0), (1.0, 1)):
+        model = ExactRatio(offset=offset)
+        gain = RatioGain()(model, simulations, PRIOR)
+        notes = disagreements(RatioGain(), model, simulations, PRIOR, gain)
+        assert len(notes) == expected
+    assert "InfoNCEGain is" in notes[0]
+    assert "nats below" in notes[0]
+
+
+def test_a_bound_that_has_reached_its_limit_contradicts_nothing():
+    simulations = rows(FAR)
+    gain = RatioGain()(ExactRatio(), simulations, PRIOR)
+    assert disagreements(RatioGain(), ExactRatio(), simulations, PRIOR, gain) == []
+
+
+def test_a_former_name_is_taken_for_one_version():
+    with pytest.warns(DeprecationWarning, match=r"use estimator=\"likelihood\""):
+        assert type(find_estimator("variational_nested")) is LikelihoodGain

@@ -1,0 +1,217 @@
+"""Estimators from a likelihood or a ratio against the linear-Gaussian closed form.
+
+Tolerances are three of an estimate's own standard errors, and where an estimator has a
+bias it must lie on the side that is claimed.
+"""
+
+import math
+
+import pytest
+import torch
+
+from sbi_active.design import (
+    CandidateSimulations,
+    InfoNCEGain,
+    LikelihoodGain,
+    RatioGain,
+)
+from sbi_active.design.estimators.base import standard_error
+from sbi_active.design.estimators.likelihood import ContrastiveGain
+from tests.design.fragile import PRIOR as FRAGILE_PRIOR
+from tests.design.fragile import Fragile, log_normal
+from tests.linear_gaussian import (
+    PRIOR,
+    ExactLikelihood,
+    ExactLikelihoodAndPosterior,
+    ExactRatio,
+    information,
+)
+
+ACTIONS = torch.tensor([[0.0], [0.5], [1.0], [2.0]])
+EXACT = information(ACTIONS)
+FAR = torch.tensor([[20.0]])  # 6 nats
+ESTIMATORS = {
+    "likelihood": (LikelihoodGain(num_contrastive=500), ExactLikelihood()),
+    "contrastive": (ContrastiveGain(num_contrastive=500), ExactLikelihood()),
+    "info_nce, ratio": (InfoNCEGain(num_contrastive=255), ExactRatio()),
+    "info_nce, likelihood": (InfoNCEGain(num_contrastive=255), ExactLikelihood()),
+    "ratio": (RatioGain(), ExactRatio()),
+}
+
+
+def rows(actions=ACTIONS, n=512, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    theta = torch.randn(n, 2, generator=generator)
+    noise = torch.randn(len(actions), n, 2, generator=generator)
+    return CandidateSimulations(theta, actions, actions[:, None] * theta + noise)
+
+
+def estimate(estimator, model, simulations, belief=PRIOR):
+    gain = estimator(model, simulations, belief)
+    return gain.mean(1), torch.stack([standard_error(row) for row in gain])
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_the_closed_form(name):
+    estimator, model = ESTIMATORS[name]
+    gain, error = estimate(estimator, model, rows())
+    assert ((gain - EXACT).abs() <= 3 * error + 1e-6).all()
+    assert (error < 0.1).all()
+
+
+@pytest.mark.parametrize("name", ["likelihood", "info_nce, ratio"])
+def test_errors_are_what_repetitions_show(name):
+    """The deviation over 40 repetitions has a standard error of 11 %."""
+    estimator, model = ESTIMATORS[name]
+    gains, errors = zip(
+        *(estimate(estimator, model, rows(n=64, seed=s)) for s in range(40)),
+        strict=True,
+    )
+    ratio = torch.stack(gains).std(0) / torch.stack(errors).mean(0)
+    assert ((ratio[1:] > 0.6) & (ratio[1:] < 1.4)).all()
+
+
+def test_what_contrastive_draws_share_is_in_the_error():
+    """Five draws move all evidences alike; without that the error is too small."""
+    estimator = LikelihoodGain(num_contrastive=5)
+    gains, errors, apart = [], [], []
+    for seed in range(40):
+        simulations = rows(n=512, seed=seed)
+        gain = estimator(ExactLikelihood(), simulations, PRIOR)[1]
+        gains.append(gain.mean())
+        errors.append(standard_error(gain))
+        apart.append(standard_error(estimate_alone(estimator, simulations)))
+    deviation = torch.stack(gains).std()
+    assert 0.6 < float(deviation / torch.stack(errors).mean()) < 1.4
+    assert float(deviation / torch.stack(apart).mean()) > 1.5
+
+
+def estimate_alone(estimator, simulations):
+    """Contributions of one action that leave out what the draws share."""
+    model, action = ExactLikelihood(), simulations.action[1]
+    theta = estimator._draw(PRIOR, simulations)
+    x = simulations.x[1]
+    apart = x[:, None] - action * theta
+    log_p = model.log_likelihood(apart, 0 * apart, action).logsumexp(1)
+    own = model.log_likelihood(x, simulations.theta, action)
+    return (own - log_p + math.log(len(theta))).double()
+
+
+def test_bounds_are_where_they_claim_to_be():
+    """Six nats are too many for 100 draws."""
+    simulations, exact, model = rows(FAR), float(information(FAR)), ExactLikelihood()
+    upper, error = estimate(LikelihoodGain(num_contrastive=100), model, simulations)
+    assert float(upper) > exact + 3 * float(error)
+    for lower in (ContrastiveGain(num_contrastive=100), InfoNCEGain()):
+        gain, error = estimate(lower, model, simulations)
+        assert float(gain) < exact - 3 * float(error)
+        assert lower.bound_on(model) == "lower"
+
+
+@pytest.mark.parametrize(
+    ("estimator", "exact"),
+    [
+        (LikelihoodGain(), "upper"),
+        (ContrastiveGain(), "lower"),
+        (InfoNCEGain(), "lower"),
+        (RatioGain(), "none"),
+    ],
+)
+def test_a_learned_likelihood_gives_no_upper_bound(estimator, exact):
+    assert estimator.bound_on(ExactLikelihoodAndPosterior()) == exact
+    learned = "lower" if exact == "lower" else "none"
+    assert estimator.bound_on(ExactLikelihoodAndPosterior(spread=2.0)) == learned
+    assert estimator.bound_on(ExactRatio()) == learned
+
+
+@pytest.mark.parametrize(
+    ("estimator", "most"),
+    [
+        (lambda m: LikelihoodGain(num_contrastive=m), 1_000),
+        (lambda m: ContrastiveGain(num_contrastive=m), 1_000),
+        (lambda m: InfoNCEGain(num_contrastive=m), 511),
+    ],
+)
+def test_bias_falls_with_contrastive_draws(estimator, most):
+    """Paired with the exact log ratio, whose mean has no bias."""
+    actions = torch.tensor([[4.0]])
+    simulations, model = rows(actions), ExactLikelihoodAndPosterior(proposal=2.0)
+    control = RatioGain()(ExactRatio(), simulations, PRIOR)[0]
+    bias = []
+    for num in (4, most):
+        gain = estimator(num)(model, simulations, PRIOR)[0] - control
+        bias.append((abs(float(gain.mean())), float(standard_error(gain))))
+    (few, _), (many, error) = bias
+    assert few > 0.1
+    assert many < 0.3 * few + 3 * error
+    assert many < few
+
+
+@pytest.mark.parametrize("spread", [0.5, 2.0])
+def test_a_wrong_likelihood_is_wrong(spread):
+    """Negative control. With a spread s, log q - log E q is known in closed form.
+
+    It is below the information by the divergence of the implied posterior; with few
+    draws it is above: no bound on either side.
+    """
+    model = ExactLikelihood(spread)
+    simulations, a = rows(), ACTIONS[:, 0].double()
+    gain, error = estimate(LikelihoodGain(num_contrastive=2_000), model, simulations)
+    wide = a**2 + spread**2
+    own = -1 / spread**2 - 2 * math.log(spread)
+    wrong = own + (a**2 + 1) / wide + wide.log()
+    assert ((gain - wrong).abs() <= 3 * error + 0.02)[:3].all()
+    assert (gain < EXACT - 3 * error)[1:].all()
+    few, error = estimate(LikelihoodGain(num_contrastive=20), model, rows(FAR))
+    assert float(few) > float(information(FAR) + 3 * error)
+    # a contrastive estimate stays below for all that
+    gain, error = estimate(ContrastiveGain(), model, simulations)
+    assert (gain < EXACT + 3 * error + 1e-6).all()
+    assert float(gain[-1]) < float(EXACT[-1] - 3 * error[-1])
+
+
+def test_a_wrong_ratio_is_wrong_but_for_info_nce():
+    """Off by a function of x, its mean is above; InfoNCE does not see it."""
+    simulations, model = rows(), ExactRatio(offset=0.5)
+    gain, error = estimate(RatioGain(), model, simulations)
+    assert (gain > EXACT + 3 * error).all()
+    blind = InfoNCEGain()(model, simulations, PRIOR)
+    assert torch.allclose(blind, InfoNCEGain()(ExactRatio(), simulations, PRIOR))
+    # a steep ratio fools the mean, and only loosens the bound
+    steep = ExactRatio(power=1.8)
+    gain, error = estimate(RatioGain(), steep, simulations)
+    assert (gain > EXACT + 3 * error)[1:].all()
+    gain, error = estimate(InfoNCEGain(), steep, simulations)
+    assert (gain < EXACT + 3 * error + 1e-6).all()
+
+
+class FragileLikelihood:
+    """Measurements or none, with their exact likelihood."""
+
+    exact_likelihood = True
+
+    def __init__(self, luck):
+        self.world = Fragile(luck)
+
+    def log_likelihood(self, x, theta, action):
+        log_v = self.world.log_valid(theta.double(), action.double())
+        lost = torch.log1p(-log_v.exp().clamp_max(1 - 1e-12))
+        measured = log_v + log_normal(x - action * theta)
+        return torch.where(x.isnan(), lost, measured)[:, 0]
+
+
+@pytest.mark.parametrize("luck", [0.0, 0.4])
+@pytest.mark.parametrize(
+    "estimator",
+    [
+        LikelihoodGain(num_contrastive=500),
+        InfoNCEGain(num_contrastive=511),
+    ],
+)
+def test_outcomes_without_a_measurement_are_information(estimator, luck):
+    model = FragileLikelihood(luck)
+    simulations = model.world.simulations(512, 0)
+    gain, error = estimate(estimator, model, simulations, FRAGILE_PRIOR)
+    exact = model.world.exact()
+    assert ((gain - exact["counted"]).abs() < 3 * error + 0.01).all()
+    assert ((gain - exact["dropped"]).abs() > 3 * error).any()  # negative control

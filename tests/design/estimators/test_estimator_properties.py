@@ -1,0 +1,174 @@
+"""What every estimator has in common, from one registry."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from sbi_active.design import (
+    CandidateSimulations,
+    EntropyGain,
+    InfoNCEGain,
+    LikelihoodGain,
+    LinearGain,
+    NestedGain,
+    PosteriorGain,
+    RatioGain,
+)
+from sbi_active.design.estimators import ESTIMATORS as NAMES
+from sbi_active.design.estimators.likelihood import ContrastiveGain
+from sbi_active.simulation import GaussianNoise
+from tests.linear_gaussian import (
+    PRIOR,
+    ExactLikelihoodAndPosterior,
+    ExactRatio,
+)
+
+ACTIONS = torch.tensor([[0.0], [0.5], [2.0]])
+
+
+class Everything(ExactLikelihoodAndPosterior, ExactRatio):
+    """A model that has all methods."""
+
+    def __init__(self):
+        super().__init__()
+        self.offset, self.power = 0.0, 1.0
+
+
+ESTIMATORS = {
+    "contrastive": ContrastiveGain(num_contrastive=50),
+    "entropy": EntropyGain(),
+    "info_nce": InfoNCEGain(num_contrastive=31),
+    "likelihood": LikelihoodGain(num_contrastive=50),
+    "linear": LinearGain(),
+    "nested": NestedGain(),
+    "posterior": PosteriorGain(),
+    "ratio": RatioGain(),
+}
+DRAWING = {"entropy", "nested"}  # other numbers in turn
+FROM_MODELS = sorted(set(ESTIMATORS) - {"entropy", "linear", "nested"})
+
+
+@pytest.fixture
+def rows():
+    theta = torch.randn(128, 2)
+    mean = ACTIONS[:, None] * theta
+    x = mean + torch.randn_like(theta)
+    return CandidateSimulations(theta, ACTIONS, x, mean, GaussianNoise(1.0))
+
+
+def test_all_estimators_are_here():
+    assert set(ESTIMATORS) == set(NAMES)
+    assert all(type(e) is NAMES[name] for name, e in ESTIMATORS.items())
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_shape_and_repetition(name, rows):
+    estimator = ESTIMATORS[name]
+    gain = estimator(Everything(), rows, PRIOR)
+    assert gain.shape == (3, 128)
+    assert gain.dtype == torch.float64
+    assert gain.isfinite().all()
+    state = torch.get_rng_state()
+    again = estimator(Everything(), rows, PRIOR)
+    assert torch.allclose(again, gain, rtol=0, atol=1e-6)  # the last bits may differ
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_permuting_candidates_permutes_the_gain(name, rows):
+    order = torch.tensor([2, 0, 1])
+    gain = ESTIMATORS[name](Everything(), rows, PRIOR)
+    permuted = ESTIMATORS[name](Everything(), rows.candidates(order), PRIOR)
+    tolerance = 0.1 if name in DRAWING else 1e-6
+    assert torch.allclose(permuted.mean(1), gain[order].mean(1), atol=tolerance)
+
+
+@pytest.mark.parametrize("name", FROM_MODELS)
+def test_an_uninformative_action_has_no_gain(name, rows):
+    gain = ESTIMATORS[name](Everything(), rows, PRIOR).mean(1)
+    assert float(gain[0]) == pytest.approx(0.0, abs=1e-6)
+    assert float(gain[2]) > 0.5
+
+
+@pytest.mark.parametrize("name", FROM_MODELS)
+def test_missing_rows_are_left_out(name, rows):
+    missing = torch.zeros(3, 128).bool()
+    missing[1, ::2] = True
+    x = rows.x.masked_fill(missing[..., None], torch.nan)
+    gain = ESTIMATORS[name](Everything(), replace(rows, x=x, missing=missing), PRIOR)
+    assert torch.equal(gain.isnan(), missing)
+    whole = ESTIMATORS[name](Everything(), rows, PRIOR).mean(1)
+    assert torch.allclose(gain.nanmean(1)[[0, 2]], whole[[0, 2]], atol=0.05)
+    assert abs(float(gain[1].nanmean() - whole[1])) < 0.5
+    missing[1] = True  # all of them
+    gain = ESTIMATORS[name](Everything(), replace(rows, x=x, missing=missing), PRIOR)
+    assert gain[1].isnan().all()
+    assert gain[2].isfinite().all()
+
+
+@pytest.mark.parametrize("name", FROM_MODELS)
+def test_outcomes_at_the_same_parameters_are_averaged(name, rows):
+    again = rows.action[:, None] * rows.theta + torch.randn_like(rows.x)
+    estimator, model = ESTIMATORS[name], Everything()
+    pairs = estimator(model, replace(rows, replicate=again), PRIOR).mean(1)
+    first = estimator(model, rows, PRIOR).mean(1)
+    second = estimator(model, replace(rows, x=again), PRIOR).mean(1)
+    tolerance = 0.1 if name in DRAWING else 1e-6
+    assert torch.allclose(pairs, (first + second) / 2, atol=tolerance)
+
+
+@pytest.mark.parametrize("name", FROM_MODELS)
+def test_batches_do_not_matter(name, rows):
+    options = dict(vars(ESTIMATORS[name])) | {"batch_size": 70}
+    gain = type(ESTIMATORS[name])(**options)(Everything(), rows, PRIOR).mean(1)
+    whole = ESTIMATORS[name](Everything(), rows, PRIOR).mean(1)
+    tolerance = 0.1 if name in DRAWING else 1e-5
+    assert torch.allclose(gain, whole, atol=tolerance)
+
+
+@pytest.mark.parametrize("name", sorted(set(FROM_MODELS) - {"posterior"}))
+def test_a_model_that_cannot_say_is_an_error(name, rows):
+    """A loss that the model does not know is refused, not dropped."""
+    x = rows.x.clone()
+    x[1, 3] = torch.nan
+    with pytest.raises(ValueError, match="outcome without a measurement is, x = NaN"):
+        ESTIMATORS[name](Everything(), replace(rows, x=x), PRIOR)
+    model = object()
+    with pytest.raises(ValueError, match=r"expected a model with log_\w+ for \w+Gain"):
+        ESTIMATORS[name](model, rows, PRIOR)
+
+
+def test_a_table_of_all_pairs_is_used(rows):
+    class Table(ExactLikelihoodAndPosterior):
+        calls = 0
+
+        def log_likelihood_table(self, x, theta, action):
+            Table.calls += 1
+            n, m = len(x), len(theta)
+            pairs = x.repeat_interleave(m, 0), theta.repeat(n, 1), action
+            return self.log_likelihood(*pairs).reshape(n, m)
+
+    estimator = ESTIMATORS["likelihood"]
+    gain = estimator(Table(), rows, PRIOR)
+    assert Table.calls == 3
+    assert torch.allclose(gain, estimator(Everything(), rows, PRIOR))
+
+
+def test_draws_of_the_belief_differ_by_simulations(rows):
+    """The halves that choose and report share none, candidates share all."""
+    estimator = LikelihoodGain(num_contrastive=5)
+    first = estimator._draw(PRIOR, rows)
+    assert torch.equal(
+        estimator._draw(PRIOR, rows.candidates(torch.tensor([1]))), first
+    )
+    other = rows.samples(slice(64))
+    assert not torch.equal(estimator._draw(PRIOR, other), first)
+    assert not torch.equal(LikelihoodGain(seed=1)._draw(PRIOR, rows)[:5], first)
+
+
+def test_without_a_belief(rows):
+    with pytest.raises(
+        ValueError, match="expected a belief for LikelihoodGain to draw"
+    ):
+        LikelihoodGain()(Everything(), rows, None)

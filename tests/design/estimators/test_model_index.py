@@ -1,0 +1,242 @@
+"""Which of several rival models is right, against quadrature.
+
+The estimate is a lower bound, reached within three standard errors for Gaussian
+predictives, and for long outcomes within a stated slack.
+"""
+
+import math
+from dataclasses import dataclass
+
+import pytest
+import torch
+
+from sbi_active import DiscreteActions, InformationGainDesigner
+from sbi_active.design import ModelIndexGain
+from sbi_active.design.estimators.densities import noise_members
+from sbi_active.design.estimators.model_index import RivalSampler
+
+ACTIONS = torch.tensor([[0.0], [0.5], [1.0], [2.0]])
+X = torch.linspace(-30, 30, 60_001).double()
+
+
+@dataclass
+class Gaussian:
+    """A predictive N(slope a, (1 + growth a)^2), without a measurement at times."""
+
+    probability: float
+    slope: float
+    growth: float = 0.0
+    lost: float = 0.0
+
+    def predict(self, action, num_samples, seed):
+        generator = torch.Generator().manual_seed(seed)
+        x = torch.randn(num_samples, 1, generator=generator)
+        x = self.slope * action + (1 + self.growth * action) * x
+        x[torch.rand(num_samples, generator=generator) < self.lost] = torch.nan
+        return x
+
+    def log_joint(self, action):
+        density = torch.distributions.Normal(
+            self.slope * action, 1 + self.growth * action
+        ).log_prob(X)
+        return density + math.log((1 - self.lost) * self.probability)
+
+
+PAIR = [Gaussian(0.5, 0.0), Gaussian(0.5, 1.0)]
+THREE = [Gaussian(0.8, 0.0), Gaussian(0.15, 1.0), Gaussian(0.05, -1.0, growth=1.0)]
+LOSSY = [Gaussian(0.6, 0.0, lost=0.1), Gaussian(0.4, 1.0, lost=0.4)]
+
+
+def information(rivals):
+    p = torch.tensor([rival.probability for rival in rivals]).double()
+    lost = p * torch.tensor([rival.lost for rival in rivals])
+    gains = []
+    for a in ACTIONS[:, 0].double():
+        log_joint = torch.stack([rival.log_joint(a) for rival in rivals])
+        log_ratio = log_joint.log_softmax(0) - p.log()[:, None]
+        gain = (log_joint.exp() * log_ratio).sum() * (X[1] - X[0])
+        gains.append(gain + torch.special.xlogy(lost, lost / lost.sum() / p).nansum())
+    return torch.stack(gains)
+
+
+def estimate(rivals, num_samples, seed=0):
+    sampler = RivalSampler(rivals, ACTIONS, seed)
+    rows = sampler.draw(num_samples, torch.arange(len(ACTIONS)), replicates=False)
+    gain = ModelIndexGain(sampler.probability)(None, rows, None)
+    return gain.mean(1), gain.std(1) / gain.shape[1] ** 0.5
+
+
+@pytest.mark.parametrize("rivals", [PAIR, THREE, LOSSY], ids=["two", "three", "lossy"])
+def test_quadrature(rivals):
+    exact = information(rivals)
+    for num_samples in (400, 1_200):
+        gain, error = estimate(rivals, num_samples)
+        assert ((gain - exact).abs() < 3 * error + 0.01).all()
+    assert gain.argsort().tolist() == exact.argsort().tolist()
+
+
+def test_small_samples_do_not_exceed_the_information():
+    gains = torch.stack([estimate(THREE, 120, seed)[0] for seed in range(8)])
+    error = gains.std(0) / 8**0.5
+    assert (gains.mean(0) < information(THREE) + 3 * error).all()
+
+
+def test_equal_models_cannot_be_told_apart():
+    gain, error = estimate([Gaussian(0.5, 1.0), Gaussian(0.5, 1.0)], 600)
+    assert (gain.abs() < 3 * error + 0.01).all()
+
+
+def test_distinct_models_give_the_entropy_of_their_probabilities():
+    far = [Gaussian(0.8, 100.0), Gaussian(0.2, -100.0)]
+    entropy = -(0.8 * math.log(0.8) + 0.2 * math.log(0.2))
+    gain, _ = estimate(far, 400)
+    assert float(gain[-1]) == pytest.approx(entropy, abs=0.01)
+
+
+@dataclass
+class Trajectory:
+    """A correlated trajectory of 200 numbers, a small wave on it or not."""
+
+    probability: float
+    wave: float
+
+    def predict(self, action, num_samples, seed):
+        generator = torch.Generator().manual_seed(seed)
+        noise = torch.randn(200, num_samples, generator=generator).double()
+        return (self.wave * action * WAVE + (FACTOR @ noise).T)[..., None]
+
+
+TIMES = torch.linspace(0, 1, 200).double()
+WAVE = torch.sin(25 * TIMES)
+SPREAD = (-(TIMES[:, None] - TIMES).abs() / 0.3).exp() + 0.01 * torch.eye(200)
+FACTOR = torch.linalg.cholesky(SPREAD)
+
+
+def test_a_difference_hidden_in_a_long_trajectory():
+    """The wave is small beside the spread, in a direction that has little of it."""
+    rivals = [Trajectory(0.5, 0.0), Trajectory(0.5, 0.4)]
+    sampler = RivalSampler(rivals, ACTIONS[[0, 1, 2]], 0)
+    rows = sampler.draw(900, torch.arange(3), replicates=False)
+    assert rows.x.shape == (3, 900, 200, 1)
+    gain = ModelIndexGain(sampler.probability)(None, rows, None)
+    error = gain.std(1) / gain.shape[1] ** 0.5
+    distance = float((0.4 * WAVE) @ torch.linalg.solve(SPREAD, 0.4 * WAVE)) ** 0.5
+    exact = []
+    for a in (0.0, 0.5, 1.0):  # one discriminating number, N(+-, 1)
+        pair = [Gaussian(0.5, 0.0), Gaussian(0.5, distance * a)]
+        log_joint = torch.stack([r.log_joint(torch.tensor(1.0)) for r in pair])
+        ratio = log_joint.log_softmax(0) + math.log(2)
+        exact.append(float((log_joint.exp() * ratio).sum() * (X[1] - X[0])))
+    exact = torch.tensor(exact)
+    assert (gain.mean(1) <= exact + 3 * error).all()
+    assert (gain.mean(1) > exact - 0.1 - 3 * error).all()
+
+
+def test_the_designer_chooses_by_it():
+    designer = InformationGainDesigner(DiscreteActions(ACTIONS), num_samples=400)
+    design = designer.select(LOSSY, target="model", seed=0)
+    assert design.action.tolist() == [2.0]
+    assert design.estimator == "ModelIndexGain"
+    assert design.bound == "lower"
+    distance = (design.expected_information_gain - information(LOSSY)).abs()
+    assert (distance < 3 * design.standard_error + 0.02).all()
+    assert ((design.probability_valid - 0.75).abs() < 0.1).all()  # of both alike
+    assert design.num_simulations <= 1_600
+    again = designer.select(LOSSY, target="model", seed=0)
+    assert torch.equal(
+        design.expected_information_gain, again.expected_information_gain
+    )
+
+
+@dataclass
+class Mixed:
+    """A predictive of 60 posterior draws' means, drawn again and again, and noise."""
+
+    probability: float
+    center: float
+    spread: float
+    noise: float = 1.0
+
+    def predict_mean(self, action, num_samples, seed):
+        generator = torch.Generator().manual_seed(seed)
+        mean = self.center + self.spread * torch.randn(60, generator=generator)
+        mean = mean[torch.randint(60, (num_samples,), generator=generator)]
+        mean = (mean * action)[:, None]
+        return mean, torch.full_like(mean, self.noise)
+
+    def predict(self, action, num_samples, seed):
+        mean, sd = self.predict_mean(action, num_samples, seed)
+        generator = torch.Generator().manual_seed(seed + 1)
+        return mean + sd * torch.randn(num_samples, 1, generator=generator)
+
+
+class Blind:
+    """The same outcomes, of which nothing is known."""
+
+    def __init__(self, rival):
+        self.probability, self.predict = rival.probability, rival.predict
+
+
+def test_draws_that_stand_for_the_same_parameters_tell_nothing_by_it():
+    """Two posteriors of few draws, far apart: each outcome is near one draw."""
+    rivals = [Mixed(0.5, 0.0, 50.0, 0.01)] * 2
+    gains = torch.stack([estimate(rivals, 400, seed)[0] for seed in range(4)])
+    error = gains.std(0) / 4**0.5
+    assert (gains.mean(0) < 3 * error + 0.02).all()
+
+
+def test_known_noise_makes_the_bound_tighter():
+    """Two classes of means that interleave, apart by many times the noise."""
+
+    class Comb(Mixed):
+        def predict_mean(self, action, num_samples, seed):
+            generator = torch.Generator().manual_seed(seed)
+            tooth = torch.randint(4, (num_samples, 1), generator=generator)
+            jitter = 0.1 * torch.randn(num_samples, 1, generator=generator)
+            mean = (tooth + self.center) * 20.0 * action + jitter
+            return mean, torch.ones_like(mean)
+
+    rivals = [Comb(0.5, 0.0, 0.0), Comb(0.5, 0.5, 0.0)]
+    known, error = estimate(rivals, 160)
+    blind, _ = estimate([Blind(rival) for rival in rivals], 160)
+    assert float(known[-1]) > math.log(2) - 0.15
+    assert float(known[-1]) < math.log(2) + 1e-9
+    assert float(known[-1]) > float(blind[-1]) + 3 * float(error[-1])
+
+
+def test_kernels_are_densities():
+    generator = torch.Generator().manual_seed(0)
+    mean = 3 * torch.randn(40, 1, generator=generator).double()
+    sd = torch.rand(40, 1, generator=generator).double() + 0.5
+    label = torch.arange(40) % 2
+    members = noise_members(mean, sd, label, torch.ones(2).bool())
+    for member in members:
+        mass = torch.trapezoid(member(X[:, None]).exp(), X, dim=0)
+        assert mass.tolist() == pytest.approx([1.0, 1.0], abs=1e-4)
+
+
+def test_errors():
+    with pytest.raises(ValueError, match="expected two or more rivals"):
+        RivalSampler(PAIR[:1], ACTIONS, 0)
+    with pytest.raises(ValueError, match=r"add up to 1; got \[0.5, 0.9\]"):
+        RivalSampler([Gaussian(0.5, 0.0), Gaussian(0.9, 1.0)], ACTIONS, 0)
+    designer = InformationGainDesigner(DiscreteActions(ACTIONS), num_samples=40)
+    with pytest.raises(ValueError, match="expected a sequence of rivals"):
+        designer.select(None, target="model")
+    pair = [Gaussian(0.5, 0.0), Trajectory(0.5, 0.0)]
+    with pytest.raises(ValueError, match="expected outcomes of one shape"):
+        designer.select(pair, target="model", seed=0)
+
+    class Short(Gaussian):
+        def predict(self, action, num_samples, seed):
+            return torch.zeros(1, 1)
+
+    with pytest.raises(ValueError, match=r"expected 10 outcomes from rival 1; got"):
+        designer.select([PAIR[0], Short(0.5, 0.0)], target="model", seed=0)
+
+    class Bare(Mixed):
+        def predict_mean(self, action, num_samples, seed):
+            return torch.zeros(num_samples), torch.ones(num_samples)
+
+    with pytest.raises(ValueError, match="expected means and deviations of shape"):
+        designer.select([Bare(0.5, 0.0, 1.0)] * 2, target="model", seed=0)

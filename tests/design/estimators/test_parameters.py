@@ -1,0 +1,135 @@
+"""Information about some of the parameters, against the linear-Gaussian closed form.
+
+The estimate is a lower bound: it may not exceed the exact value by more than three
+standard errors, and must reach it within .15 nat.
+"""
+
+import math
+
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch.distributions import MultivariateNormal
+
+from sbi_active.design import CandidateSimulations
+from sbi_active.design.estimators.densities import cross_fit, patterns_of_numbers
+from sbi_active.design.estimators.posterior import NormalScores, ParameterGain
+
+COVARIANCE = torch.tensor([[1.0, 0.6, 0.0], [0.6, 1.0, 0.0], [0.0, 0.0, 1.0]])
+BELIEF = MultivariateNormal(torch.zeros(3), COVARIANCE)
+MIX = torch.tensor([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5]])  # x = a MIX theta + N(0, I)
+ACTIONS = torch.tensor([[0.0], [0.5], [2.0], [20.0]])
+SLACK = 0.15
+
+
+def simulations(n=600, seed=0):
+    torch.manual_seed(seed)
+    theta = BELIEF.sample((n,))
+    x = ACTIONS[:, None] * (theta @ MIX.T) + torch.randn(len(ACTIONS), n, 2)
+    return CandidateSimulations(theta, ACTIONS, x)
+
+
+def information(index):
+    gains = []
+    for a in ACTIONS[:, 0]:
+        spread = a**2 * MIX @ COVARIANCE @ MIX.T + torch.eye(2)
+        cross = a * COVARIANCE[index] @ MIX.T
+        prior = COVARIANCE[index][:, index]
+        posterior = prior - cross @ torch.linalg.solve(spread, cross.T)
+        gains.append(0.5 * (torch.logdet(prior) - torch.logdet(posterior)))
+    return torch.stack(gains).double()
+
+
+def assert_lower_bound(gain, exact, slack=SLACK):
+    error = gain.std(1) / gain.shape[1] ** 0.5
+    assert (
+        gain.mean(1) < exact + 3 * error + 0.01
+    ).all()  # .01: the marginal's entropy
+    assert (gain.mean(1) > exact - slack - 3 * error).all()
+
+
+@pytest.mark.parametrize(
+    "index", [[0], [2], [0, 1], pytest.param([1, 2], marks=pytest.mark.slow)]
+)
+def test_the_closed_form(index):
+    gain = ParameterGain(index)(None, simulations(), BELIEF)
+    exact = information(index)
+    assert_lower_bound(gain, exact)
+    mean = gain.mean(1)
+    assert abs(float(mean[0])) < 0.05
+    assert mean.argsort().tolist() == exact.argsort().tolist()
+
+
+def test_a_bounded_belief_and_a_curve():
+    """x = theta_1^2 + noise under a uniform belief, by quadrature; theta_2 is idle."""
+    torch.manual_seed(0)
+    belief = BoxUniform(-torch.ones(2), torch.ones(2))
+    theta = belief.sample((800,))
+    sd = 0.05
+    x = (theta[:, :1] ** 2 + sd * torch.randn(800, 1))[None]
+    rows = CandidateSimulations(theta, torch.zeros(1, 1), x)
+    grid = torch.linspace(-1, 1, 2_001).double()
+    outcome = torch.linspace(-0.4, 1.4, 3_001).double()
+    density = torch.distributions.Normal(grid**2, sd).log_prob(outcome[:, None])
+    density = density.exp().mean(1)
+    entropy = -torch.special.xlogy(density, density).sum() * 0.0006
+    exact = entropy - 0.5 * (math.log(2 * math.pi) + 1) - math.log(sd)
+    # two modes, +- the root: a mixture is needed
+    assert_lower_bound(ParameterGain([0])(None, rows, belief), exact[None], 0.25)
+    idle = ParameterGain([1])(None, rows, belief).mean()
+    assert abs(float(idle)) < 0.05
+
+
+def test_invalid_outcomes_count():
+    """Nothing else than a validity that is the sign of theta: log 2."""
+    torch.manual_seed(0)
+    belief = MultivariateNormal(torch.zeros(2), torch.eye(2))
+    theta = belief.sample((800,))
+    x = torch.randn(1, 800, 1)
+    x[0, theta[:, 0] > 0] = torch.nan
+    missing = torch.rand(1, 800) < 0.1
+    x[missing] = torch.nan
+    rows = CandidateSimulations(theta, torch.zeros(1, 1), x, missing=missing)
+    gain = ParameterGain([0])(None, rows, belief)
+    assert torch.equal(gain.isnan(), missing)
+    known = gain[~missing]
+    error = float(known.std() / len(known) ** 0.5)
+    exact = math.log(2)
+    # a half normal is not a mixture of few Gaussians: some slack
+    assert exact - SLACK < float(known.mean()) < exact + 3 * error
+
+
+def test_normal_scores():
+    uniform = torch.rand(20_000, generator=torch.Generator().manual_seed(0)).double()
+    scores = NormalScores(uniform)
+    u = scores(uniform)
+    assert float(u.mean()) == pytest.approx(0.0, abs=4 / 20_000**0.5)
+    assert float(u.std()) == pytest.approx(1.0, abs=0.02)
+    assert (scores(torch.tensor([0.1, 0.5, 0.9]).double()).diff() > 0).all()
+    outside = scores(torch.tensor([-5.0, 5.0]).double())
+    assert outside.isfinite().all()
+    normal = torch.special.ndtri(uniform.clamp(1e-6, 1 - 1e-6))
+    assert NormalScores(normal).curve is None  # left as it is
+
+
+def test_rows_are_scored_without_themselves():
+    """A member that memorizes its training rows gains nothing."""
+
+    def memorizes(train, test):
+        assert not set(train.tolist()) & set(test.tolist())
+        return torch.stack([torch.zeros(len(test)), torch.ones(len(test))]).double()
+
+    score = cross_fit(memorizes, torch.arange(10), torch.ones(10))
+    assert score.tolist() == [1.0] * 10  # the better member, everywhere
+    groups = patterns_of_numbers(
+        torch.tensor([[1.0, torch.nan]] * 3 + [[1.0, 1.0]] * 3 + [[torch.nan] * 2]),
+        torch.ones(7).bool(), 2,
+    )  # fmt: skip
+    found = sorted((r.tolist(), c.tolist()) for r, c in groups)
+    assert found == [([0, 1, 2], [0]), ([3, 4, 5], [0, 1]), ([6], [])]
+
+
+def test_errors():
+    for index in ([], [1, 1]):
+        with pytest.raises(ValueError, match="expected one or more different"):
+            ParameterGain(index)

@@ -1,0 +1,39 @@
+import pytest
+import torch
+
+from sbi_active.design import CandidateSimulations, PosteriorGain
+from tests.linear_gaussian import PRIOR, ExactModel, information, simulator
+
+
+def simulations(actions=(0.0, 1.0, 2.0), n=4_000, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    theta = torch.randn(n, 2, generator=generator)
+    action = torch.tensor(actions)[:, None]
+    x = torch.stack([simulator(theta, a.expand(n, 1)) for a in action])
+    return CandidateSimulations(theta, action, x)
+
+
+def test_the_exact_posterior_gives_the_information():
+    rows = simulations()
+    gain = PosteriorGain()(ExactModel(), rows, PRIOR)
+    error = gain.std(1) / gain.shape[1] ** 0.5
+    distance = (gain.mean(1) - information(rows.action)).abs()
+    assert (distance <= 4 * error + 1e-6).all()
+
+
+def test_a_model_of_the_wrong_spread_loses_what_the_divergence_says():
+    """E U = I - KL(N(m, s) || N(m, (k s)^2)) in each of two dimensions."""
+    rows = simulations()
+    spread = torch.tensor(2.0)
+    gain = PosteriorGain()(ExactModel(spread=2.0), rows, PRIOR)
+    loss = 2 * (spread.log() + 0.5 / spread**2 - 0.5)
+    error = gain.std(1) / gain.shape[1] ** 0.5
+    distance = (gain.mean(1) - (information(rows.action) - loss)).abs()
+    assert (distance < 4 * error).all()
+
+
+def test_wrong_shape():
+    rows = simulations(n=5)
+    wrong = CandidateSimulations(rows.theta[:4], rows.action, rows.x)
+    with pytest.raises(ValueError, match=r"expected x of shape \(3, 4, \*x_shape\)"):
+        PosteriorGain()(ExactModel(), wrong, PRIOR)

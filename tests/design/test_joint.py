@@ -1,0 +1,63 @@
+"""Outcomes of several actions together, where information has a closed form."""
+
+import math
+
+import pytest
+import torch
+from torch.distributions import MultivariateNormal, Normal
+
+from sbi_active import GaussianNoise, StudentTNoise
+from sbi_active.design import CandidateSimulations, LikelihoodGain
+from sbi_active.design.outcomes import (
+    conditional_gain,
+    join_outcomes,
+)
+
+PRIOR = MultivariateNormal(torch.zeros(1), torch.eye(1))
+
+
+class Slope:
+    """x = action * theta + e with e ~ N(0, 1), as an exact likelihood."""
+
+    exact_likelihood = True
+
+    def log_likelihood(self, x, theta, action):
+        return Normal(action * theta, 1.0).log_prob(x).sum(-1)
+
+
+def simulated(action, theta, seed, noise=None, missing=None):
+    generator = torch.Generator().manual_seed(seed)
+    mean = action[:, None] * theta
+    x = mean + torch.randn(mean.shape, generator=generator)
+    return CandidateSimulations(theta, action, x, mean, noise, missing=missing)
+
+
+def test_a_row_is_missing_where_any_of_its_outcomes_is():
+    theta, action = torch.zeros(3, 1), torch.tensor([[1.0], [2.0]])
+    lost = torch.tensor([[True, False, False], [False, False, False]])
+    both = simulated(action, theta, 0, missing=lost)
+    joint = join_outcomes(both, simulated(action, theta, 1, missing=lost.flip(1)))
+    assert joint.missing.tolist() == [[True, False, True], [False, False, True]]
+
+
+@pytest.mark.parametrize("noise", [GaussianNoise(2.0), StudentTNoise(2.0, 3.0)])
+def test_the_noise_of_joint_outcomes_is_independent(noise):
+    theta, action = torch.zeros(4, 1), torch.tensor([[1.0], [2.0]])
+    joint = join_outcomes(
+        simulated(action, theta, 0, noise), simulated(action, theta, 1, noise)
+    )
+    x, mean = joint.x[0], joint.mean[0]
+    parts = [noise.log_prob(x[:, k], mean[:, k]) for k in range(3)]
+    assert torch.allclose(joint.noise.log_prob(x, mean), sum(parts))
+
+
+def test_what_an_action_tells_beyond_others_has_a_closed_form():
+    generator = torch.Generator().manual_seed(0)
+    theta = torch.randn(6_000, 1, generator=generator)
+    action, others = torch.tensor([[0.5], [2.0]]), torch.tensor([[1.0], [1.5]])
+    joint = join_outcomes(simulated(action, theta, 1), simulated(others, theta, 2))
+    estimator = LikelihoodGain(num_contrastive=2_000)
+    gain = conditional_gain(estimator, Slope(), joint, PRIOR, action_dim=1)
+    known = 1 + float(others.square().sum())
+    exact = [0.5 * math.log1p(a**2 / known) for a in (0.5, 2.0)]
+    assert gain.mean(1).tolist() == pytest.approx(exact, abs=0.04)

@@ -1,0 +1,97 @@
+"""Outcomes with many numbers, compared by a few summaries of them."""
+
+import pytest
+import torch
+from torch.distributions import MultivariateNormal
+
+from sbi_active import (
+    AutocorrelatedNoise,
+    DiscreteActions,
+    GaussianNoise,
+    InformationGainDesigner,
+    SimulatorModel,
+    StudentTNoise,
+)
+from sbi_active.design.outcomes import LinearSummaries
+from sbi_active.design.sampler import CandidateSampler
+from sbi_active.seeding import forked_generators
+from sbi_active.simulation.noise.whitening import whitened
+
+NUM = 300
+TIMES = torch.linspace(0.1, 1.0, NUM)
+BELIEF = MultivariateNormal(torch.zeros(2), torch.eye(2))
+BASIS = torch.stack([TIMES, torch.sin(8 * TIMES)])
+
+
+def line(theta, action):
+    return action * (theta @ BASIS)
+
+
+def exact(action: float, sd: float) -> float:
+    precision = torch.eye(2) + (action / sd) ** 2 * BASIS @ BASIS.T
+    return 0.5 * float(torch.logdet(precision.double()))
+
+
+@pytest.mark.parametrize("num_samples", [1_000])
+def test_a_linear_model_tells_what_it_tells_in_closed_form(num_samples: int):
+    model = SimulatorModel(line, noise=GaussianNoise(2.0))
+    actions = DiscreteActions([0.2, 1.0, 3.0])
+    designer = InformationGainDesigner(actions, num_samples=num_samples)
+    design = designer.select(None, model, belief=BELIEF, seed=0)
+    error = design.standard_error.nan_to_num(0.0)
+    for k, action in enumerate((0.2, 1.0, 3.0)):
+        gain = float(design.expected_information_gain[k])
+        assert abs(gain - exact(action, 2.0)) < 4 * float(error[k]) + 0.03
+    assert float(design.action) == 3.0
+    assert any(
+        "32 linear summaries stand for the 300 numbers" in n for n in design.notes
+    )
+
+
+@pytest.mark.parametrize(
+    "noise", [GaussianNoise(0.5), AutocorrelatedNoise(0.5, 0.2).at(TIMES)]
+)
+def test_differences_of_outcomes_keep_their_length_in_the_noise(noise):
+    with forked_generators(1):
+        theta = torch.randn(400, 2)
+    mean = line(theta, torch.tensor([[1.5]]))
+    summaries = LinearSummaries(noise)
+    short = summaries(torch.tensor([1.5]), mean)
+    whole = whitened(noise, mean)
+    assert short.shape == (400, 32)
+    torch.testing.assert_close(
+        torch.cdist(short, short), torch.cdist(whole, whole), rtol=1e-4, atol=1e-2
+    )
+    assert summaries.left_out < 1e-3
+
+
+def test_what_is_left_out_is_said():
+    # Each draw bends a number of its own: no few directions have them all.
+    summaries = LinearSummaries(GaussianNoise(1.0), num_kept=4)
+    mean = torch.eye(100).repeat(3, 1)
+    summaries(torch.zeros(1), mean)
+    assert summaries.left_out == pytest.approx(0.48, abs=0.03)
+
+
+def test_an_outcome_that_lacks_numbers_has_no_summary():
+    summaries = LinearSummaries(GaussianNoise(1.0))
+    mean = torch.randn(50, NUM, generator=torch.Generator().manual_seed(0))
+    mean[3], mean[7, 5] = torch.nan, torch.nan
+    short = summaries(torch.zeros(1), mean)
+    lost = short.isnan().all(1)
+    assert torch.nonzero(lost)[:, 0].tolist() == [3, 7]
+    assert bool(short[~lost].isfinite().all())
+
+
+@pytest.mark.parametrize("noise", [StudentTNoise(1.0, df=4.0), None])
+def test_other_noise_keeps_all_numbers(noise):
+    def noisy(theta, action):
+        return line(theta, action) + torch.randn(len(theta), NUM)
+
+    model = noisy if noise is None else SimulatorModel(line, noise=noise)
+    sampler = CandidateSampler(
+        model, BELIEF, torch.tensor([[1.0]]), seed=0, most_numbers=200
+    )
+    assert sampler.summaries is None
+    drawn = sampler.draw(8, torch.tensor([0]), replicates=False)
+    assert drawn.x.shape == (1, 8, NUM)
