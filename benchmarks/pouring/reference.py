@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from sbi_active.inference.emulation.statistics import learned_statistic
+from sbi_active.inference.emulation.summaries import learned_statistic
 
 __all__ = ["abc_log_prob"]
 

@@ -24,7 +24,7 @@ from benchmarks.robustness.simulations import (
 )
 from sbi_active import BoxActions, DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Trials
-from sbi_active.inference.rounds import action_rows, outcome_rows
+from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 from sbi_active.simulation import (
     Workers,
     simulate,

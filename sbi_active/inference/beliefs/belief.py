@@ -18,7 +18,7 @@ from sbi_active.display.table import Table
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.messages import warn
 from sbi_active.seeding import forked_generators
-from sbi_active.support import support_of, within_support
+from sbi_active.support import parameter_dim, support_of, within_support
 
 #: Draws behind moments and a chained belief's normalizer: a hundredth of a deviation.
 NUM_DRAWS = 20_000
@@ -26,6 +26,11 @@ NUM_DRAWS = 20_000
 MINIMAL_ACCEPTANCE = 1e-3
 NUM_SHOWN = 2_000  # draws behind the page of a notebook
 NUM_COMPARED = 5_000  # draws behind a realized information gain
+#: Nats by which the network may lie beside the refined belief before it is said.
+TOLERANCE = 0.5
+#: No density in float32 is further below another than this.
+FLOOR = -60.0
+NUM_BESIDE = 2_000  # of each belief, whose mean is then known to .02 nat a parameter
 
 
 class Belief(Distribution, ABC):
@@ -297,7 +302,66 @@ def names_of(belief: Distribution, num: int) -> list[str]:
     return [f"theta_{i + 1}" for i in range(num)] if names is None else [*names]
 
 
-def parameter_dim(prior: Distribution) -> int:
-    """Return the number of parameters, without drawing from the prior."""
-    shape = prior.event_shape or prior.batch_shape
-    return shape[-1] if shape else 1
+class ParticleDraws(Distribution):
+    """Parameters out of a finite set (p, theta_dim), each as likely.
+
+    It has no density, only probabilities, so it is a belief to design with and none to
+    train under.
+    """
+
+    arg_constraints = {}  # pyright: ignore
+
+    def __init__(self, particles: Tensor) -> None:
+        super().__init__(
+            torch.Size(), torch.Size([particles.shape[1]]), validate_args=False
+        )
+        self.particles = particles
+
+    def sample(self, sample_shape: Sequence[int] = torch.Size()) -> Tensor:
+        """Return draws, shape (*sample_shape, theta_dim)."""
+        return self.particles[torch.randint(len(self.particles), tuple(sample_shape))]
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """Return the log probability of each row, shape (...); -inf off the set."""
+        among = (value[..., None, :] == self.particles).all(-1).any(-1)
+        return torch.where(among, 1 / len(self.particles), 0.0).log()
+
+
+def compare(refined: Belief, chained: ChainedBelief) -> None:
+    r"""Add figures on the network's belief to the refined belief's diagnostics.
+
+    A network can pass a calibration test and be nats blunter than the data allow, since
+    calibration sees no sharpness. Against the refined belief r, with c the chained one:
+
+    .. math::
+        \mathrm{loss} = E_r[\log r(\theta) - \log c(\theta)], \qquad
+        \mathrm{bluntness} = H(c) - H(r).
+
+    A loss with a positive bluntness is under-confidence; a loss without it is
+    overconfidence or a wrong place. The loss is bounded by 60 nats; beyond half a nat
+    it is a warning.
+    """
+    with forked_generators(0, "compare"):
+        draws = refined.sample((NUM_BESIDE,))
+        chained_draws = chained.sample((NUM_BESIDE,))
+    refined_score = float(refined.log_prob(draws).double().mean())
+    chained_log_prob = chained.log_prob(draws).double()
+    score = float(chained_log_prob.clamp_min(refined_score + FLOOR).mean())
+    entropy = -float(chained.log_prob(chained_draws).double().mean())
+    loss, bluntness = refined_score - score, entropy + refined_score
+    refined.diagnostics = refined.diagnostics.extended(
+        refined_log_score=refined_score,
+        chained_log_score=score,
+        chained_loss=loss,
+        chained_bluntness=bluntness,
+    )
+    if loss <= TOLERANCE:
+        return
+    kind = (
+        f"under-confident, {bluntness:.1f} nats blunter than the refined belief"
+        if bluntness > 0.5 * loss
+        else f"overconfident or misplaced, {loss:.1f} nats behind the refined belief"
+    )
+    refined.diagnostics = refined.diagnostics.extended(
+        network_warnings=((f"SA122 the amortized network is {kind}"),)
+    )

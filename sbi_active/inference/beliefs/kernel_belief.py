@@ -10,7 +10,7 @@ from torch.distributions import Distribution
 
 from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
-from sbi_active.inference.sampling.bandwidth import scott
+from sbi_active.inference.sampling.weights import scott
 from sbi_active.seeding import forked_generators
 from sbi_active.support import within_support
 

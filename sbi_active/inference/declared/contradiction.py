@@ -33,7 +33,7 @@ from scipy.stats import chi2
 from torch import Tensor
 
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
-from sbi_active.inference.engine.simulated_likelihood import SimulatedLikelihood
+from sbi_active.inference.engine.potential import SimulatedLikelihood
 from sbi_active.simulation.noise.whitening import whitened
 
 Array = NDArray[Any]

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.engine import Fit, Settings, SimulatedPotential
-from sbi_active.inference.engine.simulated_likelihood import SimulatedLikelihood
+from sbi_active.inference.engine.potential import SimulatedLikelihood
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.noise.whitening import is_known_gaussian
 

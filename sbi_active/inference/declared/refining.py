@@ -33,15 +33,18 @@ from sbi_active.inference.engine import (
     search,
 )
 from sbi_active.inference.engine.pool import Pool
-from sbi_active.inference.engine.potential import STEP, unchanged
-from sbi_active.inference.engine.simulated_likelihood import (
+from sbi_active.inference.engine.potential import (
+    STEP,
     MeanTable,
     SimulatedLikelihood,
     declares_noise,
+    unchanged,
 )
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
-from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
+from sbi_active.inference.sampling.coordinates import (
+    NormalCoordinates,
+    PriorCoordinates,
+)
 from sbi_active.inference.sampling.weights import normalized, systematic
 from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators

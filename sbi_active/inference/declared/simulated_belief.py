@@ -13,9 +13,9 @@ from torch.distributions import Distribution
 from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.engine import Fit, SimulatedPotential
 from sbi_active.inference.engine.pool import Pool
-from sbi_active.inference.engine.simulated_likelihood import MeanTable
+from sbi_active.inference.engine.potential import MeanTable
+from sbi_active.inference.sampling.coordinates import NormalCoordinates
 from sbi_active.inference.sampling.gaussian_mixture import GaussianMixture
-from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
 from sbi_active.inference.sampling.student_mixture import NormalMixture
 from sbi_active.inference.sampling.weights import systematic
 

@@ -19,12 +19,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sbi_active.inference.emulation.gain import mixture_gain
-from sbi_active.inference.emulation.likelihood import correlation_root
+from sbi_active.inference.emulation.likelihood import correlation_root, mixture_gain
 from sbi_active.inference.emulation.pool import Pool
 from sbi_active.inference.emulation.processes import nearest
-from sbi_active.inference.emulation.statistics import FEW, learned_statistic
-from sbi_active.inference.emulation.summaries import Summary
+from sbi_active.inference.emulation.summaries import FEW, Summary, learned_statistic
 from sbi_active.inference.regression.process import GaussianProcess, ProcessSettings
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.seeding import derive_seed

@@ -13,20 +13,18 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.inference.declared.settings import RefinementOptions
-from sbi_active.inference.emulation.gain import mixture_gain
 from sbi_active.inference.emulation.likelihood import (
     PooledLikelihood,
     TrialLikelihood,
     correlation_root,
+    mixture_gain,
 )
 from sbi_active.inference.emulation.pool import Pool
-from sbi_active.inference.emulation.statistics import learned_statistic
-from sbi_active.inference.emulation.summaries import Summary
+from sbi_active.inference.emulation.summaries import Summary, learned_statistic
 from sbi_active.inference.engine.importance import fitted
 from sbi_active.inference.engine.learned import CHEAP
 from sbi_active.inference.engine.pool import PriorDraws
-from sbi_active.inference.refinement.course import Stage
-from sbi_active.inference.refinement.settings import StageSettings
+from sbi_active.inference.refinement.course import Stage, StageSettings
 from sbi_active.inference.refinement.stages import Stages
 from sbi_active.inference.regression.outcomes import TrialOutcome
 from sbi_active.inference.regression.process import (

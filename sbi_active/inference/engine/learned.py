@@ -8,12 +8,14 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.inference.engine.fit import Fit
 from sbi_active.inference.engine.importance import defended
 from sbi_active.inference.engine.infer import infer
+from sbi_active.inference.engine.pool import Fit
 from sbi_active.inference.engine.settings import Settings
-from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
+from sbi_active.inference.sampling.coordinates import (
+    NormalCoordinates,
+    PriorCoordinates,
+)
 from sbi_active.inference.sampling.student_mixture import Proposal
 from sbi_active.inference.sampling.weights import normalized
 

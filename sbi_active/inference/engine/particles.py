@@ -13,9 +13,8 @@ from sbi_active.inference.engine.bounded import (
     LineMoves,
     led_between,
 )
-from sbi_active.inference.engine.fit import Fit
 from sbi_active.inference.engine.importance import fitted
-from sbi_active.inference.engine.pool import Pool
+from sbi_active.inference.engine.pool import Fit, Pool
 from sbi_active.inference.engine.potential import Potential
 from sbi_active.inference.engine.search import WIDER, Found
 from sbi_active.inference.engine.settings import Settings

@@ -14,19 +14,23 @@ from torch.distributions import Distribution
 
 from sbi_active.inference.declared.contradiction import Contradiction, compared
 from sbi_active.inference.declared.settings import RefinementOptions
-from sbi_active.inference.refinement.course import UNSETTLED, Stage
-from sbi_active.inference.refinement.learned_belief import LearnedBelief
-from sbi_active.inference.refinement.outcome_checks import check_outcomes
-from sbi_active.inference.refinement.regression_error import expected_error, widened
-from sbi_active.inference.refinement.residuals import (
+from sbi_active.inference.refinement.checks import (
+    check_outcomes,
     has_hard_edges,
     noise_shape,
+    tail_probability,
     trial_correlation,
 )
-from sbi_active.inference.refinement.settings import StageSettings
+from sbi_active.inference.refinement.course import (
+    LIVE,
+    UNSETTLED,
+    Doubt,
+    Stage,
+    StageSettings,
+)
+from sbi_active.inference.refinement.learned_belief import LearnedBelief
+from sbi_active.inference.refinement.regression_error import expected_error, widened
 from sbi_active.inference.refinement.stages import Stages
-from sbi_active.inference.refinement.tails import tail_probability
-from sbi_active.inference.refinement.trust import LIVE, Doubt
 from sbi_active.inference.regression.histories import Histories, HistoryRecord
 from sbi_active.inference.regression.regions import around, cover, whole_space
 from sbi_active.inference.regression.surrogate import Surrogate, fewest_rows

@@ -11,15 +11,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sbi_active.inference.regression.noise_shape import ShapeSettings
 from sbi_active.inference.regression.outcomes import outcomes_of
 from sbi_active.inference.regression.regions import Region
-from sbi_active.inference.regression.rows import rows_of
+from sbi_active.inference.regression.residuals import ShapeSettings
 from sbi_active.inference.regression.surrogate import (
     LocalRegression,
     estimate_noise,
     fewest_rows,
 )
+from sbi_active.inference.rounds.rows import rows_of
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation.outcomes import (

@@ -37,8 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, log_expit
 
-from sbi_active.inference.regression.basis import Basis
-from sbi_active.inference.regression.regions import Region
+from sbi_active.inference.regression.regions import Basis, Region
 
 Array = NDArray[Any]
 

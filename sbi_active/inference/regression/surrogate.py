@@ -28,12 +28,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, f
 
-from sbi_active.inference.regression.basis import Basis
-from sbi_active.inference.regression.noise_shape import NoiseShape, ShapeSettings
 from sbi_active.inference.regression.outcomes import TrialOutcome
-from sbi_active.inference.regression.regions import Region, nearest_region
-from sbi_active.inference.regression.residual_covariance import (
+from sbi_active.inference.regression.regions import Basis, Region, nearest_region
+from sbi_active.inference.regression.residuals import (
+    NoiseShape,
     ResidualCovariance,
+    ShapeSettings,
     alike,
 )
 from sbi_active.inference.sampling.coordinates import PriorCoordinates

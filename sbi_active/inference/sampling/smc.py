@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.inference.sampling.student_mixture import Proposal, log_normal
-from sbi_active.inference.sampling.tempering import largest_power
 from sbi_active.inference.sampling.weights import (
     effective_sample_size,
+    largest_power,
     log_sum_exp,
     normalized,
     systematic,

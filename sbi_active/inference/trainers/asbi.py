@@ -18,21 +18,25 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import Self
 
-from sbi_active.inference.beliefs.belief import Belief, ChainedBelief, UnchangedBelief
-from sbi_active.inference.beliefs.comparison import compare
+from sbi_active.inference.beliefs.belief import (
+    Belief,
+    ChainedBelief,
+    UnchangedBelief,
+    compare,
+)
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.models.posterior import ActionPosterior
-from sbi_active.inference.networks.mixture_density import MixtureDensity
-from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
-from sbi_active.inference.networks.training import (
+from sbi_active.inference.networks.mixture_density import (
+    MixtureDensity,
     TrainingRecord,
     train_mixture_density,
 )
+from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.refinement.refining import refine
 from sbi_active.inference.rounds.condition import pack
 from sbi_active.inference.rounds.rows import Observation
-from sbi_active.inference.rounds.sbi_arguments import require_likelihood_loss, takes
+from sbi_active.inference.trainers.action_rounds import require_likelihood_loss, takes
 from sbi_active.inference.trainers.base import Told
 from sbi_active.inference.trainers.mixture_rounds import MixtureRounds, training_budget
 from sbi_active.messages import warn

@@ -19,13 +19,13 @@ from sbi_active.inference.beliefs.kernel_belief import KernelBelief
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.models.factors import ActionFactor
-from sbi_active.inference.products.belief import sample_product
-from sbi_active.inference.products.product import (
+from sbi_active.inference.models.product import (
     Product,
     TrainedRegion,
+    sample_product,
     widened,
 )
-from sbi_active.inference.refinement.settings import StageSettings
+from sbi_active.inference.refinement.course import StageSettings
 from sbi_active.inference.rounds.rows import Observation, require_whole
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.trainers.action_rounds import ActionRounds

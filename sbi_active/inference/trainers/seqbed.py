@@ -17,8 +17,7 @@ from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.beliefs.kernel_belief import KernelBelief
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.declared.settings import RefinementOptions
-from sbi_active.inference.models.lfire import LFIRE
-from sbi_active.inference.models.lfire_model import LFIREModel, fit_log_ratios
+from sbi_active.inference.models.lfire import LFIRE, LFIREModel, fit_log_ratios
 from sbi_active.inference.rounds.rows import (
     Observation,
     RoundRows,

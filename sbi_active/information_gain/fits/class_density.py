@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from sbi_active.inference.sampling.bandwidth import silverman
+from sbi_active.inference.sampling.weights import silverman
 from sbi_active.information_gain.fits.reduction import Reduction
 
 TEMPERATURES = (1.0, 0.5)  # powers of a density, against too much confidence

@@ -20,7 +20,7 @@ import math
 import torch
 from torch import Tensor
 
-from sbi_active.inference.sampling.bandwidth import silverman
+from sbi_active.inference.sampling.weights import silverman
 from sbi_active.information_gain.fits.class_density import LogDensities
 
 #: Widths h, in those of Silverman's rule.

@@ -11,7 +11,7 @@ from sbi_active.criticism import AugmentedSimulator, Effect, Trials
 from sbi_active.criticism.evidence import RivalSet
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals import TrialSimulator
-from sbi_active.inference.sampling import log_sum_exp
+from sbi_active.inference.sampling.weights import log_sum_exp
 
 NOISE, JUMP = 0.1, 0.2
 PRIOR = BoxUniform(-2 * torch.ones(2), 2 * torch.ones(2))

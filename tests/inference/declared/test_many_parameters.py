@@ -9,14 +9,16 @@ from torch.distributions import Independent, LogNormal, MultivariateNormal, Norm
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.inference import refine
-from sbi_active.inference.declared import SimulatedBelief
+from sbi_active.inference.declared.simulated_belief import SimulatedBelief
 from sbi_active.inference.engine import SimulatedPotential, search
-from sbi_active.inference.engine.simulated_likelihood import (
+from sbi_active.inference.engine.potential import (
     MeanTable,
     SimulatedLikelihood,
 )
-from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
+from sbi_active.inference.sampling.coordinates import (
+    NormalCoordinates,
+    PriorCoordinates,
+)
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.workers.settings import IN_PROCESS
 from sbi_active.tasks import get_task

@@ -13,16 +13,18 @@ from sbi.utils import BoxUniform
 from torch import Tensor
 
 from sbi_active.inference import RefinementOptions, refine
-from sbi_active.inference.declared import SimulatedBelief
+from sbi_active.inference.declared.simulated_belief import SimulatedBelief
 from sbi_active.inference.engine import Settings, SimulatedPotential, infer, search
-from sbi_active.inference.engine.simulated_likelihood import (
+from sbi_active.inference.engine.potential import (
     MeanTable,
     SimulatedLikelihood,
     declares_noise,
 )
-from sbi_active.inference.refinement import LearnedBelief
-from sbi_active.inference.sampling import PriorCoordinates
-from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
+from sbi_active.inference.refinement.learned_belief import LearnedBelief
+from sbi_active.inference.sampling.coordinates import (
+    NormalCoordinates,
+    PriorCoordinates,
+)
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, MissingRowsWarning, SimulatorModel
 from sbi_active.simulation.workers.settings import IN_PROCESS

@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 
 from sbi_active.inference.engine.importance import pareto_shape
 from sbi_active.inference.engine.learned import LearnedPotential, learned_fit
-from sbi_active.inference.sampling import PriorCoordinates
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
 
 
 def likelihood_of(dim: int, log_likelihood: Any) -> Any:

@@ -6,8 +6,11 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from sbi_active.inference.engine import infer, search
-from sbi_active.inference.engine.importance import _largest_power
-from sbi_active.inference.engine.ridges import along_ridges, reweighted
+from sbi_active.inference.engine.importance import (
+    _largest_power,
+    along_ridges,
+    reweighted,
+)
 from sbi_active.inference.engine.settings import Settings
 from sbi_active.inference.sampling.weights import effective_sample_size
 from tests.inference.engine.potentials import Given

@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from sbi_active.inference import MixtureDensity
-from sbi_active.inference.networks import Baseline, Conditioning, PreparedLoss, local
-from sbi_active.inference.networks.baseline import precision_factor
+from sbi_active.inference.networks.baseline import Baseline, local, precision_factor
+from sbi_active.inference.networks.conditioning import Conditioning
+from sbi_active.inference.networks.mixture_network import PreparedLoss
 from sbi_active.tasks.numerical import NumericalTask
 from tests import linear_gaussian
 

@@ -4,7 +4,10 @@ import pytest
 import torch
 
 from sbi_active.inference import MixtureDensity
-from sbi_active.inference.networks import TrainingBudget, train_mixture_density
+from sbi_active.inference.networks.mixture_density import (
+    TrainingBudget,
+    train_mixture_density,
+)
 
 
 def network(dim=3, condition_dim=4, n=200, **settings):

@@ -5,14 +5,13 @@ import math
 import pytest
 import torch
 
-from sbi_active.inference.networks import (
+from sbi_active.inference.networks.action_scaling import (
     ActionScaling,
-    Baseline,
     Polynomials,
-    Response,
     exponents_of,
 )
-from sbi_active.inference.networks.baseline import precision_factor
+from sbi_active.inference.networks.baseline import Baseline, precision_factor
+from sbi_active.inference.networks.response import Response
 
 
 @pytest.mark.parametrize("shift", [0.0, -3.0], ids=["round 1", "sharp belief"])

@@ -14,7 +14,7 @@ from torch.distributions import (
 )
 
 from sbi_active.inference import RefinementOptions, refine
-from sbi_active.inference.refinement import LearnedBelief
+from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.seeding import forked_generators
 from sbi_active.tasks.numerical.exact import ExactPosterior
 from tests.inference.refinement.refined_worlds import BOX, draws, numerical, observe

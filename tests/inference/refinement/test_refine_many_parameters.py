@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from sbi_active.inference import RefinementOptions, refine
-from sbi_active.inference.rounds import UnexplainedOutcomeError
+from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.seeding import forked_generators
 
 

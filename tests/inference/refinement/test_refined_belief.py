@@ -7,8 +7,8 @@ import torch
 from sbi.utils import BoxUniform
 
 from sbi_active.inference.engine.learned import learned_fit
-from sbi_active.inference.refinement import LearnedBelief
-from sbi_active.inference.sampling import PriorCoordinates
+from sbi_active.inference.refinement.learned_belief import LearnedBelief
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
 
 
 def test_a_normalizer_that_fresh_draws_do_not_have_ends_in_resampling():

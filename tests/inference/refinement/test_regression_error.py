@@ -8,16 +8,15 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from sbi_active.inference.refinement import expected_error, widened
-from sbi_active.inference.regression import (
-    Histories,
+from sbi_active.inference.refinement.regression_error import expected_error, widened
+from sbi_active.inference.regression.histories import Histories
+from sbi_active.inference.regression.regions import Region, whole_space
+from sbi_active.inference.regression.surrogate import (
     LocalRegression,
-    Region,
     Surrogate,
     estimate_noise,
-    whole_space,
 )
-from sbi_active.inference.sampling import PriorCoordinates
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
 
 DIM = 3
 PRIOR = MultivariateNormal(torch.zeros(DIM), torch.eye(DIM))

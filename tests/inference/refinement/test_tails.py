@@ -7,13 +7,10 @@ from scipy.stats import binom, chi2
 from torch.distributions import MultivariateNormal
 
 from sbi_active.inference import RefinementOptions, refine
-from sbi_active.inference.refinement.tails import _exceedance, _held_out, _squares
-from sbi_active.inference.regression import (
-    LocalRegression,
-    estimate_noise,
-    surrogate,
-    whole_space,
-)
+from sbi_active.inference.refinement.checks import _exceedance, _held_out, _squares
+from sbi_active.inference.regression import surrogate
+from sbi_active.inference.regression.regions import whole_space
+from sbi_active.inference.regression.surrogate import LocalRegression, estimate_noise
 
 NUM_ROWS, NUM_TRIALS = 120, 2
 

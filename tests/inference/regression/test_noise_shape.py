@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from sbi_active.inference.regression.noise_shape import NoiseShape, ShapeSettings
+from sbi_active.inference.regression.residuals import (
+    NoiseShape,
+    ShapeSettings,
+)
 
 NUM = 800
 TRIAL = np.array([0, 0, 1, 1])

@@ -17,14 +17,14 @@ from torch.distributions import (
     Uniform,
 )
 
-from sbi_active.inference.regression import (
+from sbi_active.inference.regression.regions import (
     SPREAD,
     Region,
     cover,
     nearest_region,
     whole_space,
 )
-from sbi_active.inference.sampling import PriorCoordinates
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
 
 PRIORS = {
     "box": BoxUniform(torch.tensor([-5.0, 0.0]), torch.tensor([5.0, 1e-3])),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sbi_active.inference.regression.residual_covariance import (
+from sbi_active.inference.regression.residuals import (
     ResidualCovariance,
     alike,
 )

@@ -5,12 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sbi_active.inference.regression import (
-    Basis,
-    LocalRegression,
-    estimate_noise,
-    whole_space,
-)
+from sbi_active.inference.regression.regions import Basis, whole_space
+from sbi_active.inference.regression.surrogate import LocalRegression, estimate_noise
 
 NUM = 400
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from sbi_active.inference.refinement import BLURRED
-from sbi_active.inference.regression import TrialOutcome, outcomes_of, whole_space
+from sbi_active.inference.refinement.checks import BLURRED
+from sbi_active.inference.regression.outcomes import TrialOutcome, outcomes_of
+from sbi_active.inference.regression.regions import whole_space
 
 NUM = 500
 NONE = np.zeros((0, 2), dtype=bool)

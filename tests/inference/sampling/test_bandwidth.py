@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import gaussian_kde
 
-from sbi_active.inference.sampling.bandwidth import scott, silverman
+from sbi_active.inference.sampling.weights import scott, silverman
 
 
 @pytest.mark.parametrize("dim", [1, 3])

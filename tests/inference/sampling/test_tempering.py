@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sbi_active.inference.sampling.tempering import largest_power
-from sbi_active.inference.sampling.weights import effective_sample_size
+from sbi_active.inference.sampling.weights import effective_sample_size, largest_power
 
 
 @pytest.mark.parametrize("answer", [0.73, 1e-3, 2.5e-8])

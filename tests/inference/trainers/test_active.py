@@ -16,7 +16,7 @@ from sbi.utils import BoxUniform
 
 from sbi_active import ALHI, ASBI, CampaignOptions, SeqBED, SeqBED_B
 from sbi_active.inference import ActiveInference, SeqBED_LFIRE
-from sbi_active.inference.rounds import SilentTracker
+from sbi_active.inference.trainers.action_rounds import SilentTracker
 
 PRIOR = BoxUniform(-torch.ones(1), torch.ones(1))
 TRAINERS = [ASBI, ALHI, SeqBED_LFIRE, SeqBED_B, SeqBED]

@@ -11,9 +11,9 @@ from sbi.utils import BoxUniform
 
 from sbi_active import ALHI, MixtureDensity, RefinementOptions
 from sbi_active.inference import Observation
-from sbi_active.inference.beliefs import KernelBelief
-from sbi_active.inference.products import Product, TrainedRegion, widened
-from sbi_active.inference.sampling import PriorCoordinates
+from sbi_active.inference.beliefs.kernel_belief import KernelBelief
+from sbi_active.inference.models.product import Product, TrainedRegion, widened
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from tests.linear_gaussian import DIM, PRIOR, simulator
 
 SETTINGS = MixtureDensity(hidden_features=(16,), num_iterations=100)

@@ -14,7 +14,7 @@ from torch.distributions import Distribution
 
 from sbi_active import ASBI, Belief, MixtureDensity
 from sbi_active.inference import ActionEmbedding, ActionPosterior
-from sbi_active.inference.networks import MixtureDensityNetwork
+from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
 from tests.linear_gaussian import DIM, PRIOR, moments, simulator
 
 SMALL = MixtureDensity(hidden_features=(32, 32), num_components=2, num_iterations=600)

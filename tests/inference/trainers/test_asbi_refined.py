@@ -9,7 +9,7 @@ from torch.distributions import MultivariateNormal
 
 from sbi_active import ASBI, MixtureDensity, RefinementOptions
 from sbi_active.inference import Observation, refine
-from sbi_active.inference.beliefs import ChainedBelief, compare
+from sbi_active.inference.beliefs.belief import ChainedBelief, compare
 from sbi_active.inference.trainers import asbi
 from sbi_active.tasks import get_task
 from tests.linear_gaussian import PRIOR, simulator

@@ -14,7 +14,7 @@ from sbi.utils.metrics import c2st
 from torch.distributions import MultivariateNormal
 
 from sbi_active import ASBI, MixtureDensity
-from sbi_active.inference.rounds import SilentTracker
+from sbi_active.inference.trainers.action_rounds import SilentTracker
 
 DIM = 2
 SHIFT, COV = -torch.ones(DIM), 0.3 * torch.eye(DIM)
