@@ -28,9 +28,7 @@ from sbi_active.actions.summaries import SummaryAction, is_fitted
 
 Array = NDArray[Any]
 
-MOST_FITTED = 1_000  # rows that a summary is fitted to: an image has 20,000 numbers
 PENALTIES = 10.0 ** np.arange(-4.0, 3.1, 0.5)  # of features of unit variance, by row
-NUM_FOLDS = 10
 FEW = 2  # numbers an outcome may have for each parameter and stay as it is
 
 
@@ -84,12 +82,16 @@ class Summary:
         return np.array(self.of.transform(x), dtype=np.float64)
 
 
-def fitted_summaries(choice: SummaryAction | None, raw: Tensor) -> list[Summary]:
+def fitted_summaries(
+    choice: SummaryAction | None, raw: Tensor, *, most_fitted: int = 1_000
+) -> list[Summary]:
     """Return the summaries of a choice, those that are fitted fitted to copies.
 
     Args:
         choice: None is the outcome itself.
         raw: Simulated outcomes, shape (n, *x_shape).
+        most_fitted: Number of rows at most that a summary is fitted to: an image has
+            20,000 numbers.
 
     Raises:
         ValueError: If one cannot be fitted to so many outcomes.
@@ -103,7 +105,7 @@ def fitted_summaries(choice: SummaryAction | None, raw: Tensor) -> list[Summary]
             continue
         rows = raw.detach().float().flatten(1)
         rows = rows[rows.isfinite().any(1)]
-        rows = rows[:: -(-len(rows) // MOST_FITTED)].double().numpy()
+        rows = rows[:: -(-len(rows) // most_fitted)].double().numpy()
         fill = np.nan_to_num(_mean(rows))
         filled = np.where(np.isfinite(rows), rows, fill)
         own = copy.deepcopy(summary)
@@ -151,7 +153,7 @@ class Statistic:
 
 
 def learned_statistic(
-    summary: Array, z: Array, *, seed: int
+    summary: Array, z: Array, *, seed: int, num_folds: int = 10
 ) -> tuple[Statistic, Array]:
     """Return the statistic of simulations and their own values of it.
 
@@ -159,6 +161,7 @@ def learned_statistic(
         summary: Finite summaries, shape (n, q).
         z: Coordinates of their parameters, shape (n, d).
         seed: Seed of the folds.
+        num_folds: Number of folds.
 
     Returns:
         The statistic, and those of the rows by regressions without them, (n, s).
@@ -174,7 +177,7 @@ def learned_statistic(
         return plain, plain(summary)
     features = (summary - center) / scale
     penalty = _best_penalty(features, z)
-    fold = np.random.default_rng(seed).permutation(n) % min(NUM_FOLDS, n)
+    fold = np.random.default_rng(seed).permutation(n) % min(num_folds, n)
     own = np.zeros_like(z)
     for k in range(fold.max() + 1):
         _, weight, _ = _ridge(features[fold != k], z[fold != k], penalty)

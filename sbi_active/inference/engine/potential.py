@@ -10,7 +10,6 @@ in coordinates u in which the prior is nearly standard normal and has no edges.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from typing import Any, Protocol, TypeGuard
 
@@ -19,12 +18,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sbi_active.inference.rounds.rows import rows_of
 from sbi_active.inference.sampling.coordinates import NormalCoordinates
 from sbi_active.inference.sampling.least_squares import LeastSquares, Whitener
 from sbi_active.inference.sampling.row_cache import RowCache
-from sbi_active.simulation import SimulatorModel, simulate
+from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.noise.whitening import whitened
-from sbi_active.simulation.outcomes import MissingRowsWarning, Outcome, SimulationError
+from sbi_active.simulation.outcomes import Outcome
 from sbi_active.simulation.workers.settings import Workers
 
 Array = NDArray[Any]
@@ -88,20 +88,14 @@ class MeanTable:
     def _simulate(self, theta: Tensor, action: Tensor) -> list[Array | None]:
         self.num_simulations += len(theta)
         actions = action.expand(len(theta), -1)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
-            try:
-                rows = simulate(
-                    self._bare,
-                    theta,
-                    actions,
-                    seed=0,
-                    batch_size=BATCH,
-                    workers=self.workers,
-                )
-            except SimulationError:  # of a few rows, all may be lost
-                self.num_missing += len(theta)
-                return [None] * len(theta)
+        rows = rows_of(
+            *(self._bare, theta, actions, 0, self.workers),
+            is_first=False,
+            batch_size=BATCH,
+        )
+        if rows is None:
+            self.num_missing += len(theta)
+            return [None] * len(theta)
         missing = (rows.status == Outcome.MISSING).tolist()
         self.num_missing += sum(missing)
         x = rows.x.numpy()  # kept as it was simulated, in single precision

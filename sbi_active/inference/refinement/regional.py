@@ -167,9 +167,8 @@ class Regions(Stages):
         for k, (region, count) in enumerate(zip(regions, counts, strict=True)):
             # The first stage's first region is the whole space, seen from the prior.
             is_overview = is_first and k == 0
-            before = len(histories) - len(histories.second)
-            histories.reuse(region, int(count), is_overview=is_overview)
-            missing = int(count) - (len(histories) - len(histories.second) - before)
+            missing = int(count)
+            missing -= histories.reuse(region, missing, is_overview=is_overview)
             if missing <= 0:
                 continue
             z = region.sample_inside(missing, self.coordinates, self.rng)

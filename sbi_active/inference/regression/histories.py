@@ -47,9 +47,7 @@ class HistoryRecord:
         theta: Parameters, shape (n, d), float32.
         x: Outcomes, shape (n, t, q); NaN where there was no measurement.
         present: Which of them were there at the first attempt, shape (n, t, q).
-        again: Outcomes of a second simulation, NaN where there was none, (n, t, q).
-        present_again: Which of those were there at the first attempt, (n, t, q).
-        has_again: Which rows were simulated twice, shape (n,).
+        twin: Number of the row that a row repeats, -1 where it repeats none, (n,).
         is_overview: Which rows were drawn from the whole prior, shape (n,).
     """
 
@@ -57,9 +55,7 @@ class HistoryRecord:
     theta: Tensor
     x: Array
     present: NDArray[np.bool_]
-    again: Array
-    present_again: NDArray[np.bool_]
-    has_again: NDArray[np.bool_]
+    twin: NDArray[np.intp]
     is_overview: NDArray[np.bool_]
 
     def precedes(self, action: Tensor) -> bool:
@@ -87,6 +83,7 @@ class Histories:
         x: Outcomes less the observed ones, or themselves where nothing was observed,
             shape (n, t * q).
         present: Which outcomes were there at the first attempt, shape (n, t * q).
+        twin: Number of the row that a row repeats, -1 where it repeats none, (n,).
         observed: Observed numbers, zero where nothing was, shape (t * q,).
         used: Which numbers were observed, shape (t * q,).
         num_drawn: Histories simulated here or taken over, those lost to faults of the
@@ -116,8 +113,7 @@ class Histories:
         self.z = np.zeros((0, coordinates.dim))
         self.x = np.zeros((0, x.size))
         self.present = np.zeros((0, x.size), dtype=bool)
-        self.first: list[int] = []
-        self.second: list[int] = []
+        self.twin = np.zeros(0, dtype=np.intp)
         self.num_simulations = self.num_drawn = self.num_missing = 0
         self._theta = torch.zeros(0, coordinates.dim)
         self._is_overview = np.zeros(0, dtype=bool)
@@ -145,33 +141,32 @@ class Histories:
         """Take past histories in a region, simulated at the further actions only.
 
         At most ``count``; for an overview those drawn from the whole prior instead, so
-        that a first stage keeps its distribution. Returns how many rows were added,
-        replicates included.
+        that a first stage keeps its distribution. Returns how many were added.
         """
         past = self._past
         if past is None or count <= 0:
             return 0
-        if is_overview:
-            eligible = past.is_overview
-        else:
+        eligible = past.is_overview
+        if not is_overview:
             eligible = region.distance(self.coordinates.to_z(past.theta)) <= 1
-        rows = np.flatnonzero(eligible & self._unused)[:count]
+        eligible = eligible & (past.twin < 0) & self._unused
+        rows = np.flatnonzero(eligible)[:count]
         if len(rows) == 0:
             return 0
         self._unused[rows] = False
-        twice = np.flatnonzero(past.has_again[rows])
-        theta = torch.cat([past.theta[rows], past.theta[rows[twice]]])
-        x = np.concatenate([past.x[rows], past.again[rows[twice]]]).reshape(
-            len(theta), -1
+        again = np.flatnonzero(np.isin(past.twin, rows))
+        again = again[np.argsort(past.twin[again])]
+        twice = np.searchsorted(rows, past.twin[again])
+        both = np.concatenate([rows, again])
+        theta = past.theta[torch.from_numpy(both)]
+        x, present = (
+            part[both].reshape(len(both), -1) for part in (past.x, past.present)
         )
-        present = np.concatenate([past.present[rows], past.present_again[rows[twice]]])
-        present = present.reshape(len(theta), -1)
         if len(past.action) < len(self.action):
             further = self._simulate(theta, len(past.action))
             x = np.concatenate([x, further[0]], 1)
             present = np.concatenate([present, further[1]], 1)
-        self._append(theta, x, present, twice, is_overview=is_overview)
-        return len(theta)
+        return self._append(theta, x, present, twice, is_overview=is_overview)
 
     def fresh(self, theta: Tensor) -> tuple[Array, NDArray[np.bool_]]:
         """Return outcomes less the observed ones (n, t * q), and which rows lack some.
@@ -187,25 +182,14 @@ class Histories:
 
     def record(self) -> HistoryRecord:
         """Return the histories for a later call with further trials."""
-        t = len(self.action)
-        x = (self.x + self.observed).reshape(len(self), t, -1)
-        is_second = np.zeros(len(self), dtype=bool)
-        is_second[self.second] = True
-        again, has_again = np.full_like(x, np.nan), np.zeros(len(self), dtype=bool)
-        again[self.first], has_again[self.first] = x[self.second], True
-        present = self.present.reshape(x.shape)
-        present_again = np.zeros_like(present)
-        present_again[self.first] = present[self.second]
-        keep = ~is_second
+        shape = len(self), *self._seen.shape
         return HistoryRecord(
             action=self.action,
-            theta=self._theta[torch.from_numpy(keep)],
-            x=x[keep],
-            present=present[keep],
-            again=again[keep],
-            present_again=present_again[keep],
-            has_again=has_again[keep],
-            is_overview=self._is_overview[keep],
+            theta=self._theta,
+            x=(self.x + self.observed).reshape(shape),
+            present=self.present.reshape(shape),
+            twin=self.twin,
+            is_overview=self._is_overview,
         )
 
     def _simulate(self, theta: Tensor, first: int) -> tuple[Array, NDArray[np.bool_]]:
@@ -280,10 +264,11 @@ class Histories:
         twice: NDArray[np.intp],
         *,
         is_overview: bool,
-    ) -> None:
+    ) -> int:
         """Append rows of which the last are replicates of ``twice``.
 
-        A history that a fault hit is left out, and its replicate with it.
+        A history that a fault hit is left out, and its replicate with it. Returns the
+        number of those that are no replicates.
         """
         num_places = len(theta) - len(twice)
         self.num_drawn += len(theta)
@@ -303,13 +288,21 @@ class Histories:
         self._theta = torch.cat([self._theta, theta])
         overview = np.full(len(theta), is_overview)
         self._is_overview = np.concatenate([self._is_overview, overview])
-        self.first += (start + twice).tolist()
-        self.second += range(start + num_places, start + len(theta))
+        twin = np.concatenate([np.full(num_places, -1), start + twice])
+        self.twin = np.concatenate([self.twin, twin])
+        return num_places
+
+    @property
+    def pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows that were simulated twice, and their repetitions, both (r,)."""
+        second = np.flatnonzero(self.twin >= 0)
+        return self.twin[second], second
 
     @property
     def noise_sds(self) -> Array:
         """Standard deviations of the noise by repeated simulations, shape (t, q)."""
-        gap = self.x[self.first] - self.x[self.second]
+        first, second = self.pairs
+        gap = self.x[first] - self.x[second]
         with np.errstate(all="ignore"):
             variance = np.nanmean(0.5 * gap**2, 0)
         return np.sqrt(np.nan_to_num(variance)).reshape(self._seen.shape)
@@ -345,7 +338,7 @@ class Histories:
         distance, valid, agrees = region.distance(self.z), self.valid, self.agrees
         needed = 2 * fewest_rows(self.coordinates.dim)
         rows = _nearest(np.where(valid, distance, np.inf), needed)
-        first, second = np.array(self.first, int), np.array(self.second, int)
+        first, second = self.pairs
         both = valid[first] & valid[second]
         if len(rows) < needed // 2 or both.sum() < 5:
             return None

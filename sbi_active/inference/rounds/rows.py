@@ -147,7 +147,8 @@ def rows_of(
     seed: int,
     workers: Workers,
     *,
-    is_first: bool,
+    is_first: bool = True,
+    batch_size: int | None = None,
 ) -> Simulations | None:
     """Return simulated rows, those that faults hit among them; None if all are lost.
 
@@ -157,7 +158,12 @@ def rows_of(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
         try:
-            return simulate(simulator, theta, action, seed=seed, workers=workers)
+            return simulate(
+                *(simulator, theta, action),
+                seed=seed,
+                workers=workers,
+                batch_size=batch_size,
+            )
         except SimulationError:  # of a few rows, all may be lost
             if is_first:
                 raise

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
@@ -26,12 +25,11 @@ from sbi_active.inference.models.product import (
     widened,
 )
 from sbi_active.inference.refinement.course import StageSettings
-from sbi_active.inference.rounds.rows import Observation, require_whole
+from sbi_active.inference.rounds.rows import Observation, require_whole, rows_of
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.trainers.action_rounds import ActionRounds
 from sbi_active.inference.trainers.base import Told
 from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation import MissingRowsWarning, simulate
 
 SAMPLERS = ("importance", "kde")
 #: Shares of the budget by stage, by what they begin at: this round's network, the
@@ -198,15 +196,14 @@ class ProductRounds(ActionRounds):
             num = int(share * settings.num_histories)
             own = derive_seed(seed, "stage", stage)
             theta = self._places(belief, num, own)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
-                rows = simulate(
-                    simulator,
-                    theta.repeat_interleave(len(trials), 0),
-                    action.repeat(num, 1),
-                    seed=derive_seed(own, "x"),
-                    workers=settings.workers,
-                )
+            rows = rows_of(
+                simulator,
+                theta.repeat_interleave(len(trials), 0),
+                action.repeat(num, 1),
+                derive_seed(own, "x"),
+                settings.workers,
+            )
+            assert rows is not None
             num_simulations += len(rows)
             num_missing += rows.counts["missing"]
             known = rows.without_missing()
