@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -187,8 +187,7 @@ class ChainedBelief(Belief):
         self._estimator = estimator.eval()
         self._condition = condition
         with torch.no_grad():
-            draws = estimator.sample(torch.Size([NUM_DRAWS]), condition)[:, 0]
-            inside = within_support(prior, draws)
+            inside = within_support(prior, self._raw(NUM_DRAWS))
         acceptance = float(inside.double().mean())
         self.diagnostics = self.diagnostics.extended(mass_inside_prior=acceptance)
         self._particles: Tensor | None = None
@@ -217,16 +216,12 @@ class ChainedBelief(Belief):
     def _sample(self, num_samples: int) -> Tensor:
         if self._particles is not None:
             return self._particles[torch.randint(len(self._particles), (num_samples,))]
-        kept: list[Tensor] = []
-        missing = num_samples
         acceptance = self.diagnostics.mass_inside_prior
-        while missing > 0:
-            size = min(int(1.1 * missing / acceptance) + 20, 1_000_000)
-            draws = self._estimator.sample(torch.Size([size]), self._condition)[:, 0]
-            draws = draws[within_support(self.prior, draws)]
-            kept.append(draws[:missing])
-            missing -= len(kept[-1])
-        return torch.cat(kept)
+        return within_prior(self.prior, self._raw, num_samples, acceptance)
+
+    def _raw(self, num: int) -> Tensor:
+        """Return draws of the network, within the support or not."""
+        return self._estimator.sample(torch.Size([num]), self._condition)[:, 0]
 
     def _log_prob(self, theta: Tensor) -> Tensor:
         return self._log_density(theta) - self._log_normalizer
@@ -234,6 +229,30 @@ class ChainedBelief(Belief):
     def _log_density(self, theta: Tensor) -> Tensor:
         with torch.no_grad():
             return self._estimator.log_prob(theta[:, None], self._condition)[:, 0]
+
+
+def within_prior(
+    prior: Distribution,
+    draw: Callable[[int], Tensor],
+    num_samples: int,
+    acceptance: float,
+) -> Tensor:
+    """Return draws that lie within a prior's support, shape (num_samples, d).
+
+    Args:
+        prior: Prior that gives the support.
+        draw: Function of a number that returns so many draws, shape (num, d).
+        num_samples: Number of draws to return.
+        acceptance: Share of draws within the support.
+    """
+    kept: list[Tensor] = []
+    missing = num_samples
+    while missing > 0:
+        draws = draw(min(int(1.1 * missing / acceptance) + 20, 1_000_000)).float()
+        draws = draws[within_support(prior, draws)]
+        kept.append(draws[:missing])
+        missing -= len(kept[-1])
+    return torch.cat(kept) if kept else torch.zeros(0, parameter_dim(prior))
 
 
 class UnchangedBelief(Belief):

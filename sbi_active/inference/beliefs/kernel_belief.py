@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.beliefs.belief import Belief
+from sbi_active.inference.beliefs.belief import Belief, within_prior
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.sampling.weights import scott
 from sbi_active.seeding import forked_generators
@@ -84,13 +84,7 @@ class KernelBelief(Belief):
         return self._draws[index] + noise @ self._factor.mT
 
     def _sample(self, num_samples: int) -> Tensor:
-        kept, missing = [], num_samples
-        while missing > 0:
-            draws = self._draw(int(1.1 * missing / self._kept) + 20).float()
-            draws = draws[within_support(self.prior, draws)]
-            kept.append(draws[:missing])
-            missing -= len(kept[-1])
-        return torch.cat(kept) if kept else self._draws[:0].float()
+        return within_prior(self.prior, self._draw, num_samples, self._kept)
 
     def _log_prob(self, theta: Tensor) -> Tensor:
         places = self._draws @ self._inverse.mT

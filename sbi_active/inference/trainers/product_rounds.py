@@ -28,7 +28,7 @@ from sbi_active.inference.refinement.course import StageSettings
 from sbi_active.inference.rounds.rows import Observation, require_whole, rows_of
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.trainers.action_rounds import ActionRounds
-from sbi_active.inference.trainers.base import Told
+from sbi_active.inference.trainers.base import Told, is_finite_somewhere
 from sbi_active.seeding import derive_seed, forked_generators
 
 SAMPLERS = ("importance", "kde")
@@ -37,7 +37,6 @@ SAMPLERS = ("importance", "kde")
 STAGES = {"network": (1.0,), "belief": (0.4, 0.6), "prior": (0.15, 0.15, 0.2, 0.5)}
 NUM_KERNELS = 2_000  # draws behind a kernel density estimate
 NUM_HINTS = 1_000  # rows that the importance sampling begins around
-NUM_PROBES = 64  # draws of the prior, at one of which a factor is finite
 
 
 class ProductRounds(ActionRounds):
@@ -295,9 +294,10 @@ class ProductRounds(ActionRounds):
 def _says_something(
     learned: ActionFactor, trial: Observation, prior: Distribution
 ) -> bool:
-    """Return whether a factor is finite anywhere: float32 has no squares of 1e20."""
-    with forked_generators(0), torch.no_grad():
-        theta = prior.sample(torch.Size([NUM_PROBES])).float()
-        rows = trial.x.expand(NUM_PROBES, *trial.x.shape)
-        action = trial.action.expand(NUM_PROBES, -1)
-        return bool(learned.log_factor(theta, rows, action).isfinite().any())
+    """Return whether the factor of a trial is finite anywhere."""
+
+    def log_factor(theta: Tensor) -> Tensor:
+        x = trial.x.expand(len(theta), *trial.x.shape)
+        return learned.log_factor(theta, x, trial.action.expand(len(theta), -1))
+
+    return is_finite_somewhere(prior, log_factor)
