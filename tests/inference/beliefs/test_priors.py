@@ -25,7 +25,6 @@ from torch.distributions import (
 from torch.distributions.transforms import AffineTransform, ExpTransform
 
 from sbi_active import BoxActions, Campaign, GaussianNoise, SimulatorModel
-from sbi_active.criticism import Effect
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.seeding import forked_generators
 
@@ -78,12 +77,6 @@ def test_a_default_dtype_of_few_bits_is_refused(dtype):
         torch.set_default_dtype(before)
 
 
-def test_a_default_device_without_numbers_is_refused():
-    prior = BoxUniform(0 * TWO, TWO)
-    with torch.device("meta"), pytest.raises(ValueError, match="device meta; call"):
-        require_support(prior)
-
-
 def test_draws_that_repeat_are_refused():
     class Rounded(Normal):
         def sample(self, sample_shape=torch.Size()):  # noqa: B008
@@ -91,25 +84,6 @@ def test_draws_that_repeat_are_refused():
 
     with pytest.raises(ValueError, match="got parameter 0, of which draws repeat"):
         campaign(independent(Rounded(0 * TWO, TWO)))
-
-
-def test_a_discrete_effect_is_refused():
-    with pytest.raises(ValueError, match="continuous prior of effect 'payload'"):
-        Effect.keyword("payload", prior=Bernoulli(0.5))
-
-
-def test_a_payload_on_or_off_has_its_probability():
-    def slide(theta, action):
-        return action**2 / (2 * 9.81 * theta[:, :1]) * (1 + 0.3 * theta[:, 1:2])
-
-    friction = BoxUniform(torch.tensor([0.2]), torch.tensor([1.0]))
-    payload = Bernoulli(torch.tensor([0.5]))
-    prior = MultipleIndependent([friction, payload], validate_args=False)
-    model = SimulatorModel(slide, noise=GaussianNoise(0.02))
-    c = Campaign(model, prior, BoxActions([0.5], [3.0]), seed=0)
-    c.attach([3.0], [1.0])
-    drawn = c.update().sample((4_000,))
-    assert float(drawn[:, 1].mean()) == pytest.approx(0.565, abs=0.05)  # by quadrature
 
 
 def scaled(theta, action):

@@ -67,13 +67,6 @@ def refine_two_of(dim: int):
     return refine(simulator, prior, torch.zeros(1, 1), x, settings=settings, seed=0)
 
 
-def test_many_edges_are_no_edge():
-    """A prior of forty parameters has most of its mass near one edge or another."""
-    belief = refine_two_of(40)
-    assert belief.diagnostics.prior_edge_mass < 0.1
-    assert not any("edge" in text for text in belief.diagnostics.warnings)
-
-
 def test_too_few_histories_are_no_unexplained_outcome():
     with pytest.raises(ValueError, match=r"at least 342 histories for 150") as error:
         refine_two_of(150)

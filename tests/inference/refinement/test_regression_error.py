@@ -40,7 +40,7 @@ def surrogate_of(q: int, num: int, seed: int):
 @pytest.mark.parametrize(("q", "num"), [(4, 100), (60, 300)])
 def test_expected_error_is_the_mean_divergence(q: int, num: int):
     expected, actual = [], []
-    for seed in range(40):
+    for seed in range(20):
         surrogate, precision = surrogate_of(q, num, seed)
         rng = np.random.default_rng(1_000 + seed)
         factor = np.linalg.cholesky(np.linalg.inv(precision))
