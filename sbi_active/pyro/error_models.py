@@ -22,8 +22,6 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-ROUNDED = 0.1  # of the log of a known deviation, whose density would be a spike
-
 
 class ErrorModel(Protocol):
     """The error of an outcome, in deviations of the predictive."""
@@ -143,8 +141,8 @@ class StudentError:
         return _student(self.df, self.scale, log_sd)
 
 
-def _known(sd: float, log_sd: Tensor) -> Tensor:
-    return dist.Normal(float(np.log(sd)), ROUNDED).log_prob(log_sd)
+def _known(sd: float, log_sd: Tensor, *, rounded: float = 0.1) -> Tensor:
+    return dist.Normal(float(np.log(sd)), rounded).log_prob(log_sd)
 
 
 def _student(df: float, scale: float, log_sd: Tensor) -> Tensor:

@@ -26,7 +26,6 @@ from sbi_active.simulation.model import SimulatorModel
 #: Combinations of values at most: each has a posterior of its own. Half refuses seven
 #: switches, twice takes twice as long.
 MOST_VALUES = 64
-NEGLIGIBLE = 0.01  # probability of values whose belief decides nothing
 
 
 @dataclass(frozen=True)
@@ -269,10 +268,12 @@ def _is_inflated(belief: Belief) -> bool:
     return "noise_inflation" in belief.diagnostics.figures
 
 
-def _diagnosed(belief: EnumeratedBelief, log_evidence: float) -> Diagnostics:
+def _diagnosed(
+    belief: EnumeratedBelief, log_evidence: float, *, negligible: float = 0.01
+) -> Diagnostics:
     """Return what is known of a mixture: the worst of the parts that count."""
     known = [part.diagnostics for part in belief.parts]
-    counts = belief.probability > NEGLIGIBLE
+    counts = belief.probability > negligible
     some = [d for d, is_seen in zip(known, counts, strict=True) if is_seen]
     effective = [d.effective_sample_size for d in some]
     texts = [

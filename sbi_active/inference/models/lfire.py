@@ -17,8 +17,6 @@ from sbi_active.expected import require
 from sbi_active.inference.beliefs.belief import ParticleDraws
 from sbi_active.inference.rounds.rows import RoundRows
 
-FEWEST = 2  # rows of each kind a fold
-
 
 @dataclass(frozen=True)
 class LogRatio:
@@ -91,7 +89,12 @@ class LFIRE:
         return torch.cat([torch.where(valid, psi, 0.0), valid.double()], 1)
 
     def fit(
-        self, own: NDArray[np.float64], marginal: NDArray[np.float64], seed: int
+        self,
+        own: NDArray[np.float64],
+        marginal: NDArray[np.float64],
+        seed: int,
+        *,
+        fewest_rows: int = 2,
     ) -> LogRatio:
         """Return the log ratio at one parameter set.
 
@@ -99,8 +102,9 @@ class LFIRE:
             own: Summaries of its outcomes, shape (n, q).
             marginal: Summaries of outcomes of the belief, shape (m, q).
             seed: Seed of the folds.
+            fewest_rows: Rows of each kind a fold at least.
         """
-        fewest = FEWEST * self.num_folds
+        fewest = fewest_rows * self.num_folds
         if min(len(own), len(marginal)) < fewest:
             raise ValueError(
                 f"expected at least {fewest} outcomes of a parameter set and of the "

@@ -13,12 +13,10 @@ from sbi_active.inference.networks.baseline import Baseline, Frames, local
 from sbi_active.inference.networks.response import STRAIGHT
 
 BLOCK = 512  # rows in double precision at once, and rows behind principal directions
-MOST_FEATURES = 256
 BaselineKind = Literal["none", "linear", "curved"]
 #: Numbers in x beyond which no regression is tried: each has coefficients of its own.
 MAX_OUTCOMES = 32
 MIN_ROWS = 40  # with a measurement, of which a fifth is held out
-LARGEST_MISFIT = 20.0  # nats, beyond which a frame has no part in the posterior
 KINDS: tuple[Literal["linear", "curved"], ...] = ("linear", "curved")
 #: Nats by which a baseline must beat the simpler one: its frames and what the network
 #: sees of them are more to overfit.
@@ -79,13 +77,13 @@ class Directions(nn.Module):
         return (x.double() - self.mean) / self.scale
 
 
-def _products(u: Tensor, action: Tensor) -> Tensor:
+def _products(u: Tensor, action: Tensor, *, most: int = 256) -> Tensor:
     """Return standardized products of parameters and actions, shape (n, f)."""
     a = (action.double() - action.mean(0)) / action.std(0).clamp_min(1e-30)
     i, j = torch.triu_indices(u.shape[1], u.shape[1])
     parts = [u, *(u * a[:, [k]] for k in range(a.shape[1]))]
     parts += [u * a[:, [k]].square() for k in range(a.shape[1])]
-    features = torch.cat([*parts, u[:, i] * u[:, j]], 1)[:, :MOST_FEATURES]
+    features = torch.cat([*parts, u[:, i] * u[:, j]], 1)[:, :most]
     features = features - features.mean(0)
     return features / features.std(0).clamp_min(1e-30)
 
@@ -227,7 +225,9 @@ class Conditioning(nn.Module):
         r""":math:`\log |\mathrm d u / \mathrm d \theta|`."""
         return -self.theta_factor.diagonal().log().sum()
 
-    def forward(self, condition: Tensor) -> tuple[Tensor, Frames]:
+    def forward(
+        self, condition: Tensor, *, largest: float = 20.0
+    ) -> tuple[Tensor, Frames]:
         """Return the network's inputs, (n, x_dim + action_dim + ...), and the frames.
 
         Numbers of x that are missing are zero; a row with any has trivial frames.
@@ -258,7 +258,7 @@ class Conditioning(nn.Module):
         seen.append(frames.mean.flatten(1))
         if frames.misfit.shape[1] > 1:
             excess = frames.misfit - frames.misfit.min(1, keepdim=True).values
-            seen.append(torch.tanh(excess / LARGEST_MISFIT))
+            seen.append(torch.tanh(excess / largest))
         return torch.cat(seen, 1), _with_global(frames)
 
 

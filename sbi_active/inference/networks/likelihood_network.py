@@ -24,13 +24,6 @@ from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.inference.networks.mixture_network import log_prob_of_batch
 from sbi_active.inference.networks.response import Response, exceeds_chance
 
-#: Choices: one hidden layer, and steps of Adam over all rows at once, which at this
-#: rate move a weight by 3 at most.
-WIDTH = 32
-NUM_ITERATIONS = 300
-LEARNING_RATE = 0.01
-WEIGHT_DECAY = 1e-3  # where few rows are invalid, the edge between stays soft
-
 
 class ValidityNetwork(nn.Module):
     r"""Logistic regression on learned features, :math:`P(\text{valid} | \theta, \xi)`.
@@ -39,12 +32,26 @@ class ValidityNetwork(nn.Module):
         seen: Standardized inputs, shape (n, p).
         valid: Mask of the rows that gave a measurement, shape (n,), bool; both kinds
             occur.
+        width: Width of the hidden layer.
+        num_iterations: Number of steps of Adam over all rows at once.
+        learning_rate: Learning rate, at which a weight moves by 3 at most.
+        weight_decay: Weight decay; where few rows are invalid, the edge between stays
+            soft.
     """
 
-    def __init__(self, seen: Tensor, valid: Tensor) -> None:
+    def __init__(
+        self,
+        seen: Tensor,
+        valid: Tensor,
+        *,
+        width: int = 32,
+        num_iterations: int = 300,
+        learning_rate: float = 0.01,
+        weight_decay: float = 1e-3,
+    ) -> None:
         super().__init__()
         self.net = nn.Sequential(
-            nn.Linear(seen.shape[1], WIDTH), nn.Tanh(), nn.Linear(WIDTH, 1)
+            nn.Linear(seen.shape[1], width), nn.Tanh(), nn.Linear(width, 1)
         )
         share = valid.double().mean().clamp(1e-3, 1 - 1e-3)
         with torch.no_grad():  # start at the share of valid rows
@@ -53,10 +60,10 @@ class ValidityNetwork(nn.Module):
             last.weight.mul_(0.1)
             last.bias.fill_(float(share.logit()))
         optimizer = torch.optim.AdamW(
-            self.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY
+            self.parameters(), lr=learning_rate, weight_decay=weight_decay
         )
         sign = valid.to(seen.dtype) * 2 - 1
-        for _ in range(NUM_ITERATIONS):
+        for _ in range(num_iterations):
             optimizer.zero_grad(set_to_none=True)
             loss = -logsigmoid(sign * self.net(seen)[:, 0]).mean()
             loss.backward()

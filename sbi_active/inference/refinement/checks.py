@@ -15,16 +15,15 @@ from sbi_active.inference.regression.surrogate import LocalRegression, Surrogate
 
 Array = NDArray[Any]
 
-HARD_NOISE = 0.03  # nats a number that a Gaussian loses on the noise
-LIGHT_TAILS = -0.3  # excess kurtosis; -1.2 for uniform noise, 0 for Gaussian
-CORRELATED = 0.25  # across trials; misfit below MISFIT reaches half of it
-RESOLUTION = 2e-5  # least tail probability
 BLURRED = 0.05  # share of repeated simulations that would differ, beyond those that do
-UNHEARD = 0.01  # probability of an outcome that calls for a warning
 
 
 def noise_shape(
-    fits: list[LocalRegression], left: float, rng: np.random.Generator
+    fits: list[LocalRegression],
+    left: float,
+    rng: np.random.Generator,
+    *,
+    hard: float = 0.03,
 ) -> tuple[float, bool]:
     r"""Return the negentropy of the residuals, nats a number, and whether it is chance.
 
@@ -34,7 +33,7 @@ def noise_shape(
     with H from the spacings of the sorted residuals, calibrated on Gaussian numbers,
     for each outcome and for all together: .18 for uniform noise, .42 for exponential.
     Of noise that is taken for a mixture it is that of the residuals' normal scores,
-    which may have ``left`` so much.
+    which may have ``left`` so much. A Gaussian may lose ``hard`` nats a number.
 
     References:
         Vasicek, J. R. Stat. Soc. B 1976.
@@ -57,7 +56,7 @@ def noise_shape(
         mean, deviation = np.mean(chance), np.std(chance)
         for member in members:
             excess.append(_negentropy(member) - mean)
-            clear.append(excess[-1] > HARD_NOISE + 4 * deviation)
+            clear.append(excess[-1] > hard + 4 * deviation)
     if any(fit.shape is not None for fit in fits):
         # One mixture serves all numbers: what counts is what they lose together.
         mean = max(float(np.mean(excess)), 0.0)
@@ -65,12 +64,14 @@ def noise_shape(
     return float(max(*excess, 0.0)), not any(clear)
 
 
-def has_hard_edges(stages: list[Stage]) -> bool:
+def has_hard_edges(stages: list[Stage], *, light: float = -0.3) -> bool:
     r"""Return whether the residuals of all stages have lighter tails than a Gaussian.
 
-    A few hundred numbers tell by their kurtosis what their entropy cannot tell yet. Its
-    standard error is :math:`\sqrt{24 / n}` for Gaussian numbers (Fisher, Proc. Lond.
-    Math. Soc. 1930). Regressions with misfit are left out, whose error has edges too.
+    A few hundred numbers tell by their kurtosis (-1.2 for uniform noise, 0 for
+    Gaussian, below ``light`` where it has edges) what their entropy cannot tell yet.
+    Its standard error is :math:`\sqrt{24 / n}` for Gaussian numbers (Fisher, Proc.
+    Lond. Math. Soc. 1930). Regressions with misfit are left out, whose error has edges
+    too.
     """
     residuals = [
         fit.standardized[:, fit.standardized.var(0) > 1e-6].ravel()
@@ -82,7 +83,7 @@ def has_hard_edges(stages: list[Stage]) -> bool:
     if values.size < 100:
         return False
     margin = 3.5 * np.sqrt(24 / values.size)
-    return bool(kurtosis(values) < LIGHT_TAILS - margin)
+    return bool(kurtosis(values) < light - margin)
 
 
 def _negentropy(values: Array) -> float:
@@ -95,9 +96,12 @@ def _negentropy(values: Array) -> float:
 
 
 def trial_correlation(
-    fits: list[LocalRegression], num_trials: int
+    fits: list[LocalRegression], num_trials: int, *, correlated: float = 0.25
 ) -> tuple[float, bool]:
-    """Return the correlation of residuals across trials beyond chance."""
+    """Return the correlation of residuals across trials, and whether it is low.
+
+    Misfit below its limit reaches half of what counts as ``correlated``.
+    """
     if num_trials == 1 or not fits:
         return 0.0, True
     excess, count = 0.0, 0
@@ -113,11 +117,11 @@ def trial_correlation(
         return 0.0, True
     correlation = max(excess / count, 0.0) ** 0.5
     has_misfit = any(fit.has_misfit for fit in fits)  # which correlates as well
-    return float(correlation), correlation < CORRELATED or has_misfit
+    return float(correlation), correlation < correlated or has_misfit
 
 
 def tail_probability(
-    surrogate: Surrogate, draws: Array, num_trials: int
+    surrogate: Surrogate, draws: Array, num_trials: int, *, least: float = 2e-5
 ) -> tuple[list[float], float]:
     r"""Return how often a simulation misses its prediction by more than reality does.
 
@@ -145,7 +149,7 @@ def tail_probability(
         pairs = zip(simulated.T, observed.T, strict=True)
         beyond += [_exceedance(known, value).sum() for known, value in pairs]
         count += len(z)
-    tail = (beyond / max(count, 1)).clip(RESOLUTION, 1.0)
+    tail = (beyond / max(count, 1)).clip(least, 1.0)
     return [float(p) for p in tail[:-1]], float(tail[-1])
 
 
@@ -236,15 +240,21 @@ def _squares(whitened: Array, num_trials: int) -> Array:
 
 
 def check_outcomes(
-    diagnostics: Diagnostics, surrogate: Surrogate, draws: Array, pool: Histories
+    diagnostics: Diagnostics,
+    surrogate: Surrogate,
+    draws: Array,
+    pool: Histories,
+    *,
+    rare: float = 0.01,
 ) -> Diagnostics:
     r"""Return a belief's diagnostics with figures on trials without a measurement.
 
     ``probability_of_outcome`` is :math:`E_b[P(\text{as observed} | \theta)]` of each
     trial, over draws of the belief (n, d). Near zero, the trial did what simulations
-    near the belief do not do: the simulator lacks a way of failing, or a fault was told
-    as "invalid". The assumption "outcomes_followed" compares repeated simulations:
-    where those agree and the regression expects them to differ, it misses an edge.
+    near the belief seldom do (less often than ``rare``): the simulator lacks a way of
+    failing, or a fault was told as "invalid". The assumption "outcomes_followed"
+    compares repeated simulations: where those agree and the regression expects them to
+    differ, it misses an edge.
     """
     share = pool.agrees.mean(0) if len(pool) else np.ones(0)
     # A trial in which simulations all agree, or none does, was not regressed.
@@ -266,11 +276,11 @@ def check_outcomes(
             f"followed coarsely ({blur:.0%} of repeated simulations would differ that "
             "do not), so that the belief is too wide; raise num_histories"
         )
-    unheard = [k for k, p in enumerate(probability) if p < UNHEARD]
+    unheard = [k for k, p in enumerate(probability) if p < rare]
     if unheard:
         texts.append(
             f"SA121 trials {', '.join(map(str, unheard))} had a measurement, or none, "
-            f"where less than {UNHEARD:.0%} of the simulations near the belief do the "
+            f"where less than {rare:.0%} of the simulations near the belief do the "
             "same: the simulator lacks a way to fail, or the status of the trial is "
             "wrong"
         )

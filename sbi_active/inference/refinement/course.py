@@ -16,12 +16,10 @@ from sbi_active.inference.regression.surrogate import MISFIT
 
 Array = NDArray[Any]
 
-UNSETTLED = 0.1  # nats a dimension
 #: Whether something that is taken for granted holds, its figure, and what to say with
 #: that where it does not.
 Doubt = tuple[bool, float, str]
 LIVE = 0.01  # mass below which a region is left out of the checks
-MIN_EFFECTIVE = 0.05  # share of the particles
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +58,17 @@ class StageSettings:
             what is wrong with the noise's shape counts as well. This trusts none of
             them, and half none of any.
         shapes: Settings of noise that is not Gaussian.
+        least_checked: Number of histories of a check at least.
+        step: Step of the differences of a check, in deviations of the belief.
+        chance: Standard errors of a shift below which it may be chance.
+        flat: Precision that stands for a uniform prior in [-1, 1].
+        rough: Share of the variance that a cubic may miss over the whole prior.
+        misfit: Residual over noise variance, chance removed, beyond which a
+            belief is doubted.
+        unsettled: Nats a dimension that the last stage may have changed in a
+            belief to be trusted.
+        effective: Share of the particles that must count at each stage, or a
+            mode may be lost.
     """
 
     first_share: float = 0.25
@@ -76,6 +85,14 @@ class StageSettings:
     largest_shift: float = 0.2
     known: float = 0.0625
     shapes: ShapeSettings = field(default_factory=ShapeSettings)
+    least_checked: int = 20
+    step: float = 0.05
+    chance: float = 3.0
+    flat: float = 3.0
+    rough: float = 0.5
+    misfit: float = 1.5
+    unsettled: float = 0.1
+    effective: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -155,7 +172,7 @@ class Course:
             best = k if errors[k] < errors[best] else best
         if self.stages[-1].error <= self.own.small or best == len(errors) - 1:
             return
-        allowed = UNSETTLED * self.stages[-1].draws.shape[1]
+        allowed = self.own.unsettled * self.stages[-1].draws.shape[1]
         if self.divergences[best + 1] > allowed + self.stages[best + 1].error:
             return
         self.divergences[best] = min(self.divergences[best : best + 2])
@@ -201,10 +218,10 @@ def diagnose(
     edge_mass = float(edge.mean(0).max(initial=0.0))
     effective = min(stage.fit.efficiency for stage in course.stages)
     change = course.divergence if len(course.stages) > 1 else -1.0
-    allowed = UNSETTLED * last.draws.shape[1]
+    allowed = own.unsettled * last.draws.shape[1]
     all_doubts: dict[str, Doubt] = {
         "few_modes": (
-            effective >= MIN_EFFECTIVE,
+            effective >= own.effective,
             effective,
             "SA111 at some stage only {:.1%} of the particles counted, as with "
             "many narrow modes, and a mode may be lost; raise num_histories",

@@ -36,11 +36,6 @@ from sbi_active.threads import single_thread
 
 Array = NDArray[Any]
 
-FEWEST = 20  # histories of a check
-STEP = 0.05  # of differences, in deviations of the belief
-STANDARD_ERRORS = 3.0  # of a shift below which it may be chance
-PRECISION = 3.0  # of a uniform prior in [-1, 1]
-
 
 @dataclass(frozen=True)
 class Confirmation:
@@ -90,7 +85,7 @@ def by_replicates(
         rng: Source of the draws.
     """
     own, coordinates = regions.own, regions.coordinates
-    num = max(FEWEST, int(own.checked_share * regions.budget))
+    num = max(own.least_checked, int(own.checked_share * regions.budget))
     with forked_generators(int(rng.integers(2**62))):
         theta = belief.sample(torch.Size([num])).float()
     histories = regions.histories
@@ -106,10 +101,10 @@ def by_replicates(
             continue
         predicted = fit.whitened(z[rows])[0]
         error = fit.whitened_outcomes(x[rows]) - predicted
-        axes = STEP * np.diag(sds)
+        axes = own.step * np.diag(sds)
         moved = [(fit.whitened(z[rows] + axis)[0] - predicted) for axis in axes]
-        slope = np.stack(moved, 2) / (STEP * sds)
-        system = np.einsum("nqj,nqk->njk", slope, slope) + PRECISION * np.eye(d)
+        slope = np.stack(moved, 2) / (own.step * sds)
+        system = np.einsum("nqj,nqk->njk", slope, slope) + own.flat * np.eye(d)
         score = np.einsum("nqj,nq->nj", slope, error)
         moves[rows] = np.linalg.solve(system, score[..., None])[..., 0]
     moves = moves[np.isfinite(moves).all(1)] / sds
@@ -119,7 +114,7 @@ def by_replicates(
         shift = float(np.abs(moves.mean(0))[worst])
         error = float(moves[:, worst].std() / np.sqrt(len(moves)))
     used = histories.num_simulations - before
-    limit = max(own.largest_shift, STANDARD_ERRORS * error)
+    limit = max(own.largest_shift, own.chance * error)
     return Confirmation(shift, used, limit)
 
 

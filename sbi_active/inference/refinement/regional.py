@@ -23,7 +23,6 @@ from sbi_active.inference.refinement.checks import (
 )
 from sbi_active.inference.refinement.course import (
     LIVE,
-    UNSETTLED,
     Doubt,
     Stage,
     StageSettings,
@@ -41,9 +40,6 @@ from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.outcomes import MissingRowsWarning
 
 Array = NDArray[Any]
-
-ROUGH = 0.5  # share of the variance that a cubic misses over the whole prior
-SERIOUS_MISFIT = 1.5  # residual over noise variance, chance removed
 
 
 @dataclass(frozen=True)
@@ -242,7 +238,7 @@ class Regions(Stages):
         dim = self.coordinates.dim
         # Of d parameters known to e nats, a mean is off by (2 e / d)^(1/2) deviations.
         allowed = 0.5 * dim * self.own.known**2
-        known = last.error / allowed, self.change / (UNSETTLED * dim)
+        known = last.error / allowed, self.change / (self.own.unsettled * dim)
         correlation, is_independent = trial_correlation(live, len(self.task.action))
         return {
             "gaussian_noise": (
@@ -260,7 +256,7 @@ class Regions(Stages):
                 "num_histories",
             ),
             "smooth_response": (
-                roughness <= ROUGH,
+                roughness <= self.own.rough,
                 roughness,
                 "SA111 over the prior the outcomes have more turns than a cubic, which "
                 "misses {:.0%} of their variance, so that four or more narrow modes "
@@ -268,7 +264,7 @@ class Regions(Stages):
                 "narrower prior",
             ),
             "no_misfit": (
-                last.excess <= SERIOUS_MISFIT,
+                last.excess <= self.own.misfit,
                 max((fit.ratio for fit in live), default=np.inf),
                 "SA112 the residuals of the surrogate have {:.2g} times the variance "
                 "of the noise, so that the belief is too wide; raise num_histories",

@@ -30,12 +30,7 @@ from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 Array = NDArray[Any]
 
-MIN_PAIRS = 20  # replicates a noise estimate rests on
 LOST = np.inf  # marks the rows of a history that a fault hit
-MAX_ATTEMPTS = 16  # more at a measurement
-ENOUGH = 0.5  # share of complete histories that needs no more attempts
-NUM_PROBES = 50  # rows to see whether another attempt is of use
-WORTHWHILE = 0.05  # share of attempts that must be
 
 
 @dataclass(frozen=True)
@@ -192,10 +187,21 @@ class Histories:
             is_overview=self._is_overview,
         )
 
-    def _simulate(self, theta: Tensor, first: int) -> tuple[Array, NDArray[np.bool_]]:
+    def _simulate(
+        self,
+        theta: Tensor,
+        first: int,
+        *,
+        most: int = 16,
+        enough: float = 0.5,
+        num_probes: int = 50,
+        worthwhile: float = 0.05,
+    ) -> tuple[Array, NDArray[np.bool_]]:
         """Return outcomes at each theta of the trials from ``first`` on.
 
         And which of them were there at the first attempt, both of shape (n, t * q).
+        Up to ``most`` more attempts are made until a share is ``enough``, if a few
+        probes show that they are ``worthwhile``.
         """
         n, t = len(theta), len(self.action) - first
         seed = derive_seed(self.seed, "histories", self.num_simulations)
@@ -203,23 +209,23 @@ class Histories:
         x = self._rows(theta.repeat_interleave(t, 0), trial, seed)
         present = np.isfinite(x)
         place = torch.arange(n).repeat_interleave(t)
-        for attempt in range(MAX_ATTEMPTS):
+        for attempt in range(most):
             # Where chance decides who gives a measurement, histories of many trials
             # would seldom be complete; given one, x has the same law at any attempt.
             lacks = (self._seen[trial] & np.isnan(x)).any(1)
             incomplete = np.flatnonzero(lacks)
             complete = ~lacks.reshape(n, t).any(1)
-            if complete.mean() >= ENOUGH or len(incomplete) == 0:
+            if complete.mean() >= enough or len(incomplete) == 0:
                 break
             if attempt == 0:  # a few show whether it is chance at all
-                incomplete = incomplete[:: max(len(incomplete) // NUM_PROBES, 1)]
+                incomplete = incomplete[:: max(len(incomplete) // num_probes, 1)]
             again = self._rows(
                 theta[place[incomplete]], trial[incomplete], derive_seed(seed, attempt)
             )
             filled = ~(self._seen[trial[incomplete]] & np.isnan(again)).any(1)
             filled &= ~np.isinf(again).any(1)  # not lost
             x[incomplete[filled]] = again[filled]
-            if filled.mean() < WORTHWHILE:
+            if filled.mean() < worthwhile:
                 break
         x, present = x.reshape(n, -1), present.reshape(n, -1)
         x[np.isinf(x).any(1)] = LOST
@@ -329,7 +335,11 @@ class Histories:
         return float((~present.any(2)).mean()) if len(self) else 0.0
 
     def regress(
-        self, region: Region, shapes: ShapeSettings | None = None
+        self,
+        region: Region,
+        shapes: ShapeSettings | None = None,
+        *,
+        min_pairs: int = 20,
     ) -> LocalRegression | None:
         """Regress the histories in a region, or the nearest where it holds few.
 
@@ -342,7 +352,7 @@ class Histories:
         both = valid[first] & valid[second]
         if len(rows) < needed // 2 or both.sum() < 5:
             return None
-        pairs = _nearest(np.where(both, distance[first], np.inf), MIN_PAIRS)
+        pairs = _nearest(np.where(both, distance[first], np.inf), min_pairs)
         scale = np.abs(self.x[rows] + self.observed).max(0)[self.used]
         noise = estimate_noise(
             self.x[first[pairs]][:, self.used],
@@ -352,7 +362,7 @@ class Histories:
         # Where all trials agree everywhere, or nowhere, there is nothing to compare.
         mixed = np.flatnonzero(agrees.any(0) & ~agrees.all(0))
         near = _nearest(distance, needed)
-        repeated = _nearest(distance[first], MIN_PAIRS)
+        repeated = _nearest(distance[first], min_pairs)
         return LocalRegression.fit(
             region,
             self.z[rows],

@@ -20,8 +20,6 @@ COVERED = 0.9997
 #: Simulations spread wider than the posterior: its ellipsoid ends at 4 posterior
 #: deviations (in two dimensions) and at 2.2 deviations of the simulations.
 SPREAD = 2.2
-#: Nats a dimension that more clusters must save.
-WORTH = 0.1
 
 
 @dataclass(frozen=True)
@@ -109,6 +107,7 @@ def cover(
     min_regions: int,
     max_regions: int,
     generous: bool,
+    worth: float = 0.1,
 ) -> list[Region]:
     """Return ellipsoids around the clusters of a sample.
 
@@ -124,7 +123,7 @@ def cover(
     best = GaussianMixture.fit(points, counts[0], rng)
     for count in counts[1:]:
         other = GaussianMixture.fit(points, count, rng)
-        if other.log_likelihood > best.log_likelihood + WORTH * d:
+        if other.log_likelihood > best.log_likelihood + worth * d:
             best = other
     label = best.assign(points)
     full = chi2.ppf(COVERED, d) ** 0.5

@@ -35,8 +35,6 @@ SAMPLERS = ("importance", "kde")
 #: Shares of the budget by stage, by what they begin at: this round's network, the
 #: belief before, or the prior.
 STAGES = {"network": (1.0,), "belief": (0.4, 0.6), "prior": (0.15, 0.15, 0.2, 0.5)}
-NUM_KERNELS = 2_000  # draws behind a kernel density estimate
-NUM_HINTS = 1_000  # rows that the importance sampling begins around
 
 
 class ProductRounds(ActionRounds):
@@ -231,7 +229,13 @@ class ProductRounds(ActionRounds):
         return coordinates.to_theta(z)
 
     def _product(
-        self, trials: Sequence[Observation], settings: RefinementOptions, seed: int
+        self,
+        trials: Sequence[Observation],
+        settings: RefinementOptions,
+        seed: int,
+        *,
+        num_kernels: int = 2_000,
+        num_hints: int = 1_000,
     ) -> Belief:
         """Return the belief under this round's network."""
         prior, previous = require_support(self._prior), self._round_belief
@@ -242,7 +246,7 @@ class ProductRounds(ActionRounds):
         if previous is not prior:
             rows = self._round_parameters()
             region = TrainedRegion.of(coordinates.to_z(rows), rng)
-            hint = rows[rng.permutation(len(rows))[:NUM_HINTS]]
+            hint = rows[rng.permutation(len(rows))[:num_hints]]
         chained = self._sampler == "kde"
         self._require_trained()
         learned = self._model(deepcopy(self._neural_net))
@@ -266,7 +270,7 @@ class ProductRounds(ActionRounds):
         sampled: Belief = belief
         if chained:
             with forked_generators(seed, "kernels"):
-                draws = belief.sample(torch.Size([NUM_KERNELS]))
+                draws = belief.sample(torch.Size([num_kernels]))
             sampled = KernelBelief(prior, draws)
         num_lost = len(used) - len(counted)
         if num_lost:
