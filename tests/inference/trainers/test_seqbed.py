@@ -138,8 +138,9 @@ def test_no_measurement_is_information():
 
     torch.manual_seed(0)
     nothing, action = torch.tensor([torch.nan]), torch.ones(1)
-    for inference in (SeqBED_LFIRE(box), SeqBED(box, show_progress_bars=False)):
-        theta, rows = inference.arrange(box.sample((1_600,)), torch.ones(1_600, 1))
+    amortized = SeqBED(box, show_progress_bars=False)
+    for inference, num in ((SeqBED_LFIRE(box), 600), (amortized, 1_600)):
+        theta, rows = inference.arrange(box.sample((num,)), torch.ones(num, 1))
         x = falls(theta, rows)
         inference.append_simulations(theta, x, action=rows).train()
         belief = inference.update(nothing, action=action, seed=0)
