@@ -87,9 +87,9 @@ _former = former_names(
     __name__,
     {
         "ActionEmbedding": "sbi_active.inference:ActionEmbedding",
-        "ActionLikelihood": "sbi_active.inference.models:ActionLikelihood",
+        "ActionLikelihood": "sbi_active.inference.models.factors:ActionLikelihood",
         "ActionPosterior": "sbi_active.inference:ActionPosterior",
-        "ActionRatio": "sbi_active.inference.models:ActionRatio",
+        "ActionRatio": "sbi_active.inference.models.factors:ActionRatio",
         "ActionSpace": "sbi_active.actions:ActionSpace",
         "ActiveInference": "sbi_active.inference:ActiveInference",
         "Design": "sbi_active.design:Design",

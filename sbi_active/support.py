@@ -141,3 +141,9 @@ def _bounds_of_components(mixture: MixtureSameFamily) -> tuple[Tensor, Tensor] |
         for end in support_bounds(support, shape.numel())
     )
     return low.amin(0), high.amax(0)
+
+
+def parameter_dim(prior: Distribution) -> int:
+    """Return the number of parameters, without drawing from the prior."""
+    shape = prior.event_shape or prior.batch_shape
+    return shape[-1] if shape else 1

@@ -21,7 +21,7 @@ import torch
 from sbi.inference import NPE_C
 
 from sbi_active import Campaign
-from sbi_active.inference.rounds import SilentTracker
+from sbi_active.inference.trainers.action_rounds import SilentTracker
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import simulate
 from sbi_active.tasks import get_task  # pyright: ignore

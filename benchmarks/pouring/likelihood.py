@@ -40,7 +40,7 @@ from scipy.optimize import minimize
 from scipy.special import gammaln, logsumexp
 
 from sbi_active.inference.emulation.likelihood import correlation_root
-from sbi_active.inference.emulation.statistics import Statistic, learned_statistic
+from sbi_active.inference.emulation.summaries import Statistic, learned_statistic
 from sbi_active.inference.regression.outcomes import TrialOutcome
 from sbi_active.inference.regression.process import GaussianProcess, ProcessSettings
 from sbi_active.inference.regression.regions import whole_space

@@ -11,7 +11,8 @@
 # does not know. With the recordings, `python -m benchmarks measured.servo_pendulum
 # --data DIR` does the same on the real machine: see
 # [the servo](../measured.md#servo) for what came out, and
-# [ball and hoop](../measured.md#motor-with-a-heavy-hoop) for a machine from its raw file on.
+# [ball and hoop](../measured.md#motor-with-a-heavy-hoop) for a machine from its
+# raw file on.
 
 # %%
 import torch

@@ -20,8 +20,9 @@ from sbi_active.campaign.spending import used_up
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.campaign.storage.storage import Storage
 from sbi_active.display.figures import legible
-from sbi_active.inference.beliefs.belief import names_of, parameter_dim
+from sbi_active.inference.beliefs.belief import names_of
 from sbi_active.seeding import derive_seed
+from sbi_active.support import parameter_dim
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

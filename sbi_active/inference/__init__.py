@@ -41,14 +41,16 @@ __all__ = [
 __getattr__ = former_names(
     __name__,
     {
-        "ActionLikelihood": "sbi_active.inference.models:ActionLikelihood",
-        "ActionRatio": "sbi_active.inference.models:ActionRatio",
-        "ChainedBelief": "sbi_active.inference.beliefs:ChainedBelief",
-        "KernelBelief": "sbi_active.inference.beliefs:KernelBelief",
-        "MixtureDensityNetwork": "sbi_active.inference.networks:MixtureDensityNetwork",
-        "RefinedBelief": "sbi_active.inference.refinement:LearnedBelief",
+        "ActionLikelihood": "sbi_active.inference.models.factors:ActionLikelihood",
+        "ActionRatio": "sbi_active.inference.models.factors:ActionRatio",
+        "ChainedBelief": "sbi_active.inference.beliefs.belief:ChainedBelief",
+        "KernelBelief": "sbi_active.inference.beliefs.kernel_belief:KernelBelief",
+        "MixtureDensityNetwork": (
+            "sbi_active.inference.networks.mixture_network:MixtureDensityNetwork"
+        ),
+        "RefinedBelief": "sbi_active.inference.refinement.learned_belief:LearnedBelief",
         "Refinement": "sbi_active:RefinementOptions",
         "SeqBED_C": "sbi_active:SeqBED",
-        "information_gained": "sbi_active.inference.beliefs:information_gained",
+        "information_gained": "sbi_active.inference.beliefs.belief:information_gained",
     },
 )

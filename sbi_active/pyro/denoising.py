@@ -18,12 +18,7 @@ from sbi_active.pyro.error_models import ErrorModel
 from sbi_active.pyro.predictive import Predictive
 from sbi_active.seeding import forked_generators
 
-NUM_WARMUP, NUM_DRAWS = 40, 160  # of each of two chains
-MAX_TREE_DEPTH = 5
-ACCEPTED = 0.65  # share of moves that steps are adapted to: the density is smooth
-STARTS = (-0.7, 0.7)  # of the coordinates; they are standard normal, channels alone
-LEAST_SIMULATIONS = 20
-SMALLEST = 1e-9  # of a channel's size: a spread below is rounding
+NUM_DRAWS = 160  # of each of two chains
 
 
 @dataclass(frozen=True)
@@ -57,7 +52,13 @@ class Denoised:
 
 
 def denoise(
-    x_o: Tensor, predictive: Tensor, error_model: ErrorModel, *, seed: int
+    x_o: Tensor,
+    predictive: Tensor,
+    error_model: ErrorModel,
+    *,
+    seed: int,
+    fewest: int = 20,
+    smallest: float = 1e-9,
 ) -> Denoised:
     r"""Return draws of :math:`p(x | x_o) \propto p(x_o | x)\, p(x)`.
 
@@ -77,15 +78,17 @@ def denoise(
         predictive: Simulations at the executed action, shape (n, q).
         error_model: p(x_o | x) by its deviations.
         seed: Seed of all draws.
+        fewest: Number of simulations at least.
+        smallest: Share of a channel's size below which its spread is rounding.
 
     Raises:
         ValueError: If shapes do not fit, a number is infinite, or a simulation has NaN.
     """
     x_o, predictive = x_o.double(), predictive.double()
     fits = predictive.ndim == 2 and x_o.shape == predictive.shape[1:]
-    if not fits or len(predictive) < LEAST_SIMULATIONS:
+    if not fits or len(predictive) < fewest:
         raise ValueError(
-            f"expected an outcome (q,) and at least {LEAST_SIMULATIONS} simulations "
+            f"expected an outcome (q,) and at least {fewest} simulations "
             f"(n, q); got {tuple(x_o.shape)} and {tuple(predictive.shape)}; pass flat "
             "outcomes"
         )
@@ -96,7 +99,7 @@ def denoise(
         )
     seen = x_o.isfinite()
     center = predictive.mean(0)
-    size = torch.maximum(center.abs(), x_o.nan_to_num().abs()) * SMALLEST
+    size = torch.maximum(center.abs(), x_o.nan_to_num().abs()) * smallest
     scale = torch.maximum(predictive.std(0), size.clamp_min(1e-300))
     fit = Predictive.fit((predictive - center) / scale, seed)
     target = ((x_o - center) / scale)[seen]
@@ -121,7 +124,14 @@ def denoise(
 
 
 def _nuts(
-    fit: Predictive, target: Tensor, coordinates: Coordinates
+    fit: Predictive,
+    target: Tensor,
+    coordinates: Coordinates,
+    *,
+    depth: int = 5,
+    accepted: float = 0.65,
+    starts: tuple[float, ...] = (-0.7, 0.7),
+    num_warmup: int = 40,
 ) -> tuple[Tensor, Tensor, int]:
     """Return coordinates and log deviations, both (n, q), and divergences."""
 
@@ -133,19 +143,19 @@ def _nuts(
         return 0.5 * y.square().sum(-1) - joint + gain
 
     draws, divergences = [], 0
-    for start in STARTS:
+    for start in starts:
         # Coordinates are about standard normal: no masses are to be learned.
         kernel = NUTS(
             potential_fn=potential,
             step_size=1.0,  # pyright: ignore
             adapt_mass_matrix=False,
-            target_accept_prob=ACCEPTED,
-            max_tree_depth=MAX_TREE_DEPTH,
+            target_accept_prob=accepted,
+            max_tree_depth=depth,
         )
         run = MCMC(
             kernel,
             NUM_DRAWS,
-            warmup_steps=NUM_WARMUP,
+            warmup_steps=num_warmup,
             initial_params={"y": torch.full_like(target, start)},
             disable_progbar=True,
         )

@@ -28,11 +28,9 @@ from sbi_active.pyro.predictive import Predictive
 
 Array = NDArray[Any]
 
-LOWEST, NUM_GRID = 1e-4, 1_000  # of deviations: the least, and how many
+NUM_GRID = 1_000  # of deviations: the least, and how many
 REACH, NUM_KNOTS = 6.0, 1_201  # of the coordinates
-NUM_BURNT, NUM_SWEEPS = 20, 80
-TEMPERED, SHARE = 0.3, 0.1  # what a channel says alone: its power, and its share
-SMALLEST = 1e-12  # variance of a channel given the others
+SHARE = 0.1  # what a channel says alone: its power, and its share
 
 
 class Coordinates:
@@ -51,14 +49,17 @@ class Coordinates:
         target: Tensor,
         error_model: ErrorModel,
         rng: np.random.Generator,
+        *,
+        tempered: float = 0.3,
+        lowest: float = 1e-4,
     ) -> None:
         highest = 10 * float(target.abs().max()) + 100
-        self._low = float(np.log(LOWEST))
+        self._low = float(np.log(lowest))
         self._step = (float(np.log(highest)) - self._low) / (NUM_GRID - 1)
         grid = self._low + self._step * torch.arange(NUM_GRID, dtype=target.dtype)
         log_prior = error_model.log_deviation(grid).numpy()
         log_alone = fit.log_alone(target, grid.exp()[:, None].expand(-1, len(target)))
-        alone = TEMPERED * log_alone.numpy().T
+        alone = tempered * log_alone.numpy().T
         alone = _normalized(alone, log_prior) + np.log(SHARE)
         gibbs = _swept(fit, target, log_prior, grid.numpy(), rng) + np.log(1 - SHARE)
         gain = np.logaddexp(alone, gibbs)  # density over the prior's, (q, grid)
@@ -106,6 +107,10 @@ def _swept(
     log_prior: Array,
     grid: Array,
     rng: np.random.Generator,
+    *,
+    num_burnt: int = 20,
+    num_sweeps: int = 80,
+    smallest: float = 1e-12,
 ) -> Array:
     """Return each channel's log marginal over its prior by Gibbs sweeps, (q, grid)."""
     x, mean, cov = target.numpy(), fit.mean.numpy(), fit.cov.numpy()
@@ -113,7 +118,7 @@ def _swept(
     num, residual = len(x), x - mean  # (k, q)
     variance = np.exp(2 * grid[rng.integers(len(grid), size=num)])
     total = np.full((num, len(grid)), -np.inf)
-    for sweep in range(NUM_BURNT + NUM_SWEEPS):
+    for sweep in range(num_burnt + num_sweeps):
         noisy = cov + np.diag(variance)
         precision = np.linalg.inv(noisy)
         log_volume = np.linalg.slogdet(noisy)[1]
@@ -124,12 +129,12 @@ def _swept(
             # Density of all other channels: the whole without this one given them.
             square = (residual * pulled).sum(1) - off**2 * own
             rest = log_weight - 0.5 * (square + log_volume - np.log(spread))
-            v = np.maximum(spread - variance[c], SMALLEST)[:, None] + variances
+            v = np.maximum(spread - variance[c], smallest)[:, None] + variances
             log_k = rest[:, None] - 0.5 * (off[:, None] ** 2 / v + np.log(v))
             gain = np.logaddexp.reduce(log_k, 0)
             log_p = gain + log_prior
             log_total = log_sum_exp(log_p)
-            if sweep >= NUM_BURNT:
+            if sweep >= num_burnt:
                 total[c] = np.logaddexp(total[c], gain - log_total)
             p = np.exp(log_p - log_total)
             drawn = variances[rng.choice(len(grid), p=p / p.sum())]
@@ -141,4 +146,4 @@ def _swept(
             )
             log_volume = log_volume + np.log(grown)
             variance[c] = drawn
-    return total - np.log(NUM_SWEEPS)
+    return total - np.log(num_sweeps)

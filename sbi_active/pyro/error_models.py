@@ -1,4 +1,4 @@
-r"""Error models :math:`p(x_o | x)` as short Pyro programs.
+r"""Error models :math:`p(x_o | x)`.
 
 All numbers are in deviations of the predictive, channel by channel. Indicators of
 misspecification are discrete and summed out; their probabilities are recovered from the
@@ -12,16 +12,15 @@ References:
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-import pyro
 import pyro.distributions as dist
 import torch
 from torch import Tensor
-
-ROUNDED = 0.1  # of the log of a known deviation, whose density would be a spike
+from torch.distributions import Distribution
 
 
 class ErrorModel(Protocol):
@@ -36,8 +35,39 @@ class ErrorModel(Protocol):
         ...
 
 
+class _RightOrWrong:
+    """A channel is right, or wrong with some probability."""
+
+    probability: float
+    spike: float
+
+    def _parts(self, x: Tensor, x_o: Tensor) -> Tensor:
+        """Return log densities of an outcome that is right and wrong, (2, n, q)."""
+        rho = torch.tensor([1 - self.probability, self.probability]).log().to(x)
+        right = dist.Normal(x, self.spike).log_prob(x_o)
+        return torch.stack([rho[0] + right, rho[1] + self._wrong(x).log_prob(x_o)])
+
+    def misspecified(self, x: Tensor, x_o: Tensor) -> Tensor:
+        """Return probabilities given denoised outcomes (n, q), shape (n, q)."""
+        return self._parts(x, x_o).softmax(0)[1]
+
+    def log_deviation(self, log_sd: Tensor) -> Tensor:
+        """Return the log density of the log deviation of a channel's error, (n,)."""
+        right = _known(self.spike, log_sd) + np.log(1 - self.probability)
+        wrong = self._wrong_deviation(log_sd) + np.log(self.probability)
+        return torch.logaddexp(right, wrong)
+
+    @abstractmethod
+    def _wrong(self, x: Tensor) -> Distribution:
+        """Return the distribution of a wrong channel around x."""
+
+    @abstractmethod
+    def _wrong_deviation(self, log_sd: Tensor) -> Tensor:
+        """Return the log density of the log deviation of a wrong channel, (n,)."""
+
+
 @dataclass(frozen=True)
-class SpikeAndSlab:
+class SpikeAndSlab(_RightOrWrong):
     r"""Each channel is right, or off by anything.
 
     .. math::
@@ -53,26 +83,39 @@ class SpikeAndSlab:
     spike: float = 0.005
     slab: float = 10.0
 
-    def __call__(self, x: Tensor, x_o: Tensor) -> None:
-        """Condition on an outcome; x of shape (..., q)."""
-        parts = self._parts(x, x_o)
-        pyro.factor("outcome", torch.logsumexp(parts, 0).sum(-1))
+    def _wrong(self, x: Tensor) -> Distribution:
+        return dist.StudentT(3.0, x, self.slab)
 
-    def misspecified(self, x: Tensor, x_o: Tensor) -> Tensor:
-        """Return probabilities given denoised outcomes (n, q), shape (n, q)."""
-        return self._parts(x, x_o).softmax(0)[1]
+    def _wrong_deviation(self, log_sd: Tensor) -> Tensor:
+        return _student(3.0, self.slab, log_sd)
 
-    def log_deviation(self, log_sd: Tensor) -> Tensor:
-        """Return the log density of the log deviation of a channel's error, (n,)."""
-        right = _known(self.spike, log_sd) + np.log(1 - self.probability)
-        wrong = _student(3.0, self.slab, log_sd) + np.log(self.probability)
-        return torch.logaddexp(right, wrong)
 
-    def _parts(self, x: Tensor, x_o: Tensor) -> Tensor:
-        rho = torch.tensor([1 - self.probability, self.probability]).log().to(x)
-        right = dist.Normal(x, self.spike).log_prob(x_o)
-        wrong = dist.StudentT(3.0, x, self.slab).log_prob(x_o)
-        return torch.stack([rho[0] + right, rho[1] + wrong])
+@dataclass(frozen=True)
+class ChannelBias(_RightOrWrong):
+    r"""Each channel is right or has a bias: :math:`x_o = x + m b`, b summed out.
+
+    It is :class:`SpikeAndSlab` with a normal slab, for sensors whose zero has moved:
+    :math:`m \sim \mathrm{Bernoulli}(\rho)`, :math:`b \sim N(0, B^2)`.
+
+    Attributes:
+        probability: :math:`\rho`.
+        bias: B.
+        spike: Deviation that is left without a bias.
+    """
+
+    probability: float = 0.1
+    bias: float = 5.0
+    spike: float = 0.005
+
+    @property
+    def _wide(self) -> float:
+        return (self.spike**2 + self.bias**2) ** 0.5
+
+    def _wrong(self, x: Tensor) -> Distribution:
+        return dist.Normal(x, self._wide)
+
+    def _wrong_deviation(self, log_sd: Tensor) -> Tensor:
+        return _known(self._wide, log_sd)
 
 
 @dataclass(frozen=True)
@@ -89,12 +132,6 @@ class StudentError:
     scale: float = 0.05
     gross: float = 10.0
 
-    def __call__(self, x: Tensor, x_o: Tensor) -> None:
-        """Condition on an outcome; x of shape (..., q)."""
-        pyro.sample(
-            "outcome", dist.StudentT(self.df, x, self.scale).to_event(1), obs=x_o
-        )
-
     def misspecified(self, x: Tensor, x_o: Tensor) -> Tensor:
         """Return whether errors are gross at denoised outcomes (n, q), shape (n, q)."""
         return ((x_o - x).abs() > self.gross * self.scale).to(x)
@@ -104,46 +141,8 @@ class StudentError:
         return _student(self.df, self.scale, log_sd)
 
 
-@dataclass(frozen=True)
-class ChannelBias:
-    r"""Each channel is right or has a bias: :math:`x_o = x + m b`, b summed out.
-
-    It is :class:`SpikeAndSlab` with a normal slab, for sensors whose zero has moved:
-    :math:`m \sim \mathrm{Bernoulli}(\rho)`, :math:`b \sim N(0, B^2)`.
-
-    Attributes:
-        probability: :math:`\rho`.
-        bias: B.
-        spike: Deviation that is left without a bias.
-    """
-
-    probability: float = 0.1
-    bias: float = 5.0
-    spike: float = 0.005
-
-    def __call__(self, x: Tensor, x_o: Tensor) -> None:
-        """Condition on an outcome; x of shape (..., q)."""
-        pyro.factor("outcome", torch.logsumexp(self._parts(x, x_o), 0).sum(-1))
-
-    def misspecified(self, x: Tensor, x_o: Tensor) -> Tensor:
-        """Return probabilities given denoised outcomes (n, q), shape (n, q)."""
-        return self._parts(x, x_o).softmax(0)[1]
-
-    def log_deviation(self, log_sd: Tensor) -> Tensor:
-        """Return the log density of the log deviation of a channel's error, (n,)."""
-        wide = (self.spike**2 + self.bias**2) ** 0.5
-        right = _known(self.spike, log_sd) + np.log(1 - self.probability)
-        return torch.logaddexp(right, _known(wide, log_sd) + np.log(self.probability))
-
-    def _parts(self, x: Tensor, x_o: Tensor) -> Tensor:
-        rho = torch.tensor([1 - self.probability, self.probability]).log().to(x)
-        wide = (self.spike**2 + self.bias**2) ** 0.5
-        parts = [dist.Normal(x, sd).log_prob(x_o) for sd in (self.spike, wide)]
-        return torch.stack([rho[0] + parts[0], rho[1] + parts[1]])
-
-
-def _known(sd: float, log_sd: Tensor) -> Tensor:
-    return dist.Normal(float(np.log(sd)), ROUNDED).log_prob(log_sd)
+def _known(sd: float, log_sd: Tensor, *, rounded: float = 0.1) -> Tensor:
+    return dist.Normal(float(np.log(sd)), rounded).log_prob(log_sd)
 
 
 def _student(df: float, scale: float, log_sd: Tensor) -> Tensor:

@@ -17,8 +17,6 @@ from torch.distributions import Distribution, Independent, Normal, StudentT, con
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel, StudentTNoise
 
-NUM_TRIED = 4  # prior draws at which the model is looked at
-
 
 class SitesPrior(Distribution):
     """The joint prior of a Pyro model's latent sites, end to end.
@@ -79,7 +77,11 @@ class PyroProblem:
 
 
 def from_pyro(
-    model: Callable[[Tensor], Any], action: Tensor, *, outcome: str = "x"
+    model: Callable[[Tensor], Any],
+    action: Tensor,
+    *,
+    outcome: str = "x",
+    num_tried: int = 4,
 ) -> PyroProblem:
     """Return simulator, prior, noise and names of a Pyro model.
 
@@ -92,6 +94,7 @@ def from_pyro(
         model: ``model(action)``.
         action: Action to try it at, shape (action_dim,).
         outcome: Name of the outcome's site.
+        num_tried: Number of prior draws at which the model is looked at.
 
     Raises:
         ValueError: If there is no such site, no parameter, a discrete one, or one whose
@@ -110,7 +113,7 @@ def from_pyro(
     with forked_generators(0, "pyro"):
         traces = [
             poutine.trace(model).get_trace(action * scale)
-            for scale in torch.linspace(1, 0.5, NUM_TRIED)
+            for scale in torch.linspace(1, 0.5, num_tried)
         ]
     sites = [_latent(trace, outcome) for trace in traces]
     first = sites[0]

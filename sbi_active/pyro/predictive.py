@@ -11,8 +11,6 @@ from torch import Tensor
 
 from sbi_active.inference.sampling.gaussian_mixture import GaussianMixture
 
-NUM_COMPONENTS = 4  # at most
-
 
 @dataclass(frozen=True)
 class Predictive:
@@ -29,10 +27,10 @@ class Predictive:
     cov: Tensor
 
     @staticmethod
-    def fit(x: Tensor, seed: int) -> Predictive:
+    def fit(x: Tensor, seed: int, *, num: int = 4) -> Predictive:
         """Return a fit to rows (n, q)."""
         rng = np.random.default_rng(seed)
-        found = GaussianMixture.fit(x.numpy(), NUM_COMPONENTS, rng)
+        found = GaussianMixture.fit(x.numpy(), num, rng)
         factor = torch.from_numpy(found.factor)
         mean, log_weight = map(torch.from_numpy, (found.mean, found.log_weight))
         return Predictive(log_weight, mean, factor @ factor.mT)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from copy import deepcopy
 from typing import Any
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.beliefs.belief import Belief, named
+from sbi_active.inference.beliefs.belief import Belief, ChainedBelief, named
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
 from sbi_active.inference.rounds.condition import pack
@@ -19,13 +20,12 @@ from sbi_active.pyro.denoising import Denoised, denoise
 from sbi_active.pyro.error_models import SpikeAndSlab
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
-from sbi_active.support import within_support
 
 NUM_PREDICTIVE = 1_000  # simulations under the belief before the trial
 NUM_AVERAGED = 100  # denoised outcomes
 
 
-class RobustBelief(Belief):
+class RobustBelief(ChainedBelief):
     r"""The network's posterior, averaged over denoised outcomes.
 
     .. math::
@@ -36,28 +36,24 @@ class RobustBelief(Belief):
         estimator: Estimator q over packed conditions.
         condition: Conditions (x_i, action), shape (n, condition_dim).
         prior: The original prior.
+        previous: The belief before the trial.
         denoised: Denoised outcomes that it was drawn with.
     """
 
     label = "robust, chained approximation"
 
     def __init__(
-        self, estimator: Any, condition: Tensor, prior: Distribution, denoised: Denoised
+        self,
+        estimator: Any,
+        condition: Tensor,
+        prior: Distribution,
+        previous: Distribution,
+        denoised: Denoised,
     ) -> None:
-        super().__init__(prior)
-        self._estimator, self._condition = estimator.eval(), condition
+        with forked_generators(0, "robust"):
+            super().__init__(estimator, condition, prior, previous)
         self.denoised = denoised
-        with torch.no_grad(), forked_generators(0, "robust"):
-            inside = within_support(prior, self._raw(20_000))
-        self._acceptance = float(inside.double().mean())
-        if self._acceptance < 1e-3:
-            raise ValueError(
-                f"expected a posterior within the prior's support; got "
-                f"{self._acceptance:.2%} of it there; check the outcome, or widen the "
-                "prior"
-            )
         self.diagnostics = self.diagnostics.extended(
-            mass_inside_prior=self._acceptance,
             misspecification=denoised.probability.tolist(),
             nuts_r_hat=denoised.r_hat,
             nuts_effective_draws=denoised.effective_sample_size,
@@ -70,24 +66,14 @@ class RobustBelief(Belief):
         draws = draws.flatten(0, 1)
         return draws[torch.randperm(len(draws))[:num]]
 
-    def _sample(self, num_samples: int) -> Tensor:
-        kept, missing = [], num_samples
-        while missing > 0:
-            draws = self._raw(int(1.1 * missing / self._acceptance) + 100)
-            draws = draws[within_support(self.prior, draws)][:missing]
-            kept.append(draws)
-            missing -= len(draws)
-        return torch.cat(kept) if kept else self._condition.new_zeros(0)
-
-    def _log_prob(self, theta: Tensor) -> Tensor:
-        num, found = len(self._condition), []
+    def _log_density(self, theta: Tensor) -> Tensor:
+        num, found = len(self._condition), [theta.new_zeros(0).double()]
         with torch.no_grad():
             for rows in theta.split(2_000):
                 each = rows[:, None].expand(-1, num, -1)
                 log_q = self._estimator.log_prob(each, self._condition)
                 found.append(log_q.double().logsumexp(1))
-        total = torch.cat(found) if found else theta.new_zeros(0)
-        return total - torch.tensor(num * self._acceptance).double().log()
+        return torch.cat(found) - math.log(num)
 
 
 class RobustASBI(ASBI):
@@ -169,7 +155,7 @@ class RobustASBI(ASBI):
         x = x.reshape(NUM_AVERAGED, *trial.x.shape)
         condition = pack(x, trial.action.expand(NUM_AVERAGED, -1)).to(self._device)
         prior = require_support(self._prior)
-        belief = RobustBelief(deepcopy(network), condition, prior, denoised)
+        belief = RobustBelief(deepcopy(network), condition, prior, previous, denoised)
         named(belief, simulator)
         self._belief, self.trials = belief, [*self.trials, trial]
         self.denoised.append(denoised)

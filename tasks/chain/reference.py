@@ -7,8 +7,10 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
+from sbi_active.inference.sampling.coordinates import (
+    NormalCoordinates,
+    PriorCoordinates,
+)
 from sbi_active.inference.sampling.smc import bridge
 from sbi_active.inference.sampling.student_mixture import NormalMixture
 from sbi_active.inference.sampling.weights import (

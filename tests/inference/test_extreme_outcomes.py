@@ -16,8 +16,8 @@ from sbi_active import (
     SimulatorModel,
 )
 from sbi_active.inference import SeqBED_LFIRE, refine
-from sbi_active.inference.rounds import UnexplainedOutcomeError
-from sbi_active.inference.sampling import normalized
+from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
+from sbi_active.inference.sampling.weights import normalized
 from tests.campaign.test_corrections import OPTIONS, RATIOS
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))

@@ -17,7 +17,7 @@ from sbi_active import (
     simulate,
 )
 from sbi_active.criticism import Trials
-from sbi_active.inference.rounds import action_rows, outcome_rows
+from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning, check_simulator
 

@@ -13,7 +13,7 @@ from sbi_active import (
     simulate,
 )
 from sbi_active.campaign.telling import outcome_told
-from sbi_active.inference.rounds import outcome_rows
+from sbi_active.inference.rounds.condition import outcome_rows
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning, SimulationError, check_simulator
 from sbi_active.simulation.simulator import outcome_tensor

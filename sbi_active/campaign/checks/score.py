@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.campaign.checks.spread import Spread
-from sbi_active.inference.sampling.bandwidth import silverman
+from sbi_active.inference.sampling.weights import silverman
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers

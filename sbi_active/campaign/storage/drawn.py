@@ -16,8 +16,7 @@ from typing_extensions import override
 
 from sbi_active.actions import ActionSpace
 from sbi_active.campaign.state import CampaignState
-from sbi_active.inference.beliefs.belief import Belief
-from sbi_active.inference.beliefs.particles import ParticleDraws
+from sbi_active.inference.beliefs.belief import Belief, ParticleDraws
 from sbi_active.seeding import forked_generators
 
 #: Draws of each. A choice: a quantile is off by some 2 % of the draws, half as many 3 %

@@ -22,8 +22,11 @@ from sbi_active.criticism.identification.spread import spread
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.kernel_belief import KernelBelief
 from sbi_active.inference.engine.importance import pareto_shape
-from sbi_active.inference.sampling.bandwidth import scott
-from sbi_active.inference.sampling.weights import effective_sample_size, normalized
+from sbi_active.inference.sampling.weights import (
+    effective_sample_size,
+    normalized,
+    scott,
+)
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sbi_active.inference.sampling.bandwidth import silverman
+from sbi_active.inference.sampling.weights import silverman
 
 NUM_FOLDS = 4  # a choice: fits of three quarters of the rows, four times
 

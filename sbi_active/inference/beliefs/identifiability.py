@@ -18,25 +18,43 @@ from sbi_active.seeding import forked_generators
 
 Array = NDArray[Any]
 
-NUM_DRAWS = 2_000  # an interval's ends to a twentieth of its length
-#: Prior deviations above which a parameter is not known by itself: what a product that
-#: is known exactly leaves of one of its factors may be no more, by the other's bounds.
-OPEN = 0.3
-#: Prior deviations above which a parameter that is in no combination is said not to be
-#: known: a uniform belief over half of a uniform prior has as much.
-WIDE = 0.5
-BINS = 20  # equally probable ones of the prior
-#: Share of them that the belief fills, in prior deviations and at most 1 of them, below
-#: which it is several narrow modes: one Gaussian hump fills 1.2.
-FILLED = 0.5
 AS_PRIOR = 0.9
-#: Effective draws a parameter below which their covariance has narrow directions that
-#: the belief has not.
-ENOUGH = 10
 SHOWN = 3  # combinations that are written out
-NAMED = 6  # parameters that are
-OUTLIERS = 0.01  # share of draws left out: a belief may hold a little of the prior
 LEVEL = 0.9
+
+
+@dataclass(frozen=True, kw_only=True)
+class CombinationSettings:
+    """Settings of what is said of parameters together.
+
+    Attributes:
+        num_draws: Number of draws; an interval's ends are known to a twentieth
+            of its length.
+        open: Prior deviations above which a parameter is not known by itself:
+            what a product that is known exactly leaves of one of its factors
+            may be no more, by the other's bounds.
+        wide: Prior deviations above which a parameter that is in no combination
+            is said not to be known: a uniform belief over half of a uniform
+            prior has as much.
+        bins: Number of equally probable bins of the prior.
+        filled: Share of the bins that the belief fills, in prior deviations and
+            at most 1 of them, below which it is several narrow modes: one
+            Gaussian hump fills 1.2.
+        enough: Number of effective draws a parameter below which their
+            covariance has narrow directions that the belief has not.
+        named: Number of parameters that are named.
+        outliers: Share of draws left out: a belief may hold a little of the
+            prior.
+    """
+
+    num_draws: int = 2_000
+    open: float = 0.3
+    wide: float = 0.5
+    bins: int = 20
+    filled: float = 0.5
+    enough: int = 10
+    named: int = 6
+    outliers: float = 0.01
 
 
 @dataclass(frozen=True)
@@ -162,17 +180,20 @@ def combinations_of(
 
 
 def combinations_of_draws(
-    after: Array, before: Array, names: Sequence[str] | None = None
+    after: Array,
+    before: Array,
+    names: Sequence[str] | None = None,
+    settings: CombinationSettings = CombinationSettings(),
 ) -> Combinations:
     """Return combinations by draws of a belief and of the prior, (m, d) and (n, d)."""
     dim = before.shape[1]
     if dim < 2 or not (np.isfinite(before).all() and np.isfinite(after).all()):
         return Combinations()
-    if _effective(after) < ENOUGH * dim:
+    if _effective(after) < settings.enough * dim:
         return Combinations()
     if names is None:
         names = [f"theta_{i + 1}" for i in range(dim)]
-    kept = _without_outliers(after)
+    kept = _without_outliers(after, settings)
 
     def moments(terms: Sequence[Term]) -> tuple[Array, Array]:
         own, old = (
@@ -184,16 +205,16 @@ def combinations_of_draws(
     everything = np.concatenate([before, after])
     low, span = everything.min(0), np.ptp(before, 0)
     own = kept.std(0) / np.maximum(before.std(0), 1e-300)
-    filled = _filled(after, before)
-    is_open = (own > OPEN) & (filled > FILLED * own.clip(max=1.0))
+    filled = _filled(after, before, settings)
+    is_open = (own > settings.open) & (filled > settings.filled * own.clip(max=1.0))
     found = search(moments, np.flatnonzero(is_open).tolist(), low, span)
     groups = linked([c for c, _ in found])
     widths = {id(c): w for c, w in found}
     known = [_known(c, widths[id(c)], after, names) for g in groups for c in g]
-    unknown = [_left(group, moments, own, names) for group in groups]
+    unknown = [_left(group, moments, own, names, settings) for group in groups]
     named = {i for c, _ in found for i in c.index}
     best = min([*own[~is_open].tolist(), *(w for _, w in found)], default=np.inf)
-    for i in np.flatnonzero(is_open & (own > WIDE)).tolist():
+    for i in np.flatnonzero(is_open & (own > settings.wide)).tolist():
         if i not in named and best < KNOWN * own[i]:
             unknown.append(UnknownCombination(names[i], float(own[i])))
     return Combinations(tuple(known), tuple(unknown))
@@ -214,9 +235,14 @@ def note_combinations(belief: Any, names: Sequence[str] | None, *, seed: int) ->
     belief.diagnostics = belief.diagnostics.extended(combinations=found)
 
 
-def _draws(distribution: Distribution, seed: int, key: str) -> Array:
+def _draws(
+    distribution: Distribution,
+    seed: int,
+    key: str,
+    settings: CombinationSettings = CombinationSettings(),
+) -> Array:
     with forked_generators(seed, "combinations", key):
-        return distribution.sample(torch.Size([NUM_DRAWS])).double().numpy()
+        return distribution.sample(torch.Size([settings.num_draws])).double().numpy()
 
 
 def _effective(draws: Array) -> float:
@@ -225,22 +251,28 @@ def _effective(draws: Array) -> float:
     return float(count.sum() ** 2 / (count**2).sum())
 
 
-def _without_outliers(draws: Array) -> Array:
+def _without_outliers(
+    draws: Array, settings: CombinationSettings = CombinationSettings()
+) -> Array:
     """Return the draws nearest to their mean, by their covariance."""
     step = draws - draws.mean(0)
     inverse = np.linalg.pinv(np.cov(step.T), hermitian=True)
     distance = np.einsum("ni,ij,nj->n", step, inverse, step)
-    return draws[distance <= np.quantile(distance, 1 - OUTLIERS)]
+    return draws[distance <= np.quantile(distance, 1 - settings.outliers)]
 
 
-def _filled(draws: Array, prior: Array) -> Array:
+def _filled(
+    draws: Array, prior: Array, settings: CombinationSettings = CombinationSettings()
+) -> Array:
     """Return the share of the prior's bins that each parameter fills, shape (d,)."""
-    edges = np.quantile(prior, np.linspace(0, 1, BINS + 1)[1:-1], axis=0)
+    edges = np.quantile(prior, np.linspace(0, 1, settings.bins + 1)[1:-1], axis=0)
     shares = []
     for own, inner in zip(draws.T, edges.T, strict=True):
-        count = np.bincount(np.searchsorted(inner, own), minlength=BINS) / len(own)
+        count = np.bincount(np.searchsorted(inner, own), minlength=settings.bins) / len(
+            own
+        )
         entropy = -(count[count > 0] * np.log(count[count > 0])).sum()
-        shares.append(np.exp(entropy) / BINS)
+        shares.append(np.exp(entropy) / settings.bins)
     return np.array(shares)
 
 
@@ -254,17 +286,21 @@ def _known(
 
 
 def _left(
-    group: Sequence[Combination], moments: Any, own: Array, names: Sequence[str]
+    group: Sequence[Combination],
+    moments: Any,
+    own: Array,
+    names: Sequence[str],
+    settings: CombinationSettings = CombinationSettings(),
 ) -> UnknownCombination:
     """Return the combination that the known ones leave open."""
     if len(group) == 1 and len(group[0].terms) == 2:
         other = group[0].mirrored()
         wide = width(other.weight, *moments(other.terms))
-        if wide > OPEN:
+        if wide > settings.open:
             return UnknownCombination(other.text(names), wide)
     index = sorted({i for c in group for i in c.index})
-    each = ", ".join(names[i] for i in index[:NAMED])
-    if len(index) > NAMED:
-        each += f" and {len(index) - NAMED} others"
+    each = ", ".join(names[i] for i in index[: settings.named])
+    if len(index) > settings.named:
+        each += f" and {len(index) - settings.named} others"
     least = float(own[index].min())
     return UnknownCombination(f"{each}, each by itself", least, several=True)

@@ -8,15 +8,13 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.beliefs.belief import Belief
+from sbi_active.inference.beliefs.belief import Belief, within_prior
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
-from sbi_active.inference.sampling.bandwidth import scott
+from sbi_active.inference.sampling.weights import scott
 from sbi_active.seeding import forked_generators
 from sbi_active.support import within_support
 
 BLOCK = 4_000_000  # pairs of a kernel and a row held in memory at once
-NUM_TRIED = 4_000  # draws behind the normalizer
-RIDGE = 1e-10  # of the largest variance, for parameters that do not vary
 
 
 class KernelBelief(Belief):
@@ -49,6 +47,9 @@ class KernelBelief(Belief):
         prior: Distribution,
         draws: Tensor,
         weight: Tensor | None = None,
+        *,
+        num_tried: int = 4_000,
+        ridge: float = 1e-10,
     ) -> None:
         super().__init__(prior)
         draws = draws.double()
@@ -62,7 +63,7 @@ class KernelBelief(Belief):
         step = draws - center
         covariance = (self._weight[:, None] * step).mT @ step
         largest = float(covariance.diagonal().max().clamp_min(1e-30))
-        covariance = covariance + RIDGE * largest * torch.eye(d).double()
+        covariance = covariance + ridge * largest * torch.eye(d).double()
         covariance = width**2 * covariance
         if weighted:
             covariance = covariance + n ** (-2 / d) * torch.cov(draws.mT).reshape(d, d)
@@ -70,8 +71,8 @@ class KernelBelief(Belief):
         self._inverse = torch.linalg.inv(self._factor)
         self._kept = 1.0
         with forked_generators(0, "kernels"):
-            inside = within_support(prior, self._draw(NUM_TRIED).float())
-        self._kept = max(float(inside.double().mean()), 1 / NUM_TRIED)
+            inside = within_support(prior, self._draw(num_tried).float())
+        self._kept = max(float(inside.double().mean()), 1 / num_tried)
         self.diagnostics = Diagnostics().extended(
             effective_sample_size=effective,
             bandwidth=width,
@@ -84,13 +85,7 @@ class KernelBelief(Belief):
         return self._draws[index] + noise @ self._factor.mT
 
     def _sample(self, num_samples: int) -> Tensor:
-        kept, missing = [], num_samples
-        while missing > 0:
-            draws = self._draw(int(1.1 * missing / self._kept) + 20).float()
-            draws = draws[within_support(self.prior, draws)]
-            kept.append(draws[:missing])
-            missing -= len(kept[-1])
-        return torch.cat(kept) if kept else self._draws[:0].float()
+        return within_prior(self.prior, self._draw, num_samples, self._kept)
 
     def _log_prob(self, theta: Tensor) -> Tensor:
         places = self._draws @ self._inverse.mT

@@ -14,9 +14,6 @@ from sbi_active.inference.beliefs.enumerated import MOST_VALUES, Enumeration
 from sbi_active.seeding import forked_generators
 from sbi_active.support import parts_of, within_support
 
-#: Steps of float32 that a prior's standard deviation is at least; a belief is narrower.
-FEWEST_STEPS = 64
-
 
 def require_support(
     prior: Distribution | None, *, enumerates: bool = False
@@ -123,7 +120,11 @@ def _shown_prior(prior: Distribution) -> str:
 
 
 def require_width(
-    prior: Distribution, names: Sequence[str] | None = None, *, seed: int
+    prior: Distribution,
+    names: Sequence[str] | None = None,
+    *,
+    seed: int,
+    fewest: int = 64,
 ) -> None:
     """Raise if a prior is empty, or has no width that float32 can hold.
 
@@ -131,6 +132,8 @@ def require_width(
         prior: Prior of the parameters.
         names: Names of the parameters, for the error.
         seed: Seed of some draws.
+        fewest: Steps of float32 that a prior's standard deviation is at least; a belief
+            is narrower.
     """
     enumeration = Enumeration.of(prior)
     if enumeration is not None:
@@ -149,7 +152,7 @@ def require_width(
     draws = draws.double()
     size = draws.abs().amax(0).clamp_min(torch.finfo(torch.float32).tiny)
     steps = draws.std(0) / (size * torch.finfo(torch.float32).eps)
-    narrow = (steps < FEWEST_STEPS).nonzero()[:, 0].tolist()
+    narrow = (steps < fewest).nonzero()[:, 0].tolist()
     if not narrow:
         _require_no_atoms(draws, names)
         return
@@ -158,7 +161,7 @@ def require_width(
     raise ValueError(
         f"expected a prior in which parameters vary; got {name} "
         f"within [{draws[:, k].min():.9g}, {draws[:, k].max():.9g}], fewer than "
-        f"{FEWEST_STEPS} steps of float32 wide; fix the parameter in the simulator, or "
+        f"{fewest} steps of float32 wide; fix the parameter in the simulator, or "
         "shift it to deviations from its value"
     )
 

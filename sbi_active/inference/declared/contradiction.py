@@ -33,19 +33,17 @@ from scipy.stats import chi2
 from torch import Tensor
 
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
-from sbi_active.inference.engine.simulated_likelihood import SimulatedLikelihood
+from sbi_active.inference.engine.potential import SimulatedLikelihood
 from sbi_active.simulation.noise.whitening import whitened
 
 Array = NDArray[Any]
 
-NUM_REPEATS = 2_000  # draws of the noise at the best fit
 MAX_INFLATIONS = 3  # a better fit may be found once the noise is wider
 NUM_NAMED = 3  # trials that a sentence lists
 #: Tail probability of the best fit's residuals under the declared noise, below which
 #: trials contradict. A right simulator crosses it once in a million updates; half and
 #: twice are the same in practice, since contradictions lie far below.
 LEVEL = 1e-6
-INFORMED = 1e-3  # derivative below which no trial informs a parameter
 
 
 @dataclass(frozen=True)
@@ -88,6 +86,7 @@ def find_contradiction(
     *,
     level: float = LEVEL,
     rng: np.random.Generator,
+    informed_above: float = 1e-3,
 ) -> Contradiction | None:
     """Return the contradiction at the best fit; None if the noise explains it.
 
@@ -99,11 +98,12 @@ def find_contradiction(
             prior, (N, d).
         level: Tail probability below which trials contradict.
         rng: Source of the draws of the noise.
+        informed_above: Derivative below which no trial informs a parameter.
     """
     t = len(likelihood)
     seen = likelihood.x.isfinite().flatten(1).numpy()
     squares = (residual.reshape(t, -1) ** 2).sum(1)
-    informed = int((np.abs(jacobian).max(0) > INFORMED).sum())
+    informed = int((np.abs(jacobian).max(0) > informed_above).sum())
     found = compared(
         likelihood.action,
         likelihood.x,
@@ -188,7 +188,11 @@ def compared(
 
 
 def _beyond_noise(
-    likelihood: SimulatedLikelihood, theta: Tensor, rng: np.random.Generator
+    likelihood: SimulatedLikelihood,
+    theta: Tensor,
+    rng: np.random.Generator,
+    *,
+    num: int = 2_000,
 ) -> bool:
     """Return whether the noise is never as unlikely as the trials, heavy tails too.
 
@@ -199,13 +203,13 @@ def _beyond_noise(
     best = int(log_likelihood.argmax())
     if not np.isfinite(log_likelihood[best]):
         return True
-    drawn = np.zeros(NUM_REPEATS)
+    drawn = np.zeros(num)
     for action, x in zip(likelihood.action, likelihood.x, strict=True):
         if not bool(x.isfinite().any()):
             continue
         mean = torch.from_numpy(likelihood.table.mean(theta[best, None], action)[0])
-        mean = mean.expand(NUM_REPEATS, *mean.shape[1:])
-        seeds = torch.from_numpy(rng.integers(2**62, size=NUM_REPEATS))
+        mean = mean.expand(num, *mean.shape[1:])
+        seeds = torch.from_numpy(rng.integers(2**62, size=num))
         outcome = likelihood.noise.sample(mean, seeds).double()
         outcome = torch.where(x.isfinite(), outcome, torch.nan)
         drawn += likelihood.noise.log_prob(outcome, mean).double().numpy()

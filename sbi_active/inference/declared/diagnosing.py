@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,24 +12,46 @@ from torch import Tensor
 
 from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.engine import Fit, Settings, SimulatedPotential
-from sbi_active.inference.engine.simulated_likelihood import SimulatedLikelihood
+from sbi_active.inference.engine.potential import SimulatedLikelihood
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.noise.whitening import is_known_gaussian
 
 Array = NDArray[Any]
 
-COARSE = 60.0  # effective draws, below which a warning is due
-TOLERATED = 0.1  # divergence of a normal fit to the draws, nats, likewise
-MOVING = 0.02  # share of moves accepted, below which particles are stuck
-REMEMBERED = 0.3  # correlation of particles with where they began that is too much
-NUM_CHECKED = 200  # draws that tail probabilities rest on
-EDGE = 0.5  # mass within 1 % of the edge of one parameter that calls for a warning
-RARE = 1e-3  # tail probability of the observation that calls for a warning
-NUM_REPEATS = 50  # of the noise a draw
+
+@dataclass(frozen=True, kw_only=True)
+class FitChecks:
+    """Limits beyond which a fit is doubted.
+
+    Attributes:
+        coarse: Number of effective draws below which a warning is due.
+        tolerated: Divergence of a normal fit to the draws, nats, likewise.
+        moving: Share of moves accepted below which particles are stuck.
+        remembered: Correlation of particles with where they began that is too
+            much.
+        num_checked: Number of draws that tail probabilities rest on.
+        edge: Mass within 1 % of the edge of one parameter that calls for a
+            warning.
+        rare: Tail probability of the observation that calls for a warning.
+        num_repeats: Number of draws of the noise for each of these.
+    """
+
+    coarse: float = 60.0
+    tolerated: float = 0.1
+    moving: float = 0.02
+    remembered: float = 0.3
+    num_checked: int = 200
+    edge: float = 0.5
+    rare: float = 1e-3
+    num_repeats: int = 50
 
 
 def diagnose_fit(
-    fit: Fit, potential: SimulatedPotential, declared: SimulatedLikelihood, seed: int
+    fit: Fit,
+    potential: SimulatedPotential,
+    declared: SimulatedLikelihood,
+    seed: int,
+    own: FitChecks = FitChecks(),
 ) -> Diagnostics:
     """Return figures about a fit, what it assumes, and warnings in words.
 
@@ -37,16 +60,17 @@ def diagnose_fit(
         potential: Potential whose noise may be inflated.
         declared: Likelihood under the noise as it was declared.
         seed: Seed of the draws behind tail probabilities.
+        own: Settings.
     """
-    assumptions, doubts = _assumptions(fit)
+    assumptions, doubts = _assumptions(fit, own)
     base = potential.coordinates.base
     z = potential.coordinates.to_z(fit.u)
     near_edge = np.abs(z[:, base.bounded]) > 0.98
     edge_mass = float((fit.weight @ near_edge).max(initial=0.0))
     rng = np.random.default_rng(derive_seed(seed, "tail"))
-    rows = rng.choice(len(z), size=NUM_CHECKED, p=fit.weight)
-    tail = _tail_probability(declared, base.to_theta(z[rows]), seed)
-    warnings = [*doubts, *misplaced(tail[:-1], tail[-1], edge_mass)]
+    rows = rng.choice(len(z), size=own.num_checked, p=fit.weight)
+    tail = _tail_probability(declared, base.to_theta(z[rows]), seed, own)
+    warnings = [*doubts, *misplaced(tail[:-1], tail[-1], edge_mass, own)]
     found = fit.found
     return Diagnostics(
         trustworthy=not warnings,
@@ -69,10 +93,12 @@ def diagnose_fit(
     )
 
 
-def _assumptions(fit: Fit) -> tuple[dict[str, Assumption], list[str]]:
+def _assumptions(
+    fit: Fit, own: FitChecks = FitChecks()
+) -> tuple[dict[str, Assumption], list[str]]:
     """Return the assumptions, and a sentence for each that fails."""
     effective, dim = fit.effective_sample_size, int((~fit.free).sum())
-    needed = max(COARSE, dim * (dim + 3) / (4 * TOLERATED))
+    needed = max(own.coarse, dim * (dim + 3) / (4 * own.tolerated))
     found = {"enough_draws": Assumption(effective >= needed, effective)}
     words = {
         "enough_draws": (
@@ -90,12 +116,13 @@ def _assumptions(fit: Fit) -> tuple[dict[str, Assumption], list[str]]:
             "the belief may miss where they are from; raise num_histories"
         )
     else:
-        own = fit.particles
-        moves = own.acceptance >= MOVING and own.memory <= REMEMBERED
-        found["particles_move"] = Assumption(moves, own.acceptance)
+        moved = fit.particles
+        moves = moved.acceptance >= own.moving
+        moves = moves and moved.memory <= own.remembered
+        found["particles_move"] = Assumption(moves, moved.acceptance)
         words["particles_move"] = (
-            f"SA117 {own.acceptance:.1%} of the moves of the particles were accepted, "
-            "too few for them to reach the posterior; raise num_histories"
+            f"SA117 {moved.acceptance:.1%} of the moves of the particles were "
+            "accepted, too few for them to reach the posterior; raise num_histories"
         )
     if fit.found is not None and not fit.is_rough:
         twice = fit.found.num_found >= 2
@@ -107,20 +134,22 @@ def _assumptions(fit: Fit) -> tuple[dict[str, Assumption], list[str]]:
     return found, [words[name] for name, a in found.items() if not a.holds]
 
 
-def misplaced(tail: list[float], joint: float, edge_mass: float) -> list[str]:
+def misplaced(
+    tail: list[float], joint: float, edge_mass: float, own: FitChecks = FitChecks()
+) -> list[str]:
     """Return warnings of a belief that may be far from the truth.
 
     They rest on the tail probability of each trial and of all, and the belief's mass
     near the edge of one parameter.
     """
     warnings = []
-    if joint < RARE or min(tail) < RARE / len(tail):
+    if joint < own.rare or min(tail) < own.rare / len(tail):
         warnings.append(
             "SA102 the observations are unlike anything simulated (tail probability "
             f"{min(joint, *tail):.1g}): the simulator lacks something, the prior "
             "excludes the truth, or a measurement is wrong"
         )
-    if edge_mass > EDGE:
+    if edge_mass > own.edge:
         warnings.append(
             f"SA103 {edge_mass:.0%} of the belief lies within 1 % of the prior's "
             "edge: the prior may exclude the truth"
@@ -129,7 +158,10 @@ def misplaced(tail: list[float], joint: float, edge_mass: float) -> list[str]:
 
 
 def _tail_probability(
-    likelihood: SimulatedLikelihood, theta: Tensor, seed: int
+    likelihood: SimulatedLikelihood,
+    theta: Tensor,
+    seed: int,
+    own: FitChecks = FitChecks(),
 ) -> list[float]:
     r"""Return the probability that noise is less likely than what was observed.
 
@@ -142,21 +174,26 @@ def _tail_probability(
     References:
         Gelman, Meng & Stern, Statistica Sinica 1996 (realized discrepancies).
     """
-    size, tail = len(theta) * NUM_REPEATS, []
+    size, tail = len(theta) * own.num_repeats, []
     total_observed, total_simulated = np.zeros(size), np.zeros(size)
     for k, x in enumerate(likelihood.x):
-        observed = np.repeat(likelihood.terms(theta, k), NUM_REPEATS)
+        observed = np.repeat(likelihood.terms(theta, k), own.num_repeats)
         simulated = np.zeros(size)
         if bool(x.isfinite().any()):
             with forked_generators(derive_seed(seed, "tail", k)):
-                simulated = _noise_terms(likelihood, theta, k)
+                simulated = _noise_terms(likelihood, theta, k, own)
         tail.append(_share(simulated <= observed))
         total_observed += observed
         total_simulated += simulated
     return [*tail, _share(total_simulated <= total_observed)]
 
 
-def _noise_terms(likelihood: SimulatedLikelihood, theta: Tensor, trial: int) -> Array:
+def _noise_terms(
+    likelihood: SimulatedLikelihood,
+    theta: Tensor,
+    trial: int,
+    own: FitChecks = FitChecks(),
+) -> Array:
     """Return log densities of draws of a trial's noise where it is seen, shape (n r,).
 
     Those of Gaussian noise are its peak less half a chi-square.
@@ -165,10 +202,10 @@ def _noise_terms(likelihood: SimulatedLikelihood, theta: Tensor, trial: int) -> 
     if is_known_gaussian(noise):
         freedom = torch.tensor(0.5 * float(x.isfinite().sum()))
         half = torch.distributions.Gamma(freedom.double(), 1.0)
-        drawn = half.sample(torch.Size([len(theta) * NUM_REPEATS]))
+        drawn = half.sample(torch.Size([len(theta) * own.num_repeats]))
         return likelihood.peak[trial] - drawn.numpy()
     mean = torch.from_numpy(likelihood.table.mean(theta, likelihood.action[trial])[0])
-    mean = mean.repeat_interleave(NUM_REPEATS, 0)
+    mean = mean.repeat_interleave(own.num_repeats, 0)
     draws = torch.where(x.isfinite(), noise.sample(mean).double(), torch.nan)
     return noise.log_prob(draws, mean).double().numpy()
 

@@ -33,26 +33,24 @@ from sbi_active.inference.engine import (
     search,
 )
 from sbi_active.inference.engine.pool import Pool
-from sbi_active.inference.engine.potential import STEP, unchanged
-from sbi_active.inference.engine.simulated_likelihood import (
+from sbi_active.inference.engine.potential import (
+    STEP,
     MeanTable,
     SimulatedLikelihood,
     declares_noise,
+    unchanged,
 )
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
-from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
+from sbi_active.inference.sampling.coordinates import (
+    NormalCoordinates,
+    PriorCoordinates,
+)
 from sbi_active.inference.sampling.weights import normalized, systematic
 from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.outcomes import MissingRowsWarning
 
 Array = NDArray[Any]
-
-NUM_HINTED = 250  # draws of each hint
-NUM_AROUND = 64  # parameters among which heavy tails have their best fit
-AROUND = 3.0  # times the width of a mode that these are drawn from
-STABLE = 1.1  # growth of the inflation below which it is settled
 
 
 def refine_declared(
@@ -149,13 +147,17 @@ def _engine_settings(
 
 
 def _near(
-    hints: Sequence[Distribution], coordinates: NormalCoordinates, seed: int
+    hints: Sequence[Distribution],
+    coordinates: NormalCoordinates,
+    seed: int,
+    *,
+    num: int = 250,
 ) -> Array | None:
     """Return draws of all hints, shape (n, d), those first that stand for each."""
     drawn, base = [], coordinates.base
     for hint in hints[:2]:
         with forked_generators(derive_seed(seed, "start")):
-            z = base.to_z(hint.sample(torch.Size([NUM_HINTED])).float())
+            z = base.to_z(hint.sample(torch.Size([num])).float())
         inside = base.inside(z)
         if inside.any():
             drawn.append(coordinates.from_z(z[inside]))
@@ -193,8 +195,16 @@ def _searched(
     near: Array | None,
     own: Settings,
     rng: np.random.Generator,
+    *,
+    num_around: int = 64,
+    wide: float = 3.0,
+    stable: float = 1.1,
 ) -> tuple[SimulatedPotential, Found | None, Contradiction | None]:
-    """Return the modes, of a noise that is inflated where trials contradict."""
+    """Return the modes, of a noise that is inflated where trials contradict.
+
+    Heavy tails have their best fit among ``num_around`` places, ``wide`` times the
+    width of a mode around it; below ``stable`` the inflation is settled.
+    """
     declared, c = potential.likelihood, potential.coordinates
     points = None if near is None else near[:2]
     found, contradiction = search(potential, rng, points, own.search), None
@@ -203,7 +213,7 @@ def _searched(
             break
         likelihood, best = potential.likelihood, found.modes[:1]
         residual, jacobian = potential.jacobian(best, unchanged, STEP)
-        around = best + AROUND * (found.guess.sample(NUM_AROUND, rng) - best)
+        around = best + wide * (found.guess.sample(num_around, rng) - best)
         around = np.clip(around, c.low, c.high)
         now = find_contradiction(
             declared,
@@ -212,7 +222,7 @@ def _searched(
             jacobian[0] * likelihood.inflation,
             rng=rng,
         )
-        if now is None or now.inflation < STABLE * likelihood.inflation:
+        if now is None or now.inflation < stable * likelihood.inflation:
             break
         contradiction = now
         wider = SimulatedLikelihood(

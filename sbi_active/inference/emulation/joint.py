@@ -19,13 +19,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sbi_active.inference.emulation.gain import mixture_gain
-from sbi_active.inference.emulation.likelihood import correlation_root
+from sbi_active.inference.emulation.likelihood import (
+    correlation_root,
+    declared_process,
+    learned_processes,
+    mixture_gain,
+)
 from sbi_active.inference.emulation.pool import Pool
 from sbi_active.inference.emulation.processes import nearest
-from sbi_active.inference.emulation.statistics import FEW, learned_statistic
-from sbi_active.inference.emulation.summaries import Summary
-from sbi_active.inference.regression.process import GaussianProcess, ProcessSettings
+from sbi_active.inference.emulation.summaries import FEW, Summary
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation.noise.base import NoiseModel
@@ -33,8 +35,6 @@ from sbi_active.simulation.noise.base import NoiseModel
 Array = NDArray[Any]
 
 NUM_OUTER, NUM_INNER = 160, 1_000
-MOST_ROWS = 600  # nearest to the belief
-OWN_ROWS = 8.0  # that the noise of all actions counts for at each
 
 
 def candidate_gains(
@@ -46,6 +46,7 @@ def candidate_gains(
     coordinates: PriorCoordinates,
     *,
     seed: int,
+    most_rows: int = 600,
 ) -> tuple[Array, Array]:
     """Return contributions to the gain and the share of measurements.
 
@@ -60,13 +61,15 @@ def candidate_gains(
         noise: Declared noise, or None.
         coordinates: Coordinates of the prior.
         seed: Seed of the outcomes.
+        most_rows: Number of rows, those nearest to the belief, that the processes rest
+            on.
 
     Returns:
         Shapes (a, K, m), nats, and (a,).
     """
     rows = pool.rows
     z, action = coordinates.to_z(rows.theta), rows.action.double().numpy()
-    near, region = nearest(z, np.ones(len(z), dtype=bool), reference, MOST_ROWS)
+    near, region = nearest(z, np.ones(len(z), dtype=bool), reference, most_rows)
     near = np.sort(near)
     rng = np.random.default_rng(derive_seed(seed, "outcomes"))
     draws = reference[rng.integers(len(reference), size=NUM_OUTER + NUM_INNER)]
@@ -119,15 +122,13 @@ def _gains(
     *,
     rng: np.random.Generator,
     seed: int,
+    own_rows: float = 8.0,
 ) -> Array:
     """Return contributions of one summary at each action, shape (a, NUM_OUTER)."""
     if len(inputs) < z.shape[1] + 4:
         return np.zeros((len(unit), NUM_OUTER))
     if noise is not None:
-        process = GaussianProcess.fit(
-            inputs, numbers, noise="none", settings=ProcessSettings(kind="rough")
-        )
-        processes = [process]
+        processes = (declared_process(inputs, numbers, ("rough",)),)
         zeros = torch.zeros(max(400, 4 * numbers.shape[1]), *x_shape).double()
         seeds = torch.from_numpy(rng.integers(2**62, size=len(zeros)))
         sampled = noise.sample(zeros, seeds).reshape(len(zeros), -1).numpy()
@@ -139,15 +140,10 @@ def _gains(
         if numbers.shape[1] > FEW * dim and inputs.shape[1] > dim:
             crossed = [numbers * inputs[:, [j]] for j in range(dim, inputs.shape[1])]
             features = np.concatenate([numbers, *crossed, inputs[:, dim:]], 1)
-        _, own = learned_statistic(features, z, seed=derive_seed(seed, "folds"))
-        processes = [
-            GaussianProcess.fit(inputs, own[:, [j]], noise="learned")
-            for j in range(own.shape[1])
-        ]
-        left_out = np.concatenate([p.left_out for p in processes], 1)
+        _, processes, left_out = learned_processes(inputs, features, z, seed=seed)
         common = np.concatenate([p.noise_sd for p in processes]) ** 2
-        total = OWN_ROWS * common + same.T.astype(float) @ left_out**2
-        sd = np.sqrt(total / (OWN_ROWS + same.sum(0))[:, None])
+        total = own_rows * common + same.T.astype(float) @ left_out**2
+        sd = np.sqrt(total / (own_rows + same.sum(0))[:, None])
         root = correlation_root(left_out)
         roots = [s[:, None] * root for s in sd]
     normal = rng.standard_normal((NUM_OUTER, len(roots[0])))

@@ -16,26 +16,31 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.special import gammaln
+from scipy.special import logsumexp
 from scipy.stats import chi2
 
+from sbi_active.inference.emulation.summaries import Statistic, learned_statistic
 from sbi_active.inference.regression.outcomes import TrialOutcome
-from sbi_active.inference.regression.process import GaussianProcess
+from sbi_active.inference.regression.process import (
+    GaussianProcess,
+    Kind,
+    ProcessSettings,
+)
 from sbi_active.inference.regression.regions import Region
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.inference.sampling.student_mixture import log_student
+from sbi_active.seeding import derive_seed
 from sbi_active.simulation.noise.base import NoiseModel
 from sbi_active.simulation.noise.gaussian import GaussianNoise
 
 Array = NDArray[Any]
-
-SHRINKAGE = 10.0  # rows that independent statistics count for in their correlation
-FREEDOM = 5.0  # degrees at least of Student's t
 
 
 @dataclass(frozen=True)
@@ -145,15 +150,11 @@ class TrialLikelihood:
         return np.broadcast_to(sd, self.x_shape).reshape(-1)[self.used]
 
     def _student(self, residual: Array, variance: Array) -> Array:
-        nu, q = self.freedom, residual.shape[1]
         spread = np.sqrt(self.learned_sd**2 + variance)
         white = np.linalg.solve(self.root, (residual / spread).T).T
         log_volume = np.log(spread).sum(1) + np.log(np.diag(self.root)).sum()
-        constant = (
-            gammaln(0.5 * (nu + q)) - gammaln(0.5 * nu) - 0.5 * q * np.log(nu * np.pi)
-        )
         square = (white**2).sum(1)
-        return constant - log_volume - 0.5 * (nu + q) * np.log1p(square / nu)
+        return log_student(square, log_volume, residual.shape[1], self.freedom)
 
     def _declared(self, mean: Array) -> Array:
         assert self.noise is not None
@@ -167,11 +168,51 @@ class TrialLikelihood:
         return self.noise.log_prob(x, at).double().numpy()
 
 
-def correlation_root(residual: Array) -> Array:
-    """Return the Cholesky factor of the correlation of residuals (n, q), shrunk."""
+def declared_process(
+    inputs: Array, numbers: Array, kinds: Sequence[Kind] = ("smooth", "rough")
+) -> GaussianProcess:
+    """Return the process of noise-free numbers, of the kernel of most evidence."""
+    fits = [
+        GaussianProcess.fit(
+            inputs, numbers, noise="none", settings=ProcessSettings(kind=kind)
+        )
+        for kind in kinds
+    ]
+    return max(fits, key=lambda process: process.log_evidence)
+
+
+def learned_processes(
+    inputs: Array, numbers: Array, z: Array, *, seed: int
+) -> tuple[Statistic, tuple[GaussianProcess, ...], Array]:
+    """Return a statistic of noisy numbers, a process of each, and residuals.
+
+    Args:
+        inputs: Inputs of the processes, shape (n, D).
+        numbers: Finite numbers of each simulation, shape (n, q).
+        z: Coordinates of the parameters that the statistic estimates, shape (n, d).
+        seed: Seed of the statistic's folds.
+
+    Returns:
+        Residuals are those of left-out rows, shape (n, s).
+    """
+    statistic, own = learned_statistic(numbers, z, seed=derive_seed(seed, "folds"))
+    processes = tuple(
+        GaussianProcess.fit(inputs, column[:, None], noise="learned")
+        for column in own.T
+    )
+    return statistic, processes, np.concatenate([p.left_out for p in processes], 1)
+
+
+def correlation_root(residual: Array, shrinkage: float = 10.0) -> Array:
+    """Return the Cholesky factor of the correlation of residuals (n, q), shrunk.
+
+    Args:
+        residual: Residuals.
+        shrinkage: Number of rows that independence counts for.
+    """
     n, q = residual.shape
     unit = residual / np.maximum(np.sqrt((residual**2).mean(0)), 1e-30)
-    correlation = (unit.T @ unit + SHRINKAGE * np.eye(q)) / (n + SHRINKAGE)
+    correlation = (unit.T @ unit + shrinkage * np.eye(q)) / (n + shrinkage)
     return np.linalg.cholesky(correlation)
 
 
@@ -193,3 +234,35 @@ class PooledLikelihood:
         for trial in self.trials:
             total = total + trial.log_likelihood(z)
         return total
+
+
+def mixture_gain(
+    mean: Array, variance: Array, root: Array, normal: Array, num_outer: int
+) -> Array:
+    r"""Return contributions to the information of the first parameters, (num_outer,).
+
+    .. math::
+        I = \mathrm E\left[\log p(x_i | \theta_i) - \log \frac{1}{M + 1}
+        \sum_{j = 0}^M p(x_i | \theta_j)\right], \qquad \theta_0 = \theta_i,
+
+    which is at most log(M + 1) (Foster et al., AISTATS 2020).
+
+    Args:
+        mean: Mean outcomes at the parameters, shape (m, q).
+        variance: Variance of the mean, shape (m, q).
+        root: Cholesky factor of the noise, shape (q, q).
+        normal: Standard normal numbers, shape (num_outer, q).
+        num_outer: Parameters that outcomes are drawn at.
+    """
+    inverse = np.linalg.inv(root)
+    m = mean @ inverse.T
+    # Where simulations are few is no property of the outcome: one variance for all.
+    v = 1 + (variance @ (inverse**2).T).mean(0) + 0 * m
+    x = m[:num_outer] + np.sqrt(v[:num_outer]) * normal
+    own = -0.5 * (normal**2 + np.log(v[:num_outer])).sum(1)
+    log_volume = 0.5 * np.log(v).sum(1)
+    # (x - m)^2 / v summed over numbers, as products of matrices
+    square = (x**2) @ (1 / v).T - 2 * x @ (m / v).T + ((m**2) / v).sum(1)
+    every = -0.5 * square - log_volume
+    keep = np.concatenate([every[:, num_outer:], own[:, None]], 1)
+    return own - (logsumexp(keep, 1) - np.log(keep.shape[1]))

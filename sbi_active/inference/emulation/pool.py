@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.regression.rows import rows_of
+from sbi_active.inference.rounds.rows import rows_of
 from sbi_active.simulation.outcomes import Outcome, Simulations
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 

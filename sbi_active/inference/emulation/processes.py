@@ -13,25 +13,24 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.inference.declared.settings import RefinementOptions
-from sbi_active.inference.emulation.gain import mixture_gain
 from sbi_active.inference.emulation.likelihood import (
     PooledLikelihood,
     TrialLikelihood,
     correlation_root,
+    declared_process,
+    learned_processes,
+    mixture_gain,
 )
 from sbi_active.inference.emulation.pool import Pool
-from sbi_active.inference.emulation.statistics import learned_statistic
 from sbi_active.inference.emulation.summaries import Summary
 from sbi_active.inference.engine.importance import fitted
 from sbi_active.inference.engine.learned import CHEAP
 from sbi_active.inference.engine.pool import PriorDraws
-from sbi_active.inference.refinement.course import Stage
-from sbi_active.inference.refinement.settings import StageSettings
+from sbi_active.inference.refinement.course import Stage, StageSettings
 from sbi_active.inference.refinement.stages import Stages
 from sbi_active.inference.regression.outcomes import TrialOutcome
 from sbi_active.inference.regression.process import (
     GaussianProcess,
-    ProcessSettings,
     num_features,
 )
 from sbi_active.inference.regression.regions import Region, whole_space
@@ -57,10 +56,6 @@ FEW_ROWS = StageSettings(
 )
 NUM_REFERENCE = 400  # draws of a belief that say where simulations matter
 MOST_ROWS = {True: 160, False: 400}  # behind a trial, with declared noise and without
-NUM_OUTER, NUM_INNER = 128, 600  # draws behind the gain of a summary
-REACH = 6.0  # deviations of the belief within which rows are near it
-SHARE_OF_PRIOR = 0.1  # of new rows, so that no place is never looked at
-FLOOR = 1e-4  # deviation at least, in half-widths of the prior
 
 
 @dataclass(frozen=True)
@@ -166,19 +161,27 @@ class Processes(Stages):
         ]
         return self.summaries[int(np.argmax(gains))].label
 
-    def gain(self, fitted: TrialLikelihood) -> float:
-        """Return the information of an outcome at a trial's action, nats."""
+    def gain(
+        self, fitted: TrialLikelihood, *, num: int = 728, outer: int = 128
+    ) -> float:
+        """Return the information of an outcome at a trial's action, nats.
+
+        Args:
+            fitted: Likelihood of the trial.
+            num: Number of parameters.
+            outer: Number of those that outcomes are drawn at.
+        """
         if not fitted.processes:
             return 0.0
-        z = np.resize(self.near, (NUM_OUTER + NUM_INNER, self.near.shape[1]))
+        z = np.resize(self.near, (num, self.near.shape[1]))
         mean, variance = fitted.predict(z)
         if self.noise is None:
             root = fitted.learned_sd[:, None] * fitted.root
         else:
             root = np.diag(fitted.declared_sd)
         rng = np.random.default_rng(derive_seed(self.seed, "gain"))
-        normal = rng.standard_normal((NUM_OUTER, mean.shape[1]))
-        return float(mixture_gain(mean, variance, root, normal, NUM_OUTER).mean())
+        normal = rng.standard_normal((outer, mean.shape[1]))
+        return float(mixture_gain(mean, variance, root, normal, outer).mean())
 
     def fit_trial(
         self, trial: PooledTrial, label: str, reference: Array
@@ -210,27 +213,12 @@ class Processes(Stages):
             near, region = nearest(z, valid, reference, most)
             inputs, values = region.scaled(z[near]), numbers[near][:, used]
             if self.noise is not None:
-                kinds = ("smooth", "rough")
-                both = [
-                    GaussianProcess.fit(
-                        inputs,
-                        values,
-                        noise="none",
-                        settings=ProcessSettings(kind=kind),
-                    )
-                    for kind in kinds
-                ]
-                processes = (max(both, key=lambda p: p.log_evidence),)
+                processes = (declared_process(inputs, values),)
             else:
-                statistic, own = learned_statistic(
-                    values, z[near], seed=derive_seed(self.seed, "folds")
+                statistic, processes, left_out = learned_processes(
+                    inputs, values, z[near], seed=self.seed
                 )
                 seen = statistic(observed[used][None])[0]
-                processes = tuple(
-                    GaussianProcess.fit(inputs, own[:, [j]], noise="learned")
-                    for j in range(own.shape[1])
-                )
-                left_out = np.concatenate([p.left_out for p in processes], 1)
                 root = correlation_root(left_out)
                 freedom = max(5.0, len(near) - 1.0 - z.shape[1])
         return TrialLikelihood(
@@ -260,7 +248,7 @@ class Processes(Stages):
         pairs = np.zeros((0, 2), dtype=bool)
         return TrialOutcome.fit(whole_space(z.shape[1]), 0, z, agrees, pairs)
 
-    def simulate(self, size: int) -> None:
+    def simulate(self, size: int, *, share_of_prior: float = 0.1) -> None:
         """Add rows at the trials that know least."""
         if size == 0:
             return
@@ -269,7 +257,7 @@ class Processes(Stages):
         c, draws = potential.coordinates, stage.draws[:NUM_REFERENCE]
         weight = np.full(len(draws), 1 / len(draws))
         near = fitted(c.from_z(draws), weight, own.num_components, own, self.rng)
-        where = Defended(near, PriorDraws(potential), SHARE_OF_PRIOR)
+        where = Defended(near, PriorDraws(potential), share_of_prior)
         errors = [t.error(draws) + 1e-9 for t in stage.surrogate.trials]
         counts = self.rng.multinomial(size, np.array(errors) / sum(errors))
         kept: list[Array] = []
@@ -289,7 +277,13 @@ class Processes(Stages):
 
 
 def nearest(
-    z: Array, valid: NDArray[np.bool_], reference: Array, most: int
+    z: Array,
+    valid: NDArray[np.bool_],
+    reference: Array,
+    most: int,
+    *,
+    reach: float = 6.0,
+    floor: float = 1e-4,
 ) -> tuple[NDArray[np.intp], Region]:
     """Return the rows nearest to a belief, and coordinates of their size.
 
@@ -300,14 +294,16 @@ def nearest(
         valid: Which of them may be taken, shape (n,).
         reference: Draws from the belief, shape (m, d).
         most: Rows to take.
+        reach: Deviations of the belief within which rows are near it.
+        floor: Deviation at least, in half-widths of the prior.
     """
     center, dim = reference.mean(0), z.shape[1]
-    covariance = np.atleast_2d(np.cov(reference.T)) + FLOOR**2 * np.eye(dim)
+    covariance = np.atleast_2d(np.cov(reference.T)) + floor**2 * np.eye(dim)
     region = Region(center, np.linalg.cholesky(covariance), 1.0)
     distance = np.where(valid, np.linalg.norm(region.scaled(z), axis=1), np.inf)
     near = np.argsort(distance, kind="stable")[: min(most, int(valid.sum()))]
     enough = min(len(near), 3 * num_features(dim + 2))
-    reach = max(REACH * np.sqrt(dim), distance[near[enough - 1]])
+    reach = max(reach * np.sqrt(dim), distance[near[enough - 1]])
     near = near[distance[near] <= reach]
     size = np.sqrt((distance[near] ** 2).mean() / dim)
     return near, Region(center, region.factor, max(1.0, float(size)))

@@ -1,4 +1,17 @@
-"""Summaries of raw outcomes: checked, and fitted to the simulations at hand."""
+r"""Summaries of raw outcomes: checked, and fitted to the simulations at hand.
+
+Few numbers from an outcome of many: what it says of each parameter.
+
+The statistic is the best linear estimate of the parameters from the summary,
+
+.. math::
+    s(x) = \hat{\mathrm E}[z | \phi(x)] = \bar z + W^\top (\phi(x) - \bar\phi),
+
+by ridge regression over simulations, its penalty by left-out rows (Fearnhead &
+Prangle, J. R. Stat. Soc. B 2012). The statistics of simulations are those of a
+regression that did not see them, so that what is then learned about their noise is not
+too small.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +28,8 @@ from sbi_active.actions.summaries import SummaryAction, is_fitted
 
 Array = NDArray[Any]
 
-MOST_FITTED = 1_000  # rows that a summary is fitted to: an image has 20,000 numbers
+PENALTIES = 10.0 ** np.arange(-4.0, 3.1, 0.5)  # of features of unit variance, by row
+FEW = 2  # numbers an outcome may have for each parameter and stay as it is
 
 
 @dataclass(frozen=True)
@@ -68,12 +82,16 @@ class Summary:
         return np.array(self.of.transform(x), dtype=np.float64)
 
 
-def fitted_summaries(choice: SummaryAction | None, raw: Tensor) -> list[Summary]:
+def fitted_summaries(
+    choice: SummaryAction | None, raw: Tensor, *, most_fitted: int = 1_000
+) -> list[Summary]:
     """Return the summaries of a choice, those that are fitted fitted to copies.
 
     Args:
         choice: None is the outcome itself.
         raw: Simulated outcomes, shape (n, *x_shape).
+        most_fitted: Number of rows at most that a summary is fitted to: an image has
+            20,000 numbers.
 
     Raises:
         ValueError: If one cannot be fitted to so many outcomes.
@@ -87,7 +105,7 @@ def fitted_summaries(choice: SummaryAction | None, raw: Tensor) -> list[Summary]
             continue
         rows = raw.detach().float().flatten(1)
         rows = rows[rows.isfinite().any(1)]
-        rows = rows[:: -(-len(rows) // MOST_FITTED)].double().numpy()
+        rows = rows[:: -(-len(rows) // most_fitted)].double().numpy()
         fill = np.nan_to_num(_mean(rows))
         filled = np.where(np.isfinite(rows), rows, fill)
         own = copy.deepcopy(summary)
@@ -108,3 +126,89 @@ def _mean(rows: Array) -> Array:
     total = np.where(present, rows, 0.0).sum(0)
     with np.errstate(invalid="ignore"):
         return total / present.sum(0)
+
+
+@dataclass(frozen=True)
+class Statistic:
+    """A linear map of summaries (n, q) to statistics (n, s).
+
+    Attributes:
+        center: Mean of the summaries, shape (q,).
+        scale: Deviation of the summaries, shape (q,); infinite if one never varies.
+        weight: Shape (q, s); None keeps the numbers as they are.
+        offset: Shape (s,).
+    """
+
+    center: Array
+    scale: Array
+    weight: Array | None
+    offset: Array
+
+    def __call__(self, summary: Array) -> Array:
+        """Return statistics, shape (n, s)."""
+        features = (summary - self.center) / self.scale
+        if self.weight is None:
+            return features
+        return self.offset + features @ self.weight
+
+
+def learned_statistic(
+    summary: Array, z: Array, *, seed: int, num_folds: int = 10
+) -> tuple[Statistic, Array]:
+    """Return the statistic of simulations and their own values of it.
+
+    Args:
+        summary: Finite summaries, shape (n, q).
+        z: Coordinates of their parameters, shape (n, d).
+        seed: Seed of the folds.
+        num_folds: Number of folds.
+
+    Returns:
+        The statistic, and those of the rows by regressions without them, (n, s).
+    """
+    n, q = summary.shape
+    center, scale = summary.mean(0), summary.std(0)
+    floor = 1e-7 * np.abs(summary).max(0, initial=0.0)
+    # What never varies says nothing, and its rounding must not.
+    scale = np.where(scale > floor, scale, np.inf)
+    if q <= FEW * z.shape[1] or not np.isfinite(scale).any():
+        varies = np.where(np.isfinite(scale), scale, np.maximum(np.abs(center), 1e-30))
+        plain = Statistic(center, varies, None, np.zeros(q))
+        return plain, plain(summary)
+    features = (summary - center) / scale
+    penalty = _best_penalty(features, z)
+    fold = np.random.default_rng(seed).permutation(n) % min(num_folds, n)
+    own = np.zeros_like(z)
+    for k in range(fold.max() + 1):
+        _, weight, _ = _ridge(features[fold != k], z[fold != k], penalty)
+        # One center for all: the means of the others would tell who was left out.
+        own[fold == k] = z.mean(0) + features[fold == k] @ weight
+    offset, weight, mean = _ridge(features, z, penalty)
+    return Statistic(center, scale, weight, offset - mean @ weight), own
+
+
+def _ridge(features: Array, z: Array, penalty: float) -> tuple[Array, Array, Array]:
+    """Return offset (d,), weight (q, d) and mean of the features (q,)."""
+    mean, offset = features.mean(0), z.mean(0)
+    f, target = features - mean, z - offset
+    n, q = f.shape
+    if n < q:
+        weight = f.T @ np.linalg.solve(f @ f.T + n * penalty * np.eye(n), target)
+    else:
+        weight = np.linalg.solve(f.T @ f + n * penalty * np.eye(q), f.T @ target)
+    return offset, weight, mean
+
+
+def _best_penalty(features: Array, z: Array) -> float:
+    """Return the penalty of the smallest error of left-out rows."""
+    f, target = features - features.mean(0), z - z.mean(0)
+    left, size, _ = np.linalg.svd(f, full_matrices=False)
+    projected, scale, n = left.T @ target, z.std(0) + 1e-12, len(z)
+    errors = []
+    for penalty in PENALTIES:
+        shrink = size**2 / (size**2 + n * penalty)
+        residual = target - left @ (shrink[:, None] * projected)
+        leverage = (left**2) @ shrink + 1 / n
+        left_out = residual / np.maximum(1 - leverage, 1e-3)[:, None] / scale
+        errors.append(float((left_out**2).mean()))
+    return float(PENALTIES[int(np.argmin(errors))])

@@ -3,8 +3,8 @@
 ``infer`` knows a potential and nothing of campaigns or verdicts.
 """
 
-from sbi_active.inference.engine.fit import Fit, WeightedDraws
 from sbi_active.inference.engine.infer import infer
+from sbi_active.inference.engine.pool import Fit, WeightedDraws
 from sbi_active.inference.engine.potential import Potential, SimulatedPotential
 from sbi_active.inference.engine.search import Found, search
 from sbi_active.inference.engine.settings import Settings

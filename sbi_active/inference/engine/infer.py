@@ -17,7 +17,6 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.inference.engine.fit import Fit
 from sbi_active.inference.engine.importance import (
     fitted,
     importance_sample,
@@ -25,7 +24,7 @@ from sbi_active.inference.engine.importance import (
     wider,
 )
 from sbi_active.inference.engine.particles import fit_of, led_particles, uninformed
-from sbi_active.inference.engine.pool import Pool, PriorDraws
+from sbi_active.inference.engine.pool import Fit, Pool, PriorDraws
 from sbi_active.inference.engine.potential import Density, Potential
 from sbi_active.inference.engine.search import WIDER, Found
 from sbi_active.inference.engine.settings import Settings

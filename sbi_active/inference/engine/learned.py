@@ -8,14 +8,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.inference.engine.fit import Fit
-from sbi_active.inference.engine.importance import defended
 from sbi_active.inference.engine.infer import infer
+from sbi_active.inference.engine.pool import Fit
 from sbi_active.inference.engine.settings import Settings
-from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
-from sbi_active.inference.sampling.student_mixture import Proposal
-from sbi_active.inference.sampling.weights import normalized
+from sbi_active.inference.sampling.coordinates import (
+    NormalCoordinates,
+    PriorCoordinates,
+)
 
 Array = NDArray[Any]
 
@@ -93,12 +92,10 @@ class LearnedFit:
     Attributes:
         potential: Prior times learned likelihood.
         fit: Weighted draws, in the potential's coordinates, and the evidence.
-        proposal: Density fitted to these draws, with wider tails, to propose more from.
     """
 
     potential: LearnedPotential
     fit: Fit
-    proposal: Proposal
 
     @property
     def efficiency(self) -> float:
@@ -132,7 +129,4 @@ def learned_fit(
     fit = infer(potential, rng, near=places, settings=own)
     if not np.isfinite(fit.log_evidence):
         return None
-    weight = normalized(fit.pool.log_weight)
-    share, num = own.share_of_wide, own.num_components
-    proposal = defended(fit.pool, weight, num, share, own, rng)
-    return LearnedFit(potential, fit, proposal)
+    return LearnedFit(potential, fit)

@@ -13,9 +13,8 @@ from sbi_active.inference.engine.bounded import (
     LineMoves,
     led_between,
 )
-from sbi_active.inference.engine.fit import Fit
 from sbi_active.inference.engine.importance import fitted
-from sbi_active.inference.engine.pool import Pool
+from sbi_active.inference.engine.pool import Fit, Pool
 from sbi_active.inference.engine.potential import Potential
 from sbi_active.inference.engine.search import WIDER, Found
 from sbi_active.inference.engine.settings import Settings
@@ -25,25 +24,26 @@ from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
 
-WIDTHS = ((1.0, 0.4), (2.0, 0.3), (3.0, 0.3))  # of the guess, and their weights
-NUM_INTEGRAL = 4_000  # draws, which cost no simulation
-UNCHANGED = 2e-3  # deviations of the noise, which single precision may change
-NUM_PROBES = 16  # draws at which uninformed parameters are changed
-
 
 def uninformed(
-    found: Found, potential: Potential, rng: np.random.Generator
+    found: Found,
+    potential: Potential,
+    rng: np.random.Generator,
+    *,
+    unchanged: float = 2e-3,
+    num: int = 16,
 ) -> NDArray[np.bool_]:
-    """Return parameters that change no trial and do not depend on others."""
+    """Return parameters that change no trial and do not depend on others.
+
+    Single precision may change a residual by ``unchanged`` deviations of the noise.
+    """
     free = ~found.informed
     none = np.zeros(potential.dim, dtype=bool)
     if not free.any() or free.all():
         return none
-    drawn, other = (potential.sample_prior(NUM_PROBES, rng) for _ in range(2))
+    drawn, other = (potential.sample_prior(num, rng) for _ in range(2))
     c = potential.coordinates
-    near, off = (
-        np.clip(found.guess.sample(NUM_PROBES, rng), c.low, c.high) for _ in range(2)
-    )
+    near, off = (np.clip(found.guess.sample(num, rng), c.low, c.high) for _ in range(2))
 
     def changes(axes: NDArray[np.bool_]) -> bool:
         pairs = (drawn, np.where(axes, other, drawn)), (near, np.where(axes, off, near))
@@ -51,7 +51,7 @@ def uninformed(
             np.abs(potential.residual(a)[0] - potential.residual(b)[0])
             for a, b in pairs
         )
-        return any(r.max() > UNCHANGED for r in residuals)
+        return any(r.max() > unchanged for r in residuals)
 
     for axis in np.flatnonzero(free):
         free[axis] = not changes(np.arange(potential.dim) == axis)
@@ -65,6 +65,8 @@ def led_particles(
     free: NDArray[np.bool_],
     rng: np.random.Generator,
     settings: Settings,
+    *,
+    widths: tuple[tuple[float, float], ...] = ((1.0, 0.4), (2.0, 0.3), (3.0, 0.3)),
 ) -> Bridged | None:
     """Return particles of all parameters; only those that trials inform are moved."""
     guess, axes = found.guess, np.flatnonzero(~free)
@@ -72,9 +74,9 @@ def led_particles(
     factors = np.linalg.cholesky(cov[:, axes[:, None], axes])
     # Tails that bend away from the normal of a mode are out of its own reach.
     own = NormalMixture(
-        np.concatenate([guess.weights * weight for _, weight in WIDTHS]),
-        np.concatenate([guess.means[:, axes]] * len(WIDTHS)),
-        np.concatenate([factors * width for width, _ in WIDTHS]),
+        np.concatenate([guess.weights * weight for _, weight in widths]),
+        np.concatenate([guess.means[:, axes]] * len(widths)),
+        np.concatenate([factors * width for width, _ in widths]),
     )
     rest = np.zeros((1, potential.dim))
 
@@ -178,7 +180,11 @@ def _as_pool(
 
 
 def _log_free(
-    potential: Potential, free: NDArray[np.bool_], rng: np.random.Generator
+    potential: Potential,
+    free: NDArray[np.bool_],
+    rng: np.random.Generator,
+    *,
+    num: int = 4_000,
 ) -> float:
     r"""Return the prior's log density of the free coordinates at zero.
 
@@ -187,7 +193,7 @@ def _log_free(
     .. math::
         p_F(0) = p(0) \Big/ \int p(0, u_F)\, du_F .
     """
-    u = np.zeros((NUM_INTEGRAL, potential.dim))
+    u = np.zeros((num, potential.dim))
     u[:, free] = WIDER * rng.standard_normal((len(u), int(free.sum())))
     square = ((u[:, free] / WIDER) ** 2 + np.log(2 * np.pi * WIDER**2)).sum(1)
     log_w = potential.log_prior(u) + 0.5 * square

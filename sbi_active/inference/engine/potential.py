@@ -1,4 +1,6 @@
-r"""The log density of parameters given trials, up to a constant.
+r"""The likelihood of trials under declared noise, exact wherever it is simulated.
+
+The log density of parameters given trials, up to a constant.
 
 .. math::
     \log p(u) + \sum_k \log p\bigl(x_k \mid f(\theta(u), \xi_k)\bigr)
@@ -8,22 +10,183 @@ in coordinates u in which the prior is nearly standard normal and has no edges.
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any, Protocol, TypeGuard
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from sbi_active.inference.engine.simulated_likelihood import SimulatedLikelihood
+from sbi_active.inference.rounds.rows import rows_of
+from sbi_active.inference.sampling.coordinates import NormalCoordinates
 from sbi_active.inference.sampling.least_squares import LeastSquares, Whitener
-from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
+from sbi_active.inference.sampling.row_cache import RowCache
+from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.noise.whitening import whitened
+from sbi_active.simulation.outcomes import Outcome
+from sbi_active.simulation.workers.settings import Workers
 
 Array = NDArray[Any]
 
+BATCH = 64  # rows a call: the same ones whatever the number of workers
+DEEP = 30.0  # nats below the peak that count as any more do
+FORGETTING = 0.3  # share of the latest call in the mean that orders trials
 #: Bound on a whitened residual, which keeps sums of squares finite.
 LARGEST = 1e6
 STEP = 3e-3  # of differences, in deviations of the prior
+
+
+def declares_noise(
+    simulator: Callable[..., Any], theta: Tensor, action: Tensor
+) -> TypeGuard[SimulatorModel]:
+    """Return whether the simulator is a noise-free function beside positive noise.
+
+    It is tried at a few parameters (n, d) and actions (n, action_dim).
+    """
+    if not isinstance(simulator, SimulatorModel) or simulator.noise is None:
+        return False
+    if not simulator.draws_by_noise_alone:
+        return False
+    if not bool((simulator.noise.parameters > 0).all()):
+        return False
+    return simulator.is_deterministic(theta, action)
+
+
+class MeanTable:
+    """Noise-free outcomes of a simulator with declared noise, each simulated once.
+
+    Attributes:
+        num_simulations: Rows simulated so far.
+        num_missing: Number of those simulations that a fault lost.
+    """
+
+    def __init__(self, simulator: SimulatorModel, workers: Workers) -> None:
+        self.simulator, self.workers = simulator, workers
+        self.num_simulations = self.num_missing = 0
+        # The same object at each call, so that worker processes are kept.
+        self._bare = simulator.without_noise()
+        self._known: RowCache[Array | None] = RowCache()
+
+    def mean(self, theta: Tensor, action: Tensor) -> tuple[Array, NDArray[np.bool_]]:
+        """Return noise-free outcomes at one action, and which rows are lost to faults.
+
+        Float32 parameters (n, d) and action (action_dim,) give shapes (n, *x_shape),
+        NaN where there is no measurement, and (n,).
+        """
+
+        def simulated(rows: NDArray[np.int64]) -> list[Array | None]:
+            return self._simulate(theta[torch.from_numpy(rows)], action)
+
+        found = self._known.get(action.numpy().tobytes(), theta.numpy(), simulated)
+        lost = np.array([x is None for x in found])
+        shape = next((x.shape for x in found if x is not None), (1,))
+        gap = np.full(shape, np.nan)
+        mean = np.stack([gap if x is None else x for x in found])
+        return mean.astype(np.float64), lost
+
+    def _simulate(self, theta: Tensor, action: Tensor) -> list[Array | None]:
+        self.num_simulations += len(theta)
+        actions = action.expand(len(theta), -1)
+        rows = rows_of(
+            *(self._bare, theta, actions, 0, self.workers),
+            is_first=False,
+            batch_size=BATCH,
+        )
+        if rows is None:
+            self.num_missing += len(theta)
+            return [None] * len(theta)
+        missing = (rows.status == Outcome.MISSING).tolist()
+        self.num_missing += sum(missing)
+        x = rows.x.numpy()  # kept as it was simulated, in single precision
+        return [None if gone else row for gone, row in zip(missing, x, strict=True)]
+
+
+class SimulatedLikelihood:
+    r"""Likelihood of all trials at simulated parameters.
+
+    .. math::
+        \log L(\theta) = \sum_k \log p\big(x_k \mid f(\theta, \xi_k)\big),
+
+    with f the noise-free simulator and p its declared noise. A trial without a
+    measurement counts as 1 where f has none either, and as 0 elsewhere.
+
+    Args:
+        table: Outcomes of f, shared among likelihoods.
+        action: Executed actions, shape (t, action_dim).
+        x: Observed outcomes, shape (t, *x_shape); NaN where nothing was measured.
+        inflation: Factor of the noise's standard deviation.
+    """
+
+    def __init__(
+        self, table: MeanTable, action: Tensor, x: Tensor, *, inflation: float = 1.0
+    ) -> None:
+        noise = table.simulator.noise
+        assert noise is not None
+        self.table, self.noise, self.inflation = table, noise, inflation
+        self.action, self.x = action.float(), x.double()
+        filled = self.x.nan_to_num(0.0)
+        peak = noise.log_prob(self.x, filled).double()
+        without = self.x.flatten(1).isnan().all(1)
+        #: Largest value of each trial's term, shape (t,).
+        self.peak = torch.where(without, 0.0, peak).numpy()
+        self._cost = np.full(len(x), DEEP)  # nats below the peak, on average
+
+    def __len__(self) -> int:
+        return len(self.action)
+
+    def terms(self, theta: Tensor, trial: int) -> Array:
+        """Return the log likelihood of one trial, shape (n,)."""
+        mean, lost = self.table.mean(theta, self.action[trial])
+        x = self.x[trial]
+        seen = x.isfinite().numpy()
+        if not seen.any():
+            agrees = np.isnan(mean).reshape(len(mean), -1).all(1)
+            return np.where(agrees & ~lost, 0.0, -np.inf)
+        agrees = np.isfinite(mean[:, seen]).all(1) & ~lost
+        term = np.full(len(mean), -np.inf)
+        rows = np.flatnonzero(agrees)
+        if len(rows):
+            known = torch.from_numpy(mean[rows])
+            outcome = x.expand_as(known)
+            if self.inflation != 1:
+                outcome = known + (outcome - known) / self.inflation
+            log_prob = self.noise.log_prob(outcome, known).double().numpy()
+            term[rows] = log_prob - seen.sum() * np.log(self.inflation)
+        return term
+
+    def __call__(
+        self,
+        theta: Tensor,
+        *,
+        floor: float = -np.inf,
+        first: int = 0,
+        last: int | None = None,
+    ) -> Array:
+        """Return log likelihoods, shape (n,), of parameters, shape (n, d).
+
+        Args:
+            theta: Float32.
+            floor: A row is given up, as -inf, and the rest of its trials are not
+                simulated, once it can no longer reach this.
+            first: The first trial to count.
+            last: The one after the last to count; None counts all.
+        """
+        total = np.zeros(len(theta))
+        left = [*range(len(self))][first:last]
+        left.sort(key=lambda k: -self._cost[k])  # what decides comes first
+        for place, k in enumerate(left):
+            reachable = total + self.peak[left[place:]].sum() >= floor
+            total[~reachable] = -np.inf
+            rows = np.flatnonzero(np.isfinite(total))
+            if len(rows) == 0:
+                break
+            term = self.terms(theta[torch.from_numpy(rows)], k)
+            depth = float(np.minimum(self.peak[k] - term, DEEP).mean())
+            self._cost[k] += FORGETTING * (depth - self._cost[k])
+            total[rows] += term
+        total[total < floor] = -np.inf
+        return total
 
 
 class Density(Protocol):

@@ -24,9 +24,6 @@ from sbi_active.inference.sampling.student_mixture import NormalMixture, lower_f
 Array = NDArray[Any]
 
 WIDER = 1.1  # than the Laplace approximation
-FAR = 5.0  # sum of squares a number, beyond which a place is far from a fit
-DISTINCT = 0.005  # deviations of the prior, within which two places are one
-FAINT = 0.1  # derivative, which rounding may give, below which more is asked
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +50,8 @@ class SearchSettings:
         num_kept: Searches that go on.
         later: Steps of each.
         progress: Fall of the cost that is worth another phase.
+        faint: Derivative, which rounding may give, below which a coordinate moves no
+            trial.
     """
 
     num_screened: int = 192
@@ -67,6 +66,7 @@ class SearchSettings:
     num_kept: int = 4
     later: int = 10
     progress: float = 0.5
+    faint: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ def search(
     return Found(
         NormalMixture(mass, np.concatenate(means), factors),
         u[modes],
-        np.abs(jac).max((0, 1)) > FAINT,
+        np.abs(jac).max((0, 1)) > own.faint,
         int((cost - cost.min() < own.same).sum()),
         num,
         np.concatenate(looked),
@@ -193,9 +193,17 @@ def _cost(problem: Potential, u: Array, whiten: Whitener) -> Array:
 
 
 def _settled(
-    problem: Potential, u: Array, whiten: Whitener, settings: SearchSettings
+    problem: Potential,
+    u: Array,
+    whiten: Whitener,
+    settings: SearchSettings,
+    *,
+    far: float = 5.0,
 ) -> tuple[Array, Array, Whitener]:
-    """Return places, their cost, and the error that the best makes most probable."""
+    """Return places, their cost, and the error that the best makes most probable.
+
+    Beyond a sum of squares of ``far`` a number, a place is far from a fit.
+    """
     own, u, cost, stalls = settings, u.copy(), _cost(problem, u, whiten), 0
     for _ in range(own.phases):
         whiten = problem.whitener(u[[cost.argmin()]])
@@ -204,17 +212,17 @@ def _settled(
         u[rows], cost[rows] = descend(problem, u[rows], whiten, problem.step, own.later)
         stalls = stalls + 1 if before - cost.min() < own.progress else 0
         # Far from a fit, a phase may be lost to finding the damping.
-        patience = 3 if cost.min() > FAR * problem.num_observed else 1
+        patience = 3 if cost.min() > far * problem.num_observed else 1
         if stalls >= patience:
             break
     return u, cost, whiten
 
 
-def _distinct(u: Array, cost: Array) -> list[int]:
+def _distinct(u: Array, cost: Array, *, distinct: float = 0.005) -> list[int]:
     """Return the rows of places that differ from all better ones, best first."""
     kept: list[int] = []
     for i in np.argsort(cost):
-        if all(np.abs(u[i] - u[j]).max() > DISTINCT for j in kept):
+        if all(np.abs(u[i] - u[j]).max() > distinct for j in kept):
             kept.append(int(i))
     return kept
 

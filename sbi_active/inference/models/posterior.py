@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from collections.abc import Callable
 from copy import deepcopy
 from typing import Any
 
@@ -174,7 +174,9 @@ class ActionPosterior:
         """Return sbi's posterior over x at an action (action_dim,), for diagnostics."""
         direct = self._direct()
         row = action_rows(action, self.action_dim, num_rows=1)
-        estimator = _AtAction(direct.posterior_estimator, row, self.x_shape)
+        estimator = _Rewritten(
+            direct.posterior_estimator, self.x_shape, row, _with_action
+        )
         return DirectPosterior(estimator, direct.prior)
 
     def _direct(self) -> DirectPosterior:
@@ -237,7 +239,7 @@ def at_conditions(
         The posterior, and numbers of shape (n, 1).
     """
     posterior = DirectPosterior(
-        _AtConditions(direct.posterior_estimator, condition),
+        _Rewritten(direct.posterior_estimator, torch.Size([1]), condition, _row_of),
         direct.prior,
         max_sampling_batch_size=direct.max_sampling_batch_size,
         device=direct.device,
@@ -247,20 +249,30 @@ def at_conditions(
 
 
 class _Rewritten(ConditionalDensityEstimator):
-    """A packed estimator whose condition is made from another one."""
+    """A packed estimator whose condition is made from another one.
+
+    Args:
+        packed: Estimator over packed conditions.
+        shape: Shape of the conditions.
+        known: Tensor that conditions are made with.
+        rows: Function of conditions (n, *shape) and that, to (n, packed_dim).
+    """
+
+    known: Tensor
 
     def __init__(
-        self, packed: ConditionalDensityEstimator, condition_shape: torch.Size
+        self,
+        packed: ConditionalDensityEstimator,
+        shape: torch.Size,
+        known: Tensor,
+        rows: Callable[[Tensor, Tensor], Tensor],
     ) -> None:
-        super().__init__(nn.Identity(), packed.input_shape, condition_shape)
-        self.packed = packed
-
-    @abstractmethod
-    def _rows(self, given: Tensor) -> Tensor:
-        """Return packed rows, (n, *condition_shape) -> (n, packed_dim)."""
+        super().__init__(nn.Identity(), packed.input_shape, shape)
+        self.packed, self.rows = packed, rows
+        self.register_buffer("known", known)
 
     def _pack(self, given: Tensor) -> Tensor:
-        rows = self._rows(given.reshape(-1, *self.condition_shape))
+        rows = self.rows(given.reshape(-1, *self.condition_shape), self.known)
         leading = given.shape[: given.ndim - len(self.condition_shape)]
         return rows.reshape(*leading, -1)
 
@@ -276,29 +288,9 @@ class _Rewritten(ConditionalDensityEstimator):
         return self.packed.sample(sample_shape, self._pack(condition), **kwargs)
 
 
-class _AtAction(_Rewritten):
-    """At one action: the condition is x alone."""
-
-    action: Tensor
-
-    def __init__(
-        self, packed: ConditionalDensityEstimator, action: Tensor, x_shape: torch.Size
-    ) -> None:
-        super().__init__(packed, x_shape)
-        self.register_buffer("action", action)
-
-    def _rows(self, given: Tensor) -> Tensor:
-        return pack(given, self.action.expand(len(given), -1))
+def _with_action(x: Tensor, action: Tensor) -> Tensor:
+    return pack(x, action.expand(len(x), -1))
 
 
-class _AtConditions(_Rewritten):
-    """At the rows of a table: the condition is a row's number."""
-
-    table: Tensor
-
-    def __init__(self, packed: ConditionalDensityEstimator, table: Tensor) -> None:
-        super().__init__(packed, torch.Size([1]))
-        self.register_buffer("table", table)
-
-    def _rows(self, given: Tensor) -> Tensor:
-        return self.table[given[:, 0].long()]
+def _row_of(number: Tensor, table: Tensor) -> Tensor:
+    return table[number[:, 0].long()]

@@ -13,11 +13,6 @@ from torch import Tensor, nn
 LOG_NORMAL_MEAN = 0.6351814227  # -E log|e| of a standard normal e
 SMALLEST_SCALE = 1e-6  # of the scale over all actions: float32 ends there
 WILD = 10.0  # residuals beyond so many medians count as that many
-SAME_WEIGHTS = 0.5  # root-mean-square difference of log-weights that share a fit
-#: Bounds of what held-out rows choose from: a choice. Chebyshev polynomials of degree
-#: 16 have 16 zeros over the actions; the noise may have half as many.
-MAX_DEGREE = 16
-MAX_NOISE_DEGREE = 8
 NUM_ITERATIONS = 4  # a choice: of location and scale in turn, from the median
 
 
@@ -186,7 +181,13 @@ def _fit_log_scale(
 
 
 def _least_squares(
-    design: Tensor, sizes: Sequence[int], y: Tensor, log_scale: Tensor, test: Tensor
+    design: Tensor,
+    sizes: Sequence[int],
+    y: Tensor,
+    log_scale: Tensor,
+    test: Tensor,
+    *,
+    same: float = 0.5,
 ) -> Tensor:
     """Weighted least squares, columns of nearly the same weights together."""
     beta = y.new_zeros(design.shape[1], y.shape[1])
@@ -194,9 +195,7 @@ def _least_squares(
     todo = list(range(y.shape[1]))
     while todo:
         near = (shape[:, todo] - shape[:, todo[:1]]).square().mean(0).sqrt()
-        group = [
-            j for j, r in zip(todo, near.tolist(), strict=True) if r < SAME_WEIGHTS
-        ]
+        group = [j for j, r in zip(todo, near.tolist(), strict=True) if r < same]
         group = group or todo[:1]
         todo = [j for j in todo if j not in group]
         weight = (-shape[:, group].mean(1, keepdim=True)).exp()
@@ -243,6 +242,9 @@ class ActionScaling(nn.Module):
     Args:
         y: Shape (n, m), finite.
         action: Actions, shape (n, action_dim).
+        max_degree: Largest degree that held-out rows choose from: Chebyshev polynomials
+            of degree 16 have 16 zeros over the actions.
+        max_noise_degree: Largest degree of the noise.
     """
 
     mean: Tensor
@@ -252,16 +254,23 @@ class ActionScaling(nn.Module):
     log_low: Tensor
     log_high: Tensor
 
-    def __init__(self, y: Tensor, action: Tensor) -> None:
+    def __init__(
+        self,
+        y: Tensor,
+        action: Tensor,
+        *,
+        max_degree: int = 16,
+        max_noise_degree: int = 8,
+    ) -> None:
         super().__init__()
         y, test = y.double(), held_out(len(y))
         mean, scale = y.mean(0), y.std(0, correction=0)
         scale = torch.where(scale > 1e-12 * (1.0 + mean.abs()), scale, 1.0)
         most = max(1, int((~test).sum()) // 10)
-        exponents, sizes = exponents_of(action, max_degree=MAX_DEGREE, max_terms=most)
+        exponents, sizes = exponents_of(action, max_degree=max_degree, max_terms=most)
         self.polynomials = Polynomials(action, exponents)
         design = self.polynomials(action)
-        degrees = min(len(sizes), MAX_NOISE_DEGREE + 1)
+        degrees = min(len(sizes), max_noise_degree + 1)
         noise = design[:, : sizes[degrees - 1]]
         beta, gamma = fit_location_and_scale(
             design, sizes, noise, sizes[:degrees], (y - mean) / scale, test

@@ -10,17 +10,6 @@ from torch import Tensor
 from sbi_active.inference.networks.action_scaling import ActionScaling, held_out
 from sbi_active.inference.networks.response import Response
 
-BLOCK = 4_096  # rows held in memory at once
-#: Training parameters among which a row finds its starts: a choice.
-NUM_CENTERS = 32
-#: At most, of damping that rises or falls by ten from its first value: a choice. Rows
-#: end before, once a step gains less than ``AT_REST``.
-NUM_STEPS = 7
-INITIAL_DAMPING = 1e-2
-AT_REST = 1e-3  # nat
-#: Rows of a curved baseline, which solves for each, that standardize v: a choice.
-NUM_SCALING_ROWS = 1_500
-
 
 class Frames(NamedTuple):
     r"""Affine coordinates of each row, :math:`v = U (u - m)`.
@@ -61,6 +50,8 @@ class Baseline(Response):
         y: Finite outcomes, of scale one over all actions, shape (n, m).
         action: Actions, shape (n, action_dim).
         kind: Whether f is linear in u.
+        num_centers: Number of training parameters among which a row finds its starts.
+        num_scaled: Number of rows of a curved baseline that standardize v.
     """
 
     centers: Tensor
@@ -72,20 +63,22 @@ class Baseline(Response):
         action: Tensor,
         *,
         kind: Literal["linear", "curved"],
+        num_centers: int = 32,
+        num_scaled: int = 1_500,
     ) -> None:
         super().__init__(u, y, action, kind=kind)
         test = held_out(len(u))
-        self.register_buffer("centers", u[~test][:NUM_CENTERS].clone())
+        self.register_buffer("centers", u[~test][:num_centers].clone())
 
         self.residual_scaling: ActionScaling | None = None
-        some = slice(NUM_SCALING_ROWS if kind == "curved" else None)
+        some = slice(num_scaled if kind == "curved" else None)
         frames = self(y[some], action[some])
         v = nearest(local(u[some], frames), frames)
         self.residual_scaling = ActionScaling(v, action[some])
 
-    def forward(self, y: Tensor, action: Tensor) -> Frames:
+    def forward(self, y: Tensor, action: Tensor, *, block: int = 4_096) -> Frames:
         """Return the frames of outcomes (n, m) and actions (n, action_dim)."""
-        blocks = zip(y.split(BLOCK), action.split(BLOCK), strict=True)
+        blocks = zip(y.split(block), action.split(block), strict=True)
         parts = zip(*(self._frames(*block) for block in blocks), strict=True)
         return Frames(*(torch.cat(part) for part in parts))
 
@@ -126,15 +119,25 @@ class Baseline(Response):
         return mean, misfit, precision
 
     def _descend(
-        self, u: Tensor, y: Tensor, beta: Tensor
+        self,
+        u: Tensor,
+        y: Tensor,
+        beta: Tensor,
+        *,
+        num_steps: int = 7,
+        initial: float = 1e-2,
+        at_rest: float = 1e-3,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Take damped Gauss-Newton steps, each accepted where it improves."""
+        """Take damped Gauss-Newton steps, each accepted where it improves.
+
+        Damping falls or rises by ten; rows end once a step gains less than ``at_rest``.
+        """
         low = self.parameter_basis.center - self.parameter_basis.half_width
         high = self.parameter_basis.center + self.parameter_basis.half_width
-        damping = torch.full_like(u[..., :1], INITIAL_DAMPING)
+        damping = torch.full_like(u[..., :1], initial)
         state = (u, *self._expand(u, y, beta))
         rows = torch.arange(len(u), device=u.device)  # not yet at rest
-        for _ in range(NUM_STEPS):
+        for _ in range(num_steps):
             u, misfit, gradient, precision = (each[rows] for each in state)
             diagonal = precision.diagonal(dim1=-2, dim2=-1)
             damped = precision + torch.diag_embed(damping * diagonal)
@@ -148,7 +151,7 @@ class Baseline(Response):
                     state, (u, misfit, gradient, precision), new, strict=True
                 )
             )
-            restless = ~(better & (misfit - new[1] < AT_REST)).all(1)
+            restless = ~(better & (misfit - new[1] < at_rest)).all(1)
             damping = torch.where(better[..., None], 0.1 * damping, 10.0 * damping)
             rows, damping = rows[restless], damping[restless]
             if not len(rows):

@@ -10,19 +10,82 @@ from torch import Tensor, nn
 
 from sbi_active.inference.networks.action_scaling import ActionScaling, held_out
 from sbi_active.inference.networks.baseline import Baseline, Frames, local
-from sbi_active.inference.networks.directions import Directions
 from sbi_active.inference.networks.response import STRAIGHT
 
+BLOCK = 512  # rows in double precision at once, and rows behind principal directions
 BaselineKind = Literal["none", "linear", "curved"]
-
 #: Numbers in x beyond which no regression is tried: each has coefficients of its own.
 MAX_OUTCOMES = 32
 MIN_ROWS = 40  # with a measurement, of which a fifth is held out
-LARGEST_MISFIT = 20.0  # nats, beyond which a frame has no part in the posterior
 KINDS: tuple[Literal["linear", "curved"], ...] = ("linear", "curved")
 #: Nats by which a baseline must beat the simpler one: its frames and what the network
 #: sees of them are more to overfit.
 MARGIN = {"linear": 0.0, "curved": 0.25}
+
+
+class Directions(nn.Module):
+    r"""Linear summaries of outcomes: what parameters move, and what moves most.
+
+    Half of the directions at most are the leading right singular vectors of
+    :math:`F^\top X`, with X the standardized outcomes and F the parameters, their
+    products, and their products with the action; the others are principal directions
+    of X beside them.
+
+    Args:
+        u: Whitened parameters, shape (n, d).
+        x: Outcomes, shape (n, m), all finite.
+        action: Actions, shape (n, action_dim).
+        num: Number of directions, fewer where rows or numbers are.
+    """
+
+    mean: Tensor
+    scale: Tensor
+    rows: Tensor
+
+    def __init__(self, u: Tensor, x: Tensor, action: Tensor, *, num: int) -> None:
+        super().__init__()
+        mean, scale = x.mean(0, dtype=torch.float64), x.std(0).double()
+        scale = torch.where(scale > 1e-12 * (1 + mean.abs()), scale, 1.0)
+        self.register_buffer("mean", mean)
+        self.register_buffer("scale", scale)
+        features = _products(u, action)
+        moved = x.new_zeros(features.shape[1], x.shape[1]).double()
+        for row in range(0, len(x), BLOCK):
+            part = slice(row, row + BLOCK)
+            moved += features[part].T @ self._standardized(x[part])
+        rows = torch.linalg.svd(moved, full_matrices=False)[2][: num // 2]
+        rest = self._standardized(x[:BLOCK])
+        rest = rest - (rest @ rows.T) @ rows
+        largest = torch.linalg.svd(rest, full_matrices=False)[2][: num - len(rows)]
+        rows = torch.linalg.qr(torch.cat([rows, largest]).T).Q.T
+        self.register_buffer("rows", rows.contiguous())
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return summaries, shape (n, k).
+
+        A number that is missing counts as the mean; an outcome without any is NaN.
+        """
+        parts = [self._summaries(part) for part in x.split(BLOCK)]
+        return torch.cat(parts)
+
+    def _summaries(self, x: Tensor) -> Tensor:
+        seen = x.isfinite()
+        known = torch.where(seen, self._standardized(x), 0.0) @ self.rows.T
+        return torch.where(seen.any(1, keepdim=True), known, torch.nan)
+
+    def _standardized(self, x: Tensor) -> Tensor:
+        return (x.double() - self.mean) / self.scale
+
+
+def _products(u: Tensor, action: Tensor, *, most: int = 256) -> Tensor:
+    """Return standardized products of parameters and actions, shape (n, f)."""
+    a = (action.double() - action.mean(0)) / action.std(0).clamp_min(1e-30)
+    i, j = torch.triu_indices(u.shape[1], u.shape[1])
+    parts = [u, *(u * a[:, [k]] for k in range(a.shape[1]))]
+    parts += [u * a[:, [k]].square() for k in range(a.shape[1])]
+    features = torch.cat([*parts, u[:, i] * u[:, j]], 1)[:, :most]
+    features = features - features.mean(0)
+    return features / features.std(0).clamp_min(1e-30)
 
 
 class Conditioning(nn.Module):
@@ -162,7 +225,9 @@ class Conditioning(nn.Module):
         r""":math:`\log |\mathrm d u / \mathrm d \theta|`."""
         return -self.theta_factor.diagonal().log().sum()
 
-    def forward(self, condition: Tensor) -> tuple[Tensor, Frames]:
+    def forward(
+        self, condition: Tensor, *, largest: float = 20.0
+    ) -> tuple[Tensor, Frames]:
         """Return the network's inputs, (n, x_dim + action_dim + ...), and the frames.
 
         Numbers of x that are missing are zero; a row with any has trivial frames.
@@ -193,7 +258,7 @@ class Conditioning(nn.Module):
         seen.append(frames.mean.flatten(1))
         if frames.misfit.shape[1] > 1:
             excess = frames.misfit - frames.misfit.min(1, keepdim=True).values
-            seen.append(torch.tanh(excess / LARGEST_MISFIT))
+            seen.append(torch.tanh(excess / largest))
         return torch.cat(seen, 1), _with_global(frames)
 
 

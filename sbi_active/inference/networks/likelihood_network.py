@@ -8,10 +8,10 @@ from dataclasses import replace
 import torch
 from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
 from torch import Tensor, nn
+from torch.nn.functional import logsigmoid
 from typing_extensions import override
 
 from sbi_active.inference.networks.action_scaling import ActionScaling
-from sbi_active.inference.networks.batches import log_prob_of_batch
 from sbi_active.inference.networks.conditioning import (
     MAX_OUTCOMES,
     MIN_ROWS,
@@ -21,8 +21,59 @@ from sbi_active.inference.networks.conditioning import (
     whitened,
 )
 from sbi_active.inference.networks.mixture_density import MixtureDensity
+from sbi_active.inference.networks.mixture_network import log_prob_of_batch
 from sbi_active.inference.networks.response import Response, exceeds_chance
-from sbi_active.inference.networks.validity_network import ValidityNetwork
+
+
+class ValidityNetwork(nn.Module):
+    r"""Logistic regression on learned features, :math:`P(\text{valid} | \theta, \xi)`.
+
+    Args:
+        seen: Standardized inputs, shape (n, p).
+        valid: Mask of the rows that gave a measurement, shape (n,), bool; both kinds
+            occur.
+        width: Width of the hidden layer.
+        num_iterations: Number of steps of Adam over all rows at once.
+        learning_rate: Learning rate, at which a weight moves by 3 at most.
+        weight_decay: Weight decay; where few rows are invalid, the edge between stays
+            soft.
+    """
+
+    def __init__(
+        self,
+        seen: Tensor,
+        valid: Tensor,
+        *,
+        width: int = 32,
+        num_iterations: int = 300,
+        learning_rate: float = 0.01,
+        weight_decay: float = 1e-3,
+    ) -> None:
+        super().__init__()
+        self.net = nn.Sequential(
+            nn.Linear(seen.shape[1], width), nn.Tanh(), nn.Linear(width, 1)
+        )
+        share = valid.double().mean().clamp(1e-3, 1 - 1e-3)
+        with torch.no_grad():  # start at the share of valid rows
+            last = self.net[-1]
+            assert isinstance(last, nn.Linear)
+            last.weight.mul_(0.1)
+            last.bias.fill_(float(share.logit()))
+        optimizer = torch.optim.AdamW(
+            self.parameters(), lr=learning_rate, weight_decay=weight_decay
+        )
+        sign = valid.to(seen.dtype) * 2 - 1
+        for _ in range(num_iterations):
+            optimizer.zero_grad(set_to_none=True)
+            loss = -logsigmoid(sign * self.net(seen)[:, 0]).mean()
+            loss.backward()
+            optimizer.step()
+        self.zero_grad(set_to_none=True)
+
+    def forward(self, seen: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the log probabilities of a measurement and of none, each (n,)."""
+        logit = self.net(seen)[:, 0]
+        return logsigmoid(logit), logsigmoid(-logit)
 
 
 class LikelihoodNetwork(ConditionalDensityEstimator):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import torch
@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from sbi_active.inference.networks.baseline import Frames, local
-from sbi_active.inference.networks.batches import log_prob_of_batch
 from sbi_active.inference.networks.conditioning import BaselineKind, Conditioning
 
 #: Bounds of the log-precision of a component in units of the standardized parameter:
@@ -27,6 +26,32 @@ FEW_DIMENSIONS = 12
 #: Numbers of the factors of draws in memory at once, 40 MB.
 MOST_FACTORS = 10_000_000
 ACTIVATIONS = {"silu": nn.SiLU, "relu": nn.ReLU}
+
+
+def log_prob_of_batch(
+    network: ConditionalDensityEstimator,
+    density: Callable[[Tensor, Tensor], Tensor],
+    input: Tensor,
+    condition: Tensor,
+) -> Tensor:
+    """Return log densities, shape (sample_dim, batch_dim).
+
+    Args:
+        network: Knows the shapes of an input and of a condition.
+        density: Log density of inputs (sample_dim, batch_dim, d), given conditions
+            (batch_dim, condition_dim).
+        input: Inputs, shape (sample_dim, batch_dim, d) or (batch_dim, d).
+        condition: Conditions, shape (batch_dim, condition_dim), or with the sample_dim
+            too.
+    """
+    network._check_condition_shape(condition)
+    network._check_input_shape(input)
+    rows = input[None] if input.ndim == 2 else input
+    if condition.ndim == 2:
+        return density(rows, condition)
+    shape = condition.shape[:2]
+    pairs = rows.expand(*shape, -1).reshape(1, -1, rows.shape[-1])
+    return density(pairs, condition.flatten(0, 1)).reshape(shape)
 
 
 class MixtureDensityNetwork(ConditionalDensityEstimator):

@@ -17,12 +17,7 @@ from sbi_active.inference.networks.action_scaling import (
     held_out,
 )
 
-MAX_FEATURES = 260  # of (action, parameters)
-#: Bounds of what held-out rows choose from: choices, as is their number above.
-MAX_ACTION_DEGREE = 14
 MAX_DEGREE = 9  # of the parameters
-MAX_NOISE_DEGREE = 8  # of the action, as for x alone
-JOINT_COST = 1.5  # degrees that a product of two parameters counts more
 STRAIGHT = 0.01  # fraction of the residual below which f is taken to be linear
 
 
@@ -41,6 +36,9 @@ class Response(nn.Module):
         y: Finite outcomes, of scale one over all actions, shape (n, m).
         action: Actions, shape (n, action_dim).
         kind: Whether f is linear in u.
+        max_features: Number of features of action and parameters at most.
+        max_action_degree: Largest degree of the action that held-out rows choose from.
+        max_noise_degree: Largest degree of the noise.
     """
 
     beta: Tensor
@@ -56,14 +54,17 @@ class Response(nn.Module):
         action: Tensor,
         *,
         kind: Literal["linear", "curved"],
+        max_features: int = 260,
+        max_action_degree: int = 14,
+        max_noise_degree: int = 8,
     ) -> None:
         super().__init__()
         self.kind = kind
         test = held_out(len(u))
         num_train, dim = int((~test).sum()), u.shape[1]
-        most = min(MAX_FEATURES, num_train // 8)
+        most = min(max_features, num_train // 8)
         exponents, sizes = exponents_of(
-            action, max_degree=MAX_ACTION_DEGREE, max_terms=max(1, most // (1 + dim))
+            action, max_degree=max_action_degree, max_terms=max(1, most // (1 + dim))
         )
         degree = MAX_DEGREE if kind == "curved" else 1
         # A degree more than there is data for costs nothing: terms are cut off below.
@@ -71,7 +72,7 @@ class Response(nn.Module):
         self.action_basis = Polynomials(action, exponents)
         self.parameter_basis = Polynomials(u, inner)
         phi, psi = self.action_basis(action), self.parameter_basis(u)
-        degrees = min(len(sizes), MAX_NOISE_DEGREE + 1)
+        degrees = min(len(sizes), max_noise_degree + 1)
         noise = phi[:, : sizes[degrees - 1]]
 
         k, j, prefixes = _joint_terms(exponents, inner, most)
@@ -180,7 +181,7 @@ def exceeds_chance(gain: Tensor) -> bool:
 
 
 def _joint_terms(
-    outer: Tensor, inner: Tensor, most: int
+    outer: Tensor, inner: Tensor, most: int, *, joint_cost: float = 1.5
 ) -> tuple[Tensor, Tensor, list[int]]:
     """Return pairs of exponents from coarse to fine, and numbers to choose from.
 
@@ -189,7 +190,7 @@ def _joint_terms(
     """
     outer_degree, inner_degree = outer.sum(1), inner.sum(1)
     ratio = MAX_DEGREE / max(int(outer_degree.max()), 1)
-    joint = (inner.ne(0).sum(1) - 1).clamp_min(0) * JOINT_COST
+    joint = (inner.ne(0).sum(1) - 1).clamp_min(0) * joint_cost
     cost = outer_degree[:, None] * ratio + (inner_degree + joint)[None]
     order = cost.flatten().argsort(stable=True)[:most]
     costs = cost.flatten()[order]

@@ -14,19 +14,22 @@ from torch.distributions import Distribution
 
 from sbi_active.inference.declared.contradiction import Contradiction, compared
 from sbi_active.inference.declared.settings import RefinementOptions
-from sbi_active.inference.refinement.course import UNSETTLED, Stage
-from sbi_active.inference.refinement.learned_belief import LearnedBelief
-from sbi_active.inference.refinement.outcome_checks import check_outcomes
-from sbi_active.inference.refinement.regression_error import expected_error, widened
-from sbi_active.inference.refinement.residuals import (
+from sbi_active.inference.refinement.checks import (
+    check_outcomes,
     has_hard_edges,
     noise_shape,
+    tail_probability,
     trial_correlation,
 )
-from sbi_active.inference.refinement.settings import StageSettings
+from sbi_active.inference.refinement.course import (
+    LIVE,
+    Doubt,
+    Stage,
+    StageSettings,
+)
+from sbi_active.inference.refinement.learned_belief import LearnedBelief
+from sbi_active.inference.refinement.regression_error import expected_error, widened
 from sbi_active.inference.refinement.stages import Stages
-from sbi_active.inference.refinement.tails import tail_probability
-from sbi_active.inference.refinement.trust import LIVE, Doubt
 from sbi_active.inference.regression.histories import Histories, HistoryRecord
 from sbi_active.inference.regression.regions import around, cover, whole_space
 from sbi_active.inference.regression.surrogate import Surrogate, fewest_rows
@@ -37,9 +40,6 @@ from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.outcomes import MissingRowsWarning
 
 Array = NDArray[Any]
-
-ROUGH = 0.5  # share of the variance that a cubic misses over the whole prior
-SERIOUS_MISFIT = 1.5  # residual over noise variance, chance removed
 
 
 @dataclass(frozen=True)
@@ -163,9 +163,8 @@ class Regions(Stages):
         for k, (region, count) in enumerate(zip(regions, counts, strict=True)):
             # The first stage's first region is the whole space, seen from the prior.
             is_overview = is_first and k == 0
-            before = len(histories) - len(histories.second)
-            histories.reuse(region, int(count), is_overview=is_overview)
-            missing = int(count) - (len(histories) - len(histories.second) - before)
+            missing = int(count)
+            missing -= histories.reuse(region, missing, is_overview=is_overview)
             if missing <= 0:
                 continue
             z = region.sample_inside(missing, self.coordinates, self.rng)
@@ -239,7 +238,7 @@ class Regions(Stages):
         dim = self.coordinates.dim
         # Of d parameters known to e nats, a mean is off by (2 e / d)^(1/2) deviations.
         allowed = 0.5 * dim * self.own.known**2
-        known = last.error / allowed, self.change / (UNSETTLED * dim)
+        known = last.error / allowed, self.change / (self.own.unsettled * dim)
         correlation, is_independent = trial_correlation(live, len(self.task.action))
         return {
             "gaussian_noise": (
@@ -257,7 +256,7 @@ class Regions(Stages):
                 "num_histories",
             ),
             "smooth_response": (
-                roughness <= ROUGH,
+                roughness <= self.own.rough,
                 roughness,
                 "SA111 over the prior the outcomes have more turns than a cubic, which "
                 "misses {:.0%} of their variance, so that four or more narrow modes "
@@ -265,7 +264,7 @@ class Regions(Stages):
                 "narrower prior",
             ),
             "no_misfit": (
-                last.excess <= SERIOUS_MISFIT,
+                last.excess <= self.own.misfit,
                 max((fit.ratio for fit in live), default=np.inf),
                 "SA112 the residuals of the surrogate have {:.2g} times the variance "
                 "of the noise, so that the belief is too wide; raise num_histories",

@@ -33,9 +33,6 @@ Array = NDArray[Any]
 
 LARGE = 0.2  # nats that the belief is off
 NUM_REPEATS = 20  # of the coefficients
-CHANCE = 0.99  # of agreement, where only chance makes a difference
-NUM_PLACES = 400  # of the belief
-REACHES = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0)  # times a region's radius
 
 
 def expected_error(
@@ -44,6 +41,7 @@ def expected_error(
     rng: np.random.Generator,
     *,
     explained: bool = False,
+    num_places: int = 400,
 ) -> float:
     """Return the expected divergence from the belief of endless simulations, in nats.
 
@@ -51,7 +49,7 @@ def expected_error(
     that lie further out than simulations are moved to where those lie, so that the
     error is that of the simulations alone.
     """
-    draws = draws[:: max(len(draws) // NUM_PLACES, 1)]
+    draws = draws[:: max(len(draws) // num_places, 1)]
     label = surrogate.assign(draws)
     change = np.zeros((NUM_REPEATS, len(draws)))
     for k, fit in enumerate(surrogate.regressions):
@@ -69,6 +67,8 @@ def widened(
     rng: np.random.Generator,
     *,
     pieces: float = 0.03,
+    chance: float = 0.99,
+    reaches: tuple[float, ...] = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0),
 ) -> tuple[Surrogate, float]:
     """Return the surrogate of more distant simulations that agree, which errs least.
 
@@ -84,20 +84,22 @@ def widened(
         pieces: Expected error, nats, beyond which one regression is tried in place of
             several. At half a banana is .03 nats further off, by its ends; at twice
             skewed noise leaves some beliefs in pieces.
+        chance: Probability of agreement where only chance makes a difference.
+        reaches: Multiples of a region's radius that are tried.
     """
     best, least, bias = surrogate, error, 0.0
     # The difference from a better surrogate is chi-squared, of as many degrees as there
     # are parameters.
     dim = draws.shape[1]
-    allowed = error * chi2.ppf(CHANCE, dim) / dim
+    allowed = error * chi2.ppf(chance, dim) / dim
     near = surrogate.log_likelihood(draws)
     num_rows = int(histories.valid.sum())
     wider: list[tuple[list[Region], tuple[float, ...]]]
-    wider = [([fit.region for fit in surrogate.regressions], REACHES)]
+    wider = [([fit.region for fit in surrogate.regressions], reaches)]
     if len(surrogate.regressions) > 1 and error > pieces:
         one = around(draws)
         reach = 1.01 * max(1.0, float(one.distance(draws).max()))
-        wider.insert(0, ([one], (reach, *(reach * further for further in REACHES))))
+        wider.insert(0, ([one], (reach, *(reach * further for further in reaches))))
     for regions, reaches in wider:
         for reach in reaches if best is surrogate else ():
             fits = [

@@ -17,10 +17,14 @@ from torch.distributions import Distribution
 
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.engine.learned import LearnedLikelihood, learned_fit
-from sbi_active.inference.refinement.course import Course, Stage
+from sbi_active.inference.refinement.course import (
+    Course,
+    Doubt,
+    Stage,
+    StageSettings,
+    diagnose,
+)
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
-from sbi_active.inference.refinement.settings import StageSettings
-from sbi_active.inference.refinement.trust import Doubt, diagnose
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 

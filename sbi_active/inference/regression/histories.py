@@ -11,15 +11,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sbi_active.inference.regression.noise_shape import ShapeSettings
 from sbi_active.inference.regression.outcomes import outcomes_of
 from sbi_active.inference.regression.regions import Region
-from sbi_active.inference.regression.rows import rows_of
+from sbi_active.inference.regression.residuals import ShapeSettings
 from sbi_active.inference.regression.surrogate import (
     LocalRegression,
     estimate_noise,
     fewest_rows,
 )
+from sbi_active.inference.rounds.rows import rows_of
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation.outcomes import (
@@ -30,12 +30,7 @@ from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 Array = NDArray[Any]
 
-MIN_PAIRS = 20  # replicates a noise estimate rests on
 LOST = np.inf  # marks the rows of a history that a fault hit
-MAX_ATTEMPTS = 16  # more at a measurement
-ENOUGH = 0.5  # share of complete histories that needs no more attempts
-NUM_PROBES = 50  # rows to see whether another attempt is of use
-WORTHWHILE = 0.05  # share of attempts that must be
 
 
 @dataclass(frozen=True)
@@ -47,9 +42,7 @@ class HistoryRecord:
         theta: Parameters, shape (n, d), float32.
         x: Outcomes, shape (n, t, q); NaN where there was no measurement.
         present: Which of them were there at the first attempt, shape (n, t, q).
-        again: Outcomes of a second simulation, NaN where there was none, (n, t, q).
-        present_again: Which of those were there at the first attempt, (n, t, q).
-        has_again: Which rows were simulated twice, shape (n,).
+        twin: Number of the row that a row repeats, -1 where it repeats none, (n,).
         is_overview: Which rows were drawn from the whole prior, shape (n,).
     """
 
@@ -57,9 +50,7 @@ class HistoryRecord:
     theta: Tensor
     x: Array
     present: NDArray[np.bool_]
-    again: Array
-    present_again: NDArray[np.bool_]
-    has_again: NDArray[np.bool_]
+    twin: NDArray[np.intp]
     is_overview: NDArray[np.bool_]
 
     def precedes(self, action: Tensor) -> bool:
@@ -87,6 +78,7 @@ class Histories:
         x: Outcomes less the observed ones, or themselves where nothing was observed,
             shape (n, t * q).
         present: Which outcomes were there at the first attempt, shape (n, t * q).
+        twin: Number of the row that a row repeats, -1 where it repeats none, (n,).
         observed: Observed numbers, zero where nothing was, shape (t * q,).
         used: Which numbers were observed, shape (t * q,).
         num_drawn: Histories simulated here or taken over, those lost to faults of the
@@ -116,8 +108,7 @@ class Histories:
         self.z = np.zeros((0, coordinates.dim))
         self.x = np.zeros((0, x.size))
         self.present = np.zeros((0, x.size), dtype=bool)
-        self.first: list[int] = []
-        self.second: list[int] = []
+        self.twin = np.zeros(0, dtype=np.intp)
         self.num_simulations = self.num_drawn = self.num_missing = 0
         self._theta = torch.zeros(0, coordinates.dim)
         self._is_overview = np.zeros(0, dtype=bool)
@@ -145,33 +136,32 @@ class Histories:
         """Take past histories in a region, simulated at the further actions only.
 
         At most ``count``; for an overview those drawn from the whole prior instead, so
-        that a first stage keeps its distribution. Returns how many rows were added,
-        replicates included.
+        that a first stage keeps its distribution. Returns how many were added.
         """
         past = self._past
         if past is None or count <= 0:
             return 0
-        if is_overview:
-            eligible = past.is_overview
-        else:
+        eligible = past.is_overview
+        if not is_overview:
             eligible = region.distance(self.coordinates.to_z(past.theta)) <= 1
-        rows = np.flatnonzero(eligible & self._unused)[:count]
+        eligible = eligible & (past.twin < 0) & self._unused
+        rows = np.flatnonzero(eligible)[:count]
         if len(rows) == 0:
             return 0
         self._unused[rows] = False
-        twice = np.flatnonzero(past.has_again[rows])
-        theta = torch.cat([past.theta[rows], past.theta[rows[twice]]])
-        x = np.concatenate([past.x[rows], past.again[rows[twice]]]).reshape(
-            len(theta), -1
+        again = np.flatnonzero(np.isin(past.twin, rows))
+        again = again[np.argsort(past.twin[again])]
+        twice = np.searchsorted(rows, past.twin[again])
+        both = np.concatenate([rows, again])
+        theta = past.theta[torch.from_numpy(both)]
+        x, present = (
+            part[both].reshape(len(both), -1) for part in (past.x, past.present)
         )
-        present = np.concatenate([past.present[rows], past.present_again[rows[twice]]])
-        present = present.reshape(len(theta), -1)
         if len(past.action) < len(self.action):
             further = self._simulate(theta, len(past.action))
             x = np.concatenate([x, further[0]], 1)
             present = np.concatenate([present, further[1]], 1)
-        self._append(theta, x, present, twice, is_overview=is_overview)
-        return len(theta)
+        return self._append(theta, x, present, twice, is_overview=is_overview)
 
     def fresh(self, theta: Tensor) -> tuple[Array, NDArray[np.bool_]]:
         """Return outcomes less the observed ones (n, t * q), and which rows lack some.
@@ -187,31 +177,31 @@ class Histories:
 
     def record(self) -> HistoryRecord:
         """Return the histories for a later call with further trials."""
-        t = len(self.action)
-        x = (self.x + self.observed).reshape(len(self), t, -1)
-        is_second = np.zeros(len(self), dtype=bool)
-        is_second[self.second] = True
-        again, has_again = np.full_like(x, np.nan), np.zeros(len(self), dtype=bool)
-        again[self.first], has_again[self.first] = x[self.second], True
-        present = self.present.reshape(x.shape)
-        present_again = np.zeros_like(present)
-        present_again[self.first] = present[self.second]
-        keep = ~is_second
+        shape = len(self), *self._seen.shape
         return HistoryRecord(
             action=self.action,
-            theta=self._theta[torch.from_numpy(keep)],
-            x=x[keep],
-            present=present[keep],
-            again=again[keep],
-            present_again=present_again[keep],
-            has_again=has_again[keep],
-            is_overview=self._is_overview[keep],
+            theta=self._theta,
+            x=(self.x + self.observed).reshape(shape),
+            present=self.present.reshape(shape),
+            twin=self.twin,
+            is_overview=self._is_overview,
         )
 
-    def _simulate(self, theta: Tensor, first: int) -> tuple[Array, NDArray[np.bool_]]:
+    def _simulate(
+        self,
+        theta: Tensor,
+        first: int,
+        *,
+        most: int = 16,
+        enough: float = 0.5,
+        num_probes: int = 50,
+        worthwhile: float = 0.05,
+    ) -> tuple[Array, NDArray[np.bool_]]:
         """Return outcomes at each theta of the trials from ``first`` on.
 
         And which of them were there at the first attempt, both of shape (n, t * q).
+        Up to ``most`` more attempts are made until a share is ``enough``, if a few
+        probes show that they are ``worthwhile``.
         """
         n, t = len(theta), len(self.action) - first
         seed = derive_seed(self.seed, "histories", self.num_simulations)
@@ -219,23 +209,23 @@ class Histories:
         x = self._rows(theta.repeat_interleave(t, 0), trial, seed)
         present = np.isfinite(x)
         place = torch.arange(n).repeat_interleave(t)
-        for attempt in range(MAX_ATTEMPTS):
+        for attempt in range(most):
             # Where chance decides who gives a measurement, histories of many trials
             # would seldom be complete; given one, x has the same law at any attempt.
             lacks = (self._seen[trial] & np.isnan(x)).any(1)
             incomplete = np.flatnonzero(lacks)
             complete = ~lacks.reshape(n, t).any(1)
-            if complete.mean() >= ENOUGH or len(incomplete) == 0:
+            if complete.mean() >= enough or len(incomplete) == 0:
                 break
             if attempt == 0:  # a few show whether it is chance at all
-                incomplete = incomplete[:: max(len(incomplete) // NUM_PROBES, 1)]
+                incomplete = incomplete[:: max(len(incomplete) // num_probes, 1)]
             again = self._rows(
                 theta[place[incomplete]], trial[incomplete], derive_seed(seed, attempt)
             )
             filled = ~(self._seen[trial[incomplete]] & np.isnan(again)).any(1)
             filled &= ~np.isinf(again).any(1)  # not lost
             x[incomplete[filled]] = again[filled]
-            if filled.mean() < WORTHWHILE:
+            if filled.mean() < worthwhile:
                 break
         x, present = x.reshape(n, -1), present.reshape(n, -1)
         x[np.isinf(x).any(1)] = LOST
@@ -280,10 +270,11 @@ class Histories:
         twice: NDArray[np.intp],
         *,
         is_overview: bool,
-    ) -> None:
+    ) -> int:
         """Append rows of which the last are replicates of ``twice``.
 
-        A history that a fault hit is left out, and its replicate with it.
+        A history that a fault hit is left out, and its replicate with it. Returns the
+        number of those that are no replicates.
         """
         num_places = len(theta) - len(twice)
         self.num_drawn += len(theta)
@@ -303,13 +294,21 @@ class Histories:
         self._theta = torch.cat([self._theta, theta])
         overview = np.full(len(theta), is_overview)
         self._is_overview = np.concatenate([self._is_overview, overview])
-        self.first += (start + twice).tolist()
-        self.second += range(start + num_places, start + len(theta))
+        twin = np.concatenate([np.full(num_places, -1), start + twice])
+        self.twin = np.concatenate([self.twin, twin])
+        return num_places
+
+    @property
+    def pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows that were simulated twice, and their repetitions, both (r,)."""
+        second = np.flatnonzero(self.twin >= 0)
+        return self.twin[second], second
 
     @property
     def noise_sds(self) -> Array:
         """Standard deviations of the noise by repeated simulations, shape (t, q)."""
-        gap = self.x[self.first] - self.x[self.second]
+        first, second = self.pairs
+        gap = self.x[first] - self.x[second]
         with np.errstate(all="ignore"):
             variance = np.nanmean(0.5 * gap**2, 0)
         return np.sqrt(np.nan_to_num(variance)).reshape(self._seen.shape)
@@ -336,7 +335,11 @@ class Histories:
         return float((~present.any(2)).mean()) if len(self) else 0.0
 
     def regress(
-        self, region: Region, shapes: ShapeSettings | None = None
+        self,
+        region: Region,
+        shapes: ShapeSettings | None = None,
+        *,
+        min_pairs: int = 20,
     ) -> LocalRegression | None:
         """Regress the histories in a region, or the nearest where it holds few.
 
@@ -345,11 +348,11 @@ class Histories:
         distance, valid, agrees = region.distance(self.z), self.valid, self.agrees
         needed = 2 * fewest_rows(self.coordinates.dim)
         rows = _nearest(np.where(valid, distance, np.inf), needed)
-        first, second = np.array(self.first, int), np.array(self.second, int)
+        first, second = self.pairs
         both = valid[first] & valid[second]
         if len(rows) < needed // 2 or both.sum() < 5:
             return None
-        pairs = _nearest(np.where(both, distance[first], np.inf), MIN_PAIRS)
+        pairs = _nearest(np.where(both, distance[first], np.inf), min_pairs)
         scale = np.abs(self.x[rows] + self.observed).max(0)[self.used]
         noise = estimate_noise(
             self.x[first[pairs]][:, self.used],
@@ -359,7 +362,7 @@ class Histories:
         # Where all trials agree everywhere, or nowhere, there is nothing to compare.
         mixed = np.flatnonzero(agrees.any(0) & ~agrees.all(0))
         near = _nearest(distance, needed)
-        repeated = _nearest(distance[first], MIN_PAIRS)
+        repeated = _nearest(distance[first], min_pairs)
         return LocalRegression.fit(
             region,
             self.z[rows],

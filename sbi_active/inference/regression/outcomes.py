@@ -37,17 +37,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, log_expit
 
-from sbi_active.inference.regression.basis import Basis
-from sbi_active.inference.regression.regions import Region
+from sbi_active.inference.regression.regions import Basis, Region
 
 Array = NDArray[Any]
 
-DEVIATIONS = (1.0, 4.0, 16.0, 64.0)  # of coefficients a priori
 INTERCEPT_DEVIATION = 8.0  # at least: an event may be rare all over a region
 DEGREES = (0, 1, 2, 3)  # of the polynomials that the evidence chooses among
-ROWS_A_FEATURE = 6  # at least
-NUM_STEPS = 40  # of Newton's method
-SURPRISE = 0.01  # probability below which an outcome is a slip
 
 
 @dataclass(frozen=True)
@@ -79,6 +74,10 @@ class TrialOutcome:
         z: Array,
         agrees: NDArray[np.bool_],
         pairs: NDArray[np.bool_],
+        *,
+        deviations: tuple[float, ...] = (1.0, 4.0, 16.0, 64.0),
+        rows_a_feature: int = 6,
+        surprise: float = 0.01,
     ) -> TrialOutcome:
         """Fit the regression with the largest evidence.
 
@@ -88,6 +87,10 @@ class TrialOutcome:
             z: Coordinates of simulations, shape (n, d).
             agrees: Whether their outcome is what was observed, shape (n,).
             pairs: Pairs of simulations at the same parameters, shape (r, 2).
+            deviations: Deviations of coefficients a priori that the evidence chooses
+                among.
+            rows_a_feature: Number of rows a feature at least.
+            surprise: Probability below which an outcome is a slip.
         """
         u, n = region.scaled(z), len(z)
         degrees = DEGREES if 0 < agrees.sum() < n else (0,)
@@ -95,10 +98,10 @@ class TrialOutcome:
         for degree in degrees:
             basis = Basis.polynomial(degree, u.shape[1])
             features = basis(u)
-            if degree > 1 and n < ROWS_A_FEATURE * features.shape[1]:
+            if degree > 1 and n < rows_a_feature * features.shape[1]:
                 break
             coefficient = np.zeros(features.shape[1])
-            for deviation in DEVIATIONS if degree > 0 else (INTERCEPT_DEVIATION,):
+            for deviation in deviations if degree > 0 else (INTERCEPT_DEVIATION,):
                 coefficient, value = _laplace(features, agrees, deviation, coefficient)
                 if value > evidence:
                     best, evidence = (basis, coefficient), value
@@ -109,7 +112,7 @@ class TrialOutcome:
             slip = 1 / (n + 2)
             coefficient = np.full(1, 60.0 if agrees.all() else -60.0)
         else:
-            slip = (1 + (actual < SURPRISE).sum()) / (n + 2)
+            slip = (1 + (actual < surprise).sum()) / (n + 2)
         expected = float((2 * probability * (1 - probability)).mean())
         num = len(pairs) + 1.0
         differ = ((pairs[:, 0] != pairs[:, 1]).sum() + 0.5) / num
@@ -153,7 +156,12 @@ def outcomes_of(
 
 
 def _laplace(
-    features: Array, agrees: NDArray[np.bool_], deviation: float, start: Array
+    features: Array,
+    agrees: NDArray[np.bool_],
+    deviation: float,
+    start: Array,
+    *,
+    num_steps: int = 40,
 ) -> tuple[Array, float]:
     r"""Return the most probable coefficients and the log evidence.
 
@@ -171,7 +179,7 @@ def _laplace(
         return float(fit - 0.5 * (prior * beta**2).sum())
 
     beta, value = start, objective(start)
-    for _ in range(NUM_STEPS):
+    for _ in range(num_steps):
         probability = expit(features @ beta)
         gradient = features.T @ (agrees - probability) - prior * beta
         weight = probability * (1 - probability)

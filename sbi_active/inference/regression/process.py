@@ -15,12 +15,6 @@ Array = NDArray[Any]
 Kind = Literal["smooth", "rough"]
 
 TREND = 3.0  # deviation of the trend's coefficients, outputs of unit size
-ROUNDED = 1e-7  # of the largest output, which single precision does not tell
-SPARE = 3  # rows beyond the features before a trend is taken off
-ROWS_A_FEATURE = 2.0  # that a quadratic trend takes at least
-MOST_FITTED = 250  # rows that hyperparameters are fitted to
-INFLATION = 16.0  # of the variance at most, where left-out rows are missed by more
-RIDGES = (1e-9, 1e-7, 1e-5, 1e-3)  # of the kernel, where it has no factor
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,6 +117,11 @@ class GaussianProcess:
         noise: Literal["none", "learned"] | Tensor,
         num_categories: int = 0,
         settings: ProcessSettings | None = None,
+        most_fitted: int = 250,
+        spare_least: int = 3,
+        rows_a_feature: float = 2.0,
+        most_inflation: float = 16.0,
+        rounded: float = 1e-7,
     ) -> GaussianProcess:
         """Return the process of inputs (n, D) and outputs (n, q), n >= 2.
 
@@ -133,11 +132,18 @@ class GaussianProcess:
                 is none, or that it is to be learned.
             num_categories: Number of inputs, the last ones, that are categories.
             settings: Kernel, trend and hyperpriors.
+            most_fitted: Number of rows that hyperparameters are fitted to.
+            spare_least: Number of rows beyond the features before a trend is taken off.
+            rows_a_feature: Number of rows a feature that a quadratic trend takes at
+                least.
+            most_inflation: Factor of the variance at most, where left-out rows are
+                missed by more.
+            rounded: Share of the largest output that single precision does not tell.
         """
         settings = settings or ProcessSettings()
         u, y = torch.as_tensor(u).double(), torch.as_tensor(y).double()
         if settings.degree is None:
-            enough = len(u) >= ROWS_A_FEATURE * num_features(u.shape[1])
+            enough = len(u) >= rows_a_feature * num_features(u.shape[1])
             settings = replace(settings, degree=2 if enough else 1)
         shift, size = y.mean(0), y.abs().amax(0)
         rest, scale = y - shift, y.std(0, correction=0)
@@ -148,15 +154,15 @@ class GaussianProcess:
             # Values that agree by common random numbers vary by less than they err.
             scale = scale.clamp_min(1e-3 * float(noise.mean()) + 1e-12)
             noise = noise.double() / scale
-        elif noise == "none" and spare >= SPARE:
+        elif noise == "none" and spare >= spare_least:
             taken_off = torch.linalg.lstsq(basis, rest, driver="gelsd").solution
             rest = rest - basis @ taken_off
             spread = (rest.square().sum(0) / spare).sqrt()
-            scale = torch.maximum(spread, (ROUNDED * size).clamp_min(1e-30))
+            scale = torch.maximum(spread, (rounded * size).clamp_min(1e-30))
         else:
             scale = torch.where(scale > 1e-6 * size, scale, size.clamp_min(1e-30))
         values = rest / scale
-        some = slice(None, None, max(1, -(-len(u) // MOST_FITTED)))
+        some = slice(None, None, max(1, -(-len(u) // most_fitted)))
         few = noise[some] if isinstance(noise, Tensor) else noise
         free, evidence = _hyperparameters(
             u[some], values[some], few, num_categories, settings
@@ -168,7 +174,7 @@ class GaussianProcess:
         inflation = torch.ones_like(scale)
         if not isinstance(noise, Tensor):
             missed = (precision @ values).square() / precision.diagonal()[:, None]
-            inflation = missed.mean(0).clamp(1.0, INFLATION)
+            inflation = missed.mean(0).clamp(1.0, most_inflation)
         return GaussianProcess(
             *(u, num_categories, settings, free, variance, values, precision),
             *(shift, taken_off, scale, inflation, evidence),
@@ -329,10 +335,12 @@ def _hyperparameters(
         return found, -float(negative_log_evidence())
 
 
-def _whitened(kernel: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+def _whitened(
+    kernel: Tensor, y: Tensor, *, ridges: tuple[float, ...] = (1e-9, 1e-7, 1e-5, 1e-3)
+) -> tuple[Tensor, Tensor]:
     """Return whitened outputs, and half the log determinant."""
     factor, failed = torch.linalg.cholesky_ex(kernel)
-    for share in RIDGES:
+    for share in ridges:
         if not failed:
             break
         size = float(kernel.detach().diagonal().max())

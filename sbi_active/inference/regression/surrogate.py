@@ -28,12 +28,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, f
 
-from sbi_active.inference.regression.basis import Basis
-from sbi_active.inference.regression.noise_shape import NoiseShape, ShapeSettings
 from sbi_active.inference.regression.outcomes import TrialOutcome
-from sbi_active.inference.regression.regions import Region, nearest_region
-from sbi_active.inference.regression.residual_covariance import (
+from sbi_active.inference.regression.regions import Basis, Region, nearest_region
+from sbi_active.inference.regression.residuals import (
+    NoiseShape,
     ResidualCovariance,
+    ShapeSettings,
     alike,
 )
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
@@ -43,15 +43,6 @@ Array = NDArray[Any]
 CAUTION = 2.0  # at least, under misfit
 FREEDOM = 20  # degrees at least, which know a variance to a third
 MISFIT = 1.12  # residual over noise variance above which the basis misses something
-#: Numbers beyond which less misfit of each is as bad, since what is missed is smooth
-#: and adds up: 3 % of the variance of 1,000 numbers moved a mean by .8 deviations. With
-#: it the largest shift of four seeds is .25, at half .44 and at twice .20: alike.
-NUMBERS = 20
-MANY = 6  # parameters beyond which bases without products are tried too
-CHANCE = 0.03  # that the largest ratio is taken for misfit where there is none
-GAIN = 0.005  # nats an outcome that a larger basis must save
-MAX_WAVES = 120  # random Fourier features
-WAVE_LENGTHS = (1.0, 0.5, 0.25)  # in half-widths of the region
 FLOAT32 = 2.0**-23  # outcomes are float32: their rounding is a floor of the noise
 
 
@@ -139,6 +130,7 @@ class LocalRegression:
         used: NDArray[np.bool_] | None = None,
         observed: Array | None = None,
         shapes: ShapeSettings | None = None,
+        gain: float = 0.005,
     ) -> LocalRegression | None:
         """Fit the basis with the smallest generalized cross-validation score.
 
@@ -152,6 +144,7 @@ class LocalRegression:
             used: Outcomes that were observed, shape (q,); None is all.
             observed: What was observed, shape (q,), for a noise that grows with it.
             shapes: Settings of noise that is not Gaussian; None takes it for Gaussian.
+            gain: Nats an outcome that a larger basis must save.
 
         Returns:
             The regression; None where simulations are too few.
@@ -182,7 +175,7 @@ class LocalRegression:
             if not is_wave and q > 0:
                 missed = (residual**2).sum(0) / (n - p) - noise.variance
                 roughness = float((missed / x.var(0).clip(noise.variance)).max())
-            if best is None or score < best[0] - GAIN * q:
+            if best is None or score < best[0] - gain * q:
                 best = (score, basis, root, residual, coefficient)
         if best is None:
             return None
@@ -306,13 +299,20 @@ def fewest_rows(dim: int) -> int:
     return 1 + dim + FREEDOM
 
 
-def _candidates(dim: int, num_rows: int) -> list[Basis]:
+def _candidates(
+    dim: int,
+    num_rows: int,
+    *,
+    many: int = 6,
+    max_waves: int = 120,
+    lengths: tuple[float, ...] = (1.0, 0.5, 0.25),
+) -> list[Basis]:
     polynomials = [Basis.polynomial(degree, dim) for degree in (1, 2, 3)]
-    if dim > MANY:  # products of two parameters each would need too many rows
+    if dim > many:  # products of two parameters each would need too many rows
         powers = [Basis.polynomial(d, dim, is_additive=True) for d in (2, 3)]
         polynomials = [polynomials[0], *powers, *polynomials[1:]]
-    num_waves = min(MAX_WAVES, num_rows // 4)
-    return polynomials + [Basis.waves(s, dim, num_waves) for s in WAVE_LENGTHS]
+    num_waves = min(max_waves, num_rows // 4)
+    return polynomials + [Basis.waves(s, dim, num_waves) for s in lengths]
 
 
 def _misfit(residual: Array, noise: NoiseEstimate, root: Array) -> float:
@@ -320,21 +320,32 @@ def _misfit(residual: Array, noise: NoiseEstimate, root: Array) -> float:
     return float((variance / noise.variance).max(initial=0.0))
 
 
-def _excess(ratio: Array, num_alike: float, freedom: int, num_pairs: int) -> float:
+def _excess(
+    ratio: Array,
+    num_alike: float,
+    freedom: int,
+    num_pairs: int,
+    *,
+    chance: float = 0.03,
+    numbers: int = 20,
+) -> float:
     """Return the misfit, residual over noise variance (q,), with chance removed.
 
     The mean over outcomes is sharp where all are missed a little, and counts as often
     as there are outcomes; the maximum is where one is missed. Each is less what chance
-    alone reaches: ratios are F distributed and correlate as the squares of the
-    residuals' correlations.
+    alone reaches, but for ``chance``: ratios are F distributed and correlate as the
+    squares of the residuals' correlations. Of more than ``numbers``, less misfit of
+    each is as bad, since what is missed is smooth and adds up: 3 % of the variance of
+    1,000 numbers moved a mean by .8 deviations. At 20 the largest shift of four seeds
+    is .25, at 10 .44 and at 40 .20.
     """
     q = len(ratio)
     if q == 0:
         return 0.0
     deviation = np.sqrt(2 / freedom + 2 / max(num_pairs, 1))
     mean = ratio.mean() - 3 * deviation * np.sqrt(num_alike / q)
-    mean = 1 + (mean - 1) * max(1.0, q / NUMBERS)
-    largest = ratio.max() / f.isf(CHANCE / q, freedom, max(num_pairs, 1))
+    mean = 1 + (mean - 1) * max(1.0, q / numbers)
+    largest = ratio.max() / f.isf(chance / q, freedom, max(num_pairs, 1))
     return float(max(mean, largest))
 
 

@@ -1,7 +1,9 @@
-"""Contents of a round with actions: checked rows, and the trials that ended it."""
+"""Contents of a round with actions: checked rows, simulated ones, and real trials."""
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,10 +12,16 @@ from sbi.utils import RestrictedPrior
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.beliefs.belief import parameter_dim
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 from sbi_active.messages import Explained, warn
-from sbi_active.support import within_support
+from sbi_active.simulation.outcomes import (
+    MissingRowsWarning,
+    SimulationError,
+    Simulations,
+)
+from sbi_active.simulation.workers.engine import simulate
+from sbi_active.simulation.workers.settings import Workers
+from sbi_active.support import parameter_dim, within_support
 
 
 class UnexplainedOutcomeError(Explained, ValueError):
@@ -130,3 +138,33 @@ def check_proposal(proposal: Any, belief: Distribution | None) -> None:
         f"proposal would take the belief's place; got {type(proposal).__name__}; "
         "pass belief= the distribution theta was drawn from"
     )
+
+
+def rows_of(
+    simulator: Callable[..., Any],
+    theta: Tensor,
+    action: Tensor,
+    seed: int,
+    workers: Workers,
+    *,
+    is_first: bool = True,
+    batch_size: int | None = None,
+) -> Simulations | None:
+    """Return simulated rows, those that faults hit among them; None if all are lost.
+
+    Raises:
+        SimulationError: If all rows of a first call fail.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
+        try:
+            return simulate(
+                *(simulator, theta, action),
+                seed=seed,
+                workers=workers,
+                batch_size=batch_size,
+            )
+        except SimulationError:  # of a few rows, all may be lost
+            if is_first:
+                raise
+            return None

@@ -13,13 +13,6 @@ Array = NDArray[Any]
 #: Maps residuals (..., N) to (..., N) of unit variance.
 Whitener = Callable[[Array], Array]
 
-#: Times that coordinates are held at their bounds, or let go, in a step.
-HELD = 20
-#: Precision that stands for a uniform prior where a proposal must have some.
-FLAT = 0.3
-#: Expected fall of a sum of squares that is worth no further iteration.
-CONVERGED = 0.02
-
 
 class Bounds(Protocol):
     """Coordinates of a search: bounds and a Gaussian that stands for the prior."""
@@ -59,9 +52,9 @@ class LeastSquares(Protocol):
         ...
 
 
-def floored(problem: LeastSquares) -> Array:
+def floored(problem: LeastSquares, *, flat: float = 0.3) -> Array:
     """Return the prior's precision, shape (dim,), a wide one between two bounds."""
-    return np.maximum(problem.coordinates.precision, FLAT)
+    return np.maximum(problem.coordinates.precision, flat)
 
 
 def descend(
@@ -74,6 +67,7 @@ def descend(
     center: Array | None = None,
     secant: bool = False,
     known: tuple[Array, Array] | None = None,
+    converged: float = 0.02,
 ) -> tuple[Array, Array]:
     """Return improved starts and their cost, shapes (n, dim) and (n,).
 
@@ -89,6 +83,8 @@ def descend(
             computed again.
         known: Whitened residuals at the starts and their derivatives, shapes (n, N) and
             (n, N, dim), where they need no simulation.
+        converged: Expected fall of the sum of squares that is worth no further
+            iteration.
     """
     c, dim = problem.coordinates, problem.dim
     weight = c.precision if center is None else floored(problem)
@@ -117,7 +113,7 @@ def descend(
         new = np.clip(u[rows] - np.where(free, move, 0.0), c.low, c.high)
         linear = np.einsum("nij,nj->ni", part, new - u[rows])
         expected = cost[rows] - penalized(r[rows] + linear, new, rows)
-        worth = expected > CONVERGED
+        worth = expected > converged
         rows, new, linear = rows[worth], new[worth], linear[worth]
         if not len(rows):
             break
@@ -137,7 +133,9 @@ def descend(
     return u, cost
 
 
-def within(system: Array, gradient: Array, u: Array, low: Array, high: Array) -> Array:
+def within(
+    system: Array, gradient: Array, u: Array, low: Array, high: Array, *, most: int = 20
+) -> Array:
     """Return the steps of normal equations, (n, dim), within bounds.
 
     A coordinate that a step would take beyond its bound is held there, and the others
@@ -150,6 +148,8 @@ def within(system: Array, gradient: Array, u: Array, low: Array, high: Array) ->
         u: Coordinates, shape (n, dim); a step is subtracted.
         low: Lower bounds, shape (dim,).
         high: Upper bounds.
+        most: Number of times at most that coordinates are held at their bounds, or let
+            go.
 
     References:
         Bertsekas, SIAM Journal on Control and Optimization 20 (1982).
@@ -158,7 +158,7 @@ def within(system: Array, gradient: Array, u: Array, low: Array, high: Array) ->
     new = u - move
     for i in np.flatnonzero(((new < low) | (new > high)).any(1)):
         side = np.zeros(u.shape[1])  # 1 held at its lower bound, -1 at its upper one
-        for _ in range(HELD):
+        for _ in range(most):
             new = u[i] - move[i]
             out = (side == 0) * ((new < low).astype(float) - (new > high))
             # What is held, and would now be better off inside.

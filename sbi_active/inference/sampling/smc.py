@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.inference.sampling.student_mixture import Proposal, log_normal
-from sbi_active.inference.sampling.tempering import largest_power
 from sbi_active.inference.sampling.weights import (
     effective_sample_size,
+    largest_power,
     log_sum_exp,
     normalized,
     systematic,
@@ -20,13 +20,8 @@ from sbi_active.inference.sampling.weights import (
 
 Array = NDArray[Any]
 
-SHARE = 0.5  # particles that a step leaves effective
-MAX_STEPS = 200
 ACCEPTED = 0.35  # share of moves that the step's length is adapted to
 FORGOTTEN = 0.05  # correlation with the start after the moves of a step
-SHARED = (
-    0.1  # of the particles after the last step, lost to copies: with less, more moves
-)
 SHRUNK = 0.05  # share of the guess's covariance in that of the particles
 
 
@@ -68,6 +63,8 @@ def bridge(
     moves: Moves | None = None,
     max_moves: int = 100,
     forgotten: float = FORGOTTEN,
+    max_steps: int = 200,
+    shared_least: float = 0.1,
 ) -> Bridged | None:
     r"""Return particles of :math:`p(u) L(u)`, or None if it takes too many moves.
 
@@ -92,6 +89,9 @@ def bridge(
         forgotten: Correlation with where they were that ends the moves of a step. At
             half the evidence is not known better; at .5 particles lag behind, and in 20
             dimensions the log evidence is off by twenty times its error.
+        max_steps: Number of steps at most.
+        shared_least: Share of the particles after the last step, lost to copies, beyond
+            which there are more moves.
 
     References:
         Del Moral, Doucet & Jasra, J. R. Stat. Soc. B 68 (2006); Cotter, Roberts, Stuart
@@ -115,7 +115,7 @@ def bridge(
     spent = n
     acceptance = 1.0
     step = 0
-    while step < MAX_STEPS:
+    while step < max_steps:
         step += 1
         ratio = target - start
         with np.errstate(invalid="ignore"):
@@ -135,7 +135,7 @@ def bridge(
         kept = 1.0
         for _ in range(max_moves):
             # All particles of the last step count, but for what they share.
-            if kept <= forgotten or (b == 1 and kept**2 * shared <= SHARED):
+            if kept <= forgotten or (b == 1 and kept**2 * shared <= shared_least):
                 break
             new, gain = moves.propose(u, rng)
             new_target, new_start = densities(new)
@@ -154,7 +154,7 @@ def bridge(
                 break
         if spent > most and b < 1:
             return None
-        memory = max(memory, kept if b < 1 or kept**2 * shared > SHARED else 0.0)
+        memory = max(memory, kept if b < 1 or kept**2 * shared > shared_least else 0.0)
         if b == 1:
             break
     else:
@@ -234,11 +234,11 @@ class NormalMoves:
         return float(kept)
 
 
-def _power(ratio: Array, b: float, num: int) -> float:
+def _power(ratio: Array, b: float, num: int, *, share: float = 0.5) -> float:
     """Return the next b; rows without a likelihood go at the first step."""
 
     def suffices(candidate: float) -> bool:
-        alive = min(SHARE, 0.5 * np.isfinite(ratio).mean())
+        alive = min(share, 0.5 * np.isfinite(ratio).mean())
         return effective_sample_size((candidate - b) * ratio) >= alive * num
 
     return largest_power(suffices, start=b, num_steps=30, least=1e-6)

@@ -17,8 +17,6 @@ Array = NDArray[Any]
 
 #: Degrees of freedom: tails above any Gaussian's, and a covariance that exists.
 FREEDOM = 5.0
-#: Smallest variance of a covariance, as a share of the largest.
-SINGULAR = 1e-12
 
 
 class Proposal(Protocol):
@@ -224,7 +222,7 @@ class Defended(Proposal):
         )
 
 
-def lower_factors(cov: Array) -> Array:
+def lower_factors(cov: Array, *, singular: float = 1e-12) -> Array:
     """Return lower Cholesky factors of covariances, shape (..., dim, dim).
 
     A covariance that is singular in floating point, as if a few trials determine many
@@ -236,7 +234,7 @@ def lower_factors(cov: Array) -> Array:
         pass
     safe = np.where(np.isfinite(cov).all((-1, -2), keepdims=True), cov, 0.0)
     values, vectors = eigh(0.5 * (safe + np.swapaxes(safe, -1, -2)))
-    least = np.maximum(SINGULAR * values[..., -1:], SINGULAR**2)
+    least = np.maximum(singular * values[..., -1:], singular**2)
     root = vectors * np.sqrt(np.maximum(values, least))[..., None, :]
     upper = np.linalg.qr(np.swapaxes(root, -1, -2), mode="r")
     sign = np.where(np.diagonal(upper, axis1=-2, axis2=-1) < 0, -1.0, 1.0)

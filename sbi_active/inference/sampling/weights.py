@@ -1,7 +1,8 @@
-"""Weighted draws: normalizing, how many of them count, resampling."""
+"""Weighted draws: normalizing, how many count, resampling, tempering, kernel widths."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -70,3 +71,54 @@ def systematic(weight: Array, num: int, offset: float) -> NDArray[np.intp]:
     place = (np.arange(num) + offset) / num
     # The cumulative sum ends at one but for rounding.
     return np.minimum(np.searchsorted(np.cumsum(weight), place), len(weight) - 1)
+
+
+def largest_power(
+    suffices: Callable[[float], bool],
+    *,
+    start: float = 0.0,
+    end: float = 1.0,
+    least: float = 1e-10,
+    num_steps: int = 40,
+) -> float:
+    """Return the largest power that suffices, between a start and an end.
+
+    The search is by bisection; from 0 by powers of ten first, since where a likelihood
+    is narrow the first power may be of the order of 1e-8.
+
+    Args:
+        suffices: Whether a power of a likelihood, or of a ratio of densities, leaves
+            draws enough effective; true up to the answer and false beyond.
+        start: Power that is taken to suffice.
+        end: Power that is returned where it suffices.
+        least: Gone beyond the start even where that does not suffice, so that a
+            sequence of steps moves on.
+        num_steps: Number of steps of the bisection.
+    """
+    if suffices(end):
+        return end
+    low, high = start, end
+    for _ in range(num_steps):
+        middle = 0.5 * (low + high) if low > 0 else 0.1 * high
+        low, high = (middle, high) if suffices(middle) else (low, middle)
+    return max(low, start + least)
+
+
+def scott(num: float, dim: int) -> float:
+    """Return Scott's width, :math:`n^{-1 / (d + 4)}`, of n draws that count.
+
+    References:
+        Scott, *Multivariate Density Estimation*, 1992.
+    """
+    return num ** (-1 / (dim + 4))
+
+
+def silverman(num: float, dim: int) -> float:
+    r"""Return Silverman's width, :math:`(4 / ((d + 2)\, n))^{1 / (d + 4)}`.
+
+    It has the least mean integrated squared error where the draws are normal.
+
+    References:
+        Silverman, *Density Estimation for Statistics and Data Analysis*, 1986.
+    """
+    return (4 / ((dim + 2) * num)) ** (1 / (dim + 4))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from typing import Any, ClassVar
+from typing import Any, ClassVar, ParamSpec, TypeVar
 
 import cloudpickle
 from sbi.inference.trainers._contracts import StartIndexContext
@@ -18,10 +19,84 @@ from typing_extensions import Self
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.rounds.condition import pack
 from sbi_active.inference.rounds.rows import RoundRows, check_proposal, round_rows
-from sbi_active.inference.rounds.sbi_arguments import given_arguments
-from sbi_active.inference.rounds.tracking import SilentTracker
 from sbi_active.inference.trainers.base import ActiveInference
 from sbi_active.threads import single_thread
+
+P = ParamSpec("P")
+R = TypeVar("R")
+Ours = TypeVar("Ours", bound=Callable[..., Any])
+#: Number of epochs that sbi's own default allows.
+NEVER = 2**31 - 1
+#: Arguments of NPE_C, which choose between losses of several rounds.
+NO_MEANING_WITH_ACTION = ("discard_prior_samples", "use_combined_loss", "num_atoms")
+
+
+def takes(theirs: Callable[P, R]) -> Callable[[Callable[..., Any]], Callable[P, R]]:
+    """Give a method of ours the signature of sbi's, which is then written once."""
+
+    def decorate(ours: Callable[..., Any]) -> Callable[P, R]:
+        ours.__signature__ = inspect.signature(theirs)  # pyright: ignore
+        return ours
+
+    return decorate
+
+
+def extends(theirs: Callable[..., Any]) -> Callable[[Ours], Ours]:
+    """Give a method the signature of sbi's, with keywords of its own after that."""
+
+    def decorate(ours: Ours) -> Ours:
+        further = inspect.signature(ours).parameters.values()
+        own = [p for p in further if p.kind is inspect.Parameter.KEYWORD_ONLY]
+        known = inspect.signature(theirs).parameters.values()
+        ours.__signature__ = inspect.Signature([*known, *own])  # pyright: ignore
+        return ours
+
+    return decorate
+
+
+def given_arguments(
+    method: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return by name the arguments that a call of a method of sbi's was given.
+
+    None stands for sbi's default, but as ``clip_max_norm``, where it says not to clip.
+    """
+    given = inspect.signature(method).bind(*args, **kwargs).arguments
+    return {
+        name: value
+        for name, value in given.items()
+        if value is not None or name == "clip_max_norm"
+    }
+
+
+def require_likelihood_loss(
+    method: Callable[..., Any], given: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return arguments without those of the losses of several rounds.
+
+    Raises:
+        ValueError: If one of these was given another value than its default.
+    """
+    parameters = inspect.signature(method).parameters
+    for name in NO_MEANING_WITH_ACTION:
+        default = parameters[name].default
+        if given.get(name, default) != default:
+            raise ValueError(
+                f"expected {name} to be left out in a round with actions, which is "
+                f"trained by maximum likelihood; got {given[name]}; drop it"
+            )
+    return {n: v for n, v in given.items() if n not in NO_MEANING_WITH_ACTION}
+
+
+class SilentTracker:
+    """Meets sbi's ``Tracker`` protocol and does nothing."""
+
+    log_dir: str | None = None
+
+    def _ignore(self, *args: Any, **kwargs: Any) -> None:
+        pass
+
+    log_metric = log_metrics = log_params = add_figure = flush = _ignore
 
 
 class ActionRounds(ActiveInference):

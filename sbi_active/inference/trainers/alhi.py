@@ -12,13 +12,13 @@ from torch import Tensor
 
 from sbi_active.inference.models.factors import ActionLikelihood
 from sbi_active.inference.networks.likelihood_network import LikelihoodNetwork
-from sbi_active.inference.networks.mixture_density import MixtureDensity
-from sbi_active.inference.networks.training import (
+from sbi_active.inference.networks.mixture_density import (
+    MixtureDensity,
     TrainingRecord,
     train_mixture_density,
 )
 from sbi_active.inference.rounds.rows import RoundRows
-from sbi_active.inference.rounds.sbi_arguments import extends, takes
+from sbi_active.inference.trainers.action_rounds import extends, takes
 from sbi_active.inference.trainers.mixture_rounds import MixtureRounds, training_budget
 from sbi_active.inference.trainers.product_rounds import ProductRounds
 

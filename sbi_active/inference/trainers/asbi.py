@@ -18,27 +18,32 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import Self
 
-from sbi_active.inference.beliefs.belief import Belief, ChainedBelief, UnchangedBelief
-from sbi_active.inference.beliefs.comparison import compare
+from sbi_active.inference.beliefs.belief import (
+    Belief,
+    ChainedBelief,
+    UnchangedBelief,
+    compare,
+)
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.models.posterior import ActionPosterior
-from sbi_active.inference.networks.mixture_density import MixtureDensity
-from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
-from sbi_active.inference.networks.training import (
+from sbi_active.inference.networks.mixture_density import (
+    MixtureDensity,
     TrainingRecord,
     train_mixture_density,
 )
+from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.refinement.refining import refine
 from sbi_active.inference.rounds.condition import pack
 from sbi_active.inference.rounds.rows import Observation
-from sbi_active.inference.rounds.sbi_arguments import require_likelihood_loss, takes
-from sbi_active.inference.trainers.base import Told
+from sbi_active.inference.trainers.action_rounds import (
+    require_likelihood_loss,
+    takes,
+)
+from sbi_active.inference.trainers.base import Told, is_finite_somewhere
 from sbi_active.inference.trainers.mixture_rounds import MixtureRounds, training_budget
 from sbi_active.messages import warn
-from sbi_active.seeding import forked_generators, kept_generators
-
-NUM_PROBES = 64  # draws of the prior, at one of which a network has a finite density
+from sbi_active.seeding import kept_generators
 
 
 class ASBI(MixtureRounds, NPE_C):
@@ -291,9 +296,10 @@ def _fault(
         knows = bool(condition.isfinite().all())  # sbi's networks take no NaN
     if not knows:
         return "SA107", "no simulation it was trained on lacks these numbers"
-    with forked_generators(0), torch.no_grad():
-        theta = prior.sample(torch.Size([NUM_PROBES])).to(condition)
-        density = network.log_prob(theta[:, None], condition)
-    # Beyond 1e19, float32 has no squares.
-    is_finite = bool(density.isfinite().any())
-    return None if is_finite else ("SA113", "its density is finite nowhere")
+
+    def log_density(theta: Tensor) -> Tensor:
+        return network.log_prob(theta.to(condition)[:, None], condition)
+
+    if is_finite_somewhere(prior, log_density):
+        return None
+    return "SA113", "its density is finite nowhere"

@@ -15,6 +15,7 @@ from sbi_active.inference.beliefs.belief import Belief, named
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 from sbi_active.inference.rounds.rows import Observation
+from sbi_active.seeding import forked_generators
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,21 @@ class Told:
         """Return the seed given, or else one from torch's global generator."""
         given = self.given_seed
         return int(torch.randint(2**62, ())) if given is None else given
+
+
+def is_finite_somewhere(
+    prior: Distribution, log_density: Callable[[Tensor], Tensor], *, num: int = 64
+) -> bool:
+    """Return whether a learned density is finite: float32 has no squares of 1e20.
+
+    Args:
+        prior: Prior of which draws are tried.
+        log_density: Log density at parameters, (n, theta_dim) -> (n,).
+        num: Number of draws.
+    """
+    with forked_generators(0), torch.no_grad():
+        theta = prior.sample(torch.Size([num])).float()
+        return bool(log_density(theta).isfinite().any())
 
 
 class ActiveInference(ABC):

@@ -12,10 +12,12 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.utils.data import DataLoader
 
-from sbi_active.inference.networks.mixture_density import MixtureDensity
-from sbi_active.inference.networks.training import TrainingBudget, TrainingRecord
-from sbi_active.inference.rounds.sbi_arguments import NEVER
-from sbi_active.inference.trainers.action_rounds import ActionRounds
+from sbi_active.inference.networks.mixture_density import (
+    MixtureDensity,
+    TrainingBudget,
+    TrainingRecord,
+)
+from sbi_active.inference.trainers.action_rounds import NEVER, ActionRounds
 
 
 class MixtureRounds(ActionRounds):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
@@ -19,27 +18,23 @@ from sbi_active.inference.beliefs.kernel_belief import KernelBelief
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.models.factors import ActionFactor
-from sbi_active.inference.products.belief import sample_product
-from sbi_active.inference.products.product import (
+from sbi_active.inference.models.product import (
     Product,
     TrainedRegion,
+    sample_product,
     widened,
 )
-from sbi_active.inference.refinement.settings import StageSettings
-from sbi_active.inference.rounds.rows import Observation, require_whole
+from sbi_active.inference.refinement.course import StageSettings
+from sbi_active.inference.rounds.rows import Observation, require_whole, rows_of
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.trainers.action_rounds import ActionRounds
-from sbi_active.inference.trainers.base import Told
+from sbi_active.inference.trainers.base import Told, is_finite_somewhere
 from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation import MissingRowsWarning, simulate
 
 SAMPLERS = ("importance", "kde")
 #: Shares of the budget by stage, by what they begin at: this round's network, the
 #: belief before, or the prior.
 STAGES = {"network": (1.0,), "belief": (0.4, 0.6), "prior": (0.15, 0.15, 0.2, 0.5)}
-NUM_KERNELS = 2_000  # draws behind a kernel density estimate
-NUM_HINTS = 1_000  # rows that the importance sampling begins around
-NUM_PROBES = 64  # draws of the prior, at one of which a factor is finite
 
 
 class ProductRounds(ActionRounds):
@@ -198,15 +193,14 @@ class ProductRounds(ActionRounds):
             num = int(share * settings.num_histories)
             own = derive_seed(seed, "stage", stage)
             theta = self._places(belief, num, own)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
-                rows = simulate(
-                    simulator,
-                    theta.repeat_interleave(len(trials), 0),
-                    action.repeat(num, 1),
-                    seed=derive_seed(own, "x"),
-                    workers=settings.workers,
-                )
+            rows = rows_of(
+                simulator,
+                theta.repeat_interleave(len(trials), 0),
+                action.repeat(num, 1),
+                derive_seed(own, "x"),
+                settings.workers,
+            )
+            assert rows is not None
             num_simulations += len(rows)
             num_missing += rows.counts["missing"]
             known = rows.without_missing()
@@ -235,7 +229,13 @@ class ProductRounds(ActionRounds):
         return coordinates.to_theta(z)
 
     def _product(
-        self, trials: Sequence[Observation], settings: RefinementOptions, seed: int
+        self,
+        trials: Sequence[Observation],
+        settings: RefinementOptions,
+        seed: int,
+        *,
+        num_kernels: int = 2_000,
+        num_hints: int = 1_000,
     ) -> Belief:
         """Return the belief under this round's network."""
         prior, previous = require_support(self._prior), self._round_belief
@@ -246,7 +246,7 @@ class ProductRounds(ActionRounds):
         if previous is not prior:
             rows = self._round_parameters()
             region = TrainedRegion.of(coordinates.to_z(rows), rng)
-            hint = rows[rng.permutation(len(rows))[:NUM_HINTS]]
+            hint = rows[rng.permutation(len(rows))[:num_hints]]
         chained = self._sampler == "kde"
         self._require_trained()
         learned = self._model(deepcopy(self._neural_net))
@@ -270,7 +270,7 @@ class ProductRounds(ActionRounds):
         sampled: Belief = belief
         if chained:
             with forked_generators(seed, "kernels"):
-                draws = belief.sample(torch.Size([NUM_KERNELS]))
+                draws = belief.sample(torch.Size([num_kernels]))
             sampled = KernelBelief(prior, draws)
         num_lost = len(used) - len(counted)
         if num_lost:
@@ -298,9 +298,10 @@ class ProductRounds(ActionRounds):
 def _says_something(
     learned: ActionFactor, trial: Observation, prior: Distribution
 ) -> bool:
-    """Return whether a factor is finite anywhere: float32 has no squares of 1e20."""
-    with forked_generators(0), torch.no_grad():
-        theta = prior.sample(torch.Size([NUM_PROBES])).float()
-        rows = trial.x.expand(NUM_PROBES, *trial.x.shape)
-        action = trial.action.expand(NUM_PROBES, -1)
-        return bool(learned.log_factor(theta, rows, action).isfinite().any())
+    """Return whether the factor of a trial is finite anywhere."""
+
+    def log_factor(theta: Tensor) -> Tensor:
+        x = trial.x.expand(len(theta), *trial.x.shape)
+        return learned.log_factor(theta, x, trial.action.expand(len(theta), -1))
+
+    return is_finite_somewhere(prior, log_factor)

@@ -15,7 +15,7 @@ from typing_extensions import Self
 from sbi_active.inference.models.factors import ActionRatio
 from sbi_active.inference.models.lfire import LFIRE
 from sbi_active.inference.networks.ratio_network import RatioClassifier, RatioNetwork
-from sbi_active.inference.rounds.sbi_arguments import extends, takes
+from sbi_active.inference.trainers.action_rounds import extends, takes
 from sbi_active.inference.trainers.product_rounds import ProductRounds
 from sbi_active.inference.trainers.seqbed import SeqBED_LFIRE
 from sbi_active.messages import ChangedWarning, warn

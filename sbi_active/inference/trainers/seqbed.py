@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -17,18 +16,17 @@ from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.beliefs.kernel_belief import KernelBelief
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.declared.settings import RefinementOptions
-from sbi_active.inference.models.lfire import LFIRE
-from sbi_active.inference.models.lfire_model import LFIREModel, fit_log_ratios
+from sbi_active.inference.models.lfire import LFIRE, LFIREModel, fit_log_ratios
 from sbi_active.inference.rounds.rows import (
     Observation,
     RoundRows,
     require_whole,
     round_rows,
+    rows_of,
 )
 from sbi_active.inference.trainers.base import ActiveInference, Told
 from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation import MissingRowsWarning, simulate
 from sbi_active.threads import single_thread
 
 
@@ -236,15 +234,9 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         with forked_generators(seed, "theta"):
             drawn = belief.sample(torch.Size([n]))
         theta, action = self.arrange(drawn, trial.action.expand(n, -1))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
-            rows = simulate(
-                simulator,
-                theta,
-                action,
-                seed=derive_seed(seed, "x"),
-                workers=settings.workers,
-            )
+        workers = settings.workers
+        rows = rows_of(simulator, theta, action, derive_seed(seed, "x"), workers)
+        assert rows is not None
         known = rows.without_missing()
         with single_thread():
             model = fit_log_ratios(

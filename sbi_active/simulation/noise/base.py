@@ -16,9 +16,6 @@ from sbi_active.arrays import own_tensor
 from sbi_active.seeding import forked_generators, row_normals, row_uniforms
 from sbi_active.simulation.noise.posterior import NoisePosterior
 
-NUM_SAMPLES = 4_096  # for the deviation of a noise that declares none
-NUM_DRAWS = 256  # of a posterior that is not one of this library's own
-
 
 class NoiseModel(ABC):
     r"""Distribution of an observation around the simulator's noise-free output.
@@ -267,11 +264,11 @@ class ScaleNoise(NoiseModel):
         draws = self._fixed_draws()
         return draws[(uniform[:, 0] * len(draws)).long()]
 
-    def _fixed_draws(self) -> Tensor:
+    def _fixed_draws(self, *, num: int = 256) -> Tensor:
         if self._table is None:
             assert self.posterior is not None
             with forked_generators(0, "noise posterior"):
-                self._table = self.posterior.sample((NUM_DRAWS,)).double()
+                self._table = self.posterior.sample((num,)).double()
         return self._table
 
     def _spread(self, sd: Tensor, shape: torch.Size) -> Tensor:
@@ -283,7 +280,7 @@ class ScaleNoise(NoiseModel):
         return terms.reshape(len(terms), -1, self._num_sd).sum(1)
 
 
-def declared_sds(noise: NoiseModel) -> Tensor:
+def declared_sds(noise: NoiseModel, *, num: int = 4_096) -> Tensor:
     """Return the standard deviations of a noise model, shape (1,) or (channels,).
 
     A noise model that has no such parameter is sampled around zero.
@@ -296,7 +293,7 @@ def declared_sds(noise: NoiseModel) -> Tensor:
     if sds:
         return torch.stack(sds).double()
     with forked_generators(0, "sd"):
-        draws = noise.sample(torch.zeros(NUM_SAMPLES, 1, dtype=torch.float64))
+        draws = noise.sample(torch.zeros(num, 1, dtype=torch.float64))
     return draws.std().reshape(1).double()
 
 

@@ -30,18 +30,9 @@ from sbi_active.simulation.noise.student import StudentTNoise, log_student
 
 NoiseKind = Literal["gaussian", "autocorrelated", "student"]
 
-TAU_CELLS = 96  # a choice: of a range of a thousand, cells 7 % wide
-TAU_SHORTEST = 0.1  # of the shortest time step: no correlation that could be seen
-TAU_LONGEST = 3.0  # times the time between first and last sample
 #: A choice: from a variance that hardly exists to nearly Gaussian, each cell a factor
 #: of 1.27 wide.
 DF_EDGES = torch.logspace(math.log10(2.05), 2, 17, dtype=torch.float64)
-SD_CELLS = 48  # a choice: of a range nine times as wide as the Gaussian's
-TAIL = 1e-4  # of the standard deviation's posterior that the grid may cut off
-MEAN_NODES = 129  # of the quadrature over an unknown mean
-MEAN_MARGIN = 10.0  # of its range beyond the data, in scales
-NEGLIGIBLE = 1e-7  # weight of a cell relative to the largest
-CHUNK = 4_000_000  # numbers at once
 
 Array = Tensor | np.ndarray
 
@@ -184,8 +175,19 @@ def _require_scatter(square: Tensor, freedom: Tensor) -> None:
 
 
 def _autocorrelated(
-    groups: list[Tensor], num_sd: int, times: Tensor | None
+    groups: list[Tensor],
+    num_sd: int,
+    times: Tensor | None,
+    *,
+    cells: int = 96,
+    shortest: float = 0.1,
+    longest: float = 3.0,
 ) -> AutocorrelatedNoise:
+    """Return noise by a grid of the correlation time.
+
+    It has ``cells`` between ``shortest`` times the shortest step, below which no
+    correlation could be seen, and ``longest`` times the recording.
+    """
     # Contrasts are independent, of mean zero, and have the noise's own covariance.
     # A number missing in one repeat is missing in all contrasts of its group.
     contrast = torch.cat(
@@ -201,9 +203,9 @@ def _autocorrelated(
         )
     stamps = time_stamps(times, (1, contrast.shape[1]))[0]
     edges = torch.logspace(
-        math.log10(TAU_SHORTEST * float(stamps.diff().min())),
-        math.log10(TAU_LONGEST * float(stamps[-1] - stamps[0])),
-        TAU_CELLS + 1,
+        math.log10(shortest * float(stamps.diff().min())),
+        math.log10(longest * float(stamps[-1] - stamps[0])),
+        cells + 1,
         dtype=torch.float64,
     )
     freedom = (~contrast.isnan()).double().reshape(-1, num_sd).sum(0)
@@ -226,27 +228,32 @@ def _autocorrelated(
     )
 
 
-def _heavy(edges: Tensor, log_weight: Tensor) -> tuple[Cells, slice]:
+def _heavy(
+    edges: Tensor, log_weight: Tensor, *, negligible: float = 1e-7
+) -> tuple[Cells, slice]:
     """Return the range of cells that carry weight, normalized."""
-    heavy = torch.nonzero(log_weight > log_weight.max() + math.log(NEGLIGIBLE))[:, 0]
+    heavy = torch.nonzero(log_weight > log_weight.max() + math.log(negligible))[:, 0]
     first, last = int(heavy[0]), int(heavy[-1])
     kept = slice(first, last + 1)
     weight = log_weight[kept].log_softmax(0)
     return Cells(edges[first : last + 2], weight), kept
 
 
-def _student(groups: list[Tensor], num_sd: int) -> StudentTNoise:
+def _student(
+    groups: list[Tensor], num_sd: int, *, cells: int = 48, tail: float = 1e-4
+) -> StudentTNoise:
+    """Return noise by a grid, which cuts off ``tail`` of a Gaussian's posterior."""
     square, freedom = _sums_of_squares(groups, num_sd)
     # The Gaussian's range, wider: an outlier or df near 2 moves the posterior.
     low, high = (
         (square / torch.from_numpy(chdtri(freedom.numpy(), level))).sqrt()
-        for level in (TAIL, 1 - TAIL)
+        for level in (tail, 1 - tail)
     )
-    share = torch.linspace(0, 1, SD_CELLS + 1, dtype=torch.float64)
+    share = torch.linspace(0, 1, cells + 1, dtype=torch.float64)
     edges = (low[:, None] / 3) * (9 * high / low)[:, None] ** share
     nodes = (edges[:, 1:] * edges[:, :-1]).sqrt()  # (channels, s)
     df_nodes = (DF_EDGES[1:] * DF_EDGES[:-1]).sqrt()
-    log_p = torch.zeros(len(df_nodes), num_sd, SD_CELLS, dtype=torch.float64)
+    log_p = torch.zeros(len(df_nodes), num_sd, cells, dtype=torch.float64)
     for group in groups:
         numbers = group.reshape(len(group), -1, num_sd)
         for channel in range(num_sd):
@@ -266,13 +273,21 @@ def _student(groups: list[Tensor], num_sd: int) -> StudentTNoise:
     return StudentTNoise(_scalar_if_one(sd), df, posterior=posterior)
 
 
-def _log_evidence(x: Tensor, scale: Tensor, df: Tensor) -> Tensor:
+def _log_evidence(
+    x: Tensor,
+    scale: Tensor,
+    df: Tensor,
+    *,
+    num_nodes: int = 129,
+    margins: float = 10.0,
+    chunk: int = 4_000_000,
+) -> Tensor:
     """Return the log evidence of repeats (k, j) with means integrated out, (s,)."""
     total = torch.zeros(len(scale), dtype=torch.float64)
     low, high = x.nan_to_num(torch.inf).amin(0), x.nan_to_num(-torch.inf).amax(0)
-    share = torch.linspace(0, 1, MEAN_NODES, dtype=torch.float64)
-    margin = MEAN_MARGIN * scale[:, None]
-    size = max(1, CHUNK // (len(scale) * len(x) * MEAN_NODES))
+    share = torch.linspace(0, 1, num_nodes, dtype=torch.float64)
+    margin = margins * scale[:, None]
+    size = max(1, chunk // (len(scale) * len(x) * num_nodes))
     for rows in torch.arange(x.shape[1]).split(size):
         start = low[rows] - margin  # (s, j)
         width = high[rows] + margin - start
@@ -282,7 +297,7 @@ def _log_evidence(x: Tensor, scale: Tensor, df: Tensor) -> Tensor:
             z = (repeat[:, None] - mean) / scale[:, None, None]
             term = log_student(z, df) - scale.log()[:, None, None]
             density += torch.where(repeat.isnan()[:, None], 0.0, term)
-        step = (width / (MEAN_NODES - 1)).log()
+        step = (width / (num_nodes - 1)).log()
         total += (density.logsumexp(-1) + step).sum(1)
     return total
 

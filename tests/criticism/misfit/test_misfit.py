@@ -7,14 +7,7 @@ import torch
 
 from sbi_active import SimulatorModel
 from sbi_active.criticism import Criticism, Trials, close_loop
-<<<<<<< HEAD
-from sbi_active.criticism.linear.search import Search
-from sbi_active.criticism.misfit import find_misfit
 from sbi_active.criticism.report.summary import misfit_line
-from sbi_active.criticism.results import ModelKey
-=======
-from sbi_active.criticism.report.under_misfit import misfit_line
->>>>>>> wt-verdict
 from sbi_active.simulation import AutocorrelatedNoise
 from tests.criticism.misfit.oscillator import (
     ACTION,

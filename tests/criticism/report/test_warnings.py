@@ -8,7 +8,6 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import Independent, Normal
 
-<<<<<<< HEAD
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials, close_loop, joint_prior
 from sbi_active.criticism.contradictions import (
@@ -24,64 +23,6 @@ from tests.criticism.report.reports import (
     residuals,
     tracing,
     trials,
-=======
-from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, StudentTNoise
-from sbi_active.criticism import Criticism, Effect, Report, Trials, close_loop
-from sbi_active.criticism.data.trials import Order
-from sbi_active.criticism.report.cautions import find_warnings
-
-ACTIONS = DiscreteActions(torch.linspace(-2, 2, 17))
-PRIOR = BoxUniform(-3 * torch.ones(2), 3 * torch.ones(2))
-NOISE = 0.1
-TRUE = torch.tensor([[1.0, -0.5]], dtype=torch.float64)
-SPREAD = torch.tensor([5, 12, 0, 9, 14, 2, 16, 7, 11, 3, 8, 15, 1, 13, 4, 10, 6])
-
-
-def curve(theta, action, cubic=0.0):
-    xi = action[:, 0]
-    return (theta[:, 0] * xi + theta[:, 1] * xi**2 + cubic * xi**3)[:, None]
-
-
-def rattle(theta, action, cubic=0.0):
-    """What a change of theta by a millionth changes by more than the noise."""
-    phase = 1e6 * theta.sum(1)[:, None] * (action + 3)
-    return curve(theta, action, cubic) + 0.3 * torch.sin(phase)
-
-
-def both(action):
-    return 0.8 - 0.4 * action**3
-
-
-TIMES = torch.linspace(0.05, 2.0, 40)
-
-
-def decay(theta, action):
-    return action * theta[:, :1] * torch.exp(-theta[:, 1:] * TIMES.to(theta))
-
-
-def normal(sd: float) -> Independent:
-    return Independent(Normal(torch.zeros(1), torch.full((1,), sd)), 1)
-
-
-def bias(sd: float = 1.0) -> Effect:
-    return Effect(
-        "bias",
-        hook="observation",
-        prior=normal(sd),
-        null=0.0,
-        apply=lambda x, phi, action, context: x + phi,
-    )
-
-
-CUBIC = Effect.keyword("cubic", prior=normal(0.5))
-DRIFT = Effect(
-    "drift",
-    hook="observation",
-    prior=normal(0.1),
-    null=0.0,
-    apply=lambda x, phi, action, context: x + phi * context.index[:, None],
-    needs_order=True,
->>>>>>> wt-verdict
 )
 
 PRIOR = BoxUniform(-3 * torch.ones(2), 3 * torch.ones(2))
@@ -199,13 +140,8 @@ CASES = {
         smooth(0.95, np.arange(40.0), known=0.9),
     ),
     "SA508": (
-<<<<<<< HEAD
         with_evidence(effective_sample_size=49.0),
         with_evidence(standard_error=0.4),
-=======
-        replace(usual, fn=rattle, noise=0.02, effects=(bias(),)).report,
-        replace(usual, effects=(bias(),), missing=lambda a: 0.0).report,
->>>>>>> wt-verdict
     ),
     "SA509": (noted(**WEAK), noted(**WEAK | {"p_value": 0.02})),
     "SA510": (

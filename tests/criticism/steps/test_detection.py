@@ -76,18 +76,6 @@ def test_a_mode_that_the_first_search_missed_is_no_alarm(monkeypatch):
     assert not is_found_again(rivals)
 
 
-<<<<<<< HEAD
-def test_the_report_says_what_raised_the_alarm():
-    weak = str(criticism(*zigzag(1.7)).report())
-    assert "rests on the chi-square alone" in " ".join(weak.split())
-    x, action = zigzag(0.0)
-    strong = criticism(x + 5 * NOISE * action**3, action)
-    assert strong.detect().by_evidence
-    assert "chi-square alone" not in " ".join(str(strong.report()).split())
-
-
-=======
->>>>>>> wt-verdict
 def test_a_parameter_that_changes_nothing_takes_up_no_residual():
     x, action = zigzag(1.0)
     both = criticism(x, action)

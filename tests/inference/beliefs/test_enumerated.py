@@ -8,7 +8,6 @@ from sbi.utils import BoxUniform, MultipleIndependent
 from torch.distributions import Bernoulli, Categorical, Independent, Normal, Poisson
 
 from sbi_active import BoxActions, Campaign, GaussianNoise, SimulatorModel
-from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.inference import refine
 from sbi_active.inference.beliefs.enumerated import EnumeratedBelief, Enumeration
 
@@ -33,10 +32,6 @@ def drawn(theta, action):
     return line(theta, action) + SD * torch.randn(len(theta), 1)
 
 
-def one_row(theta, action):
-    return [theta[1] * action[0] * (1 + theta[0]) + theta[2]]
-
-
 def exact():
     """Return probabilities of gear and switch, by a sum over a fine grid."""
     slope = torch.linspace(-3, 3, 20_001).double()
@@ -56,10 +51,9 @@ def exact():
     "simulator",
     [
         SimulatorModel(line, noise=GaussianNoise(SD)),
-        SimulatorModel(one_row, noise=GaussianNoise(SD), batched=False),
         drawn,
     ],
-    ids=["declared", "row by row", "drawn"],
+    ids=["declared", "drawn"],
 )
 def test_values_get_their_probabilities(simulator):
     belief = refine(simulator, PRIOR, ACTION, X, seed=0)
@@ -145,16 +139,3 @@ def test_a_campaign_designs_and_comes_back(tmp_path):
     assert again.belief.mean.tolist() == mean.tolist()
     again.attach([2.0], [1.9])
     assert isinstance(again.update(), EnumeratedBelief)
-
-
-def test_the_closed_loop_refuses_them():
-    model = SimulatorModel(line, noise=GaussianNoise(SD))
-    bias = Effect(
-        "bias",
-        hook="observation",
-        prior=Normal(0.0, 1.0),
-        null=0.0,
-        apply=lambda x, phi, action, context: x + phi,
-    )
-    with pytest.raises(ValueError, match="declare the choice as an Effect"):
-        Criticism(model, PRIOR, Trials(ACTION, X), effects=[bias])

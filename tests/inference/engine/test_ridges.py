@@ -6,8 +6,10 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from sbi_active.inference.engine import infer, search
-from sbi_active.inference.engine.importance import _largest_power
-from sbi_active.inference.engine.ridges import along_ridges, reweighted
+from sbi_active.inference.engine.importance import (
+    _largest_power,
+    along_ridges,
+)
 from sbi_active.inference.engine.settings import Settings
 from sbi_active.inference.sampling.weights import effective_sample_size
 from tests.inference.engine.potentials import Given
@@ -49,18 +51,6 @@ def test_a_thin_ridge_has_the_right_evidence():
     assert found.effective_sample_size >= 100
     assert found.log_evidence == pytest.approx(evidence(), abs=4 * found.standard_error)
     assert own.num_rows < 12_000
-
-
-def test_components_get_the_weights_of_their_draws():
-    own, rng = product(), np.random.default_rng(0)
-    found = search(own, rng)
-    mixture = along_ridges(own, found, found.modes, rng, SETTINGS)
-    u = mixture.means[:1] + np.zeros((5, 1))
-    more = reweighted(mixture, u, np.full(5, 0.2))
-    assert more.weights.sum() == pytest.approx(1)
-    likeliest = mixture.means[more.weights.argmax()]
-    assert likeliest == pytest.approx(mixture.means[0], abs=0.01)
-    assert more.weights.min() >= 0.4 / len(mixture.means)
 
 
 def test_the_largest_power_is_found_where_lower_ones_leave_fewer_draws():

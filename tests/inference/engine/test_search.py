@@ -45,15 +45,6 @@ def test_fewer_numbers_than_parameters_leave_the_prior_where_nothing_is_known():
     np.testing.assert_allclose(sd[0], 1 / np.sqrt(101), rtol=1e-2)
 
 
-def test_a_lost_simulation_counts_as_a_large_residual():
-    def function(u):
-        return np.where(u[:, :1] > 1, 1e6, (0.5 - u[:, :1]) / 0.1)
-
-    found = search(Given(function, 1, 1), np.random.default_rng(3))
-    assert found is not None
-    assert abs(found.modes[0, 0] - 0.5 * 100 / 101) < 0.01
-
-
 def test_where_nothing_fits_there_is_a_best_place():
     """Beside a sum of squares of 1e18 some nats are lost in the rounding."""
     own = Given(lambda u: 1e9 + np.stack([u[:, 0], 3 * u[:, 1]], 1), 2, 2)

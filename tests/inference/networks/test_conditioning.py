@@ -1,12 +1,12 @@
 import math
-import pickle
 
 import pytest
 import torch
 
 from sbi_active.inference import MixtureDensity
-from sbi_active.inference.networks import Baseline, Conditioning, PreparedLoss, local
-from sbi_active.inference.networks.baseline import precision_factor
+from sbi_active.inference.networks.baseline import Baseline, local, precision_factor
+from sbi_active.inference.networks.conditioning import Conditioning
+from sbi_active.inference.networks.mixture_network import PreparedLoss
 from sbi_active.tasks.numerical import NumericalTask
 from tests import linear_gaussian
 
@@ -69,27 +69,6 @@ def test_the_linear_baseline_is_the_exact_posterior_of_a_linear_world():
     assert float((log_p - log_q).mean()) < 0.02
 
 
-def test_the_baseline_alone_gives_the_exact_information():
-    theta, x, action = gaussian_world(5_000)
-    condition = torch.cat([x, action], 1)
-    torch.manual_seed(0)
-    settings = MixtureDensity(num_components=1)
-    net = settings.build(theta, condition, action_dim=1)
-    assert net.baseline_kind == "linear"
-    with torch.no_grad():  # a network of no effect
-        for parameter in net.parameters():
-            parameter.zero_()
-    for value in (-1.7, 0.6, 1.37):  # actions that no row has
-        theta, action = torch.randn(20_000, 2), torch.full((20_000, 1), value)
-        x = linear_gaussian.simulator(theta, action)
-        with torch.no_grad():
-            log_q = net.log_prob(theta, torch.cat([x, action], 1))[0]
-        gain = log_q - linear_gaussian.PRIOR.log_prob(theta)
-        error = float(gain.std()) / math.sqrt(20_000)
-        exact = float(linear_gaussian.information(action[:1]))
-        assert exact - 0.03 - 4 * error < float(gain.mean()) < exact + 4 * error
-
-
 @pytest.mark.parametrize(
     ("variant", "kind"),
     [("linear", "linear"), ("sinh", "curved"), ("square", "curved")],
@@ -105,14 +84,6 @@ def test_held_out_rows_choose_the_baseline(variant, kind):
     assert pure.num_frames == 1
 
 
-def test_no_baseline_where_x_tells_nothing():
-    torch.manual_seed(0)
-    theta, condition = torch.rand(1_000, 2), torch.randn(1_000, 3)
-    net = MixtureDensity().build(theta, condition, action_dim=1)
-    scores = net.conditioning.scores
-    assert scores.get("linear", 0.0) < scores["none"] + 0.05
-
-
 def test_two_modes_have_a_frame_each():
     net, _, _ = built("square", shake=False, n=4_000)
     theta = torch.tensor([[3.0, 1.0]])
@@ -126,7 +97,7 @@ def test_two_modes_have_a_frame_each():
 # In the network
 
 
-@pytest.mark.parametrize("variant", ["linear", "sinh", "square"])
+@pytest.mark.parametrize("variant", ["square"])
 @torch.no_grad()
 def test_samples_have_the_density(variant):
     """E_q[r / q] = 1 for any density r that q covers: Gaussians among the draws."""
@@ -155,7 +126,7 @@ def gaussian_around(place, draws):
     return torch.distributions.MultivariateNormal(near.mean(0), covariance)
 
 
-@pytest.mark.parametrize("variant", ["linear", "square"])
+@pytest.mark.parametrize("variant", ["square"])
 def test_density_integrates_to_one(variant):
     torch.manual_seed(0)
     theta, x, action = numerical(variant, 2_000)
@@ -168,24 +139,6 @@ def test_density_integrates_to_one(variant):
             density = net.log_prob(grid, row[None])[:, 0].exp()
         total = float(torch.trapezoid(density, grid[:, 0, 0]))
         assert total == pytest.approx(1.0, abs=5e-3)
-
-
-@pytest.mark.parametrize("variant", ["linear", "sinh"])
-def test_units_of_theta_change_log_prob_by_the_determinant_only(variant):
-    theta, x, action = numerical(variant)
-    condition = torch.cat([x, action], 1)
-    matrix = torch.tensor([[2.0, 0.0], [0.3, 100.0]], dtype=torch.float64)
-    moved = (theta.double() @ matrix.mT + 7).float()
-    log_q = []
-    for rows in (theta, moved):
-        torch.manual_seed(1)
-        net = MixtureDensity(hidden_features=(16,)).build(rows, condition, 1)
-        with torch.no_grad():
-            log_q.append(net.log_prob(rows[:200], condition[:200])[0])
-    shift = log_q[0] - log_q[1] - float(matrix.logdet())
-    # Rows of theta are float32, and the likeliest are known to 1e-4 of their range.
-    assert shift.abs().median() < 5e-3
-    assert shift.abs().quantile(0.9) < 0.05
 
 
 @pytest.mark.parametrize("variant", ["linear", "sinh"])
@@ -203,20 +156,6 @@ def test_gradients_flow_to_outcome_and_action(variant):
         atol=tolerance,
         rtol=tolerance,
     )
-
-
-def test_an_action_between_the_training_actions():
-    """Off-grid actions get what the neighbors get."""
-    net, _, _ = built("linear", n=4_000, shake=False)
-    theta, _, _ = numerical(seed=3)
-    gain = []
-    for value in (-3.0, -2.75, -2.5):
-        action = torch.full((len(theta), 1), value)
-        x = SIMULATOR["linear"].mean(theta, action) + torch.randn(len(theta), 1)
-        with torch.no_grad():
-            gain.append(float(net.log_prob(theta, torch.cat([x, action], 1)).mean()))
-    assert gain[1] == pytest.approx(0.5 * (gain[0] + gain[2]), abs=0.15)
-    assert gain[0] > 0.5
 
 
 def test_outcomes_without_a_measurement():
@@ -271,38 +210,11 @@ def test_degenerate_rows(theta, x, action):
         assert net.sample(torch.Size([2]), condition).isfinite().all()
 
 
-def test_heavy_tails():
-    theta, _, action = numerical()
-    noise = torch.distributions.StudentT(1.5).sample((len(theta), 1))
-    condition = torch.cat([theta[:, :1] * action.exp() + noise, action], 1)
-    net = MixtureDensity().build(theta, condition, 1)
-    with torch.no_grad():
-        assert net.log_prob(theta, condition).mean() > -2 * math.log(10.0) - 1.0
-
-
 def test_prepared_rows_have_the_same_loss():
     for variant in ("linear", "square"):
         net, theta, condition = built(variant)
         loss = PreparedLoss(net).loss(*net.prepare(theta, condition))
         assert torch.allclose(loss, net.loss(theta, condition), rtol=1e-5, atol=1e-4)
-
-
-@pytest.mark.parametrize("variant", ["linear", "sinh"])
-def test_pickle_and_state_keep_the_density(variant):
-    net, theta, condition = built(variant)
-    again = pickle.loads(pickle.dumps(net))
-    log_q = net.log_prob(theta[:9], condition[:9])
-    assert torch.equal(log_q, again.log_prob(theta[:9], condition[:9]))
-    assert {b.device.type for b in net.to("cpu").buffers()} == {"cpu"}
-    assert "conditioning.baseline.beta" in net.state_dict()
-
-
-def test_conditioning_leaves_the_random_state_alone():
-    theta, x, action = numerical("sinh", 500)
-    torch.manual_seed(0)
-    before = torch.get_rng_state()
-    Conditioning(theta, torch.cat([x, action], 1), 1, **FULL)
-    assert torch.equal(before, torch.get_rng_state())
 
 
 def test_whitening_removes_all_correlation():

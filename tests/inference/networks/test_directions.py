@@ -3,10 +3,9 @@
 import torch
 from torch.distributions import MultivariateNormal
 
-from sbi_active.inference.networks.conditioning import Conditioning
-from sbi_active.inference.networks.directions import Directions
-from sbi_active.inference.networks.mixture_density import MixtureDensity
-from sbi_active.inference.networks.training import (
+from sbi_active.inference.networks.conditioning import Conditioning, Directions
+from sbi_active.inference.networks.mixture_density import (
+    MixtureDensity,
     TrainingBudget,
     train_mixture_density,
 )

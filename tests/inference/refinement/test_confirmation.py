@@ -6,7 +6,7 @@ import torch
 from torch.distributions import Independent, Normal
 
 from sbi_active.inference.declared.settings import RefinementOptions
-from sbi_active.inference.refinement.confirmation import by_replicates
+from sbi_active.inference.refinement.refining import by_replicates
 from sbi_active.inference.refinement.regional import Regions, Task
 
 PRIOR = Independent(Normal(torch.zeros(2), torch.ones(2)), 1)

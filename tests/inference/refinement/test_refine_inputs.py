@@ -162,8 +162,7 @@ def test_the_record_keeps_outcomes_and_pairs():
     mean = task.simulator.mean(past.theta, action.expand(len(past.theta), 1))
     residual = torch.from_numpy(past.x[:, :, 0]) - mean
     assert abs(float(residual.std()) - 1) < 4 / (2 * len(residual)) ** 0.5
-    again = torch.from_numpy(past.again[past.has_again][:, :, 0])
-    second = again - mean[torch.from_numpy(past.has_again)]
+    second = residual[torch.from_numpy(past.twin >= 0)]
     assert abs(float(second.std()) - 1) < 4 / (2 * len(second)) ** 0.5
     assert 0 < past.is_overview.sum() < len(past.theta)
     # other first trials: nothing is taken over

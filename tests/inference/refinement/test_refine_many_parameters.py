@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from sbi_active.inference import RefinementOptions, refine
-from sbi_active.inference.rounds import UnexplainedOutcomeError
+from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.seeding import forked_generators
 
 
@@ -65,13 +65,6 @@ def refine_two_of(dim: int):
     settings = RefinementOptions(num_histories=200, num_effective=25)
     x = torch.full((1, 2), 0.5)
     return refine(simulator, prior, torch.zeros(1, 1), x, settings=settings, seed=0)
-
-
-def test_many_edges_are_no_edge():
-    """A prior of forty parameters has most of its mass near one edge or another."""
-    belief = refine_two_of(40)
-    assert belief.diagnostics.prior_edge_mass < 0.1
-    assert not any("edge" in text for text in belief.diagnostics.warnings)
 
 
 def test_too_few_histories_are_no_unexplained_outcome():

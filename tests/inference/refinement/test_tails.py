@@ -7,13 +7,10 @@ from scipy.stats import binom, chi2
 from torch.distributions import MultivariateNormal
 
 from sbi_active.inference import RefinementOptions, refine
-from sbi_active.inference.refinement.tails import _exceedance, _held_out, _squares
-from sbi_active.inference.regression import (
-    LocalRegression,
-    estimate_noise,
-    surrogate,
-    whole_space,
-)
+from sbi_active.inference.refinement.checks import _exceedance, _held_out, _squares
+from sbi_active.inference.regression import surrogate
+from sbi_active.inference.regression.regions import whole_space
+from sbi_active.inference.regression.surrogate import LocalRegression, estimate_noise
 
 NUM_ROWS, NUM_TRIALS = 120, 2
 
@@ -42,7 +39,7 @@ def regression(rng, num_numbers, correlation):
 
 @pytest.mark.parametrize("misfit", [np.inf, 0.0])  # trials have nothing in common; some
 @pytest.mark.parametrize("correlation", [0.0, 0.9])
-@pytest.mark.parametrize("num_numbers", [1, 30, 120])
+@pytest.mark.parametrize("num_numbers", [1, 30])
 def test_a_further_trial_is_as_far_out_as_those_held_out(
     num_numbers, correlation, misfit, monkeypatch
 ):
@@ -102,9 +99,3 @@ def test_many_correlated_numbers_of_the_right_simulator_are_not_unlike_it(lost):
         )
         tails.append(belief.diagnostics.tail_probability)
     assert min(tails) > 0.01
-
-
-def test_equal_draws_have_equal_tail_probabilities():
-    known = np.zeros(50)
-    assert _exceedance(known, np.zeros(3)) == pytest.approx(1.0)
-    assert _exceedance(known, np.ones(1)) < 1e-6

@@ -17,14 +17,13 @@ from torch.distributions import (
     Uniform,
 )
 
-from sbi_active.inference.regression import (
+from sbi_active.inference.regression.regions import (
     SPREAD,
     Region,
     cover,
     nearest_region,
-    whole_space,
 )
-from sbi_active.inference.sampling import PriorCoordinates
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
 
 PRIORS = {
     "box": BoxUniform(torch.tensor([-5.0, 0.0]), torch.tensor([5.0, 1e-3])),
@@ -68,14 +67,7 @@ def test_simulations_stay_in_region_and_support():
     assert coordinates.inside(z).all()
 
 
-def test_ellipsoids_come_before_the_whole_space():
-    inner = Region(np.zeros(2), 0.1 * np.eye(2), 1.0)
-    z = np.array([[0.0, 0.0], [0.5, 0.5]])
-    assert nearest_region([whole_space(2), inner], z).tolist() == [1, 0]
-    assert nearest_region([inner], z).tolist() == [0, -1]
-
-
-@pytest.mark.parametrize("num_modes", [1, 2, 4])
+@pytest.mark.parametrize("num_modes", [1, 4])
 def test_cover_holds_each_mode(num_modes: int):
     rng = np.random.default_rng(0)
     centers = np.linspace(-0.9, 0.9, num_modes) if num_modes > 1 else np.zeros(1)
@@ -90,7 +82,7 @@ def test_cover_holds_each_mode(num_modes: int):
     assert math.pi * sum(areas) < 0.1
 
 
-@pytest.mark.parametrize("dim", [1, 2, 6, 10, 20])
+@pytest.mark.parametrize("dim", [1, 6, 20])
 def test_simulations_fill_a_region_of_any_dimension(dim: int):
     rng = np.random.default_rng(0)
     prior = MultivariateNormal(torch.zeros(dim), torch.eye(dim))

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from sbi_active.inference.refinement import BLURRED
-from sbi_active.inference.regression import TrialOutcome, outcomes_of, whole_space
+from sbi_active.inference.refinement.checks import BLURRED
+from sbi_active.inference.regression.outcomes import TrialOutcome
+from sbi_active.inference.regression.regions import whole_space
 
 NUM = 500
 NONE = np.zeros((0, 2), dtype=bool)
@@ -71,12 +72,3 @@ def test_one_kind_only_follows_the_rule_of_succession(agrees: bool):
     expected = NUM + 1 if agrees else 1
     log_prob = outcome.log_prob(places(5, seed=1))
     assert log_prob == pytest.approx(np.log(expected / (NUM + 2)))
-
-
-def test_trials_that_agree_share_a_regression():
-    z = places()
-    agrees = np.stack([z[:, 0] > 0, z[:, 0] > 0, z[:, 1] > 0], 1)
-    outcomes = outcomes_of(whole_space(2), z, agrees, agrees[:9], agrees[:9], [0, 1, 2])
-    assert [outcome.trial for outcome in outcomes] == [0, 1, 2]
-    assert outcomes[0].coefficient is outcomes[1].coefficient
-    assert outcomes[0].coefficient is not outcomes[2].coefficient

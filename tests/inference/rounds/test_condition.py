@@ -2,7 +2,12 @@ import pytest
 import torch
 
 from sbi_active.inference import ActionEmbedding
-from sbi_active.inference.rounds import action_rows, outcome_rows, pack, unpack
+from sbi_active.inference.rounds.condition import (
+    action_rows,
+    outcome_rows,
+    pack,
+    unpack,
+)
 
 
 def test_unpack_undoes_pack():

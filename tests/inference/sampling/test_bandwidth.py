@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import gaussian_kde
 
-from sbi_active.inference.sampling.bandwidth import scott, silverman
+from sbi_active.inference.sampling.weights import scott, silverman
 
 
 @pytest.mark.parametrize("dim", [1, 3])
@@ -14,11 +14,3 @@ def test_the_rules_are_those_of_scipy(dim):
     kde = gaussian_kde(np.random.default_rng(0).normal(size=(dim, 50)))
     assert scott(50, dim) == pytest.approx(kde.scotts_factor())
     assert silverman(50, dim) == pytest.approx(kde.silverman_factor())
-
-
-def test_in_one_dimension_silverman_s_constant_is_1_06():
-    assert silverman(1, 1) == pytest.approx(1.06, abs=0.001)
-
-
-def test_in_two_dimensions_the_rules_agree():
-    assert scott(7.5, 2) == pytest.approx(silverman(7.5, 2))

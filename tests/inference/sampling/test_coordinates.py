@@ -18,7 +18,6 @@ from torch.distributions import (
     constraints,
 )
 
-from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.support import support_bounds
 
 ONES = torch.ones(2)
@@ -52,16 +51,3 @@ def test_the_bounds_of_joined_supports():
     low, high = support_bounds(constraints.independent(joined, 0), 3)
     assert low.tolist() == [-1, -1, 0]
     assert high.tolist() == [1, 1, np.inf]
-
-
-@pytest.mark.parametrize("name", PRIORS)
-def test_coordinates_lead_back_and_the_density_integrates_to_one(name):
-    prior, rng = PRIORS[name], np.random.default_rng(0)
-    coordinates = PriorCoordinates(prior, rng)
-    theta = prior.sample(torch.Size([500]))
-    z = coordinates.to_z(theta)
-    assert coordinates.to_theta(z).numpy() == pytest.approx(theta.numpy(), abs=1e-5)
-    assert coordinates.inside(z).all()
-    wide = rng.uniform(-2, 2, (200_000, 2))
-    mass = np.exp(coordinates.log_prior(wide)).mean() * 16
-    assert mass == pytest.approx(1, abs=0.02)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sbi_active.inference.sampling import GaussianMixture
+from sbi_active.inference.sampling.gaussian_mixture import GaussianMixture
 
 
 def test_mixture_handles_repeated_points():

@@ -6,8 +6,10 @@ import torch
 from sbi.utils import BoxUniform, MultipleIndependent
 from torch.distributions import Beta, Independent, LogNormal, Normal
 
-from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.normal_coordinates import NormalCoordinates
+from sbi_active.inference.sampling.coordinates import (
+    NormalCoordinates,
+    PriorCoordinates,
+)
 
 BOX = BoxUniform(torch.tensor([1.0, -2.0]), torch.tensor([3.0, 8.0]))
 

@@ -30,13 +30,6 @@ def test_rows_that_repeat_are_simulated_once():
     assert sums.asked == [[0, 1, 3]]
 
 
-def test_only_new_rows_are_simulated():
-    cache, sums = RowCache(), Sums()
-    cache.get("a", ROWS[:1], sums.of(ROWS))
-    assert cache.get("a", ROWS[:2], sums.of(ROWS)) == [3.0, 7.0]
-    assert sums.asked == [[0], [1]]
-
-
 def test_another_label_has_values_of_its_own():
     cache, sums = RowCache(), Sums()
     cache.get("a", ROWS[:1], sums.of(ROWS))

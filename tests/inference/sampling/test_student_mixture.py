@@ -35,12 +35,6 @@ def test_the_density_is_scipy_s():
     assert even.log_prob(Z) == pytest.approx(np.log(density(np.full(2, 0.5))))
 
 
-def test_kernels_have_the_density_of_a_mixture_of_equal_weights():
-    kernels = KernelMixture(MEANS, FACTORS)
-    assert kernels.log_prob(Z) == pytest.approx(np.log(density(np.full(2, 0.5))))
-    assert kernels.log_prob(Z[:0]).shape == (0,)
-
-
 @pytest.mark.parametrize("kind", [StudentMixture, KernelMixture])
 def test_draws_have_the_moments_of_the_mixture(kind):
     draws = kind(MEANS, FACTORS).sample(400_000, np.random.default_rng(1))
@@ -48,13 +42,6 @@ def test_draws_have_the_moments_of_the_mixture(kind):
     within = 5 / 3 * (FACTORS @ np.swapaxes(FACTORS, 1, 2)).mean(0)
     between = np.outer(*[(MEANS[1] - MEANS[0]) / 2] * 2)
     assert np.cov(draws.T) == pytest.approx(within + between, abs=0.05)
-
-
-def test_components_are_drawn_as_often_as_their_weights_say():
-    mixture = StudentMixture(MEANS, FACTORS, WEIGHTS)
-    assert np.bincount(mixture.components(200)).tolist() == [50, 150]
-    even = StudentMixture(MEANS, FACTORS)
-    assert even.components(3).tolist() == [0, 1, 0]
 
 
 def test_a_defended_proposal_mixes_densities_and_draws():
@@ -89,12 +76,6 @@ def test_a_split_mixture_of_equal_sides_is_a_student_mixture():
     split = SplitStudentMixture(MEANS, FACTORS, ones, ones, WEIGHTS)
     mixture = StudentMixture(MEANS, FACTORS, WEIGHTS)
     assert split.log_prob(Z) == pytest.approx(mixture.log_prob(Z))
-
-
-def test_lower_factors_are_those_of_cholesky():
-    a = np.random.default_rng(0).normal(size=(3, 4, 4))
-    covariance = a @ np.swapaxes(a, 1, 2)
-    assert (lower_factors(covariance) == np.linalg.cholesky(covariance)).all()
 
 
 def test_a_singular_covariance_has_its_smallest_variances_raised():

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sbi_active.inference.sampling.tempering import largest_power
-from sbi_active.inference.sampling.weights import effective_sample_size
+from sbi_active.inference.sampling.weights import effective_sample_size, largest_power
 
 
 @pytest.mark.parametrize("answer", [0.73, 1e-3, 2.5e-8])
@@ -14,19 +13,10 @@ def test_the_largest_power_is_found_whatever_its_size(answer):
     assert largest_power(lambda b: b <= answer) == pytest.approx(answer, rel=1e-6)
 
 
-def test_an_end_that_suffices_is_returned():
-    assert largest_power(lambda _: True, end=0.3) == 0.3
-
-
 def test_a_sequence_moves_on_where_nothing_suffices():
     assert largest_power(lambda _: False) == 1e-10
     assert largest_power(lambda _: False, start=0.5) == pytest.approx(0.5, abs=1e-9)
     assert largest_power(lambda _: False, start=0.5) > 0.5
-
-
-def test_a_step_begins_where_the_last_one_ended():
-    found = largest_power(lambda b: b <= 0.6, start=0.2, num_steps=25)
-    assert found == pytest.approx(0.6, abs=1e-7)
 
 
 def test_the_power_of_a_gaussian_leaves_the_share_that_its_moments_say():
@@ -40,7 +30,3 @@ def test_the_power_of_a_gaussian_leaves_the_share_that_its_moments_say():
     # (1 + s)^2 share^2 = 1 + 2 s for s = b c.
     s = (1 - share**2 + np.sqrt(1 - share**2)) / share**2
     assert power * c == pytest.approx(s, rel=0.03)
-
-
-def test_no_step_need_be_made_where_none_is_asked_for():
-    assert largest_power(lambda _: False, least=0.0) == 0

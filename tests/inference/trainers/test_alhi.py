@@ -11,9 +11,9 @@ from sbi.utils import BoxUniform
 
 from sbi_active import ALHI, MixtureDensity, RefinementOptions
 from sbi_active.inference import Observation
-from sbi_active.inference.beliefs import KernelBelief
-from sbi_active.inference.products import Product, TrainedRegion, widened
-from sbi_active.inference.sampling import PriorCoordinates
+from sbi_active.inference.beliefs.kernel_belief import KernelBelief
+from sbi_active.inference.models.product import Product
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from tests.linear_gaussian import DIM, PRIOR, simulator
 
 SETTINGS = MixtureDensity(hidden_features=(16,), num_iterations=100)
@@ -144,11 +144,6 @@ def test_kernels_have_the_stated_bandwidth():
     assert 1 < float(widened.var() / few.var()) < 1.32 * 1.05
 
 
-@pytest.mark.slow
-def test_beliefs_by_kernels_are_chained():
-    assert divergence(observe(trained(posterior="kde"))) < 0.3
-
-
 def falls(theta, action):
     """No measurement where theta exceeds a half."""
     x = theta + 0.1 * torch.randn_like(theta)
@@ -177,29 +172,6 @@ def test_no_measurement_is_information():
     assert float(belief.variance) == pytest.approx(1 / 3, rel=0.1)
 
 
-@pytest.mark.filterwarnings("ignore:.*Maximum number of epochs")
-def test_a_network_of_sbi():
-    torch.manual_seed(0)
-    inference = ALHI(PRIOR, "mdn", show_progress_bars=False)
-    theta, x, action = rows(400)
-    inference.append_simulations(theta, x, action=action).train(max_num_epochs=3)
-    model = inference.build_posterior()
-    assert model.log_likelihood(x, theta, action).shape == (400,)
-    belief = inference.update(x[0], action=action[0], seed=0)
-    assert belief.sample((3,)).shape == (3, DIM)
-
-
-def test_heavy_tails_are_the_mixture_s():
-    torch.manual_seed(0)
-    theta, action = PRIOR.sample((3_000,)), torch.rand(3_000, 1)
-    noise = torch.where(torch.rand(3_000, 1) < 0.1, 5.0, 0.2) * torch.randn(3_000, 2)
-    inference = ALHI(PRIOR, MixtureDensity(hidden_features=(32,)))
-    inference.append_simulations(theta, theta + noise, action=action)
-    assert not bool(inference.train().is_gaussian)
-    gaussian = trained().train()
-    assert bool(gaussian.is_gaussian)
-
-
 def raises(text, error=ValueError):
     return pytest.raises(error, match=re.escape(text))
 
@@ -220,40 +192,6 @@ def test_errors():
     inference.append_simulations(theta, x)
     with raises("start a new ALHI(prior) for rounds with actions"):
         inference.append_simulations(theta, x, action=action)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("variant", ["linear", "sinh", "square"])
-def test_the_numerical_task_after_four_rounds(variant):
-    """The default conditioning is within half a nat of exact, refined or not."""
-    from sbi_active.tasks import get_task
-
-    task = get_task("numerical", variant=variant)
-    for refined in (True, False):
-        gaps = []
-        for seed in range(3):
-            torch.manual_seed(seed)
-            inference = ALHI(task.prior, show_progress_bars=False)
-            actions = torch.tensor([[-5.0], [5.0], [-5.0], [5.0]])
-            outcomes = []
-            for index, action in enumerate(actions):
-                theta = inference.belief.sample((5_000,))
-                rows = task.actions.sample((5_000,))
-                x = task.simulator(theta, rows)
-                inference.append_simulations(theta, x, action=rows).train()
-                outcomes.append(task.real_system(action, seed=10 * seed + index))
-                belief = inference.update(
-                    outcomes[-1],
-                    action=action,
-                    simulator=task.simulator if refined else None,
-                    refinement=RefinementOptions(num_histories=600),
-                    seed=index,
-                )
-            exact = task.reference(actions, torch.stack(outcomes))
-            draws = exact.sample(2_000, seed=0)
-            gap = exact.log_prob(draws) - belief.log_prob(draws.float())
-            gaps.append(float(gap.mean()))
-        assert float(np.median(gaps)) < 0.5
 
 
 def test_a_failed_update_leaves_the_trainer_as_it_was():
@@ -280,19 +218,3 @@ def test_outcomes_measured_in_part_are_refused():
         inference.append_simulations(theta, x, action=action)
     with raises("expected outcomes that are measured or NaN throughout"):
         trained().update(torch.tensor([0.0, torch.nan]), action=torch.ones(1))
-
-
-def test_where_a_network_is_trained_and_trusted():
-    box = BoxUniform(-torch.ones(2), torch.ones(2))
-    rng = np.random.default_rng(0)
-    coordinates = PriorCoordinates(box, rng)
-    z = 0.1 * rng.standard_normal((2_000, 2)) + [0.9, 0.0]
-    z = z[coordinates.inside(z)]
-    wide = widened(z, 3_000, coordinates, rng)
-    assert wide.shape == (3_000, 2)
-    assert bool(coordinates.inside(wide).all())
-    # Twice as wide, less where several components share the belief between them.
-    assert 1.4 < wide[:, 1].std() / z[:, 1].std() < 2.1
-    region = TrainedRegion.of(wide, rng)
-    assert region.contains(wide).mean() > 0.99
-    assert not region.contains(np.array([[-0.9, 0.0], [0.9, -0.99]])).any()

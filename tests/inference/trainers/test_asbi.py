@@ -5,16 +5,12 @@ import pickle
 
 import pytest
 import torch
-from sbi.diagnostics import run_sbc
-from sbi.inference import DirectPosterior
 from sbi.neural_nets import posterior_nn
-from sbi.neural_nets.estimators import MixtureDensityEstimator
 from sbi.utils import BoxUniform, RestrictedPrior, get_density_thresholder
 from torch.distributions import Distribution
 
 from sbi_active import ASBI, Belief, MixtureDensity
 from sbi_active.inference import ActionEmbedding, ActionPosterior
-from sbi_active.inference.networks import MixtureDensityNetwork
 from tests.linear_gaussian import DIM, PRIOR, moments, simulator
 
 SMALL = MixtureDensity(hidden_features=(32, 32), num_components=2, num_iterations=600)
@@ -86,19 +82,6 @@ def test_each_round_has_a_new_network_and_its_own_rows():
     assert (scale < 0.9 * first.theta_scale).all()  # scales are re-estimated
 
 
-def test_the_default_is_the_lean_network_and_strings_are_honored():
-    assert isinstance(
-        trained(None, max_num_epochs=1)._neural_net, MixtureDensityNetwork
-    )
-    with pytest.warns(UserWarning, match="Maximum number of epochs"):
-        inference = trained("mdn", max_num_epochs=1)
-    assert isinstance(inference._neural_net, MixtureDensityEstimator)
-    build = posterior_nn("maf", num_transforms=1)
-    with pytest.warns(UserWarning, match="Maximum number of epochs"):
-        inference = trained(build, max_num_epochs=1)
-    assert len(inference.update(torch.zeros(2), action=torch.ones(1)).sample((4,))) == 4
-
-
 @pytest.mark.filterwarnings("ignore:.*Maximum number of epochs")
 @pytest.mark.parametrize("estimator", [SMALL, "mdn"])
 def test_budget_and_summary(estimator):
@@ -112,27 +95,6 @@ def test_budget_and_summary(estimator):
     assert len(summary["validation_loss"]) > epochs
     after = inference._neural_net.state_dict()
     assert any(not torch.equal(before[name], after[name]) for name in before)
-
-
-def test_same_torch_seed_same_network():
-    nets = []
-    for _ in range(2):
-        torch.manual_seed(7)
-        nets.append(trained()._neural_net.state_dict())
-    assert all(torch.equal(nets[0][name], nets[1][name]) for name in nets[0])
-
-
-def test_a_calibration_kernel_weighs_rows():
-    """Rows with x < 0 get no weight: the network is fitted to the others alone."""
-    theta, x, action = rows(2_000)
-    theta[x[:, 0] < 0] += 100.0
-    inference = ASBI(PRIOR, SMALL)
-    inference.append_simulations(theta, x, action=action)
-    inference.train(calibration_kernel=lambda c: (c[:, 0] >= 0).float())
-    posterior = inference.build_posterior()
-    keep = x[:, 0] >= 0
-    inside = posterior.log_posterior(theta[keep], x[keep], action[keep]).mean()
-    assert float(inside) > -4
 
 
 def test_invalid_rows_are_kept_by_ours_and_dropped_for_sbi_s():
@@ -231,16 +193,6 @@ def test_belief_is_a_distribution():
     assert torch.equal(again.log_prob(theta), belief.log_prob(theta))
 
 
-def test_belief_works_as_a_prior_of_sbi():
-    belief = trained(prior=BOX).update(torch.ones(2), action=torch.ones(1))
-    theta = belief.sample((300,))
-    inference = ASBI(belief, "mdn", show_progress_bars=False)
-    inference.append_simulations(theta, simulator(theta, torch.ones(300, 1)))
-    with pytest.warns(UserWarning, match="Maximum number of epochs"):
-        inference.train(max_num_epochs=1)
-    assert inference.build_posterior().sample((2,), x=torch.ones(1, 2)).shape == (2, 2)
-
-
 def test_a_belief_far_outside_the_prior_is_coarse_and_says_so():
     inference = trained(prior=BOX)
     with pytest.warns(UserWarning, match="lies within the prior's support"):
@@ -268,34 +220,6 @@ def test_action_posterior_offers_what_sbi_s_do():
     assert peak >= posterior.log_prob(theta, x=x, action=action).median()
 
 
-@pytest.mark.filterwarnings("ignore")
-def test_at_and_packed_are_sbi_s_posteriors():
-    posterior = trained(prior=BOX).build_posterior()
-    action, x = torch.tensor([2.0]), torch.tensor([[0.5, 0.5]])
-    at = posterior.at(action)
-    assert type(at) is DirectPosterior
-    theta = BOX.sample((20,))
-    packed = posterior.packed().log_prob(
-        theta, x=torch.cat([x, action[None]], 1), norm_posterior=False
-    )
-    assert torch.allclose(at.log_prob(theta, x=x, norm_posterior=False), packed)
-    direct = posterior.log_prob(theta, x, action, norm_posterior=False)
-    assert torch.allclose(direct, packed)
-    prior_theta = BOX.sample((20,))
-    xs = simulator(prior_theta, action.expand(20, 1))
-    ranks, _ = run_sbc(prior_theta, xs, at, num_posterior_samples=20)
-    assert ranks.shape == (20, 2)
-
-
-def test_mcmc_on_an_action_posterior():
-    inference = trained(prior=BOX)
-    posterior = inference.build_posterior(sample_with="rejection")
-    draws = posterior.sample((50,), x=torch.zeros(2), action=torch.ones(1))
-    assert draws.shape == (50, 2)
-    with pytest.raises(ValueError, match="expected a posterior with a density"):
-        posterior.log_prob(draws, x=torch.zeros(2), action=torch.ones(1))
-
-
 def test_truncated_proposals_of_the_belief_pass_and_others_do_not():
     theta, x, action = rows(200, BOX)
     inference = trained(prior=BOX)
@@ -305,31 +229,3 @@ def test_truncated_proposals_of_the_belief_pass_and_others_do_not():
     inference.append_simulations(theta, x, proposal=restricted, action=action)
     with pytest.raises(ValueError, match="expected proposal to be the belief"):
         inference.append_simulations(theta, x, proposal=packed, action=action)
-
-
-def test_an_action_off_the_grid_is_used_as_executed():
-    inference = trained()
-    beliefs = []
-    for action in (0.123, 2.9):
-        inference = trained()
-        beliefs.append(inference.update(torch.ones(2), action=torch.tensor([action])))
-    assert beliefs[0].variance[0] > 2 * beliefs[1].variance[0]
-
-
-def test_no_folder_appears():
-    # conftest checks for sbi-logs after every test; here a tracker of the user's works
-    seen = []
-
-    class Tracker:
-        log_dir = None
-
-        def log_metric(self, name, value, step=None):
-            seen.append(name)
-
-        def flush(self):
-            pass
-
-    theta, x, action = rows(300)
-    inference = ASBI(PRIOR, SMALL, tracker=Tracker())
-    inference.append_simulations(theta, x, action=action).train(max_num_epochs=1)
-    assert {"validation_loss", "training_loss", "epochs_trained"} <= {*seen}

@@ -1,4 +1,4 @@
-"""Bad input gets a clear error: the texts are part of what users see."""
+"""Bad input gets a clear error that says what to do."""
 
 import re
 
@@ -28,123 +28,87 @@ def raises(text, error=ValueError):
     return pytest.raises(error, match=re.escape(text))
 
 
-def test_wrong_action_dimension():
-    theta, x, _ = rows()
-    inference = with_round()
-    with raises("expected action of shape (50, 1) or (1,); got (50, 2)"):
-        inference.append_simulations(theta, x, action=torch.rand(50, 2))
-    inference.train()
-    with raises("expected action of shape (1, 1) or (1,); got (3,)"):
-        inference.update(torch.zeros(2), action=torch.zeros(3))
+class NoSupport(Distribution):
+    def __init__(self):
+        super().__init__(event_shape=torch.Size([2]), validate_args=False)
+
+    def sample(self, sample_shape=()):
+        return PRIOR.sample(sample_shape)
+
+    def log_prob(self, value):
+        return PRIOR.log_prob(value)
 
 
-def test_action_missing():
-    theta, x, _ = rows()
-    with raises("expected action=, since earlier rounds of this trainer have actions"):
-        with_round().append_simulations(theta, x)
-    with raises("expected action=, since belief= was given"):
-        ASBI(PRIOR).append_simulations(theta, x, belief=PRIOR)
+OUTSIDE = torch.tensor([[0.0, 3.0]]).expand(50, -1)
+FRESH = {"no support": NoSupport(), "no prior": None}
+
+
+@pytest.mark.parametrize(
+    ("text", "changes"),
+    [
+        ("expected action of shape (50, 1) or (1,)", {"action": torch.rand(50, 2)}),
+        ("earlier rounds of this trainer have actions", {"action": None}),
+        ("theta within the prior's support; got 50 of 50 rows", {"theta": OUTSIDE}),
+        (
+            "at least one simulation with a measurement",
+            {"x": torch.full((50, 2), torch.nan)},
+        ),
+        ("expected theta (n, 2) and x (n, ...)", {"theta": torch.zeros(50, 1)}),
+        ("expected x of shape (2,) or (n, 2)", {"x": torch.rand(50, 3)}),
+    ],
+)
+def test_rows_that_do_not_fit(text, changes):
+    theta, x, action = rows()
+    given = {"theta": theta, "x": x, "action": action} | changes
+    with raises(text):
+        with_round().append_simulations(**given)
+
+
+@pytest.mark.parametrize("name", FRESH)
+def test_priors_that_no_belief_begins_from(name):
+    theta, x, action = rows()
+    text = (
+        "with a support, which" if name == "no support" else "expected a prior, since"
+    )
+    with raises(text):
+        ASBI(FRESH[name]).append_simulations(theta, x, action=action)
 
 
 def test_rounds_with_and_without_action_do_not_mix():
     theta, x, action = rows()
+    with raises("expected action=, since belief= was given"):
+        ASBI(PRIOR).append_simulations(theta, x, belief=PRIOR)
     inference = ASBI(PRIOR, "mdn").append_simulations(theta, x)
     with raises("start a new ASBI(prior) for rounds with actions"):
         inference.append_simulations(theta, x, action=action)
 
 
-def test_x_without_action_and_action_without_x():
-    inference = with_round()
-    inference.train()
-    posterior = inference.build_posterior()
-    with raises("expected x= and action= together; got x without action"):
-        posterior.sample((3,), x=torch.zeros(2))
-    with raises("expected x= and action= together; got action without x"):
-        posterior.log_prob(torch.zeros(1, 2), action=torch.zeros(1))
-    with raises("expected x= and action= together; got neither"):
-        posterior.map()
-
-
-def test_theta_outside_the_prior():
-    theta, x, action = rows()
-    theta[7] = torch.tensor([0.0, 3.0])
-    with raises(
-        "expected theta within the prior's support; got 1 of 50 rows outside, the "
-        "first [0.0, 3.0] in row 7"
-    ):
-        ASBI(PRIOR).append_simulations(theta, x, action=action)
-
-
-def test_all_simulations_invalid():
-    theta, x, action = rows()
-    with raises("expected at least one simulation with a measurement; got 50 of 50"):
-        ASBI(PRIOR).append_simulations(theta, x * torch.nan, action=action)
-
-
-def test_prior_without_support():
-    class NoSupport(Distribution):
-        def __init__(self):
-            super().__init__(event_shape=torch.Size([2]), validate_args=False)
-
-        def sample(self, sample_shape=()):
-            return PRIOR.sample(sample_shape)
-
-        def log_prob(self, value):
-            return PRIOR.log_prob(value)
-
-    theta, x, action = rows()
-    with raises("expected a prior with a support, which every belief keeps; got NoSup"):
-        ASBI(NoSupport()).append_simulations(theta, x, action=action)
-    with raises("expected a prior, since a belief starts from it; got None"):
-        ASBI().append_simulations(theta, x, action=action)
-
-
-def test_shapes_of_theta_and_x():
-    theta, x, action = rows()
-    with raises("expected theta (n, 2) and x (n, ...) with as many rows; got (50, 1)"):
-        ASBI(PRIOR).append_simulations(theta[:, :1], x, action=action)
-    with raises("expected x of shape (2,) or (n, 2), as simulated; got (50, 3)"):
-        with_round().append_simulations(theta, torch.rand(50, 3), action=action)
-
-
-def test_update_needs_a_network_of_this_round():
+def test_what_a_trained_round_refuses():
     inference = with_round()
     with raises("expected a network trained under the current belief", RuntimeError):
         inference.update(torch.zeros(2), action=torch.zeros(1))
+    with raises("expected a network trained on this round's", RuntimeError):
+        inference.build_posterior()
+    with raises("expected resume_training after train() on the same rows"):
+        inference.train(resume_training=True)
     inference.train()
+    with raises("expected action of shape (1, 1) or (1,); got (3,)"):
+        inference.update(torch.zeros(2), action=torch.zeros(3))
+    with raises("expected one outcome; got 2 rows"):
+        inference.update(torch.zeros(2, 2), action=torch.zeros(1))
+    posterior = inference.build_posterior()
+    with raises("expected x= and action= together; got x without action"):
+        posterior.sample((3,), x=torch.zeros(2))
+    with raises("expected x= and action= together; got neither"):
+        posterior.map()
     inference.update(torch.zeros(2), action=torch.zeros(1))
     with raises("append simulations of the belief with action=", RuntimeError):
         inference.update(torch.zeros(2), action=torch.zeros(1))
 
 
-def test_update_takes_one_outcome():
-    inference = with_round()
-    inference.train()
-    with raises("expected one outcome; got 2 rows"):
-        inference.update(torch.zeros(2, 2), action=torch.zeros(1))
-
-
-def test_posterior_needs_a_network_of_this_round():
-    with raises("expected a network trained on this round's", RuntimeError):
-        with_round().build_posterior()
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [{"discard_prior_samples": True}, {"use_combined_loss": True}, {"num_atoms": 5}],
-)
-def test_arguments_without_meaning(arguments):
-    name = next(iter(arguments))
+@pytest.mark.parametrize("name", ["discard_prior_samples", "use_combined_loss"])
+def test_arguments_without_meaning(name):
     with raises(f"expected {name} to be left out in a round with actions"):
-        with_round().train(**arguments)
-
-
-def test_resume_needs_the_same_rows():
-    inference = with_round()
-    with raises("expected resume_training after train() on the same rows"):
-        inference.train(resume_training=True)
-
-
-def test_train_without_simulations():
+        with_round().train(**{name: True})
     with raises("No simulations found", RuntimeError):
         ASBI(PRIOR).train()

@@ -1,6 +1,5 @@
 """Updates with a simulator: the posterior of all trials from the original prior."""
 
-import pickle
 import warnings
 
 import pytest
@@ -9,9 +8,8 @@ from torch.distributions import MultivariateNormal
 
 from sbi_active import ASBI, MixtureDensity, RefinementOptions
 from sbi_active.inference import Observation, refine
-from sbi_active.inference.beliefs import ChainedBelief, compare
+from sbi_active.inference.beliefs.belief import ChainedBelief, compare
 from sbi_active.inference.trainers import asbi
-from sbi_active.tasks import get_task
 from tests.linear_gaussian import PRIOR, simulator
 
 TRIALS = [
@@ -33,19 +31,6 @@ def exact(trials):
 def divergence(belief, truth):
     theta = truth.sample((4_000,))
     return float((truth.log_prob(theta) - belief.log_prob(theta)).mean())
-
-
-def test_updates_reach_the_closed_form_without_a_network():
-    inference = ASBI(PRIOR)
-    for k, trial in enumerate(TRIALS):
-        belief = inference.update(
-            trial.x, action=trial.action, simulator=simulator, refinement=SETTINGS,
-            seed=k,
-        )  # fmt: skip
-        assert belief.label == "refined"
-        assert divergence(belief, exact(TRIALS[: k + 1])) < COST
-    assert len(inference.trials) == 3
-    assert inference.belief is belief
 
 
 def test_errors_of_a_chained_belief_do_not_stay():
@@ -73,16 +58,6 @@ def test_update_all_starts_from_scratch_and_order_does_not_matter():
     assert inference.trials == TRIALS[::-1]
     for belief in beliefs:
         assert divergence(belief, exact(TRIALS)) < COST
-
-
-def test_same_seed_same_belief():
-    beliefs = [
-        ASBI(PRIOR).update_all(TRIALS, simulator, refinement=SETTINGS, seed=s)
-        for s in (1, 1, 2)
-    ]
-    theta = beliefs[2].sample((5,))
-    assert torch.equal(beliefs[0].log_prob(theta), beliefs[1].log_prob(theta))
-    assert not torch.equal(beliefs[0].log_prob(theta), beliefs[2].log_prob(theta))
 
 
 def hides(theta, action):
@@ -178,38 +153,3 @@ def test_a_blunt_and_an_overconfident_network_are_told_apart(network, kind):
     if kind == "under-confident":
         expected = 2 * torch.tensor(6.0).log()
         assert abs(belief.diagnostics.chained_bluntness - expected) < 0.3
-
-
-def test_refined_beliefs_travel():
-    belief = ASBI(PRIOR).update_all(TRIALS, simulator, refinement=SETTINGS, seed=0)
-    again = pickle.loads(pickle.dumps(belief))
-    theta = belief.sample((5,))
-    assert torch.equal(again.log_prob(theta), belief.log_prob(theta))
-    assert not isinstance(belief, ChainedBelief)
-
-
-def test_the_first_trial_may_come_before_any_simulation():
-    belief = ASBI(PRIOR).update(
-        torch.ones(2), action=1.0, simulator=simulator, refinement=SETTINGS, seed=0
-    )
-    assert belief.sample((3,)).shape == (3, 2)
-    with pytest.raises(ValueError, match="expected num_histories in"):
-        RefinementOptions(num_histories=10)
-
-
-def test_the_faithful_network_is_flagged_as_blunt():
-    """Stock z-scoring is nats blunter than the data allow, though calibrated."""
-    task = get_task("numerical")
-    inference = ASBI(task.prior, MixtureDensity.faithful())
-    theta, action = task.prior.sample((5_000,)), task.actions.sample((5_000,))
-    x = task.simulator(theta, action)
-    inference.append_simulations(theta, x, action=action).train()
-    belief = inference.update(
-        task.real_system(torch.tensor([-5.0]), seed=0),
-        action=torch.tensor([-5.0]),
-        simulator=task.simulator,
-        seed=0,
-    )
-    assert belief.diagnostics.trustworthy
-    assert belief.diagnostics.chained_bluntness > 3
-    assert "under-confident" in belief.diagnostics.network_warnings[0]

@@ -85,26 +85,6 @@ def test_seqbed_weighs_particles():
     assert torch.equal(again.log_prob(theta), belief.log_prob(theta))
 
 
-@pytest.mark.slow
-def test_seqbed_with_a_simulator():
-    inference = SeqBED_LFIRE(NORMAL)
-    x_o, settings = torch.tensor([1.6]), RefinementOptions(num_histories=1_600)
-    torch.manual_seed(0)
-    belief = inference.update(
-        x_o, action=ACTIONS[1], simulator=simulator, refinement=settings, seed=0
-    )
-    mean, variance = moments(x_o, ACTIONS[1])
-    assert float(belief.mean) == pytest.approx(
-        float(mean), abs=3 * float(variance.sqrt()) / 12**0.5
-    )
-    assert belief.diagnostics.num_simulations == 1_600
-    assert belief.diagnostics.num_particles == 40
-    trials = [*inference.trials, *inference.trials]
-    both = inference.update_all(trials, simulator, refinement=settings, seed=1)
-    assert both.diagnostics.num_simulations == 3_200
-    assert float(both.variance) < float(belief.variance)
-
-
 @pytest.mark.parametrize(
     "trainer", [pytest.param(SeqBED_B, marks=pytest.mark.slow), SeqBED]
 )
@@ -158,25 +138,14 @@ def test_no_measurement_is_information():
 
     torch.manual_seed(0)
     nothing, action = torch.tensor([torch.nan]), torch.ones(1)
-    for inference in (SeqBED_LFIRE(box), SeqBED(box, show_progress_bars=False)):
-        theta, rows = inference.arrange(box.sample((1_600,)), torch.ones(1_600, 1))
+    amortized = SeqBED(box, show_progress_bars=False)
+    for inference, num in ((SeqBED_LFIRE(box), 600), (amortized, 1_600)):
+        theta, rows = inference.arrange(box.sample((num,)), torch.ones(num, 1))
         x = falls(theta, rows)
         inference.append_simulations(theta, x, action=rows).train()
         belief = inference.update(nothing, action=action, seed=0)
         # Kernels of a fifth of the belief's width reach over the edge.
         assert float((belief.sample((2_000,)) > 0.4).double().mean()) > 0.75
-
-
-@pytest.mark.filterwarnings("ignore:.*Maximum number of epochs")
-def test_a_classifier_of_sbi():
-    torch.manual_seed(0)
-    inference = SeqBED(PRIOR, "mlp", show_progress_bars=False)
-    theta, action = PRIOR.sample((300,)), torch.rand(300, 1)
-    x = simulator(theta, action)
-    inference.append_simulations(theta, x, action=action)
-    inference.train(max_num_epochs=2)
-    belief = inference.update(x[0], action=action[0], seed=0)
-    assert belief.sample((3,)).shape == (3, DIM)
 
 
 def test_what_had_the_name_still_works_and_a_warning_says_the_new_one():

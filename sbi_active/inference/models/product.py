@@ -1,4 +1,4 @@
-"""Prior times a product over trials of something learned."""
+"""Prior times a product over trials of something learned, and its belief."""
 
 from __future__ import annotations
 
@@ -12,20 +12,39 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.rounds.rows import Observation
+from sbi_active.inference.beliefs.diagnostics import Diagnostics
+from sbi_active.inference.engine.learned import learned_fit
+from sbi_active.inference.refinement.learned_belief import LearnedBelief
+from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.gaussian_mixture import GaussianMixture
 from sbi_active.threads import single_thread
 
 Array = NDArray[Any]
 
-#: Components of the mixture whose level set is a region: enough for a few modes.
-NUM_COMPONENTS = 6
-NUM_FITTED = 2_000  # rows that a region is fitted to
-LOST = 2e-3  # share of the rows that may lie outside
-MARGIN = 3.0  # nats below the density of the last row inside
-SPREAD = 2.0  # deviations of rows to learn from, in those of a component
 BATCH_SIZE = 20_000  # rows at once, which bounds the memory
+#: Effective draws below which the normalizer is off by more than a tenth of a nat.
+ENOUGH = 100.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegionSettings:
+    """Settings of the region where a network is trained and trusted.
+
+    Attributes:
+        num_components: Number of components of the mixture whose level set is a
+            region: enough for a few modes.
+        num_fitted: Number of rows that a region is fitted to.
+        lost: Share of the rows that may lie outside.
+        margin: Nats below the density of the last row inside.
+        spread: Deviations of rows to learn from, in those of a component.
+    """
+
+    num_components: int = 6
+    num_fitted: int = 2_000
+    lost: float = 2e-3
+    margin: float = 3.0
+    spread: float = 2.0
 
 
 class TrialModel(Protocol):
@@ -49,11 +68,13 @@ class TrainedRegion:
     floor: float
 
     @staticmethod
-    def of(z: Array, rng: np.random.Generator) -> TrainedRegion:
+    def of(
+        z: Array, rng: np.random.Generator, own: RegionSettings = RegionSettings()
+    ) -> TrainedRegion:
         """Return the region of rows, coordinates of shape (n, d)."""
-        some = rng.permutation(z)[:NUM_FITTED]
-        mixture = GaussianMixture.fit(some, NUM_COMPONENTS, rng)
-        floor = np.quantile(mixture.log_prob(z), LOST) - MARGIN
+        some = rng.permutation(z)[: own.num_fitted]
+        mixture = GaussianMixture.fit(some, own.num_components, rng)
+        floor = np.quantile(mixture.log_prob(z), own.lost) - own.margin
         return TrainedRegion(mixture, float(floor))
 
     def contains(self, z: Array) -> NDArray[np.bool_]:
@@ -62,7 +83,11 @@ class TrainedRegion:
 
 
 def widened(
-    z: Array, num_samples: int, coordinates: PriorCoordinates, rng: np.random.Generator
+    z: Array,
+    num_samples: int,
+    coordinates: PriorCoordinates,
+    rng: np.random.Generator,
+    own: RegionSettings = RegionSettings(),
 ) -> Array:
     """Return draws spread up to twice as wide as those of a belief, within the support.
 
@@ -70,13 +95,13 @@ def widened(
     parameters of any distribution. Each component of a Gaussian mixture of z, shape (n,
     d), is doubled, so that modes stay apart.
     """
-    mixture = GaussianMixture.fit(z[:NUM_FITTED], NUM_COMPONENTS, rng)
+    mixture = GaussianMixture.fit(z[: own.num_fitted], own.num_components, rng)
     factor = mixture.factor[mixture.assign(z)]
     kept, missing = [], num_samples
     while missing > 0:
         i = rng.integers(len(z), size=2 * num_samples)
         normal = rng.standard_normal((len(i), z.shape[1]))
-        step = np.sqrt(SPREAD**2 - 1) * np.einsum("nij,nj->ni", factor[i], normal)
+        step = np.sqrt(own.spread**2 - 1) * np.einsum("nij,nj->ni", factor[i], normal)
         drawn = z[i] + step
         kept.append(drawn[coordinates.inside(drawn)][:missing])
         missing -= len(kept[-1])
@@ -142,3 +167,50 @@ class Product:
             ratio = self._previous.log_prob(theta)
             total = total + (ratio - self.coordinates.prior.log_prob(theta)).double()
         return total
+
+
+def sample_product(
+    prior: Distribution,
+    product: Product,
+    hint: Tensor | None,
+    rng: np.random.Generator,
+    *,
+    num_effective: float,
+    defensive: float,
+) -> LearnedBelief:
+    r"""Return the belief of a product, sampled by :func:`.infer`.
+
+    .. math::
+        b(\theta) = (1 - \epsilon)\, \frac{p(\theta)}{Z} \prod_k q(x_k | \theta, \xi_k)
+        + \epsilon\, p(\theta)
+
+    Args:
+        prior: The original prior.
+        product: The learned likelihood of all trials.
+        hint: Draws around the posterior, shape (n, theta_dim), such as those of the
+            belief before; None begins at the prior.
+        rng: Source of randomness.
+        num_effective: Number of effective draws.
+        defensive: Share of the prior in the belief.
+    """
+    near = None if hint is None else product.coordinates.to_z(hint)
+    fit = learned_fit(product, rng, near=near, num_effective=num_effective)
+    if fit is None:
+        raise UnexplainedOutcomeError(
+            "expected outcomes that some parameters may explain; got none with a "
+            "density under the network; correct the outcome, or leave the trial out"
+        )
+    belief = LearnedBelief(prior, fit, defensive=defensive)
+    belief.label = "product over trials"
+    effective = fit.fit.effective_sample_size
+    belief.diagnostics = Diagnostics().extended(
+        effective_sample_size=effective,
+        likelihood="learned",
+        log_normalizer=fit.fit.log_evidence,
+    )
+    if effective < ENOUGH:
+        belief.diagnostics = belief.diagnostics.warned(
+            f"SA114 the belief rests on {effective:.0f} effective draws; raise "
+            "num_particles"
+        )
+    return belief
