@@ -7,7 +7,6 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 from torch.distributions import Distribution
 from tqdm import tqdm

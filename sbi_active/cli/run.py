@@ -10,6 +10,7 @@ import itertools
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,14 +43,16 @@ def run(
     """Run a campaign on a task, and save its table and figure."""
     start = time.perf_counter()
     problem = make_task(task, option)
-    sizes = {} if simulations is None else {"num_simulations": simulations}
+    options = CampaignOptions()
+    if simulations is not None:
+        options = replace(options, num_simulations=simulations)
     campaign = Campaign(
         problem.simulator,
         problem.prior,
         problem.actions,
         method=method,
         seed=seed,
-        options=CampaignOptions(**sizes),
+        options=options,
         directory=(folder := _new_folder(out)),
         show_progress=sys.stderr.isatty(),
     )
@@ -82,7 +85,7 @@ def run(
     ]
     frame.to_csv(out / "trials.csv")
     labels = frame.columns[2 : 2 + campaign.actions.action_dim]
-    shown = frame.reset_index()[["trial", *labels, *COLUMNS]]
+    shown = frame.reset_index().filter(items=["trial", *labels, *COLUMNS])
     names = zip(problem.parameter_names, problem.theta_true, strict=True)
     print(Table.of(shown).text())
     print(f"\n{status(campaign).text}")
