@@ -7,16 +7,14 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 from torch.distributions import Distribution
 from tqdm import tqdm
 
 from sbi_active.actions import ActionSpace
 from sbi_active.cli.given import problem_of
-from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation import Outcome, simulate
+from sbi_active.simulation import simulate
 from sbi_active.simulation.bank import Bank
 from sbi_active.simulation.bank.labeled import LabeledStore
 from sbi_active.simulation.workers.store import run_digest
@@ -24,9 +22,6 @@ from sbi_active.simulation.workers.store import run_digest
 #: Rows that are drawn and simulated at once. Part of the definition of a bank's theta
 #: and action given a seed, so it is never a setting.
 BLOCK = 8192
-
-#: Lines of the table of outcomes.
-LINES = 30
 
 
 def build(
@@ -114,14 +109,12 @@ def inspect(folder: Path) -> int:
         print(f"{name}: {' x '.join(map(str, shape))} a row")
     names = map(_shown, header["parameter_names"] or ["not named"])
     print(f"parameters: {', '.join(names)}")
-    print(f"rows: {len(bank)}; on disk: {bank.num_bytes / 2**20:.2f} MiB")
+    print(f"rows: {bank.counts}; on disk: {bank.num_bytes / 2**20:.2f} MiB")
     print("checksums: ok")
     if len(bank):
-        column = bank.columns("action", "status", "label")
-        for code, label in enumerate(bank.labels):
-            count = int((column["label"] == code).sum())
+        counts = bank.columns("label")["label"].bincount().tolist()
+        for label, count in zip(bank.labels, counts, strict=True):
             print(f"drawn from {_shown(label) or 'an unknown proposal'}: {count}")
-        print(_outcomes(column["action"], column["status"]))
     return 0
 
 
@@ -141,27 +134,3 @@ def migrate(folder: Path) -> None:
 def _shown(text: str) -> str:
     """Return a text from a file so that it cannot steer the terminal."""
     return text if text.isprintable() else ascii(text)
-
-
-def _outcomes(action: Tensor, status: Tensor) -> str:
-    """Return a table of outcomes by action, or by part of each action's range."""
-    distinct, inverse = torch.unique(action, dim=0, return_inverse=True)
-    names = ["action", *(o.name.lower() for o in Outcome)]
-    if len(distinct) <= LINES:
-        cells = [", ".join(f"{a:g}" for a in row) for row in distinct.tolist()]
-        return Table(names, _counts(cells, inverse, status)).text()
-    tables = []
-    for d in range(action.shape[1]):
-        edges = torch.linspace(float(action[:, d].min()), float(action[:, d].max()), 11)
-        part = torch.bucketize(action[:, d].contiguous(), edges[1:-1])
-        cells = [f"{a:g} to {b:g}" for a, b in zip(edges[:-1], edges[1:], strict=True)]
-        heading = [f"action {d + 1}", *names[1:]]
-        tables.append(Table(heading, _counts(cells, part, status)).text())
-    return "\n".join(tables)
-
-
-def _counts(cells: list[str], group: Tensor, status: Tensor) -> list[list[str]]:
-    table = torch.stack(
-        [torch.bincount(group[status == o], minlength=len(cells)) for o in Outcome], 1
-    )
-    return [[c, *map(str, n)] for c, n in zip(cells, table.tolist(), strict=True)]

@@ -32,8 +32,6 @@ TASKS = (
 )
 #: Names of the methods, as in ``sbi_active.campaign.learning.methods.METHODS``.
 METHODS = ("asbi", "nsbi", "alhi", "nlhi", "seqbed")
-#: Names of the settings of a method, as in ``sbi_active.cli.run.SETTINGS``.
-SETTINGS = ("default", "faithful")
 
 
 def _option(
@@ -111,12 +109,7 @@ RUN = [
     _argument("task", "TASK", Choice(TASKS)),
     *(METHOD, ROUNDS, SEED, OF_TASK),
     _option("--out", "folder for the results", FOLDER, "DIR", required=True),
-    _option(
-        "--setting", "the paper's is faithful", Choice(SETTINGS), default="default"
-    ),
     _option("--simulations", "to train on, a round", COUNT),
-    _option("--samples", "for the gain, a candidate action", COUNT),
-    _option("--iterations", "training steps a round", COUNT),
 ]
 BUILD = [
     *(DIR, A_TASK, OF_TASK, SIMULATOR, *SPACE, SEED, WORKERS),

@@ -2,16 +2,14 @@
 
 import json
 import math
-import subprocess
-import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pandas as pd
 import pytest
 import torch
 
-from sbi_active.cli import main
-from sbi_active.criticism import Trials
+from sbi_active.cli import criticize, main
 
 ROBOT = """
 import torch
@@ -121,82 +119,27 @@ def film(module="my_slide"):
         file.write(SLIDE)
 
 
-def test_a_row_a_sample_gives_a_report(capsys):
-    film()
-    options = ["--simulator", "my_slide.py:place", "--effects", "my_slide.py:effects"]
-    options += [*OPTIONS[:2], "--noise", "0.003", "--out", "found"]
-    columns = ["--columns", *COLUMNS, "role=role"]
-    assert main(["criticize", "trials.csv", *columns, *options]) == 0
-    printed = capsys.readouterr().out
-    assert printed.startswith("Verdict: drag (P")
-    assert "7 trials of trials.csv: action speed [m/s]; x place [m]; 6 to 7" in printed
-    assert "2 held-out trials" in printed
-    with open("found/report.md") as file:
-        assert "drag" in file.read()
+@pytest.fixture
+def compared(monkeypatch):
+    """What is compared, where it is not compared for real."""
+    calls = []
+
+    def close_loop(simulator, prior, trials, **options):
+        calls.append(SimpleNamespace(simulator=simulator, trials=trials, **options))
+        return "a report"
+
+    monkeypatch.setattr(criticize, "close_loop", close_loop)
+    return calls
 
 
-@pytest.mark.slow
-def test_the_command_itself():
-    measure()
-    with open("my_robot.py", "w") as file:
-        file.write(ROBOT)
-    command = [str(Path(sys.executable).parent / "sbi-active"), "criticize"]
-    options = ["--simulator", "my_robot.py:distance", *OPTIONS]
-    options += ["--effects", "my_robot.py:effects", "--out", "found"]
-    done = subprocess.run(
-        [*command, "trials.csv", *options], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("Verdict: drag (P")
-    wrong = subprocess.run(
-        [*command, "nowhere.csv", *options], capture_output=True, text=True
-    )
-    assert wrong.returncode == 2
-    assert "sbi-active: expected a CSV file; got none at nowhere.csv" in wrong.stderr
-
-
-def test_a_task_brings_prior_noise_and_actions(capsys):
+def test_a_task_brings_prior_noise_and_actions(compared):
     rows = [f"{a},{-3 * math.exp(3 - a) + a},fit" for a in (0, 3, 1, 4, 2)]
     write([*rows, "5,4.6,held out"], "action_xi,x_y,role")
     assert run("--task", "numerical") == 0
-    assert capsys.readouterr().out.startswith("Verdict: none")
-
-
-def test_a_table_with_all_columns():
-    write(
-        ["1,0.3,,5,", "2,,fit,7,", "1,0.4,held out,9,5"],
-        "action_speed,x_distance,role,index,repeat_of",
-    )
-    trials = Trials.from_csv("trials.csv")
-    assert trials.role == ["fit", "fit", "held out"]
-    assert trials.index.tolist() == [5, 7, 9]
-    assert trials.repeat_of.tolist() == [-1, -1, 0]
-    assert trials.valid.tolist() == [True, False, True]
-
-
-@pytest.mark.parametrize(
-    ("rows", "header", "message"),
-    [
-        (["1,2"], "speed,x_distance", r"expected columns action_\*; got speed, x_dist"),
-        (["1,2"], "action_speed,distance", r"expected columns x_\*; got action_speed"),
-        (["1,2,3"], "action_v,x_y,mass", "expected columns .*; got mass in"),
-        (["1,2", "nan,3"], "action_v,x_y", "finite number in column action_v, row 2"),
-        (["1,2", ",3"], "action_v,x_y", "row 2; got an empty cell"),
-        (["1,far"], "action_v,x_y", "a number in column x_y, row 1; got 'far'"),
-        (["1,2", "3,4", "1,2"], "action_v,x_y", "the same numbers in rows 1 and 3"),
-        (["1,2,0", "3,4,0"], "action_v,x_y,index", "got index 0 in rows 1 and 2"),
-        (["1,2,4"], "action_v,x_y,repeat_of", "an index of the table; got 4"),
-        (["1,2", "1,2,3,4"], "action_v,x_y", "as many cells in each row"),
-        ([], "action_v,x_y", "one row a trial or sample; got 0 rows"),
-        (["1,", "2,"], "action_v,x_y", "expected at least one valid trial"),
-        (["1,2,tested"], "action_v,x_y,role", "a role 'fit' or 'held out'"),
-        (["1,2,fit", "2,,held out"], "action_v,x_y,role", "in the held-out trials"),
-    ],
-)
-def test_a_table_that_is_not_understood(rows, header, message):
-    write(rows, header)
-    with pytest.raises(ValueError, match=message):
-        Trials.from_csv("trials.csv")
+    assert compared[0].trials.role == ["fit"] * 5 + ["held out"]
+    assert compared[0].actions.action_dim == 1
+    assert compared[0].simulator.noise is not None
+    assert not compared[0].designed
 
 
 @pytest.mark.parametrize(
@@ -260,62 +203,23 @@ def speed(theta, action, *, inputs, times, input_times):
 """
 
 
-def record(other_file):
-    """Write recordings of a motor with a dead zone, at two rates."""
-    space: dict = {}
-    exec(MOTOR, space)
-    gen = torch.Generator().manual_seed(0)
-    levels = 2 * torch.rand(6, 10, generator=gen).double() - 1
-    u = levels.repeat_interleave(10, 1)
-    acts = u.sign() * (u.abs() - 0.2).clamp(min=0)
-    grid = 0.02 * torch.arange(100).double()
-    times = grid[::5].expand(6, -1)
-    x = space["speed"](
-        torch.tensor([[3.0, 0.3]]).double().expand(6, -1),
-        None,
-        inputs={"voltage": acts},
-        times=times,
-        input_times=grid,
-    )
-    x = x + 0.03 * torch.randn(x.shape, generator=gen)
-    role = ["fit"] * 5 + ["held out"]
-    each = [(i, k) for i in range(6) for k in range(100)]
-    if other_file:
-        rows = [f"{i},{20 * k},{u[i, k]:.4f}" for i, k in each]
-        write(rows, "trial,time_ms,input_voltage[V]")
-        Path("trials.csv").rename("inputs.csv")
-        write(
-            [
-                f"{i},{0.1 * k:.1f},{x[i, k]:.4f},{role[i]}"
-                for i in range(6)
-                for k in range(20)
-            ],
-            "trial,time,x_speed[rad/s],role",
-        )
-    else:
-        rows = [
-            f"{i},{20 * k},{u[i, k]:.4f},{_cell(x[i], k)},{role[i]}" for i, k in each
-        ]
-        write(rows, "trial,time_ms,input_voltage[V],x_speed[rad/s],role")
-
-
-def _cell(x, k):
-    return "" if k % 5 else f"{x[k // 5]:.4f}"
-
-
-@pytest.mark.parametrize("other_file", [True, False])
-def test_recordings_with_inputs_give_a_report(other_file, capsys):
-    record(other_file)
-    module = f"my_motor_{'beside' if other_file else 'within'}.py"
-    Path(module).write_text(MOTOR)
-    command = ["criticize", "trials.csv", "--simulator", f"{module}:speed"]
+def test_inputs_stand_in_a_file_of_their_own(compared, capsys):
+    each = [(trial, k) for trial in range(6) for k in range(100)]
+    rows = [f"{trial},{20 * k},{(trial * k) % 7 - 3}" for trial, k in each]
+    write(rows, "trial,time_ms,input_voltage[V]")
+    Path("trials.csv").rename("inputs.csv")
+    rows = [f"{trial},{k / 50},{trial + k / 50}" for trial, k in each if k % 5 == 0]
+    write(rows, "trial,time,x_speed[rad/s]")
+    Path("my_motor.py").write_text(MOTOR)
+    command = ["criticize", "trials.csv", "--simulator", "my_motor.py:speed"]
     command += ["--theta-low=1,.1", "--theta-high=6,1", "--noise", "0.03"]
-    command += ["--inputs", "inputs.csv"] if other_file else []
-    assert main(command) == 0
-    printed = capsys.readouterr().out
-    assert printed.startswith("Verdict: dead zone (P")
+    assert main([*command, "--inputs", "inputs.csv", "--no-thin", "--seed", "7"]) == 0
     shown = "6 trials of trials.csv: inputs voltage [V]; x speed [rad/s]; 20 to 20"
-    assert shown in printed
+    assert shown in capsys.readouterr().out
+    (given,) = compared
+    assert given.trials.inputs["voltage"].shape == (6, 100)
+    assert "dead zone" in {effect.name for effect in given.effects}
+    assert (given.thin, given.seed) == (False, 7)
 
 
 PROBLEM = """
@@ -362,13 +266,13 @@ def test_a_folder_of_recordings_with_its_problem_file(capsys):
     assert "expected --noise > 0; got -1" in capsys.readouterr().err
 
 
-def test_a_problem_in_python_and_options_in_another_file(capsys):
+def test_a_problem_in_python_and_options_in_another_file(compared):
     folder, _ = folder_of_films()
     problem = (folder / "my_swing.py").read_text() + PROBLEM_PY
     (folder / "problem.py").write_text(problem)
     Path("mine.toml").write_text('theta-low = "0.1"\ntheta-high = "1"\nnoise = 0.004\n')
     assert main(["criticize", str(folder), "--config", "mine.toml"]) == 0
-    assert capsys.readouterr().out.startswith("Verdict: drag")
+    assert "drag" in {effect.name for effect in compared[0].effects}
 
 
 PROBLEM_PY = """

@@ -1,4 +1,4 @@
-"""Help, the version and slips of the pen are answered before torch is imported."""
+"""Help, the version, slips of the pen and completion, before torch is imported."""
 
 import importlib
 import subprocess
@@ -9,8 +9,9 @@ import pytest
 
 from sbi_active import __version__
 from sbi_active.campaign.learning import methods
-from sbi_active.cli import commands, main, run
+from sbi_active.cli import commands, main
 from sbi_active.tasks import TASKS  # pyright: ignore
+from tests.cli.sled import read, run
 
 #: Exit status, and which of what takes seconds to import has been imported.
 COMMAND = """
@@ -28,34 +29,10 @@ finally:
     ("arguments", "status", "text"),
     [
         (["--help"], 0, "Find what a simulator lacks"),
-        (["-h"], 0, "130 after an interrupt"),
-        (["run", "--help"], 0, "[asbi|nsbi|alhi|nlhi|seqbed]"),
+        (["run", "-h"], 0, "[asbi|nsbi|alhi|nlhi|seqbed]"),
         (["--version"], 0, __version__),
-        ([], 2, "Missing command."),
-        (["rnu"], 2, "No such command 'rnu'"),
         (["bank", "biuld"], 2, "No such command 'biuld'"),
-        (
-            ["run", "numerica", "--out", "d"],
-            2,
-            "is not one of 'numerical', 'oscillator'",
-        ),
-        (
-            ["run", "numerical", "--method", "abc"],
-            2,
-            "'abc' is not one of 'asbi', 'nsbi'",
-        ),
-        (
-            ["run", "numerical", "--roundz", "3", "--out", "d"],
-            2,
-            "No such option '--roundz'",
-        ),
-        (["run", "numerical"], 2, "Missing option '--out'"),
-        (["tell", "c", "--qqqq"], 2, "No such option '--qqqq'"),
-        (
-            ["correct", "c", "0", "--reason", "--json"],
-            2,
-            "'--reason' requires an argument",
-        ),
+        (["run", "numerical", "--roundz", "3", "--out", "d"], 2, "option '--roundz'"),
     ],
 )
 def test_nothing_heavy_is_imported(arguments, status, text):
@@ -68,25 +45,65 @@ def test_nothing_heavy_is_imported(arguments, status, text):
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    ("line", "text"),
     [
-        ["run", "numerical", "--out", "d", "--rounds", "0"],
-        ["bank", "build", "d", "--task", "numerical", "--rows", "0"],
-        ["check", "--task", "numerical", "--workers", "0"],
-        ["check", "--task", "numerical", "--rows", "1.5"],
+        ("", "Missing command."),
+        ("run numerica --out d", "is not one of 'numerical'"),
+        ("run numerical --method abc", "'abc' is not one of 'asbi'"),
+        ("run numerical", "Missing option '--out'"),
+        ("run numerical --out d --rounds 0", "Invalid value for '--rounds': 0"),
+        ("check --task numerical --rows 1.5", "Invalid value for '--rows': '1.5'"),
+        ("correct c 0 --reason --json", "'--reason' requires an argument"),
+        ("serve", "Missing argument 'DIR'"),
     ],
 )
-def test_counts_are_at_least_one(arguments, capsys):
-    assert main(arguments) == 2
-    text = capsys.readouterr().err
-    assert f"Invalid value for '{arguments[-2]}': " in text
-    assert arguments[-1] in text
+def test_a_slip_is_named(line, text, capsys):
+    assert main(line.split()) == 2
+    assert text in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("line", "kind", "text"),
+    [
+        ("fly camp", "NoSuchCommand", "No such command 'fly'"),
+        ("status", "MissingParameter", "Missing argument 'DIR'"),
+        ("tell camp --faster", "NoSuchOption", "No such option '--faster'"),
+        ("withdraw camp one", "BadParameter", "'one' is not a valid integer"),
+        ("status nowhere", "ValueError", "expected a campaign; got no nowhere"),
+        ("status \ud800", "UnicodeEncodeError", "surrogates not allowed"),
+    ],
+)
+def test_a_slip_is_json_as_well(line, kind, text, capfd):
+    assert main([*line.split(), "--json"]) == 2
+    shown = capfd.readouterr()
+    error = read(shown.out)["error"]
+    assert (error["type"], error["status"]) == (kind, 2)
+    assert text in error["message"]
+    assert shown.err.startswith("sbi-active: ")
+
+
+@pytest.mark.parametrize(
+    ("raised", "status", "text"),
+    [
+        (KeyboardInterrupt, 130, "interrupted"),
+        (RuntimeError("odd"), 1, "odd"),
+        (OSError("full"), 2, "full"),
+    ],
+)
+def test_statuses_of_errors(raised, status, text, capsys, monkeypatch):
+    def fail(*_, **__):
+        raise raised
+
+    monkeypatch.setattr("sbi_active.cli.campaign.open_campaign", fail)
+    assert main(["update", "camp", "--json"]) == status
+    shown = capsys.readouterr()
+    assert read(shown.out)["error"]["status"] == status
+    assert text in shown.err
 
 
 def test_names_are_those_of_the_library():
     assert (*TASKS,) == commands.TASKS
     assert (*methods.METHODS,) == commands.METHODS
-    assert (*run.SETTINGS,) == commands.SETTINGS
 
 
 def every_command(group=commands.main):
@@ -107,36 +124,22 @@ def test_every_command_has_its_function(command):
     assert any(callable(getattr(home, function, None)) for home in homes)
 
 
-#: Of release 0.1.0, each with the options that it had.
-NAMES = {
-    "run": "--method --rounds --seed --out --option --setting --simulations --samples "
-    "--iterations",
-    "bank build": "--task --simulator --option --prior --actions --simulator-version "
-    "--rows --seed --workers",
-    "bank inspect": "",
-    "check": "--task --theta-low --theta-high --prior --actions --noise --rows "
-    "--rounds --workers --seed",
-    "criticize": "--trust --config --columns --units --order --inputs --input-hold "
-    "--no-thin --task --simulator --prior --theta-low --theta-high --noise --actions "
-    "--effects --designed --out --seed",
-    "init": "--config --simulator --prior --theta-low --theta-high --actions --names "
-    "--units --noise --effects --method --num-simulations --num-samples --num-workers "
-    "--time-limit --seed",
-    "ask": "--simulator --target --json --trust",
-    "tell": "--file --invalid --missing --action --trial --json --trust",
-    "correct": "--file --invalid --missing --action --reason --json --trust",
-    "withdraw": "--reason --json --trust",
-    "status": "--json --trust",
-    "repair": "--json --trust",
-    "update": "--simulator --simulator-changed --json --trust",
-    "adopt": "--simulator --effects --json --trust",
-    "report": "--out --json --trust",
-    "export": "--simulator --netcdf --seed --json --trust",
-}
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("sbi-active st", "status"),
+        ("sbi-active tell camp --mis", "--missing"),
+        ("sbi-active init camp --method nl", "nlhi"),
+    ],
+)
+def test_a_shell_completes(line, offered):
+    env = {"_SBI_ACTIVE_COMPLETE": "bash_complete", "COMP_WORDS": line}
+    env["COMP_CWORD"] = str(line.count(" "))
+    shown, _ = run([], env=env, stdout=subprocess.PIPE).communicate()
+    assert [row.partition(",")[2] for row in shown.splitlines()] == [offered]
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_former_commands_and_options_are_there(name, capsys):
-    assert main([*name.split(), "--help"]) == 0
-    shown = capsys.readouterr().out.split()
-    assert {*NAMES[name].split(), "-h,", "--help"} <= {*shown}
+def test_the_words_for_a_shell_are_printed(capsys, monkeypatch):
+    monkeypatch.setenv("_SBI_ACTIVE_COMPLETE", "zsh_source")
+    assert main([]) == 0
+    assert "_SBI_ACTIVE_COMPLETE" in capsys.readouterr().out

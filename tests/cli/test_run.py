@@ -1,8 +1,7 @@
-import json
 import sys
 
-import arviz as az
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from matplotlib import image
@@ -10,25 +9,26 @@ from matplotlib.colors import to_rgb
 
 from sbi_active.campaign import Trial
 from sbi_active.cli import main
-from sbi_active.cli.run import _reference
+from sbi_active.cli.run import reference_of
 from sbi_active.tasks import get_task  # pyright: ignore
 
-SMALL = ["--simulations", "200", "--samples", "20", "--iterations", "30"]
+SMALL, SECONDS = ["--simulations", "200"], ["seconds", "cpu_seconds"]
 
 
-@pytest.mark.parametrize("method", ["asbi", "nsbi"])
-def test_run_writes_table_figure_and_results(method, tmp_path, capsys):
-    out = tmp_path / "results"
-    status = main(
-        ["run", "numerical", "--method", method, "--rounds", "2", "--out", str(out)]
-        + SMALL
-    )
-    assert status == 0
+def test_run_writes_table_and_figure(tmp_path, capsys):
+    frames = []
+    for name, rounds in (("b", "1"), ("a", "2")):
+        out = tmp_path / name
+        words = ["run", "numerical", "--rounds", rounds, "--out", str(out), *SMALL]
+        assert main(words) == 0
+        frames.append(pd.read_csv(out / "trials.csv").drop(columns=SECONDS))
     printed = capsys.readouterr().out
-    assert "exact EIG" in printed
-    assert "gap to exact" in printed
+    assert "exact_information" in printed
     assert "the truth: " in printed
     assert str(out / "loop.png") in printed
+    assert frames[0].equals(frames[1][:1])
+    # The prior's gain at the best action, by the exact oracle, is 8.884.
+    assert 8 < frames[0]["exact_information"][0] <= 8.885
     # Two rounds of three panels; in the middle of each the exact gain as well.
     pixels = image.imread(out / "loop.png")[..., :3]
     assert pixels.shape == (638, 1210, 3)
@@ -37,24 +37,6 @@ def test_run_writes_table_figure_and_results(method, tmp_path, capsys):
         at = np.isclose(part, to_rgb(color), atol=1 / 255).all(-1)
         rounds = at[:319].sum(), at[319:].sum()
         assert min(rounds) > 20, color
-    result = json.loads((out / "result.json").read_text())
-    assert [r["round"] for r in result["rounds"]] == [1, 2]
-    first = result["rounds"][0]
-    # The prior's gain at the chosen action, by the exact oracle: 8.884 is the largest.
-    assert first["exact_eig"] + first["regret"] == pytest.approx(8.884, abs=2e-3)
-    data = az.from_netcdf(str(out / "inference_data.nc"))
-    assert data.observed_data.x.shape == (2, 1)
-
-
-def test_same_seed_same_results(tmp_path):
-    results = []
-    for name in ("a", "b"):
-        main(
-            ["run", "numerical", "--rounds", "1", "--out", str(tmp_path / name), *SMALL]
-        )
-        result = json.loads((tmp_path / name / "result.json").read_text())["rounds"][0]
-        results.append({k: v for k, v in result.items() if "seconds" not in k})
-    assert results[0] == results[1]
 
 
 @pytest.mark.parametrize(
@@ -63,11 +45,6 @@ def test_same_seed_same_results(tmp_path):
         (
             ["run", "numerical", "--option", "variant=x"],
             "'linear', 'sinh', 'square'; got 'x'",
-        ),
-        (["run", "numerical", "--option", "variant"], "expected --option NAME=VALUE"),
-        (
-            ["run", "numerical", "--option", "target=2"],
-            "expected options of 'numerical' among variant",
         ),
         (
             ["run", "box_collision", "--option", 'noise="loud"'],
@@ -93,30 +70,15 @@ def test_what_a_task_needs_is_named(monkeypatch, tmp_path, capsys):
 def test_invalid_trials_count_in_the_exact_posterior():
     pytest.importorskip("mujoco")
     task = get_task("box_collision", reference_budget=600)
-    before = _reference(task, [])
+    before = reference_of(task, [])
     assert before.x.shape == (0, 3)
     fell = Trial(0, torch.tensor([8.0]), torch.full((3,), torch.nan), "invalid")
     missing = Trial(1, torch.tensor([1.0]), None, "missing")
-    after = _reference(task, [fell, missing])
+    after = reference_of(task, [fell, missing])
     assert after.action.tolist() == [[8.0]]
     heavy_and_rough, light_and_smooth = torch.tensor([[0.9] * 3, [0.1] * 3])
     assert float(after.log_prob(heavy_and_rough)) == -torch.inf
     assert float(after.log_prob(light_and_smooth)) > 0
-
-
-@pytest.mark.slow
-def test_a_task_s_own_options(tmp_path, capsys):
-    pytest.importorskip("mujoco")
-    status = main(
-        ["run", "box_collision", "--option", "target=2", "--option", "noise=0.01"]
-        + ["--rounds", "1", "--out", str(tmp_path), *SMALL]
-    )
-    assert status == 0
-    assert "cube_density" in capsys.readouterr().out
-    result = json.loads((tmp_path / "result.json").read_text())
-    assert result["options"] == ["target=2", "noise=0.01"]
-    trial = result["rounds"][0]
-    assert (trial["x"] == [None] * 3) == (trial["status"] == "invalid")
 
 
 def test_data_elsewhere_are_named_by_an_option(tmp_path, capsys):

@@ -5,16 +5,13 @@ import os
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from sbi_active.cli import main
-from tests.cli.test_campaign import SIMULATOR
+from tests.cli.sled import INIT, SIMULATOR, read, run
 
-LOUD = (
-    SIMULATOR
-    + """
+LOUD = """
 
 def loud(theta, action):
     import os
@@ -26,38 +23,23 @@ def loud(theta, action):
 def broken(theta, action):
     raise ZeroDivisionError("by zero")
 """
-)
-INIT = [
-    *("--theta-low=0.2,0", "--theta-high=1,1", "--actions", "0.5:3", "--noise", "0.02"),
-    *("--method", "nsbi", "--num-simulations", "200", "--simulator"),
-]
 
 
 @pytest.fixture
-def camp(monkeypatch):
+def camp(tmp_path, monkeypatch):
+    """A campaign without trials."""
+    (tmp_path / "sled.py").write_text(SIMULATOR + LOUD)
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.delitem(sys.modules, "sled", raising=False)
-    Path("sled.py").write_text(LOUD)
-    assert main(["init", "camp", *INIT, "sled.py:loud"]) == 0
-
-
-def refuse(constant):
-    raise AssertionError(f"{constant} is no JSON")
+    assert main([*INIT, "sled.py:loud"]) == 0
 
 
 class Server:
     """A session in a process of its own."""
 
     def __init__(self, *words):
-        code = "import sys; from sbi_active.cli import main; sys.exit(main())"
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", code, "serve", "camp", *words],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            encoding="latin-1",
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
-        )
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+        self.process = run(["serve", "camp", *words], **pipes, encoding="latin-1")
 
     def says(self, request):
         line = request if isinstance(request, str) else json.dumps(request)
@@ -66,25 +48,11 @@ class Server:
         self.process.stdin.write(line + "\n")
         self.process.stdin.flush()
         answer = self.process.stdout.readline()
-        return json.loads(answer, parse_constant=refuse)
+        return read(answer)
 
     def ends(self):
         _, error = self.process.communicate(timeout=60)
         return self.process.returncode, error
-
-
-@pytest.fixture(scope="module")
-def lasting(tmp_path_factory):
-    place = tmp_path_factory.mktemp("lasting")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(place)
-        patch.setattr(sys, "path", [*sys.path])
-        patch.delitem(sys.modules, "sled", raising=False)
-        Path("sled.py").write_text(LOUD)
-        assert main(["init", "camp", *INIT, "sled.py:loud"]) == 0
-        started = Server()
-    yield started
-    assert started.ends()[0] == 0
 
 
 @pytest.fixture
@@ -118,43 +86,39 @@ def test_a_robot_s_loop(server):
     assert "past Python" in error
 
 
-@pytest.mark.parametrize(
-    ("request_", "text"),
-    [
-        ("\xff", "write one JSON object a line"),
-        ("{", "write one JSON object a line"),
-        ("[1]", "write one JSON object a line"),
-        ("[" * 99_999, "write one JSON object a line"),
-        ({}, "expected a command among ask, tell, correct"),
-        ({"command": ["ask"]}, "expected a command among ask"),
-        ({"command": "init"}, "got 'init'"),
-        ({"command": "tell", "x": [0.3], "speed": 3}, "expected options among"),
-        ({"command": "tell", "x": ["fast"]}, "write them with a point"),
-        ({"command": "tell", "x": [1, 2], "action": 1}, "expected 1 numbers"),
-        ({"command": "tell", "x": [None], "action": 1}, "a number that was measured"),
-        ({"command": "tell", "x": 1}, "expected a pending trial; got none"),
-        ({"command": "withdraw"}, "Missing argument 'TRIAL'"),
-        ({"command": "withdraw", "trial": "first"}, "'first' is not a valid integer"),
-        ({"command": "ask", "target": "weather"}, "expected"),
-    ],
-)
-def test_errors_are_json_and_the_session_goes_on(lasting, request_, text):
-    answer = lasting.says(request_)
-    assert text in answer["error"]["message"]
-    assert answer["error"]["status"] == 2
-    assert answer["error"]["type"]
-    last = lasting.says('\n{"command": "status", "id": "last"}')
+#: Requests, and what their errors say.
+WRONG = [
+    ("\xff", "write one JSON object a line"),
+    ("[1]", "write one JSON object a line"),
+    ("[" * 99_999, "write one JSON object a line"),
+    ({}, "expected a command among ask, tell, correct"),
+    ({"command": ["ask"]}, "expected a command among ask"),
+    ({"command": "init"}, "got 'init'"),
+    ({"command": "tell", "x": [0.3], "speed": 3}, "expected options among"),
+    ({"command": "tell", "x": ["fast"]}, "write them with a point"),
+    ({"command": "tell", "x": [None], "action": 1}, "a number that was measured"),
+    ({"command": "tell", "x": 1}, "expected a pending trial; got none"),
+    ({"command": "withdraw"}, "Missing argument 'TRIAL'"),
+    ({"command": "withdraw", "trial": "first"}, "'first' is not a valid integer"),
+]
+
+
+def test_errors_are_json_and_the_session_goes_on(camp):
+    server = Server("--simulator", "sled.py:broken")
+    assert server.says({"command": "ask"})["error"]["status"] in (1, 2)
+    for request, text in WRONG:
+        answer = server.says(request)
+        assert text in answer["error"]["message"]
+        assert answer["error"]["status"] == 2
+        assert answer["error"]["type"]
+    last = server.says('\n{"command": "status", "id": "last"}')
     assert last["id"] == "last"
     assert last["answer"]["trials"] == []
-
-
-def test_a_simulator_that_fails_is_an_answer(camp):
-    assert main(["init", "other", *INIT, "sled.py:slide"]) == 0
-    server = Server("--simulator", "sled.py:broken")
-    answer = server.says({"command": "ask"})
-    assert answer["error"]["status"] in (1, 2)
-    assert server.says({"command": "status"})["answer"]["trials"] == []
-    assert server.ends()[0] == 0
+    server.process.send_signal(signal.SIGINT)
+    server.process.wait(timeout=60)  # before its input ends, which ends it too
+    status, error = server.ends()
+    assert status == 130
+    assert error.splitlines()[-1].startswith("sbi-active: interrupted")
 
 
 def test_another_process_may_write_between_two_requests(server):
@@ -165,32 +129,12 @@ def test_another_process_may_write_between_two_requests(server):
     assert main(["status", "camp"]) == 0
 
 
-def test_an_interrupt_ends_the_session(server):
-    assert server.says({"command": "status"})["answer"]["trials"] == []
-    server.process.send_signal(signal.SIGINT)
-    server.process.wait(timeout=60)  # before its input ends, which ends it too
-    status, error = server.ends()
-    assert status == 130
-    assert error.splitlines()[-1].startswith("sbi-active: interrupted")
-
-
-def test_what_serve_needs_is_said_before_it_begins(capsys):
-    assert main(["serve"]) == 2
-    assert "Missing argument 'DIR'" in capsys.readouterr().err
-
-
 def test_nobody_reads_the_answers(camp):
     ours, theirs = os.pipe()
     os.close(ours)
-    code = "import sys; from sbi_active.cli import main; sys.exit(main())"
-    done = subprocess.run(
-        [sys.executable, "-c", code, "serve", "camp"],
-        input='{"command": "status"}\n' * 3,
-        stdout=theirs,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    process = run(["serve", "camp"], stdin=subprocess.PIPE, stdout=theirs)
     os.close(theirs)
-    assert done.returncode == 1
-    assert "Traceback" not in done.stderr
-    assert "Exception ignored" not in done.stderr
+    _, error = process.communicate('{"command": "status"}\n' * 3)
+    assert process.returncode == 1
+    assert "Traceback" not in error
+    assert "Exception ignored" not in error

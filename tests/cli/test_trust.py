@@ -1,16 +1,16 @@
 """What of a folder is executed, and when: nothing that somebody else put there."""
 
 import json
-import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
 from sbi_active.cli import main
-from tests.cli.test_campaign import SIMULATOR
+from tests.cli.sled import SIMULATOR, run
+
+ROOT = Path(__file__).parents[2]
 
 #: A prior and actions that only a program can make.
 MINE = """
@@ -41,24 +41,16 @@ READING = [
     ["correct", "camp", "0", "0.31"],
     ["withdraw", "camp", "0"],
     ["report", "camp"],
-    ["watch", "camp", "--once", "page.html"],
     ["repair", "camp"],
-]
-SIMULATING = [
-    ["ask", "camp"],
-    ["update", "camp"],
-    ["criticize", "camp"],
-    ["adopt", "camp"],
 ]
 
 
 @pytest.fixture
 def mine(tmp_path, monkeypatch):
-    """A campaign with a simulator, a prior and actions of one file."""
+    """A campaign whose simulator, prior and actions are programs."""
     monkeypatch.setattr(sys, "path", [*sys.path])
-    for name in ("sled", "mine"):
-        monkeypatch.delitem(sys.modules, name, raising=False)
     ran = tmp_path / "ran"
+    forget(ran)
     (tmp_path / "sled.py").write_text(SIMULATOR)
     (tmp_path / "mine.py").write_text(MINE.format(run=RUN.format(ran)))
     words = ["--simulator", "sled.py:slide", "--prior", "mine.py:prior"]
@@ -93,22 +85,23 @@ def test_what_is_read_of_a_prior_that_is_a_program(mine, capsys):
         "sd": pytest.approx(0.8 / 12**0.5),
     }
     assert second["mean"] == pytest.approx(0.5)
-    assert main(["update", "camp"]) == 0  # the owner's own needs no word
-    capsys.readouterr()
-    forget(mine)
-    assert main(["status", "camp", "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)
-    assert answer["not_in_belief"] == []
-    assert answer["trials"][0]["names"] == ["speed"]
-    assert answer["belief"]["parameters"]["theta_1"]["sd"] < 0.8 / 12**0.5
     assert main(["export", "camp", "--netcdf", "out.nc"]) == 2  # no density of draws
     assert not mine.exists()
 
 
-@pytest.mark.parametrize("words", SIMULATING, ids=lambda w: w[0])
-@pytest.mark.parametrize("how", ["changed", "of another account", "within"])
+@pytest.mark.parametrize(
+    ("how", "command"),
+    [
+        ("changed", "ask"),
+        ("changed", "update"),
+        ("changed", "criticize"),
+        ("changed", "adopt"),
+        ("of another account", "ask"),
+        ("within", "ask"),
+    ],
+)
 def test_what_somebody_else_declared_is_not_imported(
-    mine, tmp_path, monkeypatch, capsys, words, how
+    mine, tmp_path, monkeypatch, capsys, command, how
 ):
     path = tmp_path / "camp" / "command.json"
     declared = json.loads(path.read_text())
@@ -119,56 +112,36 @@ def test_what_somebody_else_declared_is_not_imported(
     else:
         shutil.copy("mine.py", "camp/mine.py")
         path.write_text(json.dumps({**declared, "folder": str(tmp_path / "camp")}))
-    assert main(words) == 2
+    assert main([command, "camp"]) == 2
     assert "add --trust to have it executed" in capsys.readouterr().err
     assert not mine.exists()
     assert main(["status", "camp"]) == 0
     assert not mine.exists()
 
 
-def test_trust_is_remembered_outside_of_the_folder(mine, tmp_path, monkeypatch, capsys):
+def test_trust_is_remembered_outside_of_the_folder(mine, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
-    assert main(["update", "camp"]) == 2
-    assert main(["update", "camp", "--trust"]) == 0
+    assert main(["export", "camp", "--netcdf", "out.nc", "--trust"]) == 0
     assert mine.exists()
     forget(mine)
-    assert main(["update", "camp"]) == 0
+    assert main(["ask", "camp", "--target", "weather"]) == 2  # but it is imported
     assert mine.exists()
-
-
-def test_within_the_folder_trust_is_said_each_time(mine, tmp_path, capsys):
-    shutil.copy("mine.py", "camp/mine.py")
-    shutil.copy("sled.py", "camp/sled.py")
+    # Within the folder it is said each time.
+    forget(mine)
+    for name in ("mine.py", "sled.py"):
+        shutil.copy(name, "camp")
     path = tmp_path / "camp" / "command.json"
     declared = json.loads(path.read_text())
     path.write_text(json.dumps({**declared, "folder": str(tmp_path / "camp")}))
-    assert main(["update", "camp", "--trust"]) == 0
-    assert mine.exists()
+    assert main(["export", "camp", "--netcdf", "out.nc", "--trust"]) == 0
     forget(mine)
-    assert main(["update", "camp"]) == 2
-    assert not mine.exists()
-
-
-def test_a_simulator_of_the_command_line_needs_no_word(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.delitem(sys.modules, "sled", raising=False)
-    (tmp_path / "sled.py").write_text(SIMULATOR)
-    bounds = ["--theta-low", "0.2,0", "--theta-high", "1,1", "--actions", "1,2"]
-    assert main(["init", "camp", "--simulator", "sled.py:slide", *bounds, *SIZES]) == 0
-    (tmp_path / "camp" / "command.json").unlink()
     assert main(["ask", "camp"]) == 2
-    assert "name it, as in --simulator" in capsys.readouterr().err
-    words = ["--simulator", "sled.py:slide"]
-    main(["tell", "camp", "0.3", "--action", "1"])
-    del sys.modules["sled"]
-    # Its noise was in the file, so that it is another one, and told to be.
-    assert main(["update", "camp", *words]) == 2
-    assert "simulator_changed=True" in capsys.readouterr().err
+    assert not mine.exists()
 
 
 @pytest.mark.parametrize(
     "content",
-    ["", "[]", "{", '{"simulator": 3}', '{"effects": [1]}', "[" * 9999],
+    ["", "[]", '{"simulator": 3}', '{"effects": [1]}', "[" * 9999],
 )
 def test_a_file_that_the_command_line_did_not_write(mine, capsys, content):
     Path("camp/command.json").write_text(content)
@@ -182,23 +155,8 @@ def test_what_stands_beside_somebody_is_not_imported(mine, tmp_path):
     for name in ("torch", "sqlite3", "sled"):
         text = f"from pathlib import Path\n{RUN.format(tmp_path / 'stood')}"
         (tmp_path / "camp" / f"{name}.py").write_text(text)
-    for words in (
-        ["status", "."],
-        ["tell", ".", "0.3", "--action", "1"],
-        ["report", "."],
-    ):
-        done = subprocess.run(
-            [
-                sys.executable,
-                "-c",
-                "from sbi_active.cli import main; exit(main())",
-                *words,
-            ],
-            cwd=tmp_path / "camp",
-            env={**os.environ, "PYTHONPATH": ""},
-            capture_output=True,
-            text=True,
-        )
-        assert done.returncode == 0, done.stderr
+    for words in (["status", "."], ["report", "."]):
+        process = run(words, cwd=tmp_path / "camp", env={"PYTHONPATH": str(ROOT)})
+        assert process.wait() == 0, process.stderr.read()
     assert not (tmp_path / "stood").exists()
     assert not mine.exists()

@@ -1,6 +1,7 @@
 """The small pages that notebooks show."""
 
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
@@ -72,7 +73,8 @@ def campaign():
         MODEL.fn, noise=MODEL.noise, parameter_names=["mass", EVIL[:8]]
     )
     actions = BoxActions([0.5], [2.0], names=[f"speed {EVIL}"], units=["m/s"])
-    c = Campaign(model, PRIOR, actions, options=OPTIONS)
+    options = replace(OPTIONS, network="on demand")
+    c = Campaign(model, PRIOR, actions, options=options)
     c.ask()
     c.tell(outcome(c.pending.action, 0))
     c.update()

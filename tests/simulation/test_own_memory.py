@@ -4,7 +4,6 @@ import sys
 import warnings
 
 import cloudpickle
-import joblib
 import numpy as np
 import pytest
 import torch
@@ -19,14 +18,14 @@ from sbi_active import (
 from sbi_active.criticism import Trials
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 from sbi_active.seeding import row_normals
-from sbi_active.simulation import MissingRowsWarning, check_simulator
+from sbi_active.simulation import MissingRowsWarning
 
 # A worker cannot import a test module.
 cloudpickle.register_pickle_by_value(sys.modules[__name__])
 
 THETA = torch.linspace(0, 0.2, 600)[:, None]
 ACTION = torch.ones(600, 1)
-ENGINE = [{}, {"batch_size": 7}, {"num_workers": 2}]
+ENGINE = [{}, {"batch_size": 7}]
 
 
 class State:
@@ -90,15 +89,6 @@ def test_a_simulator_may_return_the_buffer_it_fills_again(kind, seeded, options)
     assert torch.equal(x, 2 * THETA)
 
 
-@pytest.mark.parametrize("seeded", [True, False])
-def test_buffers_in_rounds_of_joblib(seeded):
-    with joblib.parallel_config(backend="sequential"):
-        x = simulate(
-            Buffer("torch", seeded), THETA, ACTION, seed=0, workers=2, batch_size=50
-        ).x
-    assert torch.equal(x, 2 * THETA)
-
-
 def test_a_mean_is_not_overwritten_by_the_next():
     model = SimulatorModel(Buffer("torch", seeded=False), noise=GaussianNoise(1.0))
     mean = model.mean(THETA, ACTION)
@@ -153,23 +143,10 @@ def test_a_simulator_may_change_its_arguments(simulator, options):
     assert torch.equal(action, ACTION)
     assert torch.equal(rows.theta, THETA)
     assert torch.equal(rows.action, ACTION)
-    again = simulate(simulator, THETA, ACTION, seed=3, workers=2)
-    assert torch.equal(rows.x, again.x)
+    assert torch.equal(rows.x, simulate(simulator, THETA, ACTION, seed=3).x)
 
 
-def test_the_noise_of_a_row_has_its_own_seed():
-    def plain(theta, action, seeds):
-        return theta + action + row_normals(seeds, 1).float()
-
-    expected, x = (
-        simulate(SimulatorModel(fn, noise=GaussianNoise(1.0)), THETA, ACTION, seed=3).x
-        for fn in (plain, changing)
-    )
-    assert torch.equal(x, expected)
-
-
-@pytest.mark.parametrize("num_workers", [1, 2])
-def test_a_row_that_is_tried_again_gets_its_own_theta(num_workers):
+def test_a_row_that_is_tried_again_gets_its_own_theta():
     theta, action = torch.arange(300.0)[:, None], torch.zeros(300, 1)
 
     def simulator(theta, action, seeds):
@@ -181,23 +158,9 @@ def test_a_row_that_is_tried_again_gets_its_own_theta(num_workers):
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MissingRowsWarning)
-        rows = simulate(simulator, theta, action, seed=0, workers=num_workers)
+        rows = simulate(simulator, theta, action, seed=0)
     assert rows.tracebacks.keys() == {5, 70, 200}
     assert torch.equal(rows.x[rows.valid], theta[rows.valid])
-
-
-def test_a_simulator_may_keep_its_arguments_and_change_them_later():
-    kept = []
-
-    def simulator(theta, action, seeds):
-        for old in kept:
-            old.fill_(torch.nan)
-        kept.extend([theta, action])
-        return theta + action
-
-    rows = simulate(simulator, THETA, ACTION, seed=0, batch_size=100)
-    assert torch.equal(rows.x, THETA + ACTION)
-    assert rows.theta.isfinite().all()
 
 
 def test_a_model_called_directly_may_change_its_arguments():
@@ -226,15 +189,6 @@ def test_effects_of_rows_may_be_changed():
         assert torch.equal(
             model.mean(THETA[:4], ACTION[:4], gain=effect) - 1, THETA[:4]
         )
-
-
-def test_the_check_survives_a_simulator_that_changes_its_arguments():
-    from sbi.utils import BoxUniform
-
-    prior = BoxUniform(torch.zeros(1), torch.ones(1))
-    report = check_simulator(changing, prior, DiscreteActions([1.0, 2.0]), num_rows=32)
-    assert report.is_ready
-    assert report.rows_are_independent
 
 
 def test_simulations_keep_the_theta_that_was_simulated():

@@ -82,7 +82,6 @@ EMPTY = [
 ]
 
 
-@pytest.mark.parametrize("num_workers", [1, 2])
 @pytest.mark.parametrize(
     ("functions", "text"),
     [
@@ -91,10 +90,10 @@ EMPTY = [
         (EMPTY, "expected at least one number a row of x"),
     ],
 )
-def test_numbers_that_would_be_lost_are_refused(functions, text, num_workers):
-    for function in functions[: 1 if num_workers == 2 else None]:
+def test_numbers_that_would_be_lost_are_refused(functions, text):
+    for function in functions:
         with pytest.raises(ValueError, match=text):
-            x_of(function, workers=num_workers)
+            x_of(function)
         with pytest.raises(ValueError, match=text):
             simulate(model_of(function), THETA, THETA, seed=0)
 

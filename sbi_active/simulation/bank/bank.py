@@ -297,21 +297,17 @@ class Bank:
         wrong = [*self._store.problems(), *self._rows.damaged().values()]
         return [f"{self._store.path}: {reason}" for reason in wrong]
 
-    def compact(self) -> None:
-        """Give room that is not used back to the disk; safe at any moment.
-
-        Raises:
-            LockedError: If somebody else is writing.
-        """
-        self._require_lock()
-        self._store.vacuum()
-
     def repair(self) -> list[str]:
         """Give up segments that are damaged or lost, so that the others count again.
 
         The file before is kept, its name ending in ".damaged". The rows after those
         that are lost move up; ``simulate(..., store=bank)`` simulates lost ones again.
-        Returns what was wrong, as :meth:`verify` does; raises as :meth:`compact` does.
+
+        Returns:
+            The problems, as :meth:`verify` returns them.
+
+        Raises:
+            LockedError: If somebody else is writing.
         """
         self._require_lock()
         problems = self.verify()

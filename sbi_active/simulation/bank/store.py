@@ -304,14 +304,6 @@ class Store:
             return [error.reason]
         return [str(row[0]) for row in found if row[0] != "ok"]
 
-    def vacuum(self) -> None:
-        """Give room that is not used back to the disk."""
-        self.acquire()
-        with self.reading() as connection:
-            connection.execute("VACUUM")
-            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-            self._signature = self._found()
-
     def salvage(self) -> None:
         """Write the file anew from the records that are whole.
 

@@ -1,4 +1,4 @@
-"""Calls on a cluster, or on any other executor that joblib knows."""
+"""Calls on a cluster of Dask."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import asyncio
 import hashlib
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import CancelledError
 from contextlib import closing, suppress
 from functools import lru_cache
@@ -14,7 +14,7 @@ from multiprocessing import current_process
 from typing import Any
 
 import cloudpickle
-from joblib import Parallel, delayed, effective_n_jobs
+from joblib import effective_n_jobs
 from joblib.parallel import get_active_backend
 from typing_extensions import override
 
@@ -24,15 +24,11 @@ from sbi_active.simulation.workers.pickling import pickled
 from sbi_active.simulation.workers.pools import Pool, WorkerPool
 
 
-def configured_pool(simulator: Callable[..., Any], num_workers: int) -> Pool | None:
-    """Return the pool that ``joblib.parallel_config`` asks for; None for processes."""
-    backend = _backend()
-    name = type(backend).__name__
-    if name == "LokyBackend":
-        return None
-    if name == "DaskDistributedBackend":
-        return DaskPool(simulator, num_workers, backend.client)
-    return JoblibPool(simulator, effective_n_jobs(num_workers))
+def configured_client() -> Any:
+    """Return the Dask client that ``joblib.parallel_config`` names, or None."""
+    backend: Any = get_active_backend()[0]
+    is_dask = type(backend).__name__ == "DaskDistributedBackend"
+    return backend.client if is_dask else None
 
 
 class DaskPool(Pool):
@@ -178,65 +174,6 @@ class DaskPool(Pool):
                 cluster.scale(num_wanted)
 
 
-class JoblibPool(Pool):
-    """Runs calls in rounds through :class:`joblib.Parallel`.
-
-    An exception costs its rows alone; a worker that dies ends the simulation wherever
-    the executor does not replace it.
-
-    Args:
-        simulator: Simulator, sent with each call, and unpickled once a worker.
-        num_workers: Calls at a time.
-    """
-
-    def __init__(self, simulator: Callable[..., Any], num_workers: int) -> None:
-        self.num_slots = 4 * num_workers
-        self._num_workers = num_workers
-        self._simulator = pickled(simulator)
-        self._waiting: list[Call] = []
-        self._num_running = 0
-        self._round: Iterator[tuple[Call, Reply]] | None = None
-
-    @property
-    @override
-    def num_free(self) -> int:
-        return 0 if self._round is not None else self.num_slots - len(self._waiting)
-
-    @override
-    def submit(self, call: Call, time_limit: float | None) -> None:
-        self._waiting.append(call)
-
-    @override
-    def collect(self) -> list[tuple[Call, Reply]]:
-        if self._round is None:
-            self._round = self._start(self._waiting)
-            self._num_running = len(self._waiting)
-            self._waiting = []
-        done = next(self._round)
-        self._num_running -= 1
-        if not self._num_running:
-            next(self._round, None)  # lets joblib clear up
-            self._round = None
-        return [done]
-
-    def _start(self, calls: list[Call]) -> Iterator[tuple[Call, Reply]]:
-        streams = _backend().supports_return_generator
-        parallel = Parallel(
-            n_jobs=self._num_workers,
-            return_as="generator_unordered" if streams else "list",
-            batch_size=1,  # pyright: ignore[reportArgumentType]  # "auto" or a number
-            pre_dispatch="all",
-        )
-        run = delayed(_answer_numbered)
-        replies: Any = parallel(run(i, self._simulator, c) for i, c in enumerate(calls))
-        for i, reply in replies:
-            yield calls[i], reply
-
-
-def _backend() -> Any:
-    return get_active_backend()[0]
-
-
 def _same(simulator: bytes) -> bytes:
     return simulator
 
@@ -265,7 +202,3 @@ def _child(simulator: bytes) -> WorkerPool:
     # with their parent.
     current_process()._config.pop("daemon", None)  # pyright: ignore
     return WorkerPool(_loaded(simulator), 1)
-
-
-def _answer_numbered(number: int, simulator: bytes, call: Call) -> tuple[int, Reply]:
-    return number, answer(_loaded(simulator), call)

@@ -23,7 +23,7 @@ from sbi_active.simulation.outcomes import (
     Simulations,
 )
 from sbi_active.simulation.simulator import require_noise, require_rows
-from sbi_active.simulation.workers.cluster import configured_pool
+from sbi_active.simulation.workers.cluster import DaskPool, configured_client
 from sbi_active.simulation.workers.meter import spend
 from sbi_active.simulation.workers.pace import pace_of
 from sbi_active.simulation.workers.pools import InProcess, Pool, WorkerPool
@@ -66,16 +66,14 @@ def simulate(
 
     More than one worker means processes of this machine, one thread each, which receive
     the simulator once. They wait a minute for the next call with the same simulator, so
-    that a module of it that is edited meanwhile is not read again. Another executor is
-    one line of joblib's configuration. Dask::
+    that a module of it that is edited meanwhile is not read again. A cluster of Dask is
+    one line of joblib's configuration::
 
         client = distributed.Client("scheduler:8786")
         with joblib.parallel_config(backend="dask"):
             simulate(simulator, theta, action, seed=0, workers=64)
 
-    A lost Dask worker loses no rows. Ray is configured likewise, by
-    ``ray.util.joblib.register_ray()`` and ``parallel_config(backend="ray")``, which is
-    not tested. Time limits need the processes of this machine.
+    A lost Dask worker loses no rows. Time limits need the processes of this machine.
 
     Args:
         simulator: ``simulator(theta, action)``, see
@@ -155,16 +153,16 @@ def simulate(
 def _pool(simulator: Callable[..., Any], workers: Workers) -> Pool:
     if workers.num_workers == 1 and workers.time_limit is None:
         return InProcess(simulator)
-    elsewhere = configured_pool(simulator, workers.num_workers)
-    if elsewhere is None:
+    client = configured_client()
+    if client is None:
         return WorkerPool(simulator, effective_n_jobs(workers.num_workers))
     if workers.time_limit is not None:
         raise ValueError(
-            "expected the processes of this machine for time_limit; got another "
-            "executor from joblib.parallel_config, whose workers cannot be killed from "
-            "here; simulate outside that block, or limit the time in the simulator"
+            "expected the processes of this machine for time_limit; got Dask from "
+            "joblib.parallel_config, whose workers cannot be killed here; simulate "
+            "outside that block, or limit the time in the simulator"
         )
-    return elsewhere
+    return DaskPool(simulator, workers.num_workers, client)
 
 
 def _run(

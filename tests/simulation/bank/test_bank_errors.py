@@ -4,7 +4,6 @@ import resource
 import shutil
 import subprocess
 import warnings
-from pathlib import Path
 
 import pytest
 import torch
@@ -12,7 +11,6 @@ import torch
 from sbi_active import Bank, GaussianNoise, SimulatorModel, simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import Simulations
-from sbi_active.simulation.bank import CorruptSegmentError
 from sbi_active.simulation.bank.fingerprint import differences, fingerprint
 from tests.simulation.bank.filled import execute
 
@@ -141,35 +139,6 @@ def test_proposal_and_label_belong_together(bank):
         bank.append(rows(), seed=5, proposal=normal, label="prior")
 
 
-@pytest.mark.parametrize("damage", ["cut", "flip", "empty", "rewritten"])
-def test_a_damaged_segment_is_named_and_refused(bank, damage):
-    x = bank.read(slice(100, 200)).x.numpy().tobytes()
-    bank.close()
-    path = bank.path / "store.db"
-    content = bytearray(path.read_bytes())
-    if damage == "cut":
-        path.write_bytes(content[: len(content) // 2])
-    elif damage == "empty":
-        path.write_bytes(b"")
-    elif damage == "flip":
-        content[content.index(x) + 100] ^= 1
-        path.write_bytes(content)
-    else:
-        execute(bank.path, "UPDATE segments SET content = x'00' WHERE number = 2")
-    with pytest.raises(CorruptSegmentError, match=str(path)) as raised:
-        Bank(bank.path).read()
-    assert raised.value.path == path
-    if damage in ("flip", "rewritten"):
-        reader = Bank(bank.path)
-        (problem,) = reader.verify()
-        assert problem.startswith(f"{path}: ")
-        with pytest.raises(CorruptSegmentError):
-            for _ in reader.chunks(10):
-                pass
-    if damage == "flip":  # the others are read
-        assert len(reader.read(slice(0, 100))) == 100
-
-
 def full_disk(folder):
     """Return whether a small file system could be mounted."""
     command = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)]
@@ -251,8 +220,3 @@ def test_rows_from_elsewhere_are_noticed(bank):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         bank.append(inside, seed=8, proposal=half, label="h")
-
-
-def test_paths_may_be_strings(tmp_path):
-    Bank(str(tmp_path / "bank"), simulator=simulator)
-    assert Path(tmp_path / "bank" / "store.db").is_file()

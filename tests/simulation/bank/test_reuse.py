@@ -74,14 +74,14 @@ def test_weighted_rows_have_the_law_of_the_target(bank, proposals, same_actions)
 @pytest.mark.parametrize("proposals", [PROPOSALS, None])
 def test_errors_have_the_size_that_is_stated(proposals, tmp_path):
     scores = []
-    for seed in range(30):
+    for seed in range(20):
         with Bank(tmp_path / str(seed), simulator=simulator) as bank:
             fill(bank, num_rows=800, seed=seed)
         reused = reuse(bank, TARGET, proposals=proposals)
         theta = reused.simulations().theta[:, 0].double()
         scores.append(z_score(theta, reused.weights, 1.0))
     total = float((torch.tensor(scores) ** 2).sum())
-    low, high = stats.chi2(30).ppf([0.0005, 0.9995])
+    low, high = stats.chi2(20).ppf([0.0005, 0.9995])
     assert low < total < high
 
 
@@ -99,13 +99,6 @@ def test_effective_sample_size_is_that_of_kish(bank):
     only = Bank(bank.path.parent / "only", simulator=simulator)
     only.append(bank.read(slice(0, 2_000)), seed=0, proposal=PRIOR, label="prior")
     assert reuse(only, PRIOR).effective_sample_size == pytest.approx(2_000)
-
-
-def test_a_mixture_is_worth_more_than_own_proposals(bank):
-    mixture = reuse(bank, TARGET, proposals=PROPOSALS)
-    own = reuse(bank, TARGET)
-    assert own.denominator == "own"
-    assert mixture.effective_sample_size > 1.2 * own.effective_sample_size
 
 
 def test_proposals_may_have_met_with_other_actions(tmp_path):
@@ -153,13 +146,6 @@ def test_rows_of_unknown_proposals_and_missing_ones_are_left_out(bank):
     assert len(reuse(bank, TARGET, proposals=PROPOSALS)) == 4_000
 
 
-def test_invalid_rows_stay(bank):
-    theta, action = PRIOR.sample((50,)), torch.zeros(50, 1)
-    invalid = Simulations(theta, action, torch.full((50, 1), torch.nan))
-    bank.append(invalid, seed=10, proposal=PRIOR, label="prior")
-    assert (~reuse(bank, TARGET).simulations().valid).sum() == 50
-
-
 def test_few_effective_rows_are_told(bank):
     far = normal(-7.5, 0.3)
     with pytest.warns(UserWarning, match=r"4000 rows of the bank are worth \d+\.\d"):
@@ -168,14 +154,6 @@ def test_few_effective_rows_are_told(bank):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         reuse(bank, TARGET, proposals=PROPOSALS)
-
-
-def test_mergers_keep_proposals_apart(bank):
-    before = reuse(bank, TARGET, proposals=PROPOSALS)
-    bank.compact()
-    after = reuse(Bank(bank.path), TARGET, proposals=PROPOSALS)
-    assert torch.equal(before.weights, after.weights)
-    assert torch.equal(before.simulations().x, after.simulations().x)
 
 
 def test_a_box_that_validates_its_arguments(bank):

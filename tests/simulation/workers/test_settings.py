@@ -47,12 +47,6 @@ def test_a_simulation_takes_them_as_one_value_or_their_number():
     assert CampaignOptions(workers=2).workers == Workers(2)  # pyright: ignore
 
 
-def test_their_numbers_alone_are_taken_for_one_version():
-    simulator = partial(fails, times=2, attempts=[])
-    with pytest.warns(RenamedWarning, match=r"use workers=Workers\(num_retries=\)"):
-        assert simulate(simulator, *ROWS, seed=0, workers=1, num_retries=2).x == 2
-
-
 def test_former_options_of_a_campaign_are_taken_for_one_version():
     former: Any = {"num_workers": 2, "time_limit": 9.0, "num_scored": 200}
     with pytest.warns(RenamedWarning) as noted:

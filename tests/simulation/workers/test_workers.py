@@ -13,7 +13,6 @@ import pytest
 import torch
 
 from sbi_active import simulate
-from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning, Workers
 from sbi_active.simulation.workers import IDLE
 
@@ -34,10 +33,6 @@ def pids_of_rows(theta, action, seeds):
 
 def other_pids(theta, action, seeds):
     return pids_of_rows(theta, action, seeds)
-
-
-def seeded(theta, action, seeds):
-    return theta + row_normals(seeds, 1).float()
 
 
 def workers_of(simulator, num_workers=2):
@@ -104,18 +99,6 @@ def test_a_worker_that_dies_while_it_waits_costs_no_row():
         again = workers_of(pids_of_rows)
     assert max(pids) in again
     assert min(pids) not in again
-
-
-def test_x_of_kept_workers_is_that_of_new_ones():
-    def unseeded(theta, action):
-        return theta + torch.randn_like(theta)
-
-    for simulator in (seeded, unseeded):
-        expected = simulate(simulator, *ROWS, seed=5).x
-        for _ in range(3):
-            assert torch.equal(
-                simulate(simulator, *ROWS, seed=5, workers=2).x, expected
-            )
 
 
 def test_a_forked_child_leaves_them_alone():

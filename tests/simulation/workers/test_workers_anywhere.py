@@ -73,7 +73,6 @@ SLOW = pytest.mark.slow
 @pytest.mark.parametrize(
     "rest",
     [
-        pytest.param("", id="script", marks=SLOW),
         pytest.param(FORKED, id="forked"),
         pytest.param(THREADS, id="threads", marks=SLOW),
         pytest.param(NESTED, id="nested", marks=SLOW),

@@ -1,0 +1,37 @@
+"""A sled's simulator, and the words that make a campaign of it."""
+
+import json
+import os
+import subprocess
+import sys
+
+SIMULATOR = """
+import torch
+
+
+def slide(theta, action):
+    friction, drag = theta[:, :1], theta[:, 1:]
+    return action**2 / (2 * 9.81 * friction) / (1 + drag * action)
+"""
+BOX = ["--theta-low=0.2,0", "--theta-high=1,1"]
+SMALL = ["--noise", "0.02", "--num-simulations", "200", "--method", "nsbi"]
+INIT = ["init", "camp", *BOX, *SMALL, "--actions", "0.5:3", "--simulator"]
+
+
+def run(words, *, flags=(), env=(), **options):
+    """Return a call in a process of its own, as a shell makes it."""
+    code = "import sys; from sbi_active.cli import main; sys.exit(main())"
+    return subprocess.Popen(
+        [sys.executable, *flags, "-c", code, *words],
+        env={**os.environ, "OMP_NUM_THREADS": "1", **dict(env)},
+        **{"stderr": subprocess.PIPE, "text": True, **options},
+    )
+
+
+def read(text):
+    """Return what a line of strict JSON says."""
+    return json.loads(text, parse_constant=_refuse)
+
+
+def _refuse(constant):
+    raise AssertionError(f"{constant} is no JSON")

@@ -1,0 +1,297 @@
+"""Odd calls: each is right or a clear error, and what a program reads is JSON."""
+
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from sbi_active import Campaign
+from sbi_active.cli import main
+from tests.cli.sled import BOX, INIT, SIMULATOR, SMALL, read, run
+
+ODD = """
+import ctypes, os, sys, torch
+print("imported")
+NUMBER = 3.0
+listed = [1, 2]
+
+
+def loud(theta, action):
+    print("simulating")
+    ctypes.CDLL(None).puts(b"in C")
+    os.write(1, b"past Python")
+    return theta[:, :1] * action
+
+
+def broken(theta, action):
+    raise ZeroDivisionError("by zero")
+
+
+def stopped(theta, action):
+    raise KeyboardInterrupt
+
+
+def left(theta, action):
+    sys.exit(3)
+
+
+def short(theta, action):
+    return theta[:1, :1]
+
+
+def effects():
+    raise RuntimeError("no library")
+"""
+FILES = {
+    "odd.py": ODD.encode(),
+    "divides.py": b"1 / 0",
+    "leaves.py": b"raise SystemExit(3)",
+    "halves.py": b"def f(:",
+    "bom.csv": b"\xef\xbb\xbf0.84\n",
+    "named.csv": b"x_height\n0.84\n",
+    "unit.csv": b"0.84 m\n",
+    "semicolon.csv": b"0,84;1\n",
+    "empty.csv": b"",
+    "utf16.csv": "0.84\n".encode("utf-16"),
+    "nul.csv": b"0.8\x004\n",
+    "heading.csv": b"distance\n\n",
+    "quote.csv": b'"0.84\n',
+    "nan.csv": b"x\nnan\n",
+    "two.csv": b"0.1,0.2\n",
+    "seed.toml": b'seed = "x"',
+    "date.toml": b"noise = 2026-01-01",
+    "table.toml": b"[noise]\na = 1",
+    "flag.toml": b"noise = true",
+    "list.toml": b"method = [1, 2]",
+    "trust.toml": b"trust = true",
+    "half.toml": b"seed = ",
+    "bytes.toml": b"\xff\xfe",
+    "noize.toml": b"noize = 0.1",
+}
+OF = ["init", "new", *BOX, *SMALL, "--simulator"]
+SLED, ASK = [*OF, "sled.py:slide"], ["--actions", "1,2"]
+CHECK = ["check", "sled.py:slide", *BOX]
+
+#: What has to be told apart by its exit status, and a part of the error's text.
+CALLS = [
+    # Numbers.
+    (0, "", "tell camp 1e-20 --json"),
+    (0, "", "correct camp 0 -2e-1 --json"),
+    (0, "", "correct camp 0 --action 2 --json"),
+    (0, "", "tell camp --missing --json"),
+    *(
+        (2, "expected", ["tell", "camp", x])
+        for x in ("", "nan", "inf", "1e39", "1e-50", "0,84", "1_000", "0.84 m", "0x1")
+    ),
+    *(
+        (2, "expected", ["tell", "camp", "1", "--action", a])
+        for a in ("", "inf", "1,2")
+    ),
+    (2, "expected a trial from 0", "tell camp 1 --trial 99 --action 1"),
+    (2, "expected 1 numbers", "tell camp 1 2"),
+    (2, "got several; write one", "tell camp 1 --file bom.csv"),
+    (2, "got several; write one", "tell camp --invalid --missing"),
+    (2, "expected a trial from 0", "tell camp 1 --trial -1"),
+    (2, "expected a trial from 0", "correct camp 7 0.1"),
+    (2, "expected 1 numbers", "correct camp 0 --reason typo"),
+    (0, "", ["withdraw", "camp", "0", "--reason", "\n\x1b[31m", "--json"]),
+    # Files.
+    *((0, "", f"correct camp 0 --file {name}") for name in ("bom.csv", "named.csv")),
+    *(
+        (2, "expected", f"correct camp 0 --file {name}")
+        for name in FILES
+        if name.endswith("csv") and name not in ("bom.csv", "named.csv")
+    ),
+    (2, "No such file", "tell camp --file none.csv"),
+    # Folders.
+    (2, "expected a campaign; got no", "ask nowhere"),
+    (2, "", ["status", "a\0b"]),
+    (2, "choose another folder", [*INIT, "sled.py:slide"]),
+    (2, "No such file", "report camp --out no/such/folder/page.html"),
+    (0, "", "report camp --json"),
+    (0, "", "repair camp --json"),
+    (2, "expected --simulator or --task", "criticize bom.csv"),
+    # A campaign has its own of these.
+    (2, "for a campaign", "criticize camp --noise 0.1"),
+    (2, "for a campaign", "criticize camp --task numerical"),
+    (2, "no_such_module", "criticize camp --effects no_such_module:effects"),
+    (1, "no library", "criticize camp --effects odd.py:effects"),
+    (2, "expected a list of Effect", "criticize camp --effects odd.py:listed"),
+    # Spaces.
+    *(
+        (2, text, [*SLED, "--actions", *spec.split()])
+        for text, spec in (
+            ("at most 100000 actions", "1:2:1000000000"),
+            ("at most 100000 actions", "1:2:1000 1:2:1000"),
+            ("write, say, 0:5:11", "1:2:0"),
+            ("write, say, 0:5:11", "1:2:3:4"),
+            ("expected", "2:1"),
+            ("", "nan:1"),
+            ("expected finite numbers", "1,,2"),
+            ("No module named 'a'", "a:b"),
+            ("expected a space", "odd.py:NUMBER"),
+        )
+    ),
+    (0, "", [*SLED, "--actions", "-1:1", "-5,-4"]),
+    *(
+        (2, text, [*SLED, *ASK, *words.split()])
+        for text, words in (
+            ("expected finite", "--noise nan"),
+            ("expected --noise > 0", "--noise -1"),
+            ("separate them by commas", "--names a,b"),
+            ("expected a torch distribution", "--prior odd.py:NUMBER"),
+            ("low below high", "--theta-low 1,1"),
+            ("expected num_simulations", "--num-simulations 0"),
+            ("expected num_workers", "--num-workers 0"),
+            ("expected time_limit", "--time-limit nan"),
+            ("is not a valid integer", "--seed 1.5"),
+        )
+    ),
+    *(
+        (2, "", [*OF[:4], "--simulator", "sled.py:slide", *ASK, "--config", name])
+        for name in FILES
+        if name.endswith("toml")
+    ),
+    (2, "as in --simulator my_robot.py:fn", ["init", "new", *BOX]),
+    # Programs.
+    *(
+        (2, text, [*OF, name, *ASK])
+        for text, name in (
+            ("expected MODULE:NAME", "sled"),
+            ("expected MODULE:NAME", ":slide"),
+            ("expected 'none' in module", "sled.py:none"),
+            ("expected a file; got none", "none.py:fn"),
+            ("expected a function", "odd.py:NUMBER"),
+            ("got ZeroDivisionError", "divides.py:f"),
+            ("got SystemExit", "leaves.py:f"),
+            ("got SyntaxError", "halves.py:f"),
+            ("one row a parameter set", "odd.py:short"),
+        )
+    ),
+    (1, "by zero", [*OF, "odd.py:broken", *ASK]),
+    (1, "", [*OF, "odd.py:left", *ASK]),
+    (130, "interrupted", [*OF, "odd.py:stopped", *ASK]),
+    (1, "", "check odd.py:broken --theta-low 0 --theta-high 1 --actions 1,2"),
+    (2, "at most 100000 actions", [*CHECK, "--actions", "1:2:1000000000"]),
+    (2, "got no nowhere/store.db", "bank inspect nowhere"),
+    (2, "expected options of 'numerical'", "run numerical --out o --option target=2"),
+    (2, "expected --option NAME=VALUE", "run numerical --out o --option variant"),
+]
+
+
+@pytest.fixture
+def files(camp):
+    for name, content in FILES.items():
+        Path(name).write_bytes(content)
+    return camp
+
+
+@pytest.mark.parametrize(("status", "text", "words"), CALLS, ids=lambda w: str(w)[:60])
+def test_an_odd_call(files, capfd, status, text, words):
+    assert main(words.split() if isinstance(words, str) else words) == status
+    shown = capfd.readouterr()
+    if status:
+        assert "sbi-active" in shown.err or "defect" in shown.out
+        assert text in shown.err
+        assert "Traceback" not in shown.err
+    elif "--json" in words:
+        read(shown.out)
+
+
+@pytest.mark.parametrize("text", ["-1e-3", "-.5e2", "-3."])
+def test_numbers_may_begin_with_a_minus(files, text):
+    words = ["--actions", "-2:2", "--simulator", "sled.py:slide"]
+    assert main(["init", "new", *BOX, *SMALL, *words]) == 0
+    assert main(["tell", "new", text, "--action", "-1e-1"]) == 0
+    (trial,) = Campaign.load("new").history
+    assert trial.action.tolist() == pytest.approx([-0.1])
+    assert trial.x.tolist() == pytest.approx([float(text)])
+
+
+def test_what_is_refused_changes_nothing(files):
+    before = [(t.status, t.x) for t in Campaign.load(files).history]
+    for words in (
+        ["tell", "camp", "O"],
+        ["correct", "camp", "0", "--file", "unit.csv"],
+    ):
+        assert main(words) == 2
+    assert [(t.status, t.x) for t in Campaign.load(files).history] == before
+
+
+def test_numbers_that_are_not_finite_are_null(camp, capfd, monkeypatch):
+    infinite = SimpleNamespace(
+        mean=torch.tensor([torch.nan, 1.0]), variance=torch.tensor([torch.inf, 4.0])
+    )
+    monkeypatch.setattr(Campaign, "belief", infinite)
+    monkeypatch.setattr(Campaign, "parameter_names", ["a", "b"])
+    Path("camp/status.json").unlink()  # what was summed up with another belief
+    assert main(["status", "camp", "--json"]) == 0
+    assert read(capfd.readouterr().out)["belief"]["parameters"] == {
+        "a": {"mean": None, "sd": None},
+        "b": {"mean": 1.0, "sd": 2.0},
+    }
+
+
+@pytest.mark.parametrize(
+    "workers", [[], pytest.param(["--num-workers", "2"], marks=pytest.mark.slow)]
+)
+def test_standard_output_holds_the_answer_alone(files, workers):
+    box = ["--theta-low", "-1,0", "--theta-high", "1,1"]
+    words = ["--simulator", "odd.py:loud", *box, *ASK, *SMALL[:4], *workers]
+    assert main(["init", "loud", *words]) == 0
+    process = run(["ask", "loud", "--json"], stdout=subprocess.PIPE)
+    shown, error = process.communicate()
+    assert read(shown)["trial"] == 0
+    for text in ("imported", "simulating", "in C", "past Python"):
+        assert text in error
+
+
+@pytest.mark.parametrize("how", ["head", "full"])
+def test_an_output_that_takes_no_more(camp, how):
+    if how == "head":
+        ours, theirs = os.pipe()
+        os.close(ours)
+    else:
+        theirs = os.open("/dev/full", os.O_WRONLY)
+    process = run(["status", "camp"], stdout=theirs)
+    os.close(theirs)
+    _, error = process.communicate()
+    assert process.returncode == (1 if how == "head" else 2)
+    assert "Traceback" not in error
+    assert "Exception ignored" not in error
+    assert ("No space left" in error) == (how == "full")
+
+
+def test_a_locale_that_is_not_utf8(camp):
+    env = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": ""}
+    Path("metre.toml").write_text('units = "µm"\nnames = "größe"', encoding="utf-8")
+    for words in (
+        [*SLED, *ASK, "--config", "metre.toml"],
+        ["tell", "new", "0.3", "--action", "1"],
+        ["correct", "new", "0", "0.4", "--reason", "µ", "--json"],
+    ):
+        process = run(words, stdout=subprocess.PIPE, env=env, flags=["-O"])
+        shown, error = process.communicate()
+        assert process.returncode == 0, error
+    answer = read(shown)
+    assert (answer["names"], answer["units"]) == (["größe"], ["µm"])
+    assert answer["reason"] == "µ"
+
+
+def test_interrupted_while_it_simulates():
+    slow = "\nimport time\n\n\ndef slow(theta, action):\n    open('on', 'w')\n"
+    Path("slow.py").write_text(SIMULATOR + slow + "    time.sleep(60)\n")
+    process = run(["check", "slow.py:slow", *BOX, *ASK], stdout=subprocess.PIPE)
+    for _ in range(600):
+        if Path("on").exists():
+            break
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert "Traceback" not in error
