@@ -53,7 +53,8 @@ def folder(tmp_path_factory):
         parameter_names=["a", "b"],
         channel_names=["left", "right", "up", "down"],
     )
-    with go_on(new(path, simulator=named, method="asbi"), 2) as c:
+    speeds = DiscreteActions([0.5, 1.0, 2.0], names=["speed"], units=["m/s"])
+    with go_on(Campaign(named, PRIOR, speeds, options=OPTIONS, directory=path), 2) as c:
         c.ask()
         c.tell(status="missing")
         c.update()

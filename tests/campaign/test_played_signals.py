@@ -62,11 +62,12 @@ def motor(action, seed, *, dead=0.0):
 
 def test_a_campaign_asks_for_signals_and_learns():
     campaign = Campaign(MODEL, PRIOR, SPACE, options=OPTIONS, seed=0)
-    for k in range(2):
-        trial = campaign.ask()
-        assert bool(SPACE.contains(trial.action))
-        assert SPACE.inputs(trial.action)["voltage"].shape == (51,)
-        campaign.tell(motor(trial.action, k))
+    trial = campaign.ask()
+    assert bool(SPACE.contains(trial.action))
+    assert SPACE.inputs(trial.action)["voltage"].shape == (51,)
+    campaign.tell(motor(trial.action, 0))
+    for k, action in enumerate(SPACE.sample((2,), seed=1), 1):
+        campaign.attach(action, motor(action, k))
     campaign.update()
     mean, sd = campaign.belief.mean, campaign.belief.stddev
     assert bool(((mean - TRUTH[0]).abs() < 4 * sd + 0.01).all())

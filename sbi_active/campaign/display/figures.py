@@ -39,7 +39,7 @@ def plot_campaign(
     num_predicted: int,
     most_parameters: int = 24,
 ) -> Figure:
-    """Return the figure of :meth:`.CampaignView.plot`.
+    """Return the figure of :meth:`.Campaign.plot`.
 
     Args:
         state: State of the campaign.
