@@ -34,7 +34,6 @@ FLOORS = (
     "campaign",
     "migration",
     "export",
-    "plots",
     "tasks",
     "cli",
 )

@@ -1,17 +1,12 @@
 """Who leaves the global generators of torch and NumPy as they were: see seeding."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
-from sbi.utils import BoxUniform
 
 from sbi_active import (
     ALHI,
     ASBI,
-    Campaign,
-    DiscreteActions,
     GaussianNoise,
     InformationGainDesigner,
     RandomDesigner,
@@ -25,19 +20,20 @@ from sbi_active.criticism import Trials, close_loop
 from sbi_active.inference import Observation, refine
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import check_simulator, estimate_noise
-from tests.campaign.test_corrections import OPTIONS, RATIOS
+from tests.campaign.problem import (
+    ACTIONS,
+    MODEL,
+    OPTIONS,
+    PRIOR,
+    RATIOS,
+    campaign,
+    noisy,
+)
 
-PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
-ACTIONS = DiscreteActions([0.5, 1.0, 3.0])
-MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise(0.1))
 THETA = torch.linspace(0.1, 0.9, 300)[:, None]
 ACTION = ACTIONS.sample((300,), seed=0)
 X = simulate(MODEL, THETA, ACTION, seed=0).x
 REAL = torch.tensor([[1.0], [3.0], [0.5]]), torch.tensor([[0.6], [1.8], [0.3]])
-
-
-def noisy(theta, action):
-    return theta * action + 0.1 * torch.randn_like(theta)
 
 
 def by_numpy(theta, action):
@@ -68,22 +64,15 @@ def kept():
     assert kept.changed == []
 
 
-@pytest.mark.parametrize("simulator", [MODEL, noisy, by_numpy])
 @pytest.mark.parametrize(
-    "method",
+    ("method", "simulator"),
     [
-        *["asbi", "alhi"],
-        *[pytest.param(m, marks=pytest.mark.slow) for m in ("nsbi", "nlhi", "seqbed")],
+        *[("asbi", by_numpy), ("alhi", MODEL)],
+        *[pytest.param(m, noisy, marks=pytest.mark.slow) for m in ("nlhi", "seqbed")],
     ],
 )
 def test_a_campaign(kept, method, simulator):
-    options = OPTIONS
-    if method == "seqbed":
-        options = replace(OPTIONS, density_estimator=RATIOS)
-    c = kept(
-        "Campaign",
-        lambda: Campaign(simulator, PRIOR, ACTIONS, method=method, options=options),
-    )
+    c = kept("Campaign", lambda: campaign(method, simulator, network="each round"))
     for _ in range(2):
         trial = kept("ask", c.ask)
         kept("tell", lambda trial=trial: c.tell(0.6 * trial.action))
@@ -166,9 +155,9 @@ def test_a_report(kept):
 
 def test_what_draws_as_in_sbi_and_torch():
     """The exceptions that seeding names; a seed would be a change of their meaning."""
-    campaign = Campaign(MODEL, PRIOR, ACTIONS, method="nsbi", options=OPTIONS)
-    campaign.tell(0.6, action=[1.0])
-    belief = campaign.update()
+    c = campaign()
+    c.tell(0.6, action=[1.0])
+    belief = c.update()
     for call in (
         lambda: ASBI(PRIOR, show_progress_bars=False),
         lambda: belief.sample((3,)),

@@ -5,11 +5,16 @@ A snippet whose first line is ``# name.py`` is a file, from which others may imp
 
 import re
 import sys
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
+
+from sbi_active.campaign.learning.learner import Learner
+from sbi_active.design import designer
+from sbi_active.search import GradientSearch
 
 ROOT = Path(__file__).parents[1]
 FILE = re.compile(r"# (\w+)\.py\n")
@@ -22,12 +27,21 @@ pytestmark = [
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
-    """Return a function that runs a page, and returns the names of each snippet."""
+    """Return a function that runs a page, and returns the names of each snippet.
+
+    README runs as printed. On the other pages a network is trained where something asks
+    for it, and a search for the next action is short.
+    """
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
     before = {*sys.modules}
 
     def page(name: str) -> list[SimpleNamespace]:
         ran = []
+        if name != "README.md":
+            quick = partial(GradientSearch, num_rounds=1, num_starts=4)
+            monkeypatch.setattr(designer, "GradientSearch", quick)
+            monkeypatch.setattr(Learner, "trains_each_round", False)
         text = (ROOT / name).read_text()
         for snippet in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
             file = FILE.match(snippet)
@@ -161,13 +175,9 @@ def test_robots(run, capsys):
     assert verdict.report.verdict == "hinge friction loss"
     assert motion.design.estimator == "LinearGain"
     assert motion.limits(motion.design.action[None]).all()
-    text = (ROOT / "docs/robots.md").read_text()
-    for snippet in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
-        assert len([line for line in snippet.splitlines() if line.strip()]) <= 40
 
 
-def test_getting_started(run, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_getting_started(run, capsys):
     (page,) = run("docs/start.md")
     assert "Belief(refined: friction" in capsys.readouterr().out
     assert len(page.campaign.history) == 1
@@ -196,8 +206,7 @@ def test_question_two_models(run):
     assert rivals.actions.contains(torch.as_tensor(rivals.found.action)[None]).all()
 
 
-def test_question_thrown_ball(run, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_question_thrown_ball(run, capsys):
     (ball,) = run("docs/howto/thrown_ball.md")
     assert ball.report.verdict == "drag"
     (line,) = [t for t in capsys.readouterr().out.splitlines() if t[:9] == "drag [1/m"]
@@ -206,14 +215,10 @@ def test_question_thrown_ball(run, capsys, tmp_path, monkeypatch):
     table = ball.report.before_after.set_index("metric")
     # Errors of a camera of 1 cm, and of starts that its first frames tell.
     assert table.loc["rmse", "after"] < 0.03 < table.loc["rmse", "before"]
-    text = (ROOT / "docs/howto/thrown_ball.md").read_text()
-    (snippet,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    assert len([line for line in snippet.splitlines() if line.strip()]) <= 40
 
 
-def test_question_recordings(run, tmp_path, monkeypatch):
+def test_question_recordings(run):
     pytest.importorskip("mcap")
-    monkeypatch.chdir(tmp_path)
     (read,) = run("docs/howto/recordings.md")
     assert list(read.frame.columns) == ["time", "angle", "motor"]
     assert read.frame.time.iloc[-1] == pytest.approx(0.99)
@@ -227,32 +232,12 @@ def test_question_warnings(run):
 
 
 def test_no_page_is_forgotten():
-    pages = {
-        page.name
-        for page in [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    ran = {*re.findall(r'run\("(.*?)"\)', Path(__file__).read_text())}
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    assert ran == {
+        str(page.relative_to(ROOT))
+        for page in pages
         if "```python" in page.read_text() and "_build" not in page.parts
-    }
-    assert pages == {
-        "README.md",
-        "campaigns.md",
-        "simulations.md",
-        "methods.md",
-        "seeing.md",
-        "closing_the_loop.md",
-        "identifiability.md",
-        "robots.md",
-        "trust.md",
-        "start.md",
-        "overview.md",
-        "how_many_simulations.md",
-        "failed_trial.md",
-        "which_parameters.md",
-        "two_models.md",
-        "thrown_ball.md",
-        "recordings.md",
-        "pouring.md",
-        "robust.md",
-        "warnings.md",
     }
 
 

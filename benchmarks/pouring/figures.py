@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.pouring.summary import column, label
 from benchmarks.rows import read
-from sbi_active.plots import save
+from sbi_active.display.figures import save
 
 __all__ = ["log_prob_figure", "selected_figure"]
 

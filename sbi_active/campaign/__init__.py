@@ -13,9 +13,8 @@ from sbi_active.renamed import former_names, lazy_names
 
 if TYPE_CHECKING:
     from sbi_active.campaign.campaign import Campaign
-    from sbi_active.campaign.options import CampaignOptions
+    from sbi_active.campaign.options import CampaignOptions, StopRules
     from sbi_active.campaign.state import Trial
-    from sbi_active.campaign.stopping import StopRules
 
 __all__ = ["Campaign", "CampaignOptions", "StopRules", "Trial"]
 
@@ -23,9 +22,8 @@ __getattr__ = lazy_names(
     __name__,
     {
         "campaign": "Campaign",
-        "options": "CampaignOptions",
+        "options": "CampaignOptions StopRules",
         "state": "Trial",
-        "stopping": "StopRules",
     },
     former_names(
         __name__,

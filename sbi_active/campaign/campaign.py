@@ -15,16 +15,12 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
-from sbi_active.campaign.display.progress import StageWatch, rounds
 from sbi_active.campaign.isolation import guarded, isolated
-from sbi_active.campaign.learning.draws import keep_draws
-from sbi_active.campaign.learning.limits import Limits
 from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.learning.planner import Planner
 from sbi_active.campaign.learning.pooled import make_learner
-from sbi_active.campaign.learning.revision import criticize, recompute, revise
+from sbi_active.campaign.learning.revision import recompute, revise
 from sbi_active.campaign.options import CampaignOptions
-from sbi_active.campaign.spending import learned, require_left
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.campaign.storage.directory import CampaignDirectory
 from sbi_active.campaign.storage.loading import load
@@ -33,7 +29,7 @@ from sbi_active.campaign.storage.simulations import num_rows
 from sbi_active.campaign.storage.storage import Storage, stored
 from sbi_active.campaign.trials import CampaignTrials
 from sbi_active.renamed import set_later
-from sbi_active.simulation.workers.meter import metering
+from sbi_active.simulation.workers.meter import SimulationBudgetError, metering
 
 if TYPE_CHECKING:
     from sbi_active.criticism import Effect, Report
@@ -117,9 +113,9 @@ class Campaign(CampaignTrials):
         state = CampaignState(method, seed, options, num_earlier=num_rows(options.bank))
         with metering(state.meter):
             learner = make_learner(simulator, prior, actions, state)
-        limits = Limits(actions, constraint, cost)
-        state.watch = StageWatch(show_progress)
-        self._begin(state, actions, learner, Planner(limits, state, effects))
+        state.show_progress = show_progress
+        planner = Planner(actions, state, effects, constraint=constraint, cost=cost)
+        self._begin(state, actions, learner, planner)
         disk = None
         if directory is not None:
             manifest = new_manifest(
@@ -171,19 +167,17 @@ class Campaign(CampaignTrials):
             simulator: Simulator that the campaign was made with. Without it the
                 campaign can be read, told and corrected, and neither :meth:`ask` nor
                 :meth:`update` compute.
-            prior: Prior of the parameters. It is needed if it is of your own class;
-                else None takes the directory's.
-            actions: Action space or list of actions, needed if it is of your own class;
-                else None takes the directory's.
+            prior: Prior of the parameters, needed if it is of your own class; else
+                None takes the directory's.
+            actions: Action space, likewise.
             effects: Effects given to the constructor, and those that were adopted
                 since: functions are not stored.
             cost: Cost of actions, as given to the constructor.
-            constraint: Constraint of actions, as given to the constructor.
-            options: Options of the campaign; None takes the directory's. They are
-                needed if an estimator is of your own class. Changed options hold for
-                this process, with a warning. A dict gives all that are not default, as
-                in the constructor.
-            show_progress: Whether to draw a progress bar, as in the constructor.
+            constraint: Constraint of actions, likewise.
+            options: Options as in the constructor, needed if an estimator is of your
+                own class; None takes the directory's. Changed options hold for this
+                process, with a warning.
+            show_progress: Whether to draw a progress bar.
             simulator_changed: Whether to take another simulator than the campaign was
                 made with, and compute everything again with it.
             repair: Whether to drop damaged records. The former files are kept beside,
@@ -206,11 +200,11 @@ class Campaign(CampaignTrials):
             repair=repair,
         )
         self = cls.__new__(cls)
-        limits = Limits(found.actions, constraint, cost)
         known = found.disk.manifest["effects"]
         declared = [effect for effect in effects if effect.name in known]
-        planner = Planner(limits, found.state, declared)
-        found.state.watch = StageWatch(show_progress)
+        limits: Any = {"constraint": constraint, "cost": cost}
+        planner = Planner(found.actions, found.state, declared, **limits)
+        found.state.show_progress = show_progress
         self._begin(found.state, found.actions, found.learner, planner)
         self._storage = Storage(found.disk, found.state.options.bank, found.prior)
         return self
@@ -244,7 +238,7 @@ class Campaign(CampaignTrials):
         yet. Only the methods "asbi" and "nsbi" have one; others raise a ValueError.
         """
         index = len(self.state.trials) if self.pending is None else self.pending.index
-        return self._learner.posterior(index)
+        return self._learner.round.posterior(index)
 
     @stored
     def ask(self, *, target: str | Sequence[str] = "auto") -> Trial:
@@ -268,7 +262,11 @@ class Campaign(CampaignTrials):
             return self.pending
         self._planner.require(target)
         self.update()
-        require_left(self.state)
+        if self.state.used_up is not None:
+            raise SimulationBudgetError(
+                f"{self.state.used_up}. Load the campaign with a larger "
+                "max_simulations to go on"
+            )
         index = len(self.state.trials)
         self.state.trials.append(Trial(index, torch.empty(0)))
         try:
@@ -276,9 +274,8 @@ class Campaign(CampaignTrials):
                 index, target, self._learner, alarmed=self.health == "alarm"
             )
             what = {"action": design.action, "design": design, "target": purpose}
-            self.state.account(
-                index, design.num_simulations, design.num_missing, **what
-            )
+            spent = design.num_simulations, design.num_missing
+            self.state.account(index, *spent, **what)
         except BaseException:
             self.state.trials.pop()
             raise
@@ -297,11 +294,11 @@ class Campaign(CampaignTrials):
         for trial in self.history:
             if trial.index in state.processed:
                 continue
-            if trial.is_measured and not learned(learner, state, trial):
+            if trial.is_measured and not learner.takes(trial):
                 break
             state.processed.append(trial.index)
             if trial.is_measured:
-                keep_draws(state, learner.belief)
+                state.keep_draws(learner.belief)
             self._storage.save(state, learner)
             if self.on_update is not None:
                 self.on_update(state.trials[trial.index])
@@ -317,9 +314,7 @@ class Campaign(CampaignTrials):
         """Run rounds on a real system that can be called.
 
         It ends early if there is a :attr:`stop_reason`; a trial that was designed by
-        then stays pending.
-
-        An exception of the real system passes through; the trial stays pending.
+        then stays pending, as it does after an exception of the real system.
 
         Args:
             real_system: Function that takes an action, shape (action_dim,), and gives
@@ -331,7 +326,10 @@ class Campaign(CampaignTrials):
         Returns:
             The belief after the last trial.
         """
-        for _ in rounds(self.state, num_rounds):
+        from tqdm.auto import tqdm
+
+        hidden = not self.state.show_progress
+        for _ in tqdm(range(num_rounds), desc="rounds", disable=hidden):
             if self.stop_reason is not None:
                 break
             index = self.ask().index
@@ -352,9 +350,8 @@ class Campaign(CampaignTrials):
 
         Args:
             effects: Effects that the simulator may lack; None takes the campaign's;
-                those already adopted are left out. The first library of a model counts
-                as frozen: with another one, or other priors, the report is
-                "exploratory".
+                those already adopted are left out. After the first library of a model,
+                another one, or other priors, make the report "exploratory".
             evaluate: Whether to report the error before and after, see
                 :func:`.close_loop`.
 
@@ -366,12 +363,16 @@ class Campaign(CampaignTrials):
                 not fit.
         """
         self.update()
-        report = criticize(
-            self.state,
-            self._planner.compare(self._learner, self.state.measured, effects),
-            evaluate=evaluate,
-            designed=find_method(self.state.method).designs,
-        )
+        state = self.state
+        criticism = self._planner.compare(self._learner, state.measured, effects)
+        earlier = state.version.examined
+        with state.watched(len(state.trials), "criticism"):
+            report = criticism.report(
+                evaluate=evaluate,
+                designed=find_method(state.method).designs,
+                exploratory=any(digest != criticism.digest for digest in earlier),
+            )
+        state.examined(criticism.digest)
         found: Any = {"digest": report.digest, "verdict": report.verdict}
         self._storage.write("examined", **found, chosen=[*report.tracing.chosen])
         return report

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+import torch
 from torch import Tensor
+from torch.distributions import Distribution
 
-from sbi_active.campaign.cards import trial_html
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.design.design import Design
+from sbi_active.display.notebook import card, facts
+from sbi_active.display.table import number
 from sbi_active.inference.emulation.pool import Batch
+from sbi_active.progress import News, is_asked_for
+from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.workers.meter import Meter
 
 Status = Literal["pending", "ok", "invalid", "missing", "withdrawn"]
@@ -92,7 +97,35 @@ class Trial:
     num_missing: int = 0
 
     def _repr_html_(self) -> str:
-        return trial_html(self)
+        gain, error = map(number, self.expected_gain)
+        pairs = [
+            ("action", _first(self.action)),
+            ("outcome", _first(self.x) if self.status == "ok" else ""),
+            ("chosen for", self.target),
+            ("expected to tell", f"{gain} ± {error or '?'} nats" if gain else ""),
+            ("told", _with(self.information_gained, "nats")),
+            ("surprise", _with(self.surprise)),
+            ("misfit after it", _with(self.misfit)),
+            ("beyond all simulations by", _with(self.outlyingness, "of their ranges")),
+            ("simulations", self.num_simulations),
+            ("lost of them", self.num_missing),
+            ("time", _with(sum(self.seconds.values()) or None, "s")),
+            ("reason", self.reason),
+        ]
+        shown = [(name, value) for name, value in pairs if value]
+        return card(f"Trial {self.index}: {self.status}", facts(shown))
+
+    @property
+    def expected_gain(self) -> tuple[float, float]:
+        """The action's expected information gain and its standard error, nats.
+
+        They are NaN for a trial that was not designed.
+        """
+        design = self.design
+        if design is None:
+            return float("nan"), float("nan")
+        gain, error = design.expected_information_gain, design.standard_error
+        return float(gain[design.index]), float(error[design.index])
 
     @property
     def is_measured(self) -> bool:
@@ -140,12 +173,16 @@ UNSCORED: dict[str, Any] = {
 }
 
 
-Watch = Callable[["CampaignState", int, str], AbstractContextManager[None]]
+def _with(value: float | None, unit: str = "") -> str:
+    return f"{number(value)} {unit}".strip() if value is not None else ""
 
 
-def unwatched(state: CampaignState, index: int, name: str) -> nullcontext[None]:
-    """Tell nobody of a stage."""
-    return nullcontext()
+def _first(values: Tensor | None, most: int = 6) -> str:
+    """Return the first numbers of an action or an outcome."""
+    numbers = [] if values is None else values.flatten().tolist()
+    shown = ", ".join(f"{v:.4g}" for v in numbers[:most])
+    left = len(numbers) - most
+    return f"{shown} and {left} more" if left > 0 else shown
 
 
 @dataclass
@@ -166,9 +203,7 @@ class CampaignState:
         batches: Simulations made for the current model where belief, designs and scores
             share their simulations.
         meter: Counter of the campaign's simulations.
-        watch: Context that is entered around whatever may take long, with the state,
-            the index of the trial that it is for (of the next one where it is for none)
-            and its name.
+        show_progress: Whether to draw a bar of what takes long.
     """
 
     method: str
@@ -182,7 +217,7 @@ class CampaignState:
     draws: dict[int, Tensor] = field(default_factory=dict)
     batches: list[Batch] = field(default_factory=list)
     meter: Meter = field(default_factory=Meter)
-    watch: Watch = field(default=unwatched, repr=False, compare=False)
+    show_progress: bool = field(default=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         self.meter.limit = self.options.max_simulations
@@ -241,13 +276,67 @@ class CampaignState:
             **changes,
         )
 
+    def keep_draws(self, belief: Distribution, num: int = 256) -> None:
+        """Keep draws of the belief after the last trial in it, to show it later.
+
+        Nothing is computed from them, and no other random number depends on them.
+
+        Args:
+            belief: Belief after ``processed``.
+            num: Number of draws; 256 give a standard deviation to 4 %, in 3 kB a trial
+                of 3 parameters.
+        """
+        if not self.processed:
+            return
+        index = self.processed[-1]
+        seed = derive_seed(self.seed, "draws", index)
+        quick = getattr(belief, "quick_sample", None)
+        if quick is not None:
+            draws = quick(num, seed=seed)
+        else:  # the prior, where nothing explained the trials
+            with forked_generators(seed):
+                draws = belief.sample(torch.Size([num]))
+        self.draws[index] = draws.reshape(num, -1).detach()
+
+    @property
+    def used_up(self) -> str | None:
+        """Why no round can begin, where the campaign's simulations are used up."""
+        meter, fewest = self.meter, 24
+        if meter.left >= fewest:
+            return None
+        return (
+            f"the simulations are used up: {meter.spent} of max_simulations = "
+            f"{meter.limit} were run, and a round needs {fewest} or more; the last "
+            "belief stands"
+        )
+
+    @contextmanager
+    def watched(self, index: int, name: str) -> Iterator[None]:
+        """Show progress while the block runs, by how long it took the last time.
+
+        Args:
+            index: Index of the trial that the work is for; of the next one where it is
+                for none.
+            name: Name of the work.
+        """
+        if not is_asked_for(self.show_progress):
+            yield
+            return
+        what = f"trial {index}: {name}" if index < len(self.trials) else name
+        before = next((t for t in self.trials[:index][::-1] if name in t.seconds), None)
+        expected = None if before is None else before.seconds[name]
+        place = "" if before is None else f"trial {before.index}"
+        bar = self.show_progress
+        with News(what, expected=expected, before=place, has_bar=bar).told():
+            yield
+
     @contextmanager
     def stage(self, index: int, name: str) -> Iterator[None]:
         """Add the time spent in the block to a trial's account, less stages within.
 
         Work before a trial is asked for is not added to any account.
         """
-        with self.watch(self, index, name):
+        with self.watched(index, name):
             if index == len(self.trials):
                 yield
             else:

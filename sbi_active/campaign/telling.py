@@ -92,11 +92,6 @@ def find_trial(state: CampaignState, trial: Trial | int) -> Trial:
     return state.trials[index]
 
 
-def new_trial(state: CampaignState) -> Trial:
-    """Return the record of a trial that is not one of the campaign yet."""
-    return Trial(len(state.trials), torch.empty(0))
-
-
 def recorded(state: CampaignState, facts: Mapping[str, Any]) -> Trial:
     """Return the record of a trial as the log has it.
 
@@ -193,7 +188,7 @@ def _trial_to_tell(
     if pending:
         return pending[0]
     if has_action:
-        return new_trial(state)
+        return Trial(len(state.trials), torch.empty(0))
     if state.trials:  # the last one, told twice
         last = state.trials[-1]
         if same_outcome(last, replace(last, x=outcome, status=status)):

@@ -1,41 +1,255 @@
-"""Telling, correcting and withdrawing trials."""
+"""What a campaign shows, and how it takes what happened: all that computes nothing."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from torch import Tensor
+from torch.distributions import Distribution
 
+from sbi_active.actions import ActionSpace
+from sbi_active.campaign.display.figures import plot_campaign
+from sbi_active.campaign.display.page import campaign_html, to_dataframe
+from sbi_active.campaign.health import Health, assess, calibration_lost
 from sbi_active.campaign.isolation import guarded, isolated
-from sbi_active.campaign.state import UNSCORED, Status, Trial
-from sbi_active.campaign.telling import find_trial, new_trial, told_trial
-from sbi_active.campaign.view import CampaignView
+from sbi_active.campaign.state import UNSCORED, CampaignState, Status, Trial
+from sbi_active.campaign.storage.storage import Storage
+from sbi_active.campaign.telling import find_trial, told_trial
+from sbi_active.display.figures import legible
+from sbi_active.inference.beliefs.belief import names_of, parameter_dim
+from sbi_active.seeding import derive_seed
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+    from sbi_active.criticism import Effect
+
+Numbers = Tensor | np.ndarray | Sequence[float] | float
 
 
-class CampaignTrials(CampaignView):
-    """The half of a :class:`.Campaign` that takes what happened, and computes nothing.
+class CampaignTrials:
+    """The half of a :class:`.Campaign` that shows and records, and computes nothing.
 
     Attributes:
+        actions: Actions that the robot may take.
+        state: State of the campaign.
         on_trial: Function that is called with each trial that was told, once it is
             recorded; set it.
         on_update: Function that is called with each trial, once the belief contains it;
             set it.
     """
 
+    actions: ActionSpace
+    state: CampaignState
+    _learner: Any
+    _planner: Any
+    _storage: Storage
     on_trial: Callable[[Trial], None] | None = None
     on_update: Callable[[Trial], None] | None = None
+
+    def __repr__(self) -> str:
+        done, pending = len(self.history), self.pending is not None
+        return (
+            f"Campaign({self.state.method}, {done} trials"
+            f"{', one pending' if pending else ''}{self._known_together()})"
+        )
+
+    def _repr_html_(self) -> str:
+        return campaign_html(self)
+
+    def _known_together(self) -> str:
+        """Return the combinations that the belief knows of parameters not known alone.
+
+        A belief that was not read from the directory yet is not read for this.
+        """
+        learner = self._learner
+        is_here = self.state.processed and learner._saved is None
+        found = getattr(learner.belief if is_here else None, "diagnostics", None)
+        return f"; {found.combinations}" if found and found.combinations else ""
+
+    @property
+    def belief(self) -> Distribution:
+        """The belief after the trials in ``state.processed``; the prior before any.
+
+        A trial that nothing in the prior explains, as after an error of the unit, is
+        left out of it: at five times the range of all simulations beyond them, the
+        model would extrapolate and push the belief to an edge.
+        ``belief.diagnostics.trustworthy`` is then False and ``warnings`` names the
+        trial, until it is told again or withdrawn. Trials that are beyond all
+        simulations but nearer stay in the belief and are named as well.
+        """
+        return self._learner.stated_belief
+
+    @property
+    def simulator(self) -> Callable[..., Any]:
+        """The current simulator, with the effects that were adopted."""
+        return self._learner.simulator
+
+    @simulator.setter
+    def simulator(self, simulator: Callable[..., Any]) -> None:
+        self._learner.simulator = simulator
+
+    @property
+    def prior(self) -> Distribution:
+        """The original prior, times those of the effects that were adopted."""
+        return self._learner.prior
+
+    @property
+    def effects(self) -> Sequence[Effect]:
+        """Effects that the simulator may lack, as the campaign was told."""
+        return self._planner.effects
+
+    @property
+    def first_prior(self) -> Distribution:
+        """The prior that the campaign began with."""
+        prior = self._storage.prior
+        return self.prior if prior is None else prior
+
+    @property
+    def directory(self) -> Path | None:
+        """Folder of the campaign; None if it is kept in memory alone."""
+        return self._storage.path
+
+    @property
+    def x_shape(self) -> torch.Size:
+        """Shape of an outcome."""
+        return self._learner.x_shape
+
+    @property
+    def events(self) -> Sequence[Mapping[str, Any]]:
+        """The lines of the log on the disk so far, without one in memory alone."""
+        disk = self._storage.disk
+        return () if disk is None else disk.events
+
+    def contains(self, trial: Trial) -> bool:
+        """Return whether the belief takes account of a trial as it is recorded now."""
+        return trial.index in self.state.processed and not self.state.is_stale
+
+    @property
+    def health(self) -> Health:
+        """Whether the simulator still explains the trials that the belief contains.
+
+        While it is right, an "alarm" comes in at most 5 % of campaigns, however long
+        they are, and a "watch" now and then. Under an alarm the belief may be narrow
+        and wrong: do :meth:`criticize`.
+        """
+        return assess(self.state)
+
+    @property
+    def parameter_names(self) -> list[str]:
+        """One a parameter of the current simulator; theta_1, ... where it has none."""
+        num = parameter_dim(self.prior)
+        names = self._declared("parameter_names")
+        if names is None or len(names) != num:
+            return names_of(self.belief, num)
+        return [*names]
+
+    @property
+    def channel_names(self) -> list[str] | None:
+        """One an entry of the outcome's last axis, where the simulator names them."""
+        names = self._declared("channel_names")
+        return None if names is None else [*names]
+
+    def _declared(self, what: str) -> Sequence[str] | None:
+        """Return names that the simulator has, or had where it is not given."""
+        disk = self._storage.disk
+        if self.simulator is None and disk is not None:
+            return disk.manifest[what]
+        return getattr(self.simulator, what, None)
+
+    @property
+    def history(self) -> Sequence[Trial]:
+        """The trials that were told, in order."""
+        return tuple(t for t in self.state.trials if t.status != "pending")
+
+    @property
+    def pending(self) -> Trial | None:
+        """The trial that was asked for and not told yet."""
+        waiting = [t for t in self.state.trials if t.status == "pending"]
+        return waiting[0] if waiting else None
+
+    @property
+    def stop_reason(self) -> str | None:
+        """Why ``options.stop`` says to stop, after the trials the belief contains.
+
+        None while the health is not "ok", but for a lost calibration: a confident wrong
+        belief would stop first.
+        """
+        if self.state.used_up is not None:
+            return self.state.used_up
+        if self.state.options.stop.calibration_lost:
+            key = (*self.state.processed, self.state.version.number)
+            known = self.__dict__.setdefault("_calibrations", {})
+            if key not in known:
+                known[key] = isolated(calibration_lost)(self)
+            if known[key] is not None:
+                return known[key]
+        if self.health != "ok":
+            return None
+        design = None if self.pending is None else self.pending.design
+        return self.state.options.stop.reason(
+            self.belief, design, seed=derive_seed(self.state.seed, len(self.history))
+        )
+
+    def to_dataframe(self) -> DataFrame:
+        """Return the trials as a table, a row a trial, a pending one too.
+
+        Columns: status and target; the entries of the action, with their units; the
+        numbers of the outcome, or an array "x" where they are more than 16; those of
+        :class:`.Trial` by their names there; "expected_information" of the action and
+        "expected_information_error", its standard error, in nats; "health" when the
+        trial had been used, missing where it was not; "seconds" and "cpu_seconds" over
+        all stages. The index is the trial's. Units stand in ``attrs["units"]``.
+        """
+        return to_dataframe(
+            self.state,
+            self.actions,
+            parameter_names=self.parameter_names,
+            channel_names=self.channel_names,
+        )
+
+    def plot(
+        self, *, theta_true: Tensor | None = None, num_predicted: int = 64
+    ) -> Figure:
+        """Draw the campaign so far, in one figure.
+
+        It shows the belief of each parameter by round; the expected information gain of
+        actions, as the last map if actions have several entries; each outcome with its
+        prediction; and the expected and realized information gain of each trial, in
+        another color under a watch or an alarm.
+
+        Args:
+            theta_true: The truth where it is known, shape (theta_dim,).
+            num_predicted: Simulations of each trial behind the predictions; with 0, or
+                without the simulator, the surprise of each trial takes their place.
+
+        Raises:
+            ValueError: If ``theta_true`` has more numbers than there are parameters.
+        """
+        figure = plot_campaign(
+            self.state,
+            None if self.simulator is None else self._learner.at,
+            self.prior,
+            parameter_names=self.parameter_names,
+            theta_true=theta_true,
+            num_predicted=0 if self.state.meter.limit else num_predicted,
+        )
+        return legible(figure)
 
     @guarded
     @isolated
     def tell(
         self,
-        x: Tensor | np.ndarray | float | Sequence[float] | None = None,
+        x: Numbers | None = None,
         *,
         trial: Trial | int | None = None,
-        action: Tensor | np.ndarray | Sequence[float] | None = None,
+        action: Numbers | None = None,
         status: Status = "ok",
     ) -> Trial:
         """Record the outcome of a trial and return at once.
@@ -75,8 +289,8 @@ class CampaignTrials(CampaignView):
     @guarded
     def attach(
         self,
-        action: Tensor | np.ndarray | Sequence[float] | float,
-        x: Tensor | np.ndarray | float | Sequence[float] | None = None,
+        action: Numbers,
+        x: Numbers | None = None,
         *,
         status: Status = "ok",
     ) -> Trial:
@@ -92,7 +306,7 @@ class CampaignTrials(CampaignView):
         Raises:
             ValueError: If :meth:`tell` would refuse the trial.
         """
-        new = new_trial(self.state)
+        new = Trial(len(self.state.trials), torch.empty(0))
         told = self._checked(x, trial=new, action=action, status=status)
         return self._record("attached", told)
 
@@ -100,9 +314,9 @@ class CampaignTrials(CampaignView):
     def correct(
         self,
         trial: Trial | int,
-        x: Tensor | np.ndarray | float | Sequence[float] | None = None,
+        x: Numbers | None = None,
         *,
-        action: Tensor | np.ndarray | Sequence[float] | None = None,
+        action: Numbers | None = None,
         status: Status = "ok",
         reason: str = "",
     ) -> Trial:

@@ -21,8 +21,8 @@ from sbi_active.campaign import Campaign, CampaignOptions
 from sbi_active.cli.declared import declared_of_task, write_declared
 from sbi_active.cli.given import make_task
 from sbi_active.cli.trials import status, sum_up_campaign
+from sbi_active.display.figures import save
 from sbi_active.display.table import Table
-from sbi_active.plots import plot_rounds, save
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 from sbi_active.tasks import Task  # pyright: ignore
@@ -57,22 +57,15 @@ def run(
         show_progress=sys.stderr.isatty(),
     )
     write_declared(folder, declared_of_task(task, option))
-    gains, beliefs = [], [campaign.belief]
+    gains = []
     for index in tqdm(range(rounds), desc=method, unit="round"):
         gains.append(_exact_gain(problem, campaign))
         action = campaign.ask().action
-        campaign.tell(
-            problem.real_system(action, seed=derive_seed(seed, "real", index))
-        )
-        beliefs.append(campaign.update())
+        real = derive_seed(seed, "real", index)
+        campaign.tell(problem.real_system(action, seed=real))
+        campaign.update()
     with forked_generators(seed, "figure"):
-        figure = plot_rounds(
-            beliefs,
-            [t.design for t in campaign.history if t.design is not None],
-            parameter_names=problem.parameter_names,
-            theta_true=problem.theta_true,
-            exact_gains=gains,
-        )
+        figure = campaign.plot(theta_true=problem.theta_true)
     save(figure, str(out / "loop.png"))
     sum_up_campaign(campaign)
     campaign.close()

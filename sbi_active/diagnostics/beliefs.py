@@ -42,11 +42,6 @@ from sbi_active.simulation import simulate
 #: From actions (t, action_dim), outcomes (t, *x_shape) and a seed to a belief.
 Infer = Callable[[Tensor, Tensor, int], Distribution]
 
-NUM_COMPARED = 1_000  # draws behind a divergence
-DIFFERENT = 0.3  # nats a parameter; twice the width is .8 or .3 by the direction
-EXCLUDED = 0.6  # nats a parameter of refits that the belief does not hold
-DEEPEST = 12.0  # nats that one draw may count
-
 
 @dataclass(frozen=True, kw_only=True)
 class BeliefCheck:
@@ -85,10 +80,7 @@ class BeliefCheck:
 
     def to_dict(self) -> dict[str, Any]:
         """Return all figures, in a form that JSON can hold."""
-        return {
-            name: [*value] if isinstance(value, tuple) else value
-            for name, value in asdict(self).items()
-        }
+        return asdict(self)
 
     def __str__(self) -> str:
         lines = [f"{self.verdict}: {self.num_repeats} repeats around the belief"]
@@ -165,8 +157,12 @@ def check_belief(
     assert belief is not None
     action = torch.stack([t.action for t in trials])
     x = torch.stack([t.x for t in trials])
-    if infer is None:
-        infer = _refinement(simulator, prior, refinement)
+    model, settings = simulator, refinement
+
+    def refined(action: Tensor, x: Tensor, seed: int) -> Distribution:
+        return refine(model, prior, action, x, settings=settings, seed=seed)
+
+    infer = refined if infer is None else infer
     refits = [
         _compare(belief, infer(action, x, derive_seed(seed, "refit", r)), seed)
         for r in range(num_refits)
@@ -195,28 +191,30 @@ def _given(inference: Any) -> tuple[Distribution, Sequence[Any]]:
     return inference._prior, inference.trials
 
 
-def _refinement(
-    simulator: Callable[..., Any],
-    prior: Distribution,
-    settings: RefinementOptions | None,
-) -> Infer:
-    def infer(action: Tensor, x: Tensor, seed: int) -> Distribution:
-        return refine(simulator, prior, action, x, settings=settings, seed=seed)
-
-    return infer
-
-
 def _compare(
-    belief: Distribution, other: Distribution, seed: int
+    belief: Distribution,
+    other: Distribution,
+    seed: int,
+    *,
+    num_compared: int = 1_000,
+    deepest: float = 12.0,
 ) -> tuple[float, float]:
-    """Return E[log other - log belief] at the other's draws, and the reverse."""
+    """Return E[log other - log belief] at the other's draws, and the reverse.
+
+    Args:
+        belief: Belief to be judged.
+        other: Refit.
+        seed: Seed of the draws.
+        num_compared: Draws behind each divergence.
+        deepest: Nats that one draw may count.
+    """
     with forked_generators(derive_seed(seed, "compare")):
-        there = other.sample(torch.Size([NUM_COMPARED])).float()
-        here = belief.sample(torch.Size([NUM_COMPARED])).float()
+        there = other.sample(torch.Size([num_compared])).float()
+        here = belief.sample(torch.Size([num_compared])).float()
 
     def excess(a: Distribution, b: Distribution, theta: Tensor) -> float:
-        gap = (smooth(a, theta) - smooth(b, theta)).nan_to_num(nan=0.0, posinf=DEEPEST)
-        return float(gap.clamp(-DEEPEST, DEEPEST).mean())
+        gap = (smooth(a, theta) - smooth(b, theta)).nan_to_num(nan=0.0, posinf=deepest)
+        return float(gap.clamp(-deepest, deepest).mean())
 
     return excess(other, belief, there), excess(belief, other, here)
 
@@ -259,6 +257,36 @@ def _scores(
     return np.stack(scores)
 
 
+def _judge_refits(
+    refits: Sequence[tuple[float, float]],
+    dim: int,
+    *,
+    different: float = 0.3,
+    excluded: float = 0.6,
+) -> list[tuple[Verdict, str]]:
+    """Return what refits say of a belief.
+
+    Args:
+        refits: Nats beyond and within it, of each refit.
+        dim: Number of parameters.
+        different: Nats a parameter at which two beliefs differ; twice the width is .8
+            or .3 by the direction.
+        excluded: Nats a parameter of refits that the belief does not hold.
+    """
+    if not refits:
+        return []
+    a, b = min(refits, key=max)
+    text = f"inferred again it is another: {a:.2f} nats are beyond it, {b:.2f} in it"
+    if a > excluded * dim:
+        return [("stop", f"{text}; it is too narrow or lost a mode")]
+    if max(a, b) > different * dim:
+        return [("refine", f"{text}; raise num_histories")]
+    if max(map(max, refits)) > 2 * different * dim:
+        text = "two inferences of the same trials differ; raise num_histories"
+        return [("refine", text)]
+    return []
+
+
 def _judge(
     names: tuple[str, ...],
     refits: Sequence[tuple[float, float]],
@@ -266,26 +294,9 @@ def _judge(
     level: float,
     num_simulations: int,
 ) -> BeliefCheck:
-    dim, found = len(names), list[tuple[Verdict, str]]()
+    dim, found = len(names), _judge_refits(refits, len(names))
     beyond = tuple(a for a, _ in refits)
     within = tuple(b for _, b in refits)
-    if refits:
-        nearest = min(range(len(refits)), key=lambda r: max(refits[r]))
-        a, b = refits[nearest]
-        text = (
-            f"inferred again it is another: {a:.2f} nats are beyond it, {b:.2f} in it"
-        )
-        if a > EXCLUDED * dim:
-            found.append(("stop", f"{text}; it is too narrow or lost a mode"))
-        elif max(a, b) > DIFFERENT * dim:
-            found.append(("refine", f"{text}; raise num_histories"))
-        elif max(max(pair) for pair in refits) > 2 * DIFFERENT * dim:
-            found.append(
-                (
-                    "refine",
-                    "two inferences of the same trials differ; raise num_histories",
-                )
-            )
     n, is_other = len(scores), bool(found)
     spread, shift, p_value, ends = [], [], [], []
     labels = (*names, "the density")

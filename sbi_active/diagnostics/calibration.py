@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Literal
 
 from torch import Tensor
@@ -107,18 +107,8 @@ class Calibration:
 
     def to_dict(self) -> dict[str, Any]:
         """Return all figures, in a form that JSON can hold."""
-        return {
-            "verdict": self.verdict,
-            "reasons": [*self.reasons],
-            "gap_method": self.gap_method,
-            "num_simulations": self.num_simulations,
-            "num_invalid": self.num_invalid,
-            "parameter_names": [*self.parameter_names],
-            "tarp_area": self.tarp_area,
-            "local_p_values": [*self.local],
-            "overall": _plain(self.overall),
-            "strata": [_plain(s) for s in self.strata],
-        }
+        found = asdict(self)
+        return {entry.name: found[entry.name] for entry in fields(self) if entry.repr}
 
     def __str__(self) -> str:
         lines = [f"{self.verdict}: {describe(self.overall)}"]
@@ -151,10 +141,3 @@ def worst(verdicts: Sequence[Verdict]) -> Verdict:
     """Return the strictest of verdicts."""
     order: tuple[Verdict, ...] = ("trust", "refine", "stop")
     return order[max((order.index(v) for v in verdicts), default=0)]
-
-
-def _plain(stratum: Stratum) -> dict[str, Any]:
-    found = asdict(stratum)
-    for name in ("coverage", "coverage_interval"):
-        found[name] = {f"{key:g}": value for key, value in found[name].items()}
-    return found

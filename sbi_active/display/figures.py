@@ -28,6 +28,14 @@ def svg(figure: Figure) -> str:
     return f"data:image/svg+xml;base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 
+def save(figure: Figure, path: str) -> None:
+    """Write a figure to a file and free it."""
+    import matplotlib.pyplot as plt
+
+    legible(figure).savefig(path, dpi=110)
+    plt.close(figure)
+
+
 def legible(figure: Figure) -> Figure:
     """Return a figure whose texts are what they say: no formulas, no control marks.
 

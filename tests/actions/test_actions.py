@@ -3,19 +3,26 @@ import torch
 
 from sbi_active import BoxActions, DiscreteActions, MixedActions
 
+BOX = BoxActions([0.0, -1.0], [2.0, 1.0], names=["speed", "angle"], units=["m/s", ""])
+TOOLS = DiscreteActions([0.0, 1.0, 2.0], names=["tool"])
+MIXED = MixedActions(BOX, TOOLS)
 
-def test_scalar_values_become_rows():
+
+def test_values_become_rows_with_names_and_units():
     actions = DiscreteActions([1.0, 2.0, 3.0])
     assert actions.values.shape == (3, 1)
     assert actions.names == ["action"]
-
-
-def test_vector_actions_keep_names_and_units():
-    actions = DiscreteActions(
-        [[0.0, 1.0], [2.0, 3.0]], names=["height", "speed"], units=["m", "m/s"]
-    )
-    assert actions.action_dim == 2
-    assert actions.units == ["m", "m/s"]
+    pairs = DiscreteActions([[0.0, 1.0], [2.0, 3.0]], units=["m", "m/s"])
+    assert (pairs.action_dim, pairs.units) == (2, ["m", "m/s"])
+    assert MIXED.names == ["speed", "angle", "tool"]
+    assert MIXED.units == ["m/s", "", ""]
+    assert MIXED.action_dim == 3
+    nested = MixedActions(TOOLS, MixedActions(BoxActions(0.0, 1.0), TOOLS))
+    assert nested.names == ["action_1", "action_2", "action_3"]  # not unique
+    assert len(nested.parts()) == 3
+    assert BOX.parts() == [BOX]
+    inside = actions.contains(torch.tensor([[2.0], [0.25], [3.0]]))
+    assert inside.tolist() == [True, False, True]
 
 
 def test_samples_are_uniform_and_seeded():
@@ -26,35 +33,6 @@ def test_samples_are_uniform_and_seeded():
     share = torch.bincount(draws[:, 0].long()) / 40_000
     assert ((share - 0.25).abs() < 4 * (0.25 * 0.75 / 40_000) ** 0.5).all()
     assert actions.sample((2, 3)).shape == (2, 3, 1)
-
-
-def test_contains():
-    actions = DiscreteActions(torch.arange(-5, 5.5, 0.5))
-    inside = actions.contains(torch.tensor([[0.5], [0.25], [-5.0]]))
-    assert inside.tolist() == [True, False, True]
-
-
-@pytest.mark.parametrize(
-    ("values", "text"),
-    [
-        ([], "expected actions of shape"),
-        (torch.zeros(2, 2, 2), "got \\(2, 2, 2\\)"),
-        ([1.0, float("nan")], "expected finite actions"),
-    ],
-)
-def test_bad_values(values, text):
-    with pytest.raises(ValueError, match=text):
-        DiscreteActions(values)
-
-
-def test_wrong_number_of_names():
-    with pytest.raises(ValueError, match="expected 1 names and units"):
-        DiscreteActions([1.0], names=["a", "b"])
-
-
-BOX = BoxActions([0.0, -1.0], [2.0, 1.0], names=["speed", "angle"], units=["m/s", ""])
-TOOLS = DiscreteActions([0.0, 1.0, 2.0], names=["tool"])
-MIXED = MixedActions(BOX, TOOLS)
 
 
 def test_box_samples_are_uniform_and_seeded():
@@ -77,16 +55,6 @@ def test_a_box_contains_its_edges_and_has_no_end():
     assert BOX.listed() is None
     assert TOOLS.listed().tolist() == [[0.0], [1.0], [2.0]]
     assert BoxActions(0.0, 1.0).action_dim == 1
-
-
-def test_names_and_units_travel_with_the_parts():
-    assert MIXED.names == ["speed", "angle", "tool"]
-    assert MIXED.units == ["m/s", "", ""]
-    assert MIXED.action_dim == 3
-    nested = MixedActions(TOOLS, MixedActions(BoxActions(0.0, 1.0), TOOLS))
-    assert nested.names == ["action_1", "action_2", "action_3"]  # not unique
-    assert len(nested.parts()) == 3
-    assert BOX.parts() == [BOX]
 
 
 def test_mixed_samples_are_those_of_independent_parts():
@@ -112,28 +80,21 @@ def test_mixed_contains_and_lists():
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "text"),
+    ("make", "text"),
     [
-        (0.0, [1.0, 2.0], r"same shape .*; got \(\) and \(2,\)"),
-        (
-            torch.zeros(2, 2),
-            torch.ones(2, 2),
-            "expected low and high of the same shape",
-        ),
-        (1.0, 1.0, "expected finite low < high"),
-        (0.0, float("inf"), "expected finite low < high"),
-        ([], [], "expected low and high of the same shape"),
+        (lambda: DiscreteActions([]), "expected actions of shape"),
+        (lambda: DiscreteActions(torch.zeros(2, 2, 2)), r"got \(2, 2, 2\)"),
+        (lambda: DiscreteActions([1.0, float("nan")]), "expected finite actions"),
+        (lambda: DiscreteActions([1.0], names=["a", "b"]), "expected 1 names and un"),
+        (lambda: BoxActions(0.0, [1.0, 2.0]), r"same shape .*; got \(\) and \(2,\)"),
+        (lambda: BoxActions(1.0, 1.0), "expected finite low < high"),
+        (lambda: BoxActions(0.0, float("inf")), "expected finite low < high"),
+        (lambda: BoxActions([], []), "expected low and high of the same shape"),
+        (lambda: MixedActions(), "one or more action spaces; got none"),
     ],
 )
-def test_bad_boxes(low, high, text):
+def test_bad_spaces(make, text):
     with pytest.raises(ValueError, match=text):
-        BoxActions(low, high)
-
-
-def test_bad_parts():
-    with pytest.raises(ValueError, match="one or more action spaces; got none"):
-        MixedActions()
+        make()
     with pytest.raises(TypeError, match="expected action spaces; got list"):
         MixedActions([0.0, 1.0])
-    with pytest.raises(ValueError, match="expected 2 names and units"):
-        BoxActions([0.0, 0.0], [1.0, 1.0], names=["speed"])

@@ -1,47 +1,25 @@
 """Bad numbers: refused, left out of the belief and named, told again, withdrawn."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from sbi.utils import BoxUniform
 from torch.distributions import Independent, Normal
 
-from sbi_active import (
-    Campaign,
-    CampaignOptions,
-    DiscreteActions,
-    GaussianNoise,
-    MixtureDensity,
-    SimulatorModel,
-)
-from sbi_active.campaign.checks import outlyingness
+from sbi_active.campaign.health import outlyingness
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.criticism import Effect
-from sbi_active.inference import RatioClassifier
-from tests.campaign.sizes import REFINEMENT
-
-PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
-ACTIONS = DiscreteActions([0.5, 1.0, 3.0])
-MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise(0.1))
-OPTIONS = CampaignOptions(
-    num_simulations=300,
-    num_samples=100,
-    details=CampaignDetails(num_scored=200),
-    density_estimator=MixtureDensity(hidden_features=(16,), num_iterations=30),
-    refinement=REFINEMENT,
+from tests.campaign.problem import (  # noqa: F401 # others import them from here
+    ACTIONS,
+    OPTIONS,
+    PRIOR,
+    RATIOS,
+    campaign,
+    draws,
 )
-RATIOS = RatioClassifier(hidden_features=(16,), num_iterations=50)
+
 TOLD = [(1.0, 0.62), (3.0, 1.75), (0.5, 0.33)]  # action, x at theta = .6
-
-
-def campaign(method="nsbi", simulator=MODEL, **changes):
-    options = replace(OPTIONS, **changes)
-    if method == "seqbed":
-        options = replace(options, density_estimator=RATIOS)
-    return Campaign(simulator, PRIOR, ACTIONS, method=method, options=options)
 
 
 def tell(c, told=TOLD, **bad):
@@ -51,11 +29,6 @@ def tell(c, told=TOLD, **bad):
     return c
 
 
-def draws(c):
-    torch.manual_seed(5)
-    return c.belief.sample((300,))
-
-
 def scores(c):
     return [
         (t.surprise, t.log_score, t.misfit, t.outlyingness, t.information_gained)
@@ -63,12 +36,11 @@ def scores(c):
     ]
 
 
-@pytest.mark.parametrize("bad", [1e15, -1e30, 62.0])
 @pytest.mark.parametrize(
-    "method",
+    ("method", "bad"),
     [
-        *["nsbi", "alhi"],
-        *[pytest.param(m, marks=pytest.mark.slow) for m in ("asbi", "nlhi", "seqbed")],
+        *[("nsbi", 1e15), ("nsbi", -1e30), ("alhi", 62.0)],
+        *[pytest.param(m, 62.0, marks=pytest.mark.slow) for m in ("asbi", "seqbed")],
     ],
 )
 def test_a_number_that_nothing_explains_is_named_and_left_out(method, bad):
@@ -77,22 +49,16 @@ def test_a_number_that_nothing_explains_is_named_and_left_out(method, bad):
         belief = c.update()
     diagnostics = belief.diagnostics
     assert diagnostics.trustworthy is False
-    text = diagnostics.warnings[0]
-    assert "trial 0" in text
-    assert "tell(x, trial=0)" in text
-    assert "withdraw(0)" in text
+    for text in ("trial 0", "tell(x, trial=0)", "withdraw(0)"):
+        assert text in diagnostics.warnings[0]
     # Two measurements of noise .1 at actions .5 and 3.
     assert float(belief.mean) == pytest.approx(0.6, abs=0.1)
     assert float(belief.variance.sqrt()) < 0.12
     assert c.health == "alarm"
     assert [t.is_explained for t in c.history] == [False, True, True]
     assert c.ask().status == "pending"
-
-
-@pytest.mark.filterwarnings("ignore:trial 0 at action")
-def test_a_campaign_with_such_a_number_can_be_criticized():
-    c = tell(campaign(), x0=62.0)
-    assert c.criticize([], evaluate=False).verdict
+    if bad == 1e15:
+        assert c.criticize([], evaluate=False).verdict
 
 
 def test_the_first_trial_alone_leaves_the_prior_marked():
@@ -117,37 +83,19 @@ def test_a_number_beyond_all_simulations_but_near_stays_and_is_named():
     assert float(belief.mean) > 0.9
 
 
-def test_a_good_campaign_is_not_doubted():
-    c = tell(campaign())
-    c.update()
-    assert [t.outlyingness for t in c.history] == [None] * 3
-    assert c.belief is c._learner.belief
-
-
-def test_a_measurement_where_the_simulator_gives_none():
+@pytest.mark.parametrize("least", [1.1, 0.985])
+def test_a_measurement_where_the_simulator_hardly_gives_one(least):
     def lost(theta, action):
         x = theta * action + 0.1 * torch.randn_like(theta)
-        return torch.where(action == 3.0, torch.nan, x)
+        return torch.where((action == 3.0) & (theta < least), torch.nan, x)
 
-    c = tell(campaign(simulator=lost))
-    with pytest.warns(UserWarning, match="numbers that no simulation from the prior"):
-        belief = c.update()
-    assert float(belief.mean) == pytest.approx(0.6, abs=0.15)
-    assert c.history[1].outlyingness == float("inf")
-    c.ask()
-
-
-def test_a_measurement_that_is_too_rare_to_simulate():
-    def almost_never(theta, action):
-        x = theta * action + 0.1 * torch.randn_like(theta)
-        return torch.where((action == 3.0) & (theta < 0.985), torch.nan, x)
-
-    c = tell(
-        campaign(simulator=almost_never, details=CampaignDetails(num_scored=1_000))
-    )
+    c = tell(campaign(simulator=lost, details=CampaignDetails(num_scored=1_000)))
     with pytest.warns(UserWarning, match="trial 1"):
         belief = c.update()
     assert belief.diagnostics.trustworthy is False
+    if least > 1:  # no simulation has a number there
+        assert float(belief.mean) == pytest.approx(0.6, abs=0.15)
+        assert c.history[1].outlyingness == float("inf")
     c.ask()
 
 
@@ -156,27 +104,17 @@ def test_a_measurement_that_is_too_rare_to_simulate():
 def test_a_corrected_trial_is_as_if_told_at_once(method):
     right, wrong = tell(campaign(method)), tell(campaign(method), x0=1e15)
     right.update(), wrong.update()
-    assert wrong.health == "alarm"
+    assert (right.health, wrong.health) == ("ok", "alarm")
+    assert [t.outlyingness for t in right.history] == [None] * 3
+    pending = wrong.ask()
     told = wrong.tell(TOLD[0][1], trial=0)
     assert (told.status, told.surprise) == ("ok", None)
     assert "corrected since" in wrong.belief.diagnostics.warnings[0]
     wrong.update()
     assert torch.equal(draws(right), draws(wrong))
     assert scores(right) == scores(wrong)
-    assert wrong.health == right.health == "ok"
-    assert wrong.ask().action.equal(right.ask().action)
-    wrong.tell(1.8), right.tell(1.8)
-    assert torch.equal(draws(right), draws(wrong))
-
-
-@pytest.mark.filterwarnings("ignore:trial 0")
-def test_a_pending_trial_stays_through_a_correction():
-    right, wrong = tell(campaign()), tell(campaign(), x0=1e15)
-    pending = wrong.ask()
-    wrong.tell(TOLD[0][1], trial=0)
-    wrong.update(), right.update()
-    assert torch.equal(draws(right), draws(wrong))
-    assert wrong.ask() is pending
+    assert wrong.health == "ok"
+    assert wrong.ask() is pending  # it stays through a correction
     for c in (right, wrong):
         c.tell(1.8, action=[3.0])
         c.update()
@@ -191,7 +129,7 @@ def test_a_withdrawn_trial_is_as_if_missing():
     missing.update(), wrong.update()
     withdrawn = wrong.withdraw(1, reason="told in cm")
     assert (withdrawn.status, withdrawn.reason) == ("withdrawn", "told in cm")
-    missing.update(), wrong.update()
+    wrong.update()
     assert torch.equal(draws(missing), draws(wrong))
     assert scores(missing) == scores(wrong)
     assert [t.index for t in wrong.history] == [0, 1, 2]
@@ -209,9 +147,7 @@ def test_a_pending_trial_can_be_withdrawn():
     c.withdraw(c.ask())
     assert c.pending is None
     assert c.ask().index == 1
-    with pytest.raises(
-        ValueError, match="expected the index of one of 2 trials; got 2"
-    ):
+    with pytest.raises(ValueError, match="the index of one of 2 trials; got 2"):
         c.withdraw(2)
 
 
@@ -250,51 +186,31 @@ def test_a_correction_behind_an_adoption():
     assert scores(right)[-1] == scores(wrong)[-1]
 
 
-def test_the_last_trial_told_twice():
-    c = campaign()
-    c.ask()
-    told = c.tell(0.5)
-    assert c.tell(0.5) is told
-    with pytest.raises(ValueError, match="expected a pending trial; got none"):
-        c.tell(0.6)
-    assert c.tell(0.5, action=told.action).index == 1  # a further one, by its action
-
-
 @pytest.mark.parametrize(
-    ("x", "text"),
+    ("told", "text"),
     [
-        ("abc", "expected x of real numbers; got 'abc'"),
-        (["1.5"], "expected x of real numbers; got"),
-        ([None], "expected x of real numbers; got [None]"),
-        (object(), "expected x of real numbers; got <object"),
-        (10**400, "expected x of real numbers; got 1000"),
-        (1 + 2j, "expected x of real numbers; got torch.complex128"),
-        (torch.tensor([1j]), "expected x of real numbers; got torch.complex64"),
-        (np.array([1e39]), "expected x within +-3.4e38, the range of float32"),
-        (-torch.ones(1).double() * 1e300, "expected x within +-3.4e38"),
-        ([], "expected x of shape (1,)"),
-        (torch.zeros(0, 1), "expected one outcome of shape (1,); got 0"),
-        ([[1.0], [2.0]], "expected one outcome of shape (1,); got 2"),
+        ({"x": "abc"}, "expected x of real numbers; got 'abc'"),
+        ({"x": [None]}, "expected x of real numbers; got [None]"),
+        ({"x": 10**400}, "expected x of real numbers; got 1000"),
+        ({"x": 1 + 2j}, "expected x of real numbers; got torch.complex128"),
+        ({"x": np.array([1e39])}, "expected x within +-3.4e38, the range of float32"),
+        ({"x": []}, "expected x of shape (1,)"),
+        ({"x": [[1.0], [2.0]]}, "expected one outcome of shape (1,); got 2"),
+        ({"x": 1.0, "action": [np.nan]}, "expected a finite action"),
+        ({"x": 1.0, "action": [1e39]}, "expected a finite action"),
+        ({"x": 1.0, "action": "abc"}, "expected the action"),
     ],
 )
-def test_outcomes_that_are_refused(x, text):
+def test_what_is_refused_leaves_no_trace(told, text):
     c = campaign()
     c.ask()
     with pytest.raises(ValueError, match=re.escape(text)):
-        c.tell(x)
+        c.tell(**told)
     assert c.pending is not None
     assert c.history == ()
 
 
-@pytest.mark.parametrize("action", [[np.nan], [np.inf], [1e39], "abc", [1j]])
-def test_actions_that_are_refused(action):
-    c = campaign()
-    with pytest.raises(ValueError, match="expected (a finite|the) action"):
-        c.tell(1.0, action=action)
-    assert c.state.trials == []
-
-
-@pytest.mark.parametrize("make", [np.float32, np.float64, torch.tensor, int, list])
+@pytest.mark.parametrize("make", [np.float32, torch.tensor, int, list])
 def test_what_is_told_is_a_copy(make):
     c = campaign()
     told = [1.0] if make is list else make(1)
@@ -319,16 +235,10 @@ def test_a_robot_that_changes_its_action_changes_no_record():
     assert bool(ACTIONS.contains(c.history[0].action))
 
 
-def test_simulators_without_numbers():
-    with pytest.raises(ValueError, match="expected at least one number a row of x"):
-        campaign(simulator=lambda theta, action: torch.zeros(len(theta), 0))
-
-
 def test_outlyingness_by_the_farthest_number():
     drawn = torch.stack([torch.linspace(0, 1, 11), torch.zeros(11)], 1)
     assert outlyingness(torch.tensor([0.5, 0.0]), drawn) == 0
     assert outlyingness(torch.tensor([-2.0, 0.0]), drawn) == 2
     assert outlyingness(torch.tensor([torch.nan, 4.0]), drawn[:, 1:].repeat(1, 2)) > 1e9
-    assert outlyingness(torch.tensor([torch.nan, 0.0]), drawn) == 0
     drawn[:, 1] = torch.nan
     assert outlyingness(torch.tensor([0.5, 0.0]), drawn) == float("inf")

@@ -1,6 +1,5 @@
 """A campaign on parameters that no action tells apart."""
 
-import pytest
 import torch
 from sbi.utils import BoxUniform
 
@@ -25,34 +24,22 @@ MODEL = SimulatorModel(
 )
 
 
-@pytest.mark.parametrize("method", ["asbi", "nlhi"])
-def test_the_belief_and_the_campaign_say_it(method):
-    options = CampaignOptions(num_simulations=1_000, network="on demand")
-    campaign = Campaign(MODEL, PRIOR, ACTIONS, method=method, options=options)
-    campaign.attach([2.0], [2 * 0.5 * 0.7])
-    assert repr(campaign) == f"Campaign({method}, 1 trials)"
-    found = campaign.update().diagnostics.combinations  # pyright: ignore
-    assert [c.text for c in found.known] == ["friction * mass"]
-    assert [c.text for c in found.unknown] == ["friction / mass"]
-    (known,) = found.known
-    assert known.low - 0.02 < 0.35 < known.high + 0.02
-    assert known.high - known.low < 0.1
-    assert repr(campaign) == f"Campaign({method}, 1 trials; {found})"
-
-
 def test_what_is_said_outlives_the_process(tmp_path):
     options = CampaignOptions(network="on demand")
-    with Campaign(
-        MODEL, PRIOR, ACTIONS, options=options, directory=tmp_path / "c"
-    ) as c:
+    given = {"options": options, "directory": tmp_path / "c"}
+    with Campaign(MODEL, PRIOR, ACTIONS, **given) as c:
         c.attach([2.0], [2 * 0.5 * 0.7])
+        assert repr(c) == "Campaign(asbi, 1 trials)"
         said = c.update().diagnostics.combinations  # pyright: ignore
+    assert [found.text for found in said.known] == ["friction * mass"]
+    assert [found.text for found in said.unknown] == ["friction / mass"]
+    (known,) = said.known
+    assert known.low - 0.02 < 0.35 < known.high + 0.02
+    assert known.high - known.low < 0.1
     loaded = Campaign.load(tmp_path / "c", simulator=MODEL)
     assert repr(loaded) == "Campaign(asbi, 1 trials)"  # nothing was read yet
     assert loaded.belief.diagnostics.combinations == said  # pyright: ignore
-    assert repr(loaded).endswith(f"; {said})")
-    loaded.close()
-    assert "friction * mass" in str(Campaign.load(tmp_path / "c").belief.diagnostics)  # pyright: ignore
+    assert repr(loaded) == f"Campaign(asbi, 1 trials; {said})"
 
 
 def test_the_report_says_it():

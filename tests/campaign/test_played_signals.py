@@ -3,13 +3,7 @@
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import (
-    Campaign,
-    CampaignOptions,
-    GaussianNoise,
-    SimulatorModel,
-    simulate,
-)
+from sbi_active import Campaign, CampaignOptions, GaussianNoise, SimulatorModel
 from sbi_active.actions import SignalActions
 from sbi_active.actions.waveforms import step
 from sbi_active.campaign.options import CampaignDetails
@@ -68,11 +62,12 @@ def motor(action, seed, *, dead=0.0):
 
 def test_a_campaign_asks_for_signals_and_learns():
     campaign = Campaign(MODEL, PRIOR, SPACE, options=OPTIONS, seed=0)
-    for k in range(3):
-        trial = campaign.ask()
-        assert bool(SPACE.contains(trial.action))
-        assert SPACE.inputs(trial.action)["voltage"].shape == (51,)
-        campaign.tell(motor(trial.action, k))
+    trial = campaign.ask()
+    assert bool(SPACE.contains(trial.action))
+    assert SPACE.inputs(trial.action)["voltage"].shape == (51,)
+    campaign.tell(motor(trial.action, 0))
+    for k, action in enumerate(SPACE.sample((2,), seed=1), 1):
+        campaign.attach(action, motor(action, k))
     campaign.update()
     mean, sd = campaign.belief.mean, campaign.belief.stddev
     assert bool(((mean - TRUTH[0]).abs() < 4 * sd + 0.01).all())
@@ -113,14 +108,3 @@ def test_recorded_inputs_take_the_place_of_the_signals():
     assert abs(posterior[:, 0].mean() - 3.0) < 0.05
     assert loop.actions is SPACE
     assert loop.equivalent() == ()
-
-
-def test_workers_play_the_same_signals():
-    theta, action = PRIOR.sample((40,)), SPACE.sample((40,), seed=2)
-    one, two = (
-        simulate(MODEL, theta, action, seed=5, workers=n, show_progress=False).x
-        for n in (1, 2)
-    )
-    assert torch.equal(one, two)
-    seen = speed(theta, action, inputs=SPACE.inputs(action), times=TIMES.expand(40, -1))
-    assert float((one - seen).square().mean().sqrt()) < 0.03

@@ -88,14 +88,6 @@ def test_a_target_that_cannot_be_had():
     assert c.pending is None
 
 
-def test_the_campaigns_effects_are_its_library():
-    c = campaign(effects=LIBRARY)
-    tell(c, actions=(1.0, -2.0, 2.0, -1.0))
-    report = c.criticize(evaluate=False)
-    assert {"bias", "drift"} <= {*report.probabilities}
-    assert not report.exploratory
-
-
 def run(c, slope=0.5, shift=0.0, num_rounds=6):
     gen = torch.Generator().manual_seed(1)
 

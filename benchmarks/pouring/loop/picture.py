@@ -26,7 +26,7 @@ from benchmarks.pouring.loop.run import (
     poured,
 )
 from benchmarks.pouring.loop.worlds import get_world
-from sbi_active.plots import save
+from sbi_active.display.figures import save
 from sbi_active.seeding import derive_seed
 
 __all__ = ["blocks", "residual_figure", "standardized"]

@@ -13,8 +13,8 @@ import numpy as np
 from benchmarks.pouring.figures import boxes, subplots
 from benchmarks.pouring.summary import Rows
 from benchmarks.rows import read
+from sbi_active.display.figures import save
 from sbi_active.display.table import Table
-from sbi_active.plots import save
 
 __all__ = ["checks_table", "intervol_figure", "summarize"]
 

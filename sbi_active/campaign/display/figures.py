@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.campaign.display.frame import expected_gain, health_after
-from sbi_active.campaign.display.predictions import predict
+from sbi_active.campaign.health import health_after
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.design.drawing import draw, labels_of
 from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.simulation import simulate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,9 +23,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 
-MOST_PARAMETERS = 24  # that have a panel
-LEAST_SHARE = 0.05  # of a panel that the last belief takes
-NUM_PRIOR = 2_000  # draws behind the prior's quantiles
 #: Quantiles that are drawn: the median, half and nine tenths of the belief.
 LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 TRUTH, EXPECTED, FAINT = "#c1432e", "#333333", "#9aa3ab"
@@ -40,8 +37,9 @@ def plot_campaign(
     parameter_names: Sequence[str],
     theta_true: Tensor | None,
     num_predicted: int,
+    most_parameters: int = 24,
 ) -> Figure:
-    """Return the figure of :meth:`.CampaignView.plot`.
+    """Return the figure of :meth:`.Campaign.plot`.
 
     Args:
         state: State of the campaign.
@@ -50,6 +48,7 @@ def plot_campaign(
         parameter_names: Names of the parameters.
         theta_true: True parameters, shape (theta_dim,), where known.
         num_predicted: Simulations of each trial.
+        most_parameters: Parameters that have a panel.
 
     Raises:
         ValueError: If ``theta_true`` has another number of parameters.
@@ -63,7 +62,7 @@ def plot_campaign(
             f"expected theta_true with at most {len(parameter_names)} numbers; got "
             f"{len(truth)}; pass one a parameter"
         )
-    shown = parameter_names[:MOST_PARAMETERS]
+    shown = parameter_names[:most_parameters]
     columns = min(max(len(shown), 2), 4 if len(shown) <= 12 else 5)
     rows = -(-len(shown) // columns)
     high = 2.0 * rows if rows > 1 else 2.7
@@ -97,21 +96,62 @@ def plot_campaign(
     return figure
 
 
+def predict(
+    state: CampaignState,
+    simulator: Callable[[int], Any] | None,
+    prior: Distribution,
+    num_simulations: int,
+) -> dict[int, Array]:
+    """Return simulations of each executed action, by the index of its trial, (n, q).
+
+    They use the kept draws of the belief before the trial. Where these draws are of
+    other parameters, those of an earlier model, there is no prediction.
+
+    Args:
+        state: State of the campaign.
+        simulator: Simulator of a trial, by its index; None for no predictions.
+        prior: Prior of the current parameters.
+        num_simulations: Simulations of each trial; 0 for no predictions.
+    """
+    if simulator is None or num_simulations == 0:
+        return {}
+    with forked_generators(derive_seed(state.seed, "shown")):
+        before = prior.sample(torch.Size([num_simulations]))
+    before = before.reshape(num_simulations, -1)
+    dim, found = before.shape[1], {}
+    for index in state.processed:
+        trial = state.trials[index]
+        if trial.status == "ok" and trial.x is not None and before.shape[1] == dim:
+            theta = before[torch.arange(num_simulations) % len(before)]
+            rows = simulate(
+                simulator(index),
+                theta,
+                trial.action.expand(num_simulations, -1),
+                seed=derive_seed(state.seed, "shown", index),
+                workers=state.options.workers,
+            )
+            x = rows.without_missing().x.flatten(1).double().numpy()
+            if np.isfinite(x).any():
+                found[index] = x
+        before = state.draws.get(index, before)
+    return found
+
+
 def _quantiles(
-    state: CampaignState, prior: Distribution, dim: int
+    state: CampaignState, prior: Distribution, dim: int, num: int = 2_000
 ) -> list[tuple[int, Array]]:
     """Return the quantiles of each belief by the number of trials in it, (5, dim).
 
     Parameters that an earlier model did not have are NaN.
     """
     with forked_generators(derive_seed(state.seed, "draws")):
-        first = prior.sample(torch.Size([NUM_PRIOR])).reshape(NUM_PRIOR, -1)
+        first = prior.sample(torch.Size([num])).reshape(num, -1)
     found = []
     used = [i for i in state.processed if i in state.draws]
     for k, draws in enumerate([first, *(state.draws[i] for i in used)]):
         levels = np.full((len(LEVELS), dim), np.nan)
-        num = min(draws.shape[1], dim)
-        levels[:, :num] = np.quantile(draws[:, :num].double().numpy(), LEVELS, axis=0)
+        size = min(draws.shape[1], dim)
+        levels[:, :size] = np.quantile(draws[:, :size].double().numpy(), LEVELS, axis=0)
         number = 0 if k == 0 else state.processed.index(used[k - 1]) + 1
         found.append((number, levels))
     return found
@@ -123,6 +163,7 @@ def _belief(
     k: int,
     name: str,
     truth: float | None,
+    least_share: float = 0.05,
 ) -> None:
     """Draw quantiles of one parameter over the rounds, readable to the last."""
     rounds = np.array([number for number, _ in beliefs])
@@ -132,21 +173,19 @@ def _belief(
     ax.plot(rounds, levels[:, 2], "o-", color="C0", ms=3, lw=1)
     if truth is not None:
         ax.axhline(truth, color=TRUTH, ls="--", lw=1)
-    # From the round on from which the last belief is more than a line.
+    # From the round on from which the last belief takes its share of the panel.
     low, high, width = levels[:, 0], levels[:, 4], levels[-1, 4] - levels[-1, 0]
     for first in range(len(levels)):
         ends = np.nanmin(low[first:]), np.nanmax(high[first:])
-        if width >= LEAST_SHARE * (ends[1] - ends[0]):
+        if width >= least_share * (ends[1] - ends[0]):
             break
     if truth is not None and low[0] <= truth <= high[0]:
         ends = min(ends[0], truth), max(ends[1], truth)
     room = 0.08 * (ends[1] - ends[0]) or 1e-6 + 0.01 * abs(ends[0])
     ax.set_ylim(ends[0] - room, ends[1] + room)
-    last = levels[-1]
-    digits = _digits(last[2], last[4] - last[0])
-    middle, low, high = (f"{v:.{digits}g}" for v in last[[2, 0, 4]])
-    numbers = f"{middle} ({low} to {high})"
-    ax.set_title(f"{_cut(name)}\n{numbers}", fontsize=8)
+    middle, low, high = (f"{v:.4g}" for v in levels[-1, [2, 0, 4]])
+    shown = name if len(name) <= 24 else f"{name[:12]}…{name[-11:]}"
+    ax.set_title(f"{shown}\n{middle} ({low} to {high})", fontsize=8)
     ax.locator_params(axis="y", nbins=5)
     ax.tick_params(labelsize=8)
     ax.locator_params(axis="x", integer=True)
@@ -265,7 +304,7 @@ def _information(ax: Axes, state: CampaignState) -> None:
     colors = [BARS[health_after(state, t)] for t in used]
     index = [t.index for t in used]
     ax.bar(index, gained, color=colors, alpha=0.7, width=0.7, label="gained")
-    expected = [(t.index, *expected_gain(t.design)) for t in state.trials]
+    expected = [(t.index, *t.expected_gain) for t in state.trials]
     known = np.array([row for row in expected if np.isfinite(row[1])]).reshape(-1, 3)
     if len(known):
         error = 2 * np.nan_to_num(known[:, 2])
@@ -281,19 +320,3 @@ def _information(ax: Axes, state: CampaignState) -> None:
     ax.set_title(total + (f"; {', '.join(worst)}" if worst else ""))
     ax.title.set_fontsize(10)
     ax.set(xlabel="trial", ylabel="information [nats]")
-
-
-def _digits(value: float, width: float) -> int:
-    """Return the digits at which a number shows where in an interval it lies.
-
-    Example:
-        >>> _digits(0.1, 0.5), _digits(150.0, 1.0)
-        (3, 5)
-    """
-    if not (np.isfinite(value) and width > 0):
-        return 3
-    return int(np.clip(np.ceil(np.log10(max(abs(value) / width, 1e-9))) + 2, 3, 5))
-
-
-def _cut(name: str) -> str:
-    return name if len(name) <= 24 else f"{name[:12]}…{name[-11:]}"

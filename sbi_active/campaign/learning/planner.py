@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from sbi_active.campaign.checks.unlike import most_unlike
+from sbi_active.actions import ActionSpace, DiscreteActions
 from sbi_active.campaign.learning.learner import Learner
-from sbi_active.campaign.learning.limits import Limits
 from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.learning.pooled import PooledLearner
 from sbi_active.campaign.learning.revision import compare
@@ -18,6 +18,7 @@ from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.design.design import Design, equal_errors, naming
 from sbi_active.design.designer import InformationGainDesigner
 from sbi_active.design.estimators.automatic import ESTIMATORS
+from sbi_active.design.limits import DesignLimits, pricing
 from sbi_active.design.random_designer import RandomDesigner
 from sbi_active.seeding import derive_seed
 
@@ -31,16 +32,29 @@ class Planner:
     """Designs the trials of a campaign.
 
     Args:
-        limits: The action space, what of it is permitted, and its cost.
+        actions: Action space of the campaign.
         state: State of the campaign.
         effects: Effects that its simulator may lack.
+        constraint: Function of actions (n, action_dim) that says which are permitted,
+            shape (n,), bool; None permits all.
+        cost: Cost of actions (n, action_dim), shape (n,), or one number an action of a
+            list; None for none.
 
     Attributes:
         effects: Effects that the simulator may lack.
+
+    Raises:
+        ValueError: If constraint or cost has another shape, or permits nothing.
     """
 
     def __init__(
-        self, limits: Limits, state: CampaignState, effects: Sequence[Effect]
+        self,
+        actions: ActionSpace,
+        state: CampaignState,
+        effects: Sequence[Effect],
+        *,
+        constraint: Callable[[Tensor], Tensor] | None = None,
+        cost: Callable[[Tensor], Tensor] | Tensor | None = None,
     ) -> None:
         from sbi_active.criticism.effects.declarations import (
             require_distinct,
@@ -49,8 +63,16 @@ class Planner:
 
         require_distinct(effects)
         require_nested(effects)
-        self._limits, self._state, self.effects = limits, state, (*effects,)
-        options, actions = state.options, limits.actions
+        self._state, self.effects = state, (*effects,)
+        options = state.options
+        none = torch.empty(0, actions.action_dim)
+        least = options.details.min_probability_valid
+        price = pricing(cost, actions)
+        self._limits = DesignLimits(actions, constraint, none, price, least)
+        # A wrong shape is an error here, and not in a later round.
+        permitted(self._limits)
+        listed = actions.listed()
+        self._limits.cost(actions.sample((8,), seed=0) if listed is None else listed)
         self._designs = find_method(state.method).designs
         self._designer = (
             InformationGainDesigner(
@@ -100,7 +122,7 @@ class Planner:
             self._state,
             learner.simulator,
             learner.prior,
-            self._limits.permitted(),
+            permitted(self._limits),
             trials=trials,
             effects=self.effects if effects is None else effects,
         )
@@ -122,54 +144,68 @@ class Planner:
             alarmed: Whether the simulator no longer explains the trials; then what is
                 to be learned about its parameters does not count.
         """
-        options = self._state.options
-        told = [t for t in self._state.trials if t.is_measured]
-        executed = torch.stack([t.action for t in told]) if told else torch.empty(0)
-        exclude = None if options.details.repeat or not told else executed
-        limits = self._limits.options(exclude)
-        limits["min_probability_valid"] = options.details.min_probability_valid
+        details = self._state.options.details
+        told = [t.action for t in self._state.trials if t.is_measured]
+        limits = self._limits
+        if told and not details.repeat:
+            limits = replace(limits, exclude=torch.stack(told))
         if not self._designs:
-            return self._select(index, learner, self._designer, **limits), "random"
+            options = _keywords(limits)
+            return self._select(index, learner, self._designer, **options), "random"
         if target == "auto" and self._checks(index):
-            places = most_unlike(self._limits.permitted(exclude), executed)
-            designer = RandomDesigner(places, workers=options.workers)
+            places = most_unlike(permitted(limits), told)
+            designer = RandomDesigner(places, workers=self._state.options.workers)
             return self._select(index, learner, designer), "check"
-        about_model = None
-        # What nothing explains would draw the next trial after it; reports have it.
-        trials = self._state.explained
-        can_compare = self.effects and len(trials) >= FEWEST_TRIALS
-        if target == "model" or (target == "auto" and can_compare):
-            with self._state.stage(index, "criticism"):
-                about_model = _model_design(
-                    self.compare(learner, trials), self._limits, exclude
-                )
+        about_model = self._about_model(index, target, learner, limits)
         if about_model is not None and (target == "model" or alarmed):
             return about_model, "model"
         own = "theta" if target in ("auto", "model") else target
         if isinstance(learner, PooledLearner):
-            pooled = learner.design(
-                index,
-                self._limits.design(exclude, options.details.min_probability_valid),
-            )
-            if about_model is not None and _utility(about_model) > _utility(pooled):
-                return about_model, "model"
-            return pooled, "theta"
-        model = learner.model(index)
+            design, own = learner.design(index, limits), "theta"
+        else:
+            design = self._about_parameters(index, own, learner, limits)
+        if about_model is not None and _utility(about_model) > _utility(design):
+            return about_model, "model"
+        return design, own if isinstance(own, str) else ", ".join(own)
+
+    def _about_model(
+        self,
+        index: int,
+        target: str | Sequence[str],
+        learner: Learner,
+        limits: DesignLimits,
+    ) -> Design | None:
+        """Return the design for the right model, where it is asked for or may be."""
+        # What nothing explains would draw the next trial after it; reports have it.
+        trials = self._state.explained
+        can_compare = self.effects and len(trials) >= FEWEST_TRIALS
+        if target != "model" and not (target == "auto" and can_compare):
+            return None
+        with self._state.stage(index, "criticism"):
+            return _model_design(self.compare(learner, trials), limits)
+
+    def _about_parameters(
+        self,
+        index: int,
+        target: str | Sequence[str],
+        learner: Learner,
+        limits: DesignLimits,
+    ) -> Design:
+        """Return the design for parameters, with the model of the round."""
+        model = learner.round.model(index)
         design = self._select(
             index,
             learner,
             self._designer,
             model,
-            target=own,
-            cost=self._limits.cost,
-            simulations=learner.simulations,
-            **limits,
+            target=target,
+            cost=limits.price,
+            simulations=learner.round.simulations,
+            **_keywords(limits),
         )
         if model.was_asked:
-            learner.note(index, "design" if _rests_on_model(design) else "notes")
-        if about_model is not None and _utility(about_model) > _utility(design):
-            return about_model, "model"
-        return design, own if isinstance(own, str) else ", ".join(own)
+            learner.round.note(index, "design" if _rests_on_model(design) else "notes")
+        return design
 
     def _select(
         self,
@@ -195,26 +231,85 @@ class Planner:
         return every is not None and (index + 1) % every == 0
 
 
-def _model_design(
-    criticism: Criticism, limits: Limits, exclude: Tensor | None
-) -> Design | None:
+def permitted(limits: DesignLimits) -> ActionSpace:
+    """Return the space, where it is limited as a list of what is permitted.
+
+    Raises:
+        ValueError: If nothing is permitted.
+    """
+    actions = limits.actions
+    if limits.constraint is None and not len(limits.exclude):
+        return actions
+    values, _ = limits.listed()
+    if values is None:
+        values = limits.drawn(0)
+    return DiscreteActions(values, names=actions.names, units=actions.units)
+
+
+def most_unlike(
+    actions: ActionSpace, executed: Sequence[Tensor], num_draws: int = 1_024
+) -> ActionSpace:
+    r"""Return the permitted actions farthest from all executed ones.
+
+    .. math::
+        \arg\max_\xi \min_t \lVert (\xi - \xi_t) / r \rVert
+
+    with r the range of each entry. Actions of most information about d parameters tend
+    to repeat about d settings, at which any model of d parameters fits.
+
+    Args:
+        actions: The permitted ones.
+        executed: Executed actions, each of shape (action_dim,).
+        num_draws: Candidates of a space without end.
+
+    References:
+        Johnson, Moore & Ylvisaker, J. Stat. Plan. Inference 1990 (maximin distance).
+
+    Example:
+        >>> speeds = DiscreteActions([0.0, 1.0, 2.0, 3.0, 4.0])
+        >>> most_unlike(speeds, [torch.tensor([0.0]), torch.tensor([4.0])]).values
+        tensor([[2.]])
+    """
+    if not executed:
+        return actions
+    values = actions.listed()
+    if values is None:
+        values = actions.sample((num_draws,), seed=0)
+    width = values.max(0).values - values.min(0).values
+    width = torch.where(width > 0, width, torch.ones_like(width))
+    places = torch.stack([*executed])
+    distance = torch.cdist(values / width, places / width).min(1).values
+    best = distance >= distance.max() - 1e-6
+    return DiscreteActions(values[best], names=actions.names, units=actions.units)
+
+
+def _keywords(limits: DesignLimits) -> dict[str, Any]:
+    """Return limits as a designer takes them, without the cost."""
+    return {
+        "constraint": limits.constraint,
+        "exclude": limits.exclude,
+        "min_probability_valid": limits.least,
+    }
+
+
+def _model_design(criticism: Criticism, limits: DesignLimits) -> Design | None:
     """Return the design that tells most about which rival is right.
 
     Args:
         criticism: Comparison of the model with all trials so far.
         limits: Limits of the actions, and their cost.
-        exclude: Actions not to repeat, shape (t, action_dim).
 
     Returns:
         None if no permitted action tells anything: one rival is left, or those left
         predict the same.
     """
     spent = criticism.rivals.simulator.num_simulations
-    found = criticism.next_action(limits.permitted(exclude), beyond=False)
+    found = criticism.next_action(permitted(limits), beyond=False)
     if found.action is None:
         return None
     candidates = torch.as_tensor(found.candidates).float()
-    gain, cost = torch.as_tensor(found.information_gain), limits.price(candidates)
+    gain = torch.as_tensor(found.information_gain)
+    cost = None if limits.price is None else limits.price(candidates)
     # Without a cost the choice was made on other simulations than these estimates.
     action = torch.as_tensor(found.action).float()
     index = int((candidates == action).all(1).int().argmax())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,16 +14,13 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.actions.summaries import find_summaries
-from sbi_active.campaign.checks.misfit import error_nats, misfit
-from sbi_active.campaign.checks.score import compared
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.learning.methods import find_method
+from sbi_active.campaign.score import Score, compared
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.design.design import Design
 from sbi_active.design.elimination import Estimates, choose
 from sbi_active.design.limits import DesignLimits
-from sbi_active.inference.beliefs.belief import information_gained
-from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.identifiability import note_combinations
 from sbi_active.inference.emulation.joint import candidate_gains
 from sbi_active.inference.emulation.pool import Pool
@@ -39,7 +36,6 @@ MOST_CANDIDATES = 48  # of a space without end
 NUM_LEADERS = 6  # that the second half of a design's simulations goes to
 FEW = 8  # rows to look at a simulator
 BESIDE = 8  # rows at an executed action, beyond one a parameter, before it is used
-NUM_PREDICTED = 2_000  # that an outcome is compared with, at no simulation
 
 
 class PooledLearner(Learner):
@@ -51,6 +47,8 @@ class PooledLearner(Learner):
         ValueError: If the method is neither "asbi" nor "nsbi", or beliefs are not
             refined.
     """
+
+    has_networks = False
 
     def __init__(
         self,
@@ -79,17 +77,14 @@ class PooledLearner(Learner):
         return action
 
     def _probe(self) -> torch.Size:
-        seed = self._state.seed
-        with forked_generators(seed, "probe"):
-            theta: Tensor = self.prior.sample(torch.Size([FEW]))
-        action = self._actions.sample((FEW,), seed=derive_seed(seed, "probe"))
+        theta, action = self._few(FEW)
         rows = simulate(
             self.simulator,
             theta,
             self.simulated(action),
-            seed=derive_seed(seed, "probe", 1),
+            seed=derive_seed(self.state.seed, "probe", 1),
             check_noise=True,
-            workers=self._state.options.workers,
+            workers=self.state.options.workers,
         )
         return rows.x.shape[1:]
 
@@ -101,11 +96,8 @@ class PooledLearner(Learner):
             return None
         if model.noise is None or not bool((model.noise.parameters > 0).all()):
             return None
-        seed = self._state.seed
-        with forked_generators(seed, "probe"):
-            theta: Tensor = self.prior.sample(torch.Size([FEW]))
-        action = self._actions.sample((FEW,), seed=derive_seed(seed, "probe"))
-        bare, workers = model.without_noise(), self._state.options.workers
+        theta, action = self._few(FEW)
+        bare, workers = model.without_noise(), self.state.options.workers
         first, second = (
             simulate(bare, theta, action, seed=k, workers=workers).x for k in (1, 2)
         )
@@ -115,10 +107,10 @@ class PooledLearner(Learner):
     @cached_property
     def pool(self) -> Pool:
         """All simulations for the current model."""
-        simulator, workers = self.simulator, self._state.options.workers
+        simulator, workers = self.simulator, self.state.options.workers
         if self.noise is not None and isinstance(simulator, SimulatorModel):
             simulator = simulator.without_noise()
-        return Pool(simulator, self._state.batches, workers)
+        return Pool(simulator, self.state.batches, workers)
 
     def _processes(self, *key: int | str) -> Processes:
         return Processes(
@@ -127,9 +119,9 @@ class PooledLearner(Learner):
             self.noise,
             tuple(self.x_shape),
             fitted_summaries(self._choice, self.pool.rows.x),
-            self._state.options.refinement,
+            self.state.options.refinement,
             self.belief,
-            seed=derive_seed(self._state.seed, "pooled", *key),
+            seed=derive_seed(self.state.seed, "pooled", *key),
         )
 
     def _trial(self, trial: Trial) -> PooledTrial:
@@ -140,29 +132,26 @@ class PooledLearner(Learner):
         return PooledTrial(self.simulated(trial.action), trial.x.float(), label)
 
     def _add(self, theta: Tensor, action: Tensor, belief: Distribution) -> None:
-        seed = derive_seed(self._state.seed, "pool", len(self._state.batches))
+        seed = derive_seed(self.state.seed, "pool", len(self.state.batches))
         self.pool.simulate(
             theta, action, seed=seed, log_proposal=belief.log_prob(theta).double()
         )
 
     def _drawn(self, num: int) -> Tensor:
         """Return parameters from the belief, shape (num, theta_dim)."""
-        with forked_generators(self._state.seed, "pool", len(self._state.batches)):
+        with forked_generators(self.state.seed, "pool", len(self.state.batches)):
             return self.belief.sample(torch.Size([num])).float()
 
     def _rows_left(self, part: str, index: int) -> int:
         """Return how many rows the design or the belief of a trial may take."""
-        state, options = self._state, self._state.options
-        designs = find_method(state.method).designs
-        share = DESIGN_SHARE if designs else 0.0
+        state, options = self.state, self.state.options
+        share = DESIGN_SHARE if find_method(state.method).designs else 0.0
         if options.max_simulations is None:
-            total = options.num_simulations
             if part == "design":
-                return int(share * total)
-            spent = (
-                0 if index >= len(state.trials) else state.trials[index].num_simulations
-            )
-            return max(total - spent, 0)
+                return int(share * options.num_simulations)
+            is_new = index >= len(state.trials)
+            spent = 0 if is_new else state.trials[index].num_simulations
+            return max(options.num_simulations - spent, 0)
         to_go = options.planned_trials - len(state.measured)
         to_go = to_go if to_go >= 1 else 2
         left = state.meter.left
@@ -172,23 +161,16 @@ class PooledLearner(Learner):
 
     def design(self, index: int, limits: DesignLimits) -> Design:
         """Return the design of a trial, by simulations of the pool."""
-        with self._state.stage(index, "design"):
+        with self.state.stage(index, "design"):
             return self._design(index, limits)
 
     def _design(self, index: int, limits: DesignLimits) -> Design:
-        seed = derive_seed(self._state.seed, "design", index)
-        listed, notes = limits.listed()
-        if listed is None:
-            listed = limits.drawn(seed)[:MOST_CANDIDATES]
-            if self._choice is not None:  # all summaries of the same actions
-                values = self._choice.values[:, 0]
-                few = listed[: max(1, MOST_CANDIDATES // len(values))]
-                listed = few.repeat_interleave(len(values), 0)
-                listed[:, self._entry] = values.repeat(len(few))
+        seed = derive_seed(self.state.seed, "design", index)
+        listed, notes = self._candidates(limits, seed)
         places, which = self.simulated(listed).unique(dim=0, return_inverse=True)
-        start, allowed = self._state.meter.spent, self._rows_left("design", index)
+        start, allowed = self.state.meter.spent, self._rows_left("design", index)
         half = allowed // 2
-        if half < 1 and not len(self._state.batches):
+        if half < 1 and not len(self.state.batches):
             raise SimulationBudgetError(
                 f"expected simulations for a design; got {allowed}; raise "
                 "max_simulations"
@@ -225,15 +207,29 @@ class PooledLearner(Learner):
             limits,
             estimator="PooledGain",
             bound="none",
-            num_simulations=self._state.meter.spent - start,
+            num_simulations=self.state.meter.spent - start,
             num_missing=0,
             seed=seed,
         )
 
+    def _candidates(
+        self, limits: DesignLimits, seed: int
+    ) -> tuple[Tensor, tuple[str, ...]]:
+        """Return actions, some of a space without end, and notes on the others."""
+        listed, notes = limits.listed()
+        if listed is None:
+            listed = limits.drawn(seed)[:MOST_CANDIDATES]
+            if self._choice is not None:  # all summaries of the same actions
+                values = self._choice.values[:, 0]
+                few = listed[: max(1, MOST_CANDIDATES // len(values))]
+                listed = few.repeat_interleave(len(values), 0)
+                listed[:, self._entry] = values.repeat(len(few))
+        return listed, notes
+
     def _spread(self, places: Tensor, num: int) -> None:
         """Simulate parameters from the belief where the pool is worth least."""
         worth = torch.zeros(len(places), dtype=torch.float64)
-        if self._state.batches:
+        if self.state.batches:
             weight, rows = self.pool.weights(self.belief), self.pool.rows.action
             for k, place in enumerate(places):
                 own = weight[torch.isclose(rows, place, atol=1e-7).all(1)]
@@ -241,7 +237,7 @@ class PooledLearner(Learner):
                     worth[k] = own.sum() ** 2 / own.square().sum()
         jitter = torch.rand(
             len(places),
-            generator=torch.Generator().manual_seed(len(self._state.batches)),
+            generator=torch.Generator().manual_seed(len(self.state.batches)),
         )
         counts = torch.zeros(len(places), dtype=torch.int64)
         for _ in range(num):
@@ -268,12 +264,12 @@ class PooledLearner(Learner):
         """
         dim, lacking = self.belief.sample(torch.Size([1])).shape[-1], []
         for trial in trials:
-            here = len(self.pool.at(trial.action)) if self._state.batches else 0
+            here = len(self.pool.at(trial.action)) if self.state.batches else 0
             if here < dim + BESIDE:
                 lacking.append((trial.action, 2 * (dim + BESIDE) - here))
         total = sum(num for _, num in lacking)
         if total > max(allowed, 0):
-            state = self._state
+            state = self.state
             raise SimulationBudgetError(
                 f"expected {total} simulations for the belief; got {allowed} of "
                 f"max_simulations = {state.options.max_simulations}, of which "
@@ -284,78 +280,54 @@ class PooledLearner(Learner):
             action = torch.cat([a.expand(num, -1) for a, num in lacking])
             self._add(self._drawn(total), action, self.belief)
 
-    def score(self, trial: Trial) -> None:
-        """Compare a trial with what the belief before it and the pool predict."""
-        state, start = self._state, self._state.meter.spent
-        with state.stage(trial.index, "scoring"):
-            own = self._trial(trial)
-            self._require_rows([own], self._rows_left("belief", trial.index))
-            processes = self._processes("score", trial.index)
-            near, label = processes.near, processes.best_summary(own)
-            fitted = processes.fit_trial(own, label, near)
-            rng = np.random.default_rng(derive_seed(state.seed, "score", trial.index))
-            z = near[rng.integers(len(near), size=NUM_PREDICTED)]
-            if fitted.processes:
-                drawn = torch.from_numpy(fitted.draw(z, rng))
-                surprise, log_score = compared(drawn, torch.from_numpy(fitted.observed))
-            else:
-                share = 1.0
-                if fitted.outcome is not None:
-                    share = float(np.exp(fitted.outcome.log_prob(z)).mean())
-                surprise, log_score = (share if share < 0.5 else 1.0), math.log(share)
-        state.account(
-            trial.index,
-            state.meter.spent - start,
-            0,
-            surprise=surprise,
-            belief_error=error_nats(getattr(self.belief, "diagnostics", Diagnostics())),
-            log_score=log_score,
-            version=state.version.number,
-        )
+    def _score(self, trial: Trial, num_predicted: int = 2_000) -> Score:
+        """Compare a trial with what the belief and the pool predict, by draws."""
+        state, start = self.state, self.state.meter.spent
+        own = self._trial(trial)
+        self._require_rows([own], self._rows_left("belief", trial.index))
+        processes = self._processes("score", trial.index)
+        near, label = processes.near, processes.best_summary(own)
+        fitted = processes.fit_trial(own, label, near)
+        rng = np.random.default_rng(derive_seed(state.seed, "score", trial.index))
+        z = near[rng.integers(len(near), size=num_predicted)]
+        if fitted.processes:
+            drawn = torch.from_numpy(fitted.draw(z, rng))
+            surprise, log_score = compared(drawn, torch.from_numpy(fitted.observed))
+        else:
+            share = 1.0
+            if fitted.outcome is not None:
+                share = float(np.exp(fitted.outcome.log_prob(z)).mean())
+            surprise, log_score = (share if share < 0.5 else 1.0), math.log(share)
+        return Score(surprise, log_score, state.meter.spent - start, 0)
 
-    def _learn(self, trial: Trial) -> None:
-        state, before = self._state, self.belief
-        start = state.meter.spent
-        with state.stage(trial.index, "update"):
-            trials = [*(t for t in state.explained if t.index != trial.index), trial]
-            belief = self._infer(trials, trial.index)
-            gained = information_gained(
-                belief, before, seed=derive_seed(state.seed, "gain", trial.index)
-            )
-        state.account(
-            trial.index,
-            state.meter.spent - start,
-            self.pool.num_missing,
-            information_gained=gained,
-            misfit=misfit(belief.diagnostics),
-        )
+    def _prepare(self, index: int) -> None:
+        pass  # there is no network
+
+    def _updated(self, trial: Trial) -> tuple[Any, int, int]:
+        state, start = self.state, self.state.meter.spent
+        trials = [*(t for t in state.explained if t.index != trial.index), trial]
+        belief = self._infer(trials, trial.index)
+        return belief, state.meter.spent - start, self.pool.num_missing
 
     def _infer(self, trials: Sequence[Trial], key: int) -> Any:
         own = [self._trial(t) for t in trials]
         index = trials[-1].index
-        allowed, start = self._rows_left("belief", index), self._state.meter.spent
+        allowed, start = self._rows_left("belief", index), self.state.meter.spent
         self._require_rows(own, allowed)
-        allowed -= self._state.meter.spent - start
+        allowed -= self.state.meter.spent - start
         processes = self._processes("belief", key)
         processes.begin(own, max(allowed, 0))
         belief = processes.run()
         if self._choice is not None:
             for trial, label in zip(trials, processes.labels, strict=True):
-                self._state.change(trial.index, summary=label)
-        note_combinations(belief, self._names, seed=self._state.seed)
+                self.state.change(trial.index, summary=label)
+        note_combinations(belief, self._names, seed=self.state.seed)
         self._trainer.resume(belief, [self._observation(t) for t in trials])
         self._saved = None
         return belief
 
     def _examine(self, trial: Trial) -> Trial:
         return trial  # few simulations tell nothing about all of the prior
-
-    def posterior(self, index: int) -> NoReturn:
-        """Raise: there is no network."""
-        raise ValueError(
-            "expected a campaign that trains networks; got max_simulations or a "
-            "SummaryAction, with which none is trained; use the belief"
-        )
 
 
 def make_learner(

@@ -11,7 +11,6 @@ import torch
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
-from sbi_active.campaign.learning.draws import keep_draws
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.learning.pooled import make_learner
 from sbi_active.campaign.state import CampaignState, ModelVersion, Trial
@@ -67,28 +66,6 @@ def compare(
     )
 
 
-def criticize(
-    state: CampaignState, criticism: Criticism, *, evaluate: bool, designed: bool
-) -> Report:
-    """Return the report of a comparison, and note it in the campaign's state.
-
-    Args:
-        state: State of the campaign.
-        criticism: Comparison from :func:`compare`.
-        evaluate: Whether to report the error before and after.
-        designed: Whether the actions were chosen for information.
-    """
-    examined = state.version.examined
-    with state.watch(state, len(state.trials), "criticism"):
-        report = criticism.report(
-            evaluate=evaluate,
-            designed=designed,
-            exploratory=any(d != criticism.digest for d in examined),
-        )
-    state.examined(criticism.digest)
-    return report
-
-
 def revise(state: CampaignState, actions: ActionSpace, report: Report) -> Learner:
     """Return the learner of a report's simulator, which has learned all trials.
 
@@ -130,14 +107,14 @@ def revise(state: CampaignState, actions: ActionSpace, report: Report) -> Learne
     state.batches.clear()  # they are of another simulator
     try:
         revised = make_learner(report.simulator, report.prior, actions, state)
-        with state.watch(state, len(state.trials), "inference from all trials"):
+        with state.watched(len(state.trials), "inference from all trials"):
             misfit = revised.infer(state.measured)
     except BaseException:
         state.versions.pop()
         state.batches[:] = batches
         raise
     state.versions[-1] = replace(version, misfit=misfit)
-    keep_draws(state, revised.belief)
+    state.keep_draws(revised.belief)
     return revised
 
 
@@ -198,9 +175,9 @@ def recompute(state: CampaignState, learner: Learner) -> None:
     learner.restart()
     if version.trials:
         before = [t for i in version.trials if (t := state.trials[i]).is_measured]
-        with state.watch(state, len(state.trials), "inference from all trials"):
+        with state.watched(len(state.trials), "inference from all trials"):
             misfit = learner.infer(before)
         state.versions[-1] = replace(version, misfit=misfit)
         state.processed.extend(version.trials)
-        keep_draws(state, learner.belief)
+        state.keep_draws(learner.belief)
     state.is_stale = False

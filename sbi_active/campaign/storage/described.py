@@ -13,8 +13,12 @@ from torch import Tensor
 from torch import distributions as td
 
 from sbi_active.actions import ActionSpace, BoxActions, DiscreteActions, MixedActions
-from sbi_active.campaign.options import GROUPS, CampaignDetails, CampaignOptions
-from sbi_active.campaign.stopping import StopRules
+from sbi_active.campaign.options import (
+    GROUPS,
+    CampaignDetails,
+    CampaignOptions,
+    StopRules,
+)
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.models.lfire import LFIRE
 from sbi_active.inference.networks.mixture_density import MixtureDensity

@@ -12,7 +12,7 @@ import torch
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
-from sbi_active.campaign.checks.unexplained import doubts, in_doubt
+from sbi_active.campaign.health import doubts, in_doubt
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.learning.pooled import make_learner
 from sbi_active.campaign.learning.revision import rebuilt

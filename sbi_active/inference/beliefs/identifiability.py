@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from torch.distributions import Distribution
 
 from sbi_active.combinations.formula import Combination, Term, linked
-from sbi_active.combinations.rounding import width
-from sbi_active.combinations.search import KNOWN, search
+from sbi_active.combinations.search import KNOWN, search, width
 from sbi_active.seeding import forked_generators
 
 Array = NDArray[Any]

@@ -7,18 +7,11 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import Independent, Normal
 
-from sbi_active import (
-    Campaign,
-    CampaignOptions,
-    DiscreteActions,
-    GaussianNoise,
-    MixtureDensity,
-    SimulatorModel,
-)
-from sbi_active.campaign.checks import most_unlike
+from sbi_active import Campaign, DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active.campaign.learning.planner import most_unlike
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.criticism import Effect
-from tests.campaign.sizes import REFINEMENT
+from tests.campaign import problem
 
 PRIOR = BoxUniform(-2 * torch.ones(1), 2 * torch.ones(1))
 ACTIONS = DiscreteActions([-2.0, -1.0, 1.0, 2.0])
@@ -27,13 +20,7 @@ MODEL = SimulatorModel(
     noise=GaussianNoise(0.1),
     parameter_names=["slope"],
 )
-OPTIONS = CampaignOptions(
-    num_simulations=400,
-    num_samples=100,
-    details=CampaignDetails(num_scored=400),
-    density_estimator=MixtureDensity(hidden_features=(16,), num_iterations=30),
-    refinement=REFINEMENT,
-)
+OPTIONS = replace(problem.OPTIONS, details=CampaignDetails(num_scored=400))
 SHIFT = 0.8
 
 
@@ -192,15 +179,9 @@ def test_every_second_trial_may_go_where_none_was():
         actions.append(float(c.ask().action))
         c.tell([0.5 * actions[-1]])
     for index, (action, trial) in enumerate(zip(actions, c.history, strict=True)):
-        unlike = most_unlike(ACTIONS, torch.tensor(actions[:index])[:, None])
+        executed = [torch.tensor([a]) for a in actions[:index]]
+        unlike = most_unlike(ACTIONS, executed)
         is_check = index % 2 == 1
         assert trial.design.expected_information_gain.isnan().all() == is_check
         if is_check:
             assert action in unlike.values[:, 0].tolist()
-
-
-def test_options_are_checked():
-    with pytest.raises(ValueError, match="expected num_scored >= 100; got 5"):
-        CampaignOptions(details=CampaignDetails(num_scored=5))
-    with pytest.raises(ValueError, match="expected check_every >= 1 or None; got 0"):
-        CampaignOptions(check_every=0)

@@ -2,16 +2,20 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 from scipy.integrate import quad
 from torch.distributions import MultivariateNormal, Normal
 
-from sbi_active.campaign import CampaignOptions, Trial
-from sbi_active.campaign.checks import assess, log_e_value, score_outcome
+from sbi_active import StopRules
+from sbi_active.campaign import CampaignOptions, Trial, health
+from sbi_active.campaign.health import assess, log_e_value
+from sbi_active.campaign.score import score_outcome
 from sbi_active.campaign.state import CampaignState, ModelVersion
 from sbi_active.seeding import derive_seed
+from tests.campaign.problem import campaign
 
 PRIOR = MultivariateNormal(torch.zeros(1), torch.eye(1))
 ACTION = torch.tensor([2.0])
@@ -39,17 +43,6 @@ def test_surprise_and_log_score_are_those_of_the_predictive():
         assert found.surprise == pytest.approx(tail, abs=4 * error + 1 / 2_000)
         assert found.log_score == pytest.approx(log_p, abs=0.2)
     assert score([60.0]).surprise == pytest.approx(1 / 2_001)
-
-
-def test_surprises_are_uniform_where_the_simulator_is_right():
-    gen = torch.Generator().manual_seed(0)
-    p = []
-    for i in range(200):
-        x = 2 * torch.randn(1, generator=gen) + 0.5 * torch.randn(1, generator=gen)
-        p.append(score(x, seed=i, num_samples=200).surprise)
-    ordered = torch.tensor(p).sort().values
-    gap = (ordered - torch.linspace(1 / 200, 1, 200)).abs().max()
-    assert float(gap) < 1.63 / math.sqrt(200)  # Kolmogorov, level .01
 
 
 def test_a_failure_is_as_surprising_as_it_is_rare():
@@ -101,9 +94,9 @@ def test_health_from_surprises():
 
 def test_a_belief_that_is_off_for_want_of_simulations_is_no_test():
     made = state([0.4, 5e-4, 5e-3])
-    for error, health in ((0.1, "alarm"), (0.3, "ok"), (math.inf, "ok")):
+    for error, expected in ((0.1, "alarm"), (0.3, "ok"), (math.inf, "ok")):
         made.change(1, belief_error=error)
-        assert assess(made) == health
+        assert assess(made) == expected
 
 
 def test_health_from_misfit():
@@ -127,3 +120,29 @@ def test_alarms_are_rare_unless_predictions_fail(effect):
     else:  # the level, and 3 of its binomial errors
         level = 0.025
         assert alarms / num < level + 3 * math.sqrt(level * (1 - level) / num)
+
+
+@pytest.mark.parametrize("refine", [True, False])
+def test_a_lost_calibration_stops_and_is_judged_once(refine, monkeypatch):
+    calls = []
+
+    def check(*_, **__):
+        calls.append(1)
+        return SimpleNamespace(
+            verdict="stop" if len(calls) > 1 else "trust",
+            reasons=("it excludes the truth",),
+        )
+
+    name = "check_belief" if refine else "check_calibration"
+    monkeypatch.setattr(health, name, check)
+    c = campaign(stop=StopRules(calibration_lost=True), refine=refine)
+    c.run(lambda action: 0.4 * action, num_rounds=3)
+    assert len(c.history) == len(calls) == 2
+    assert c.stop_reason == "calibration is lost: it excludes the truth"
+
+
+def test_a_right_belief_is_not_lost():
+    c = campaign(stop=StopRules(calibration_lost=True))
+    c.tell(0.4, action=[1.0])
+    c.update()
+    assert c.stop_reason is None

@@ -1,0 +1,264 @@
+"""What a round trains on, and the network that it trains."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+
+from sbi_active.actions import ActionSpace
+from sbi_active.campaign.isolation import isolated
+from sbi_active.inference.beliefs.enumerated import Enumeration
+from sbi_active.inference.models.posterior import ActionPosterior
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.simulation.bank.bank import Bank
+from sbi_active.simulation.bank.reweighting import FEW, reuse
+from sbi_active.simulation.outcomes import Simulations
+from sbi_active.simulation.workers.engine import simulate
+from sbi_active.simulation.workers.settings import Workers
+from sbi_active.simulation.workers.store import find_store
+
+LOGGER = logging.getLogger("sbi_active")
+DENSITIES = ("log_posterior", "log_likelihood", "log_ratio")
+
+
+def simulate_round(
+    simulator: Callable[..., Any],
+    theta: Tensor,
+    action: Tensor,
+    *,
+    prior: Distribution | None,
+    actions: ActionSpace,
+    num_earlier: int,
+    seed: int,
+    workers: Workers,
+) -> tuple[Simulations, int, int]:
+    """Return simulations of a round; of a first one those that a bank has among them.
+
+    The new ones of a first round are stored with their density under the prior, so that
+    the next campaign can weight them.
+
+    Args:
+        simulator: The current one.
+        theta: Parameters of the round, shape (n, theta_dim).
+        action: Actions of the round, shape (n, action_dim).
+        prior: Prior that theta was drawn from, for a first round; else None.
+        actions: Rows of other actions are not taken.
+        num_earlier: Rows of the bank that were there before this campaign; what it
+            stored itself must not count when it begins again.
+        seed: Seed of the new simulations, and of the choice of earlier ones.
+        workers: Workers that run the simulations.
+
+    Returns:
+        At most n rows without the missing, how many were simulated, and how many of
+        these are missing.
+    """
+    store = None if prior is None else find_store(simulator)
+    if prior is None or not isinstance(store, Bank):
+        rows = simulate(simulator, theta, action, seed=seed, workers=workers)
+        return rows.without_missing(), len(rows), rows.counts["missing"]
+    earlier = _earlier(store, prior, actions, num_earlier, len(theta), seed)
+    first = 0 if earlier is None else len(earlier)
+    if earlier is not None and first == len(theta):
+        return earlier, 0, 0
+    rows = simulate(
+        simulator,
+        theta[first:],
+        action[first:],
+        seed=seed,
+        workers=workers,
+        store=store.drawn_from(prior, label="prior"),
+    )
+    known = rows.without_missing()
+    if earlier is not None:
+        parts = [(getattr(earlier, n), getattr(known, n)) for n in ("theta", "action")]
+        x = torch.cat([earlier.x, known.x])
+        known = Simulations(*map(torch.cat, parts), x=x)
+    return known, len(rows), rows.counts["missing"]
+
+
+def _earlier(
+    bank: Bank,
+    prior: Distribution,
+    actions: ActionSpace,
+    num_earlier: int,
+    num_rows: int,
+    seed: int,
+) -> Simulations | None:
+    """Return as many earlier rows as they are worth; None if that is too few."""
+    if not num_earlier:
+        return None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # their number is said below
+            found = reuse(bank, prior)
+    except ValueError:  # none whose proposal is known
+        return None
+    permitted = actions.contains(bank.read(found.rows).action)
+    weights = found.weights * (permitted & (found.rows < num_earlier))
+    if not weights.sum() > 0:
+        return None
+    found = replace(found, weights=weights / weights.sum())
+    worth = found.effective_sample_size
+    used = min(num_rows, int(worth))
+    LOGGER.info(
+        "first round: %d of %d rows are read from %s, whose %d earlier rows are worth "
+        "%.0f draws from the prior",
+        *(used if used >= FEW else 0, num_rows, bank.path, int((weights > 0).sum())),
+        worth,
+    )
+    if used < FEW:
+        return None
+    return found.resample(used, seed=derive_seed(seed, "reused"))
+
+
+class Round:
+    """A round of a campaign: its simulations, its network and who uses it.
+
+    Args:
+        learner: Learner whose belief the round begins at.
+
+    Attributes:
+        simulations: Simulations that the last training was on, where the design is to
+            rest on them; else None.
+    """
+
+    def __init__(self, learner: Any) -> None:
+        self._learner = learner
+        self.simulations: Simulations | None = None
+        self.close()
+
+    def close(self) -> None:
+        """Have the next question train a network again."""
+        self._is_trained, self._asked = False, ()
+
+    def note(self, index: int, *by: str) -> None:
+        """Write down what asked this round's network, see :class:`.Trial`."""
+        state = self._learner.state
+        self._asked = (*self._asked, *by)
+        if index < len(state.trials):
+            earlier = state.trials[index].network_used_by
+            asked = tuple(dict.fromkeys((*earlier, *self._asked)))
+            state.change(index, network_used_by=asked)
+
+    def model(self, index: int) -> RoundModel:
+        """Return the model that a design asks, trained now or on demand.
+
+        Args:
+            index: Index of the trial that is designed.
+        """
+        learner = self._learner
+        if Enumeration.of(learner.prior) is not None:
+            return RoundModel(None)
+        is_fresh = learner.state.options.details.design_on == "fresh"
+        can_wait = learner.inference.amortized and is_fresh
+        is_due = learner.trains_each_round or not can_wait
+        return RoundModel(
+            lambda: self.trained(index), self.trained(index) if is_due else None
+        )
+
+    def posterior(self, index: int) -> ActionPosterior:
+        """Return the model of this round where it is a posterior.
+
+        Args:
+            index: Index of the trial that the round is for.
+
+        Raises:
+            ValueError: If it is another one, or none is trained.
+        """
+        if not self._learner.has_networks:
+            raise ValueError(
+                "expected a campaign that trains networks; got max_simulations or a "
+                "SummaryAction, with which none is trained; use the belief"
+            )
+        model = self.trained(index)
+        if not isinstance(model, ActionPosterior):
+            raise ValueError(
+                "expected the method 'asbi' or 'nsbi', whose network is a posterior; "
+                f"got {self._learner.state.method!r}; use the belief"
+            )
+        self.note(index, "posterior")
+        return model
+
+    def trained(self, index: int) -> Any:
+        """Return the model trained under the current belief, training if needed.
+
+        Args:
+            index: Index of the trial that the work is for.
+        """
+        learner, state = self._learner, self._learner.state
+        if not self._is_trained:
+            with state.stage(index, "simulation"):
+                rows, num_simulations, num_missing = self._rows(index)
+                if state.options.details.design_on == "training":
+                    self.simulations = rows
+            with state.stage(index, "training"):
+                learner.inference.append_simulations(
+                    rows.theta, rows.x, action=rows.action, belief=learner.belief
+                )
+                with forked_generators(state.seed, "train", len(state.explained)):
+                    learner.inference.train()
+            state.account(index, num_simulations, num_missing)
+            self._is_trained = True
+        return learner.inference.build_posterior()
+
+    def _rows(self, index: int) -> tuple[Simulations, int, int]:
+        """Simulate the round: parameters from the belief, actions from the space."""
+        learner, state = self._learner, self._learner.state
+        # Not the index: a trial that was missing, or taken out, trains nothing.
+        seed, num, key = state.seed, state.options.num_simulations, len(state.explained)
+        with forked_generators(seed, "theta", key):
+            drawn = learner.belief.sample(torch.Size([num]))
+        action = learner.actions.sample((num,), seed=derive_seed(seed, "action", key))
+        theta, action = learner.inference.arrange(drawn, action)
+        is_first = key == 0 and theta is drawn and not learner.has_index
+        return simulate_round(
+            learner.at(index),
+            theta,
+            action,
+            prior=learner.belief if is_first else None,
+            actions=learner.actions,
+            num_earlier=state.num_earlier,
+            seed=derive_seed(seed, "x", key),
+            workers=state.options.workers,
+        )
+
+
+class RoundModel:
+    """The model of a round, as a designer takes it.
+
+    Args:
+        train: Function that returns the model, trained in this call if needed; None
+            if none can be, as of discrete parameters.
+        model: The trained model; None leaves it untrained until something asks for one
+            of its densities.
+
+    Attributes:
+        was_asked: Whether something did.
+    """
+
+    def __init__(self, train: Callable[[], Any] | None, model: Any = None) -> None:
+        self._train, self._model = train, model
+        self.was_asked = False
+
+    @property
+    def is_trained(self) -> bool:
+        """Whether the model is there without any work."""
+        return self._model is not None
+
+    def __getattr__(self, name: str) -> Any:
+        is_density = name in DENSITIES
+        if self._train is None:
+            raise AttributeError(name)
+        if is_density and self._model is None:
+            # Estimates are made without gradients, training is not.
+            self._model = isolated(self._train)()
+        found = getattr(self._model, name)
+        self.was_asked |= is_density
+        return found

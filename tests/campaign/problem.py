@@ -1,0 +1,51 @@
+"""One parameter, a push and noise of a tenth: a campaign of a fraction of a second."""
+
+from dataclasses import replace
+
+import torch
+from sbi.utils import BoxUniform
+
+from sbi_active import (
+    Campaign,
+    CampaignOptions,
+    DiscreteActions,
+    GaussianNoise,
+    MixtureDensity,
+    SimulatorModel,
+)
+from sbi_active.campaign.options import CampaignDetails
+from sbi_active.inference import RatioClassifier
+from tests.campaign.sizes import REFINEMENT
+
+PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
+ACTIONS = DiscreteActions([0.5, 1.0, 3.0])
+MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise(0.1))
+DETAILS = CampaignDetails(num_scored=200)
+OPTIONS = CampaignOptions(
+    num_simulations=300,
+    num_samples=100,
+    details=DETAILS,
+    density_estimator=MixtureDensity(hidden_features=(16,), num_iterations=30),
+    refinement=REFINEMENT,
+    network="on demand",
+)
+RATIOS = RatioClassifier(hidden_features=(16,), num_iterations=50)
+
+
+def noisy(theta, action):
+    """The same model, which draws its noise itself."""
+    return theta * action + 0.1 * torch.randn_like(theta)
+
+
+def campaign(method="nsbi", simulator=MODEL, *, actions=ACTIONS, given=None, **changes):
+    """Return a campaign with options changed, and further arguments given."""
+    network = RATIOS if method == "seqbed" else OPTIONS.density_estimator
+    options = replace(OPTIONS, **{"density_estimator": network, **changes})
+    return Campaign(
+        simulator, PRIOR, actions, method=method, options=options, **(given or {})
+    )
+
+
+def draws(c, num=300):
+    torch.manual_seed(5)
+    return c.belief.sample((num,))
