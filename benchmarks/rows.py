@@ -1,12 +1,16 @@
-"""Rows of results in CSV files, to which resumable benchmarks add."""
+"""Rows of results in CSV and JSON files, to which resumable benchmarks add."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any, TypeVar
 
 from torch import Tensor
+
+T = TypeVar("T")
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -33,3 +37,22 @@ def append(
 def short(value: object) -> object:
     """Return a number with six digits."""
     return f"{float(value):.6g}" if isinstance(value, (float, Tensor)) else value
+
+
+def stages(path: Path) -> dict[str, Any]:
+    """Return the stages of a JSON file by name, none if it is not there."""
+    return json.loads(path.read_text()) if path.is_file() else {}
+
+
+def keep(path: Path, rows: Mapping[str, Any]) -> None:
+    """Write all stages of a JSON file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(rows, indent=1) + "\n")
+
+
+def measured(read_data: Callable[..., T], *arguments: Any) -> T:
+    """Return measured data, or end the process where they are not there."""
+    try:
+        return read_data(*arguments)
+    except FileNotFoundError as error:
+        raise SystemExit(f"{error}, as in --data DIR") from None

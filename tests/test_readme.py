@@ -64,7 +64,7 @@ def test_overview(run, capsys):
     assert len(style.inference.trials) == 2
     assert loop.report.verdict == "bias"
     assert "Verdict: bias (P" in printed
-    assert "P holds among the\ndeclared effects alone" in printed
+    assert "P holds among the declared effects alone" in " ".join(printed.split())
 
 
 def test_simulations(run, capsys):
@@ -129,7 +129,7 @@ def test_seeing(run, capsys, monkeypatch):
     for name in ("campaign.png", "design.png"):
         assert Path(name).stat().st_size > 10_000
     belief = page.campaign.belief
-    assert belief.parameter_names == ("friction", "loss")
+    assert belief.parameter_names == ("friction", "drag")
     assert ((belief.mean - page.truth).abs() < 4 * belief.variance.sqrt()).all()
 
 

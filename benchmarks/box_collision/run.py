@@ -5,7 +5,7 @@
     python -m benchmarks box_collision --target 1 --setting paper --methods asbi
     python -m benchmarks box_collision --table coverage --rounds 3 --reference none
     python -m benchmarks box_collision --table references --particles 30
-    python -m benchmarks box_collision --summary --figures FOLDER
+    python -m benchmarks box_collision --summary
 
 Resumable: a trial that stands in the CSV is not run again. One row a round, one file a
 method, target and setting, in ``benchmarks/box_collision/results``. The tables are
@@ -37,7 +37,6 @@ from benchmarks.box_collision.summary import (
     REPORTED,
     STAGES,
     coverage_table,
-    draw,
     summarize,
 )
 from benchmarks.rows import append, read, short
@@ -135,7 +134,6 @@ class Settings:
         bank: Folder to keep first rounds' simulations in; for one worker, and the time
             of a first round is then not that of a campaign alone.
         results: Folder of the results.
-        figures: Folder for the figures.
         summary: Whether to run nothing, and print the table of the rows.
     """
 
@@ -152,7 +150,6 @@ class Settings:
     particles: int = 100
     bank: Path | None = None
     results: Path = RESULTS
-    figures: Path | None = None
     summary: bool = False
 
     def __post_init__(self) -> None:
@@ -381,5 +378,3 @@ def main(arguments: Settings) -> None:
             if rows:
                 cells[method, target] = rows
     print(coverage_table(cells) if is_coverage else summarize(cells))
-    if arguments.figures is not None and cells:
-        print(*draw(cells, arguments.figures), sep="\n")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ __all__ = [
     "REPORTED",
     "STAGES",
     "coverage_table",
-    "draw",
     "read",
     "summarize",
 ]
@@ -36,7 +34,6 @@ PUBLISHED = published("box collision")
 PUBLISHED_SPEEDS = published("box collision speeds")
 (PUBLISHED_TIME,) = published("box collision time")["a round"]
 COMPARED = 3  # round by which target 2 should be pushed more slowly
-COLORS = {"1": "tab:blue", "2": "tab:orange"}
 
 #: Of the reference's log p, nats, above which importance sampling has failed.
 LARGEST_ERROR = 0.5
@@ -192,86 +189,6 @@ def coverage_table(cells: Cells) -> str:
         return "no trials of three rounds yet"
     header = ["", "round", "trials", "in 50 % region", "in 90 % region", "gap"]
     return Table(header, table).text()
-
-
-def draw(cells: Cells, folder: Path) -> list[Path]:
-    """Draw Figures 7 to 9 and return their paths.
-
-    Args:
-        cells: Rows by method and target.
-        folder: Made where it is missing.
-    """
-    from matplotlib.figure import Figure
-
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    targets = sorted({target for _, target in cells})
-    methods = [*dict.fromkeys(method for method, _ in cells)]
-
-    figure = Figure(figsize=(5 * len(targets), 3.5), layout="constrained")
-    for axes, target in zip(grid(figure, len(targets)), targets, strict=True):
-        present = [m for m in methods if (m, target) in cells]
-        for k, method in enumerate(present):
-            rows = cells[method, target]
-            rounds = range(1, num_rounds(rows) + 1)
-            boxes = axes.boxplot(
-                [column(rows, "log_prob_true", r) for r in rounds],
-                positions=[r + 0.25 * (k - (len(present) - 1) / 2) for r in rounds],
-                widths=0.2,
-                manage_ticks=False,
-                patch_artist=True,
-                boxprops={"facecolor": f"C{k}", "alpha": 0.6},
-                medianprops={"color": "black"},
-                flierprops={"markersize": 3},
-            )
-            boxes["boxes"][0].set_label(method.upper())
-        axes.axhline(0, color="tab:purple", ls=":", label="prior")
-        axes.set(title=f"Target {target}", xlabel="round")
-        axes.set_ylabel("log p(truth), nats")
-        axes.legend()
-    paths.append(save(figure, folder / "log_prob.png"))
-
-    figure = Figure(figsize=(4 * len(methods), 3.5), layout="constrained")
-    for axes, method in zip(grid(figure, len(methods)), methods, strict=True):
-        for target in targets:
-            if (method, target) not in cells:
-                continue
-            rows = cells[method, target]
-            rounds = range(1, num_rounds(rows) + 1)
-            speeds = [column(rows, "speed", r) for r in rounds]
-            mean = np.array([s.mean() for s in speeds])
-            sd = np.array([s.std() for s in speeds])
-            color = COLORS.get(target, "gray")
-            axes.plot(rounds, mean, "o-", color=color, label=f"target {target}")
-            axes.fill_between(rounds, mean - sd, mean + sd, color=color, alpha=0.2)
-        axes.set(title=method.upper(), xlabel="round", ylabel="speed, m/s")
-        axes.legend()
-    paths.append(save(figure, folder / "speeds.png"))
-
-    figure = Figure(figsize=(3 + len(methods), 3.5), layout="constrained")
-    axes = figure.subplots()
-    for k, method in enumerate(methods):
-        rows = [row for (m, _), part in cells.items() if m == method for row in part]
-        bottom = 0.0
-        for j, (part, seconds) in enumerate(time_parts(rows, "wall").items()):
-            label = part if k == 0 else None
-            axes.bar(method.upper(), seconds, bottom=bottom, color=f"C{j}", label=label)
-            bottom += seconds
-    axes.set_ylabel("wall s a round")
-    figure.legend(loc="outside right upper")
-    paths.append(save(figure, folder / "time.png"))
-    return paths
-
-
-def grid(figure: Any, num: int) -> list[Any]:
-    """Return axes side by side."""
-    return [*figure.subplots(1, num, squeeze=False)[0]]
-
-
-def save(figure: Any, path: Path) -> Path:
-    """Write a figure and return its path."""
-    figure.savefig(path, dpi=120)
-    return path
 
 
 def by_seed(rows: Rows, round_: int) -> dict[int, float]:

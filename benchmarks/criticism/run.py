@@ -6,7 +6,6 @@
     python -m benchmarks criticism --table pairs --world B --trials 12 --cases 60
     python -m benchmarks criticism --table active --world B --trials 10 --cases 40
     python -m benchmarks criticism --table priors --world A --scale 3 --cases 100
-    python -m benchmarks criticism --table correlation --world C --cases 100
     python -m benchmarks criticism --table loop --world D --kind library --cases 60
     python -m benchmarks criticism --table loop --world A --summary
 
@@ -14,8 +13,7 @@ loop: false alarms, power, tracing, calibration, error before and after. open: t
 effect was removed from the library, or removed with all that could stand in for it, or
 never stood in it. pairs: two effects. active:
 actions chosen by the loop beside random ones. priors: the scales of the effects' priors
-are wrong by a factor. correlation: false alarms and power by the correlation of the
-errors, as the loop does by default and with the errors taken as independent.
+are wrong by a factor.
 
 Resumable: a case that stands in the CSV is not run again. One row a case, one file a
 setting, in benchmarks/criticism/results. Give each command a core of its own
@@ -24,7 +22,6 @@ setting, in benchmarks/criticism/results. Give each command a core of its own
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -44,7 +41,6 @@ TABLES: dict[str, tuple[str, ...]] = {
     "pairs": ("pair",),
     "active": ("library",),
     "priors": ("clean", "library"),
-    "correlation": ("clean", "library"),
 }
 
 
@@ -75,32 +71,23 @@ class Settings:
     summary: bool = False
 
 
-def settings(arguments: Settings) -> Iterator[tuple[str, bool]]:
-    """Yield every kind of case and whether errors are taken as independent."""
-    kinds = (arguments.kind,) if arguments.kind else TABLES[arguments.table]
-    both = arguments.table == "correlation"
-    for kind in kinds:
-        for independent in (False, True) if both else (arguments.independent,):
-            yield kind, independent
-
-
-def paths(arguments: Settings, kind: str, independent: bool) -> list[Path]:
+def paths(arguments: Settings, kind: str) -> list[Path]:
     """Return the setting's file, then those of processes with another first case."""
     name = f"{arguments.world}_{kind}_{arguments.trials}"
     name += f"_scale_{arguments.scale:.3g}" if arguments.scale != 1 else ""
-    name += "_independent" if independent else ""
+    name += "_independent" if arguments.independent else ""
     name += "_active" if arguments.table == "active" else ""
     mine = f"{name}_from_{arguments.first}" if arguments.first else name
     others = sorted({RESULTS / f"{name}.csv", *RESULTS.glob(f"{name}_from_*.csv")})
     return [RESULTS / f"{mine}.csv", *others]
 
 
-def run_setting(arguments: Settings, kind: str, independent: bool) -> None:
+def run_setting(arguments: Settings, kind: str) -> None:
     """Run the cases that are in none of the files yet."""
-    path, *others = paths(arguments, kind, independent)
+    path, *others = paths(arguments, kind)
     path.parent.mkdir(parents=True, exist_ok=True)
     done = {int(row["case"]) for other in others for row in read(other)}
-    options = {"assume_independent": True} if independent else {}
+    options = {"assume_independent": True} if arguments.independent else {}
     world = get_world(arguments.world, **options)
     active = arguments.table == "active"
     for number in range(arguments.first, arguments.first + arguments.cases):
@@ -131,12 +118,13 @@ def run_setting(arguments: Settings, kind: str, independent: bool) -> None:
 
 def main(arguments: Settings) -> None:
     """Run what is asked for and print its table."""
-    found: dict[tuple[str, bool], list[dict[str, str]]] = {}
-    for kind, independent in settings(arguments):
+    found: dict[str, list[dict[str, str]]] = {}
+    for kind in (arguments.kind,) if arguments.kind else TABLES[arguments.table]:
         if not arguments.summary:
-            run_setting(arguments, kind, independent)
-        _, *files = paths(arguments, kind, independent)
-        found[kind, independent] = [row for file in files for row in read(file)]
+            run_setting(arguments, kind)
+        _, *files = paths(arguments, kind)
+        found[kind] = [row for file in files for row in read(file)]
     world = get_world(arguments.world)
-    for line in tables.summary(arguments.table, world, found):
+    title = ", iid errors" if arguments.independent else ""
+    for line in tables.summary(arguments.table, world, found, title):
         print(line)

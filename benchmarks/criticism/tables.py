@@ -24,28 +24,25 @@ BINS = ((0.0, 10.0), (10.0, 25.0), (25.0, np.inf))
 
 
 def summary(
-    table: str, world: World, found: Mapping[tuple[str, bool], Sequence[Row]]
+    table: str, world: World, found: Mapping[str, Sequence[Row]], title: str = ""
 ) -> list[str]:
     """Return the lines of a table.
 
     Args:
-        table: Its name.
-        world: Where.
-        found: Rows by kind and by whether errors were taken as independent.
+        table: Name of the table.
+        world: World of the rows.
+        found: Rows by kind.
+        title: Words behind each kind.
     """
     lines: list[str] = []
-    for (kind, independent), rows in found.items():
-        title = f"world {world.name}, {kind}" + (", iid errors" if independent else "")
-        lines += ["", f"## {title}: {len(rows)} cases"]
+    for kind, rows in found.items():
+        lines += ["", f"## world {world.name}, {kind}{title}: {len(rows)} cases"]
         failed = [r for r in rows if r["failure"]]
         lines += [f"failed {r['case']}: {r['failure']}" for r in failed]
         rows = [r for r in rows if not r["failure"]]
         if not rows:
             continue
-        if table == "correlation":
-            lines += _by_correlation(world, kind, rows)
-        else:
-            lines += SUMMARIES[table, kind](world, rows)
+        lines += SUMMARIES[table, kind](world, rows)
         lines += _cost(rows)
     if table in ("loop", "priors") and len(found) == 2:
         # As many of each, as the prior has it: "none" is right in half of the sets.
@@ -256,19 +253,6 @@ def _active(world: World, rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-def _by_correlation(world: World, kind: str, rows: Sequence[Row]) -> list[str]:
-    lines = SUMMARIES["loop", kind](world, rows)
-    for rho in sorted({float(r["correlation"]) for r in rows}):
-        these = [r for r in rows if float(r["correlation"]) == rho]
-        if kind == "clean":
-            lines.append(f"rho {rho:g}: alarms {rate([*map(_detected, these)])}")
-        else:
-            strong = [r for r in these if float(r["lambda"]) > BINS[-1][0]]
-            found = rate([*map(_detected, strong)])
-            lines.append(f"rho {rho:g}: detected at lambda > 25 {found}")
-    return lines
-
-
 def _calibration(world: World, rows: Sequence[Row]) -> list[str]:
     stated = [merged(world, json.loads(r["probabilities"])) for r in rows]
     truth = [_key(world, r["effects"]) for r in rows]
@@ -354,8 +338,8 @@ def _range(values: np.ndarray) -> str:
 
 
 SUMMARIES: dict[tuple[str, str], Callable[[World, Sequence[Row]], list[str]]] = {
-    **{(table, "clean"): _clean for table in ("loop", "priors", "correlation")},
-    **{(table, "library"): _library for table in ("loop", "priors", "correlation")},
+    **{(table, "clean"): _clean for table in ("loop", "priors")},
+    **{(table, "library"): _library for table in ("loop", "priors")},
     ("open", "removed"): _removed,
     ("open", "inexpressible"): _removed,
     ("open", "outside"): _outside,

@@ -10,24 +10,27 @@ on the rest. Rows that are there are kept. ``--figures DIR`` draws, and
 
 from __future__ import annotations
 
-import json
-import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from benchmarks.measured.ball_tables import tables
-from benchmarks.measured.fall_least_squares import (
+from benchmarks.measured.ball_forecast import (
     KINDS,
+    Forecast,
+    aligned_error,
+    forecast,
     forecast_error,
     second_drop_error,
 )
-from benchmarks.measured.forecast import Forecast, aligned_error, forecast
+from benchmarks.measured.verdicts import row_of
+from benchmarks.rows import keep, measured, stages
 from sbi_active.criticism import Criticism
 from sbi_active.criticism.results import NONE, ModelKey, Tracing
+from sbi_active.display.table import Table
 from sbi_active.tasks.ball_drops import (  # pyright: ignore
     DRAG,
     Drop,
@@ -38,37 +41,41 @@ from sbi_active.tasks.ball_drops import (  # pyright: ignore
     trials_of,
 )
 
-__all__ = ["judge", "main", "score"]
+__all__ = ["called", "judge", "main", "score", "tables"]
 
+Array = NDArray[Any]
+Row = dict[str, Any]
 DATA = Path("../shared/data/ball_drops")
 RESULT = Path(__file__).parent / "results" / "ball_drops.json"
 UNTIL = 0.8  # s
 DRAWN = ("bowling_ball", "blue_basketball", "yellow_whiffle_ball")
+LIKELY = 0.5  # probability of the family of drag from which it is the verdict
+NUM_BOOTSTRAP = 4_000
+WHEN = ("before", "after")
+COLUMNS = (*WHEN, *KINDS)
 
 
-def judge(drops: Sequence[Drop], *, seed: int = 0) -> dict[str, Any]:
+def judge(drops: Sequence[Drop], *, seed: int = 0) -> Row:
     """Return what the drops of one ball say of it.
 
     Args:
-        drops: Of one ball.
-        seed: Of all draws.
+        drops: Drops of one ball.
+        seed: Seed of all draws.
     """
     begin = time.process_time()
-    loop = _criticism(trials_of([*drops]), seed)
+    loop = criticism(trials_of([*drops]), seed)
     detection, tracing = loop.detect(), loop.trace()
-    power = loop.rivals.fit(ModelKey(("power-law drag",))).evidence
-    linear, quadratic = (
-        loop.rivals.fit(ModelKey((name,))).evidence.log_evidence
-        for name in ("linear drag", "quadratic drag")
+    power, linear, quadratic = (
+        loop.rivals.fit(ModelKey((f"{form} drag",))).evidence
+        for form in ("power-law", "linear", "quadratic")
     )
     return {
         "ball": drops[0].ball,
-        **_found(tracing),
+        **found(tracing),
         "alarm": detection.alarm,
         "log_bayes_factor": detection.log_bayes_factor,
-        "robust": tracing.robust,
         "exponent": np.quantile(power.draws[:, -1], [0.05, 0.5, 0.95]).tolist(),
-        "linear_over_quadratic": linear - quadratic,
+        "linear_over_quadratic": linear.log_evidence - quadratic.log_evidence,
         "cpu_seconds": time.process_time() - begin,
         "simulations": loop.rivals.simulator.num_simulations,
     }
@@ -76,60 +83,56 @@ def judge(drops: Sequence[Drop], *, seed: int = 0) -> dict[str, Any]:
 
 def score(
     fitted: Drop, tested: Drop, *, seed: int = 0
-) -> tuple[dict[str, Any], dict[str, Forecast]]:
+) -> tuple[Row, dict[str, Forecast]]:
     """Return the errors on the rest of a drop, and the forecasts.
 
     Args:
-        fitted: Fitted whole.
-        tested: Fitted in its first 0.8 s.
-        seed: Of all draws.
+        fitted: Drop that is fitted whole.
+        tested: Drop that is fitted in its first 0.8 s.
+        seed: Seed of all draws.
     """
     begin = time.process_time()
     pair = [fitted, tested]
-    loop = _criticism(trials_of(pair, until={1: UNTIL}), seed)
+    loop = criticism(trials_of(pair, until={1: UNTIL}), seed)
     tracing, whole = loop.trace(), trials_of(pair)
     verdicts = {"before": NONE, "after": tracing.verdict}
     averaged = {"before": {NONE: 1.0}, "after": tracing.probabilities}
-    found = {
+    forecasts = {
         when: forecast(loop.rivals, whole, probabilities=p, trial=1, seed=seed)
         for when, p in averaged.items()
     }
-    row: dict[str, Any] = {
-        "ball": tested.ball,
-        "tested": tested.drop,
-        **_found(tracing),
-    }
+    row: Row = {"ball": tested.ball, "tested": tested.drop, **found(tracing)}
     for when, verdict in verdicts.items():
+        error = aligned_error(loop.rivals, whole, verdict=verdict, trial=1)
         row |= {
-            f"forecast {when}": found[when].rmse,
-            f"coverage {when}": found[when].coverage,
-            f"second drop {when}": aligned_error(
-                loop.rivals, whole, verdict=verdict, trial=1
-            ),
+            f"forecast {when}": forecasts[when].rmse,
+            f"coverage {when}": forecasts[when].coverage,
+            f"second drop {when}": error,
         }
     for kind in KINDS:
         row[f"forecast {kind}"] = forecast_error(fitted, tested, kind, until=UNTIL)
         row[f"second drop {kind}"] = second_drop_error(fitted, tested, kind)
-    return row | {"cpu_seconds": time.process_time() - begin}, found
+    return row | {"cpu_seconds": time.process_time() - begin}, forecasts
 
 
-def _criticism(trials: Any, seed: int) -> Criticism:
+def criticism(trials: Any, seed: int) -> Criticism:
+    """Return the closed loop on some drops."""
     return Criticism(
         make_simulator(), make_prior(), trials, effects=make_effects(), seed=seed
     )
 
 
-def _found(tracing: Tracing) -> dict[str, Any]:
+def found(tracing: Tracing) -> Row:
+    """Return a verdict, and the probability of any drag."""
     drags = {e.name for e in make_effects() if e.family == DRAG}
-    return {
-        "verdict": tracing.verdict,
-        "probabilities": tracing.probabilities,
-        "credible_set": [*tracing.credible_set],
+    row = row_of(tracing)
+    kept = {name: row[name] for name in ("verdict", "probabilities", "credible_set")}
+    return kept | {
         "probability_of_drag": sum(
             p
-            for name, p in tracing.probabilities.items()
+            for name, p in row["probabilities"].items()
             if drags & {*name.split(" + ")}
-        ),
+        )
     }
 
 
@@ -141,7 +144,7 @@ def main(
     reports: Path | None = None,
     balls: Sequence[str] | None = None,
     seed: int = 0,
-) -> int:
+) -> None:
     """Run what is missing from the results, and print the tables.
 
     Args:
@@ -152,20 +155,13 @@ def main(
         balls: Names of balls; all by default.
         seed: Seed of the engine.
     """
-    try:
-        drops = read_drops(data)
-    except FileNotFoundError as error:
-        print(f"{error}, as in --data DIR", file=sys.stderr)
-        return 2
-    rows: dict[str, Any] = {}
-    if out.is_file():
-        rows = json.loads(out.read_text())
-    by_ball: dict[str, list[Drop]] = {}
-    for drop in drops:
+    rows, by_ball = stages(out), {}
+    for drop in measured(read_drops, data):
         by_ball.setdefault(drop.ball, []).append(drop)
-    for ball, pair in by_ball.items():
-        if balls and ball not in balls:
-            continue
+    wanted = {
+        ball: pair for ball, pair in by_ball.items() if ball in (balls or by_ball)
+    }
+    for ball, pair in wanted.items():
         for key in (ball, f"{ball} 1", f"{ball} 2"):
             if key in rows:
                 continue
@@ -174,26 +170,25 @@ def main(
             else:
                 tested = int(key[-1]) - 1
                 rows[key], _ = score(pair[1 - tested], pair[tested], seed=seed)
-            out.parent.mkdir(parents=True, exist_ok=True)
-            out.write_text(json.dumps(rows, indent=1) + "\n")
+            keep(out, rows)
     print(tables([*rows.values()]))
     if figures is not None:
         _draw(rows, by_ball, figures, seed=seed)
     if reports is not None:
-        for ball in balls or by_ball:
-            loop = _criticism(trials_of(by_ball[ball]), seed)
+        for ball, pair in wanted.items():
+            loop = criticism(trials_of(pair), seed)
             print(loop.report(evaluate=False).save(reports / ball))
-    return 0
 
 
 def _draw(
-    rows: dict[str, Any], by_ball: dict[str, list[Drop]], folder: Path, *, seed: int
+    rows: dict[str, Row], by_ball: dict[str, list[Drop]], folder: Path, *, seed: int
 ) -> None:
     from benchmarks.measured.ball_figures import draw_exponents, draw_forecasts
 
     folder.mkdir(parents=True, exist_ok=True)
     judged = [row for row in rows.values() if "alarm" in row]
-    draw_exponents(judged, folder / "exponents.png")
+    shown = [row for row in judged if called(row) == "drag-like"]
+    draw_exponents(shown, folder / "exponents.png")
     pairs = {ball.replace("_", " "): by_ball[ball] for ball in DRAWN if ball in by_ball}
     draw_forecasts(
         {name: score(one, two, seed=seed)[1] for name, (one, two) in pairs.items()},
@@ -201,3 +196,93 @@ def _draw(
         folder / "forecasts.png",
         until=UNTIL,
     )
+
+
+def tables(rows: Sequence[Row]) -> str:
+    """Return the verdicts a ball, and the errors over all folds, in Markdown.
+
+    Args:
+        rows: Rows of ``judge``, with "alarm", and of ``score``.
+    """
+    balls = [row for row in rows if "alarm" in row]
+    folds = [row for row in rows if "tested" in row]
+    return "\n\n".join([_verdicts(balls), _errors(folds), _folds(folds)])
+
+
+def called(row: Row) -> str:
+    """Return the verdict on a ball, that of the family for a drag."""
+    is_drag = row["verdict"] != "none" and row["probability_of_drag"] > LIKELY
+    return "drag-like" if is_drag else row["verdict"]
+
+
+def _verdicts(rows: Sequence[Row]) -> str:
+    cells = []
+    for row in rows:
+        low, middle, high = row["exponent"]
+        verdict, exponent, favor = called(row), "", ""
+        if verdict == "drag-like":
+            exponent = f"{middle:.2f} ({low:.2f} to {high:.2f})"
+            favor = f"{row['linear_over_quadratic']:+.1f}"
+        odds = f"{row['probability_of_drag']:.2f}", f"{row['log_bayes_factor']:.1f}"
+        ball, kept = row["ball"].replace("_", " "), ", ".join(row["credible_set"])
+        cells.append((ball, verdict, *odds, kept, exponent, favor))
+    header = ["ball", "verdict", "P(drag)", "log BF", "not excluded (90 %)"]
+    header += ["exponent, 5 to 95 %", "linear over quadratic, nats"]
+    return Table(header, cells).markdown()
+
+
+def _errors(rows: Sequence[Row]) -> str:
+    """Return root mean squares over folds, with intervals over balls."""
+    balls = sorted({row["ball"] for row in rows})
+    rng = np.random.default_rng(0)
+    resampled = rng.integers(len(balls), size=(NUM_BOOTSTRAP, len(balls)))
+
+    def squares(what: str, name: str) -> Array:
+        """Return the mean square of each ball."""
+        every = [(r["ball"], r[f"{what} {name}"] ** 2) for r in rows]
+        return np.array([np.mean([v for b, v in every if b == ball]) for ball in balls])
+
+    def cell(value: float, many: Array) -> str:
+        low, high = np.quantile(np.sqrt(many), [0.05, 0.95])
+        return f"{np.sqrt(value):.2f} ({low:.2f} to {high:.2f})"
+
+    cells = []
+    for what in ("second drop", "forecast"):
+        square = {name: squares(what, name) for name in COLUMNS}
+        mean = {name: s.mean() for name, s in square.items()}
+        many = {name: s[resampled].mean(1) for name, s in square.items()}
+        ratio = cell(mean["after"] / mean["before"], many["after"] / many["before"])
+        cells.append([what, *(cell(mean[n], many[n]) for n in COLUMNS), ratio])
+    cover = [f"{np.mean([row[f'coverage {w}'] for row in rows]):.2f}" for w in WHEN]
+    rest = [""] * (len(KINDS) + 1)
+    cells.append(["90 % coverage of the forecast", *cover, *rest])
+    names = [*WHEN, *(f"{kind}, least squares" for kind in KINDS)]
+    header = [f"RMSE, m, {len(rows)} folds", *names, "after / before"]
+    return Table(header, cells).markdown()
+
+
+def _folds(rows: Sequence[Row]) -> str:
+    cells = []
+    for row in rows:
+        pairs = [
+            f"{row[f'{what} before']:.2f} -> {row[f'{what} after']:.2f}"
+            for what in ("second drop", "forecast", "coverage")
+        ]
+        drop, drag = f"{row['ball']} {row['tested']}", row["probability_of_drag"]
+        cells.append((drop.replace("_", " "), called(row), f"{drag:.2f}", *pairs))
+    errors = ("second drop, m", "forecast, m", "coverage")
+    return Table(("tested drop", "verdict", "P(drag)", *errors), cells).markdown()
+
+
+def jobs_without_drag(data: Path, balls: Sequence[str]) -> Iterator[tuple[Any, ...]]:
+    """Yield what is fitted of each ball where no drag is declared.
+
+    Args:
+        data: Folder of the measured set.
+        balls: Names of balls.
+    """
+    drops = read_drops(data)
+    left = [e for e in make_effects() if e.family != DRAG]
+    for ball in balls:
+        trials = trials_of([d for d in drops if d.ball == ball])
+        yield ball, make_simulator(), make_prior(), trials, left

@@ -8,8 +8,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from benchmarks.measured.ball_tables import called
-from benchmarks.measured.forecast import Forecast
+from benchmarks.measured.ball_forecast import Forecast
 from sbi_active.tasks.ball_drops import Drop  # pyright: ignore
 
 __all__ = ["draw_exponents", "draw_forecasts"]
@@ -18,13 +17,13 @@ BEFORE, AFTER, FAINT = "#b5533c", "#2b6a8f", "#8a949c"
 
 
 def draw_exponents(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Draw the exponent of the drag of each ball that shows one.
+    """Draw the exponent of the drag of balls that show one.
 
     Args:
         rows: Of ``judge``.
         path: Of the PNG.
     """
-    shown = [row for row in rows if called(row) == "drag-like"][::-1]
+    shown = [*rows][::-1]
     figure = Figure(figsize=(5.5, 0.7 + 0.28 * len(shown)), layout="constrained")
     ax = figure.subplots()
     for y, row in enumerate(shown):

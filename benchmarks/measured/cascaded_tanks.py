@@ -13,37 +13,39 @@ squares fits the same pieces, and beside them the first record as a whole.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from benchmarks.measured.record_stages import (
-    Bench,
-    Settings,
-    as_row,
-    run_settings,
-    with_error,
-)
-from benchmarks.measured.tanks_least_squares import (
-    fit_pieces,
-    fit_tanks,
-    run_pieces,
-    score,
-)
-from sbi_active.criticism import Trials
+from benchmarks.measured.least_squares import Fit, effect_bounds, fit_record, run_rows
+from benchmarks.measured.record_stages import Bench, Settings, run_settings, with_error
+from benchmarks.misfit.refit import least_squares
+from sbi_active.criticism import Effect, Trials
 from sbi_active.tasks import cascaded_tanks  # pyright: ignore
-from sbi_active.tasks.cascaded_tanks import split  # pyright: ignore
-from sbi_active.tasks.cascaded_tanks.model import SENSOR_SD  # pyright: ignore
+from sbi_active.tasks.cascaded_tanks import (  # pyright: ignore
+    FOUND_ON,
+    levels,
+    make_effects,
+    split,
+)
+from sbi_active.tasks.cascaded_tanks.model import (  # pyright: ignore
+    PRIOR_HIGH,
+    PRIOR_LOW,
+    SENSOR_SD,
+)
 from sbi_active.tasks.cascaded_tanks.recordings import (  # pyright: ignore
     EVERY,
     LEAD,
     LENGTH,
     SLOPE,
 )
-from sbi_active.tasks.records import Record, cut  # pyright: ignore
+from sbi_active.tasks.records import Pieces, Record, cut  # pyright: ignore
 
-__all__ = ["main", "make_bench"]
+__all__ = ["fit_pieces", "fit_tanks", "main", "make_bench", "run_pieces", "score"]
 
 RESULT = Path(__file__).parent / "results" / "cascaded_tanks.json"
 CHANNEL = "level [V]"
@@ -65,14 +67,146 @@ GIVEN = (
     ("overflow", "linear outflow"),
     ("overflow", "outflow exponent"),
 )
+#: Of the start levels beside what the first readings tell, V.
+START_LOW, START_HIGH = (-10.0, -1.0), (10.0, 1.0)
+
+
+def run_pieces(
+    parameters: Tensor,
+    starts: Tensor,
+    pieces: Pieces,
+    effects: Sequence[Effect] = (),
+) -> Tensor:
+    """Return predictions, shape (n, t, k).
+
+    Args:
+        parameters: Theta and strengths, shape (n, 4 + d), float64.
+        starts: Of both levels beside what the first readings tell, shape (n, t, 2), V.
+        pieces: The t pieces.
+        effects: Whose strengths they are, all of them keyword arguments.
+    """
+    upper, lower = starts.reshape(-1, 2).unbind(1)
+    start = {"upper_start": upper, "lower_start": lower}
+    return run_rows(levels, parameters, pieces, effects, 4, **start)
+
+
+def score(
+    parameters: Tensor, scored: Pieces, effects: Sequence[Effect] = ()
+) -> dict[str, float]:
+    """Return the root mean square error of the mean prediction of a record, V.
+
+    The start levels are found on the first 50 samples, for each row of the parameters,
+    and the record is scored after these.
+
+    Args:
+        parameters: Draws or one fit, shape (n, 4 + d).
+        scored: In one piece.
+        effects: As for :func:`run_pieces`.
+    """
+    known = FOUND_ON - 1  # readings after the first
+    begin = replace(
+        scored,
+        voltage=scored.voltage[:, :FOUND_ON],
+        times=scored.times[:known],
+        output=scored.output[:, :known],
+    )
+    num = len(parameters)
+
+    def predict(z: Tensor) -> Tensor:
+        own = parameters.repeat_interleave(len(z) // num, 0)
+        return run_pieces(own, z[:, None], begin, effects).flatten(1)
+
+    def row(*values: float) -> Tensor:
+        return torch.tensor(values, dtype=torch.float64)
+
+    best, least = None, torch.full((num,), torch.inf, dtype=torch.float64)
+    for upper in (-3.0, 0.0, 3.0):
+        z, residual = least_squares(
+            predict,
+            torch.from_numpy(begin.output).expand(num, -1),
+            row(upper, 0.0).expand(num, 2),
+            low=row(*START_LOW),
+            high=row(*START_HIGH),
+            scale=row(1.0, 1.0),
+            weak=row(torch.inf, torch.inf),
+        )
+        cost = residual.square().sum(1)
+        best = z if best is None else torch.where((cost < least)[:, None], z, best)
+        least = torch.minimum(cost, least)
+    assert best is not None
+    x = run_pieces(parameters, best[:, None], scored, effects).mean(0)[0]
+    error = x - torch.from_numpy(scored.output[0])
+    return {"validation": float(error[known:].square().mean().sqrt())}
+
+
+def fit_pieces(
+    pieces: Pieces, names: Sequence[str] = (), *, starts: int = 6, seed: int = 0
+) -> tuple[Fit, list[Effect]]:
+    """Return the fit of pieces that run before they are read, and the effects.
+
+    Args:
+        pieces: To fit.
+        names: Names of the effects.
+        starts: Number of local fits.
+        seed: Seed of the starts.
+
+    Returns:
+        Parameters are theta and the strengths.
+    """
+    effects = [effect for effect in make_effects() if effect.name in names]
+    least, most = effect_bounds(effects)
+    known = torch.from_numpy(pieces.output).isfinite()
+
+    def predict(z: Tensor) -> Tensor:
+        starts = torch.zeros(len(z), len(pieces), 2, dtype=torch.float64)
+        return run_pieces(z, starts, pieces, effects)[:, known]
+
+    found = fit_record(
+        predict,
+        torch.from_numpy(pieces.output)[known],
+        [*PRIOR_LOW, *least],
+        [*PRIOR_HIGH, *most],
+        starts=starts,
+        seed=seed,
+    )
+    return found, effects
+
+
+def fit_tanks(
+    record: Record, names: Sequence[str] = (), *, starts: int = 6, seed: int = 0
+) -> tuple[Fit, list[Effect]]:
+    """Return the fit of the whole record with both start levels, and the effects.
+
+    Args:
+        record: Record ``estimation``.
+        names: Names of the effects.
+        starts: Number of local fits.
+        seed: Seed of the starts.
+
+    Returns:
+        Parameters are theta, the strengths, and the two start levels beside the first
+        reading.
+    """
+    whole = cut(record, len(record) - 1, slope=SLOPE)
+    effects = [effect for effect in make_effects() if effect.name in names]
+    least, most = effect_bounds(effects)
+    found = fit_record(
+        lambda z: run_pieces(z[:, :-2], z[:, None, -2:], whole, effects).flatten(1),
+        torch.from_numpy(whole.output[0]),
+        [*PRIOR_LOW, *least, *START_LOW],
+        [*PRIOR_HIGH, *most, *START_HIGH],
+        starts=starts,
+        seed=seed,
+    )
+    return found, effects
 
 
 def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
     """Return the machine.
 
     Args:
-        records: Of ``read_recordings``.
-        every: Readings of the fitted pieces that are kept.
+        records: Records of ``read_recordings``.
+        every: Stride of the readings of the fitted pieces that are kept.
     """
     pieces, scored = split(records, every=every)
     fitted = records["estimation"]
@@ -81,9 +215,9 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
         fit, effects = fit_pieces(pieces, names)
         whole, _ = fit_tanks(fitted, names)
         own = torch.from_numpy(fit.parameters)[None]
-        row = as_row(fit, score(own, scored, effects))
+        row = fit.row(score(own, scored, effects))
         own = torch.from_numpy(whole.parameters[:-2])[None]
-        return row | {"as one record": as_row(whole, score(own, scored, effects))}
+        return row | {"as one record": whole.row(score(own, scored, effects))}
 
     def replay(seed: int, names: tuple[str, ...]) -> Trials:
         fit, effects = fit_tanks(fitted, names)
@@ -107,6 +241,6 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
     )
 
 
-def main(settings: Settings) -> int:
+def main(settings: Settings) -> None:
     """Run the stages that are missing from the results, and print the tables."""
-    return run_settings(settings, cascaded_tanks, make_bench, RESULT)
+    run_settings(settings, cascaded_tanks, make_bench, RESULT)

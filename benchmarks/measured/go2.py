@@ -21,33 +21,55 @@ Beside the verdicts plain least squares, given the same effects.
 
 from __future__ import annotations
 
-import json
-import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
 from benchmarks.criticism.scores import counted
-from benchmarks.measured.go2_least_squares import fit_leg
 from benchmarks.measured.go2_leg import DATA, LEGS, Leg, read_leg, usual_parameters
-from benchmarks.measured.go2_tables import tables
-from benchmarks.measured.record_verdicts import center
+from benchmarks.measured.verdicts import center, row_of, said
+from benchmarks.rows import keep, measured, stages
 from sbi_active.criticism import Criticism, Effect
 from sbi_active.criticism.report.summary import misfit_line
 from sbi_active.criticism.results import ModelKey, Tracing
+from sbi_active.display.table import Table
 from sbi_active.mujoco import Robot, force_effects, mjcf_effects
 
-__all__ = ["judge", "main"]
+__all__ = ["fit_leg", "judge", "main", "tables"]
 
+Array = NDArray[np.float64]
 RESULT = Path(__file__).parent / "results" / "go2.json"
 ROUNDS = 5
+PARTS = ("fitted", "held out")
 #: Of a joint.
 KINDS = ("friction loss by *", "static friction", "quadratic damping", "*stiffness")
 KINDS += ("zero offset", "sensor bias", "sensor delay")
 #: The same for the other legs, and with an effect removed: what was near on the first.
 FEW_KINDS = ("friction loss by *", "static friction")
+
+
+#: Where parameters start, by the end of their names, and strengths, in deviations.
+START = {"armature": 0.02, "damping": 0.15, "frictionloss": 0.25, "scale": 0.9}
+STRENGTH = 0.3
+#: Relative step of finite differences, and evaluations of the Jacobian at most.
+DIFFERENCE, EVALUATIONS = 1e-3, 15
+#: Samples at rest, which are not compared.
+AT_REST = 17
+MILLI = 1e3
+
+
+def line_of(tracing: Tracing) -> str:
+    """Return the first line of a report on a verdict."""
+    if tracing.misfit is None:
+        return f"Verdict: {tracing.verdict}"
+    return f"Verdict: {misfit_line(tracing.verdict, tracing.misfit)}"
 
 
 def judge(
@@ -88,7 +110,8 @@ def judge(
         adopted += [e for n in tracing.chosen for e in effects if e.name == n]
         values = center(tracing.evidences[str(ModelKey(tracing.chosen))])
         run = leg.free_run(parameters, adopted, values)[0]
-        row = _row(tracing) | {
+        row = row_of(tracing) | {
+            "line": line_of(tracing),
             "values": values[0].tolist(),
             "after": leg.errors(run),
         }
@@ -107,29 +130,6 @@ def judge(
     return row | {
         "cpu_seconds": time.process_time() - begin,
         "trial_simulations": count(),
-    }
-
-
-def _row(tracing: Tracing) -> dict[str, Any]:
-    """Return a verdict as plain figures."""
-    misfit, helps = tracing.misfit, tracing.chosen
-    evidence = tracing.evidences[str(ModelKey(helps))]
-    cause = tracing.inclusion if misfit is None else misfit.cause
-    describe = {e.name: e.describe for e in tracing.estimates}
-    return {
-        "verdict": tracing.verdict,
-        "line": "Verdict: "
-        + (tracing.verdict if misfit is None else misfit_line(tracing.verdict, misfit)),
-        "named": [*(helps if misfit is None else misfit.named)],
-        "helps": [*helps],
-        "describe": [describe[name] for name in helps],
-        "cause": {name: float(cause.get(name, 0.0)) for name in tracing.inclusion},
-        "better": {} if misfit is None else dict(misfit.better),
-        "log_evidence": {k: e.log_evidence for k, e in tracing.evidences.items()},
-        "parameters": {
-            name: [float(z.mean()), float(z.std())]
-            for name, z in zip(evidence.names, evidence.draws.T, strict=True)
-        },
     }
 
 
@@ -154,31 +154,21 @@ class Settings:
     seed: int = 0
 
 
-def main(arguments: Settings) -> int:
+def main(arguments: Settings) -> None:
     """Run the stages that are missing from the results, and print the tables."""
-    try:
-        legs = [read_leg(arguments.data, name) for name in arguments.legs]
-    except FileNotFoundError as error:
-        print(f"{error}, as in --data DIR", file=sys.stderr)
-        return 2
-    rows: dict[str, Any] = {}
-    if arguments.out.is_file():
-        rows = json.loads(arguments.out.read_text())
+    legs = [measured(read_leg, arguments.data, name) for name in arguments.legs]
+    rows = stages(arguments.out)
     for leg in legs:
         for name, row in _stages(leg, rows, arguments):
             rows[name] = row
-            arguments.out.parent.mkdir(parents=True, exist_ok=True)
-            arguments.out.write_text(json.dumps(rows, indent=1) + "\n")
-            if "line" in row:
-                print(f"{name}: {row['line']}, {row['cpu_seconds']:.0f} CPU s")
-            sys.stdout.flush()
+            keep(arguments.out, rows)
+            print(f"{name}: {row.get('line', '')}", flush=True)
     print(tables(rows))
     if arguments.figures is not None:
         from benchmarks.measured.go2_figures import draw
 
         for leg in legs:
             draw(rows[leg.name], leg, arguments.figures)
-    return 0
 
 
 def _library(
@@ -206,8 +196,7 @@ def _stages(leg: Leg, rows: dict[str, Any], arguments: Any) -> Any:
         return name not in rows and (chosen or not stage)
 
     def judged(name: str, library: Any, **options: Any) -> Any:
-        row = judge(leg, library, seed=seed, **options)
-        return name, row
+        return name, judge(leg, library, seed=seed, **options)
 
     if wanted(""):
         yield judged(own, _library(leg, few=own != LEGS[0]))
@@ -237,3 +226,93 @@ def _least_squares(leg: Leg, sets: Sequence[tuple[str, ...]]) -> dict[str, Any]:
             leg, parameters, [effects[name] for name in each]
         )
     return found
+
+
+def fit_leg(
+    leg: Leg, parameters: Mapping[str, Any], effects: Sequence[Effect]
+) -> dict[str, Any]:
+    """Return the fit of one free run over the fitted triangles, and its errors.
+
+    Args:
+        leg: Whose record it is.
+        parameters: Of ``from_mjcf``.
+        effects: That the simulator is given.
+    """
+    num = leg.split
+
+    def residual(rows: Array) -> Array:
+        x = leg.free_run(parameters, effects, torch.from_numpy(rows), num)
+        left = (x - leg.position[:num])[:, AT_REST:]
+        return np.nan_to_num(MILLI * left.reshape(len(rows), -1), nan=MILLI)
+
+    start = np.array([_start(name) for name in parameters])
+    draws = [effect.declared_draws().numpy() for effect in effects]
+    sds = np.concatenate([np.zeros(0), *[np.sqrt((d**2).mean(0)) for d in draws]])
+    low = np.zeros(len(parameters))
+    high = np.array([bounds[1] for bounds in parameters.values()], dtype=float)
+    least = [np.where((d >= 0).all(0), 0.0, -np.inf) for d in draws]
+    low, high = (
+        np.concatenate([low, *least]),
+        np.append(high, np.full(len(sds), np.inf)),
+    )
+    x0 = np.concatenate([start, STRENGTH * sds])
+    scale = np.maximum(np.abs(x0), 0.02)
+
+    def jacobian(x: Array) -> Array:
+        steps = DIFFERENCE * scale
+        steps = np.where(x + steps > high, -steps, steps)
+        both = residual(np.concatenate([x[None], x + np.diag(steps)]))
+        return ((both[1:] - both[0]) / steps[:, None]).T
+
+    found = least_squares(
+        lambda x: residual(x[None])[0],
+        x0,
+        jac=jacobian,  # pyright: ignore[reportArgumentType]
+        bounds=(low, high),
+        x_scale=scale,
+        max_nfev=EVALUATIONS,
+    )
+    values = torch.from_numpy(found.x)[None]
+    run = leg.free_run(parameters, effects, values)[0]
+    return {"parameters": found.x.tolist(), **leg.errors(run)}
+
+
+def _start(name: str) -> float:
+    return next(value for end, value in START.items() if name.endswith(end))
+
+
+def tables(rows: Mapping[str, Any]) -> str:
+    """Return verdicts, errors and parameters by stage, in Markdown."""
+    judged = {name: row for name, row in rows.items() if "line" in row}
+    verdicts, errors = [], []
+    for name, row in judged.items():
+        cost = f"{row['trial_simulations']:,}", f"{row['cpu_seconds']:.0f}"
+        errors.append((f"{name}: before", *_errors(row["before"])))
+        for k, one in enumerate(row.get("rounds", [row])):
+            word = f", round {k + 1}" if "rounds" in row else ""
+            helps = ", ".join(f"{n} {one['cause'][n]:.2f}" for n in one["helps"])
+            spent = cost if k == 0 else ("", "")
+            verdicts.append((name + word, said(one), helps, *spent))
+            errors.append((f"{name}: after{word}", *_errors(one["after"])))
+    for name, row in rows.items():
+        if "line" not in row:
+            errors += [
+                (f"{name}: {given}", *_errors(fit)) for given, fit in row.items()
+            ]
+    values = [
+        (what, f"{mean:.3g} +- {sd:.2g}")
+        for name, row in judged.items()
+        for what, (mean, sd) in row["parameters"].items()
+        if "," not in name
+    ]
+    header = ("stage", "verdict", "P(cause)", "simulated trials", "CPU s")
+    parts = [
+        Table(header, verdicts),
+        Table(("RMSE, mrad: hip / thigh / knee", *PARTS), errors),
+        Table(("parameters and strengths", "mean +- sd"), values),
+    ]
+    return "\n\n".join(part.markdown() for part in parts)
+
+
+def _errors(row: Mapping[str, Any]) -> tuple[str, ...]:
+    return tuple(" / ".join(f"{1e3 * e:.1f}" for e in row[part]) for part in PARTS)

@@ -148,16 +148,21 @@ class Leg:
         return [self.log(begin, end, EVERY) for begin, end in pairs]
 
     def free_run(
-        self, parameters: Mapping[str, Any], effects: Sequence[Effect], values: Tensor
+        self,
+        parameters: Mapping[str, Any],
+        effects: Sequence[Effect],
+        values: Tensor,
+        samples: int | None = None,
     ) -> Array:
-        """Return the whole record from its first reading on, shape (n, samples, 3).
+        """Return the record from its first reading on, shape (n, samples, 3).
 
         Args:
             parameters: Of ``from_mjcf``.
             effects: That the simulator has.
             values: Theta and strengths of the effects, shape (n, d).
+            samples: Number of samples; all by default.
         """
-        robot = self.robot(parameters, [self.log(0, len(self.time))])
+        robot = self.robot(parameters, [self.log(0, samples or len(self.time))])
         sizes = [len(parameters), *[effect.phi_dim for effect in effects]]
         theta, *phi = values.double().split(sizes, 1)
         model = AugmentedSimulator(robot.simulator, [*effects])

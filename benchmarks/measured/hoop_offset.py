@@ -11,14 +11,14 @@ is missing is run.
 
 from __future__ import annotations
 
-import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from benchmarks.measured.ball_and_hoop import make_bench
-from benchmarks.measured.record_stages import judge, said
+from benchmarks.measured.record_stages import judge
+from benchmarks.measured.verdicts import said
+from benchmarks.rows import keep, measured, stages
 from sbi_active.display.table import Table
 from sbi_active.tasks.ball_and_hoop import (  # pyright: ignore
     DATA,
@@ -47,30 +47,20 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
     return Table((*header, held_out, "CPU s"), lines).markdown()
 
 
-def main(
-    *,
-    data: Path = DATA,
-    out: Path = RESULT,
-) -> int:
+def main(*, data: Path = DATA, out: Path = RESULT) -> None:
     """Run what is missing from the results, and print the table.
 
     Args:
         data: Folder of the measured set.
         out: File of the results.
     """
-    rows = json.loads(out.read_text()) if out.is_file() else {}
+    rows = stages(out)
     wanted = {f"{sd:g} {every}": (sd, every) for sd in SDS for every in EVERY}
     missing = {name: pair for name, pair in wanted.items() if name not in rows}
-    try:
-        records = read_recordings(data) if missing else {}
-    except FileNotFoundError as error:
-        print(f"{error}, as in --data DIR", file=sys.stderr)
-        return 2
+    records = measured(read_recordings, data) if missing else {}
     for name, (sd, every) in missing.items():
         bench = make_bench(records, every=every)
         row = judge(replace(bench, prior=make_prior(offset_sd=sd)))
         rows[name] = {"offset_sd": sd, "every": every, **row}
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(json.dumps(rows, indent=1) + "\n")
+        keep(out, rows)
     print(table({name: rows[name] for name in wanted}))
-    return 0

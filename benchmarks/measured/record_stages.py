@@ -11,9 +11,6 @@
 
 from __future__ import annotations
 
-import json
-import re
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -26,29 +23,19 @@ import torch
 from torch import Tensor
 
 from benchmarks.criticism.scores import counted
-from benchmarks.measured.record_least_squares import Fit
-from benchmarks.measured.record_verdicts import read_report
+from benchmarks.measured.verdicts import causes, center, read_report, said, shares_left
+from benchmarks.rows import keep, measured, stages
 from sbi_active import SimulatorModel
 from sbi_active.criticism import Effect, Trials, close_loop
+from sbi_active.criticism.results import NONE
+from sbi_active.display.table import Table
 
-__all__ = [
-    "Bench",
-    "aliases",
-    "judge",
-    "Settings",
-    "run_settings",
-    "run_stages",
-    "said",
-    "table",
-]
+__all__ = ["Bench", "Settings", "aliases", "judge", "run_settings", "run_stages"]
 
 Errors = dict[str, float]
-
 #: Seed of the first replay; nothing was chosen by those from here on.
 FIRST_REPLAYED = 2_000
 REPLAYS = {"clean": "the bare model", "full": "the model of the first verdict"}
-#: What a report's first paragraph says of an effect that is named.
-SHARE_LEFT = re.compile(r"\d+ %\s+of\s+the\s+excess")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,16 +44,17 @@ class Bench:
 
     Attributes:
         model: The bare simulator.
-        prior: Of theta.
+        prior: Prior of theta.
         effects: The declared library.
-        trials: To fit.
+        trials: Trials to fit.
         removals: Sets of effects to remove from the library, one stage each.
         given: Sets of effects that least squares is given in any case, each in the
             order of the library.
-        score: Theta and strengths (n, d), and effects, to errors by held-out record.
-        least_squares: Names of effects to a fit's row.
-        replay: Seed and names of effects to trials that a fitted model makes.
-        nuisances: Declared besides.
+        score: Function of theta and strengths (n, d), and effects, to errors by
+            held-out record.
+        least_squares: Function of names of effects to a fit's row.
+        replay: Function of seed and names of effects to trials that a fitted model
+            makes.
     """
 
     model: SimulatorModel
@@ -78,22 +66,18 @@ class Bench:
     score: Callable[[Tensor, Sequence[Effect]], Errors]
     least_squares: Callable[[tuple[str, ...]], dict[str, Any]]
     replay: Callable[[int, tuple[str, ...]], Trials]
-    nuisances: Sequence[Effect] = ()
 
     @classmethod
     def of(cls, task: Any, **parts: Any) -> Bench:
         """Return the bench of a task.
 
         Args:
-            task: A package with ``make_simulator``, ``make_prior`` and
-                ``make_effects``.
+            task: Package with ``make_simulator``, ``make_prior`` and ``make_effects``.
             parts: All that the task does not say.
         """
+        made = task.make_simulator(), task.make_prior(), task.make_effects()
         return cls(
-            model=task.make_simulator(),
-            prior=task.make_prior(),
-            effects=task.make_effects(),
-            **parts,
+            **dict(zip(("model", "prior", "effects"), made, strict=True)), **parts
         )
 
 
@@ -122,23 +106,16 @@ class Settings:
 
 def run_settings(
     settings: Settings, task: Any, make_bench: Callable[..., Bench], out: Path
-) -> int:
+) -> None:
     """Run the stages that are missing from a file of results, and print the tables.
 
     Args:
         settings: What is run.
-        task: A package with records.
-        make_bench: ``make_bench(records, every=)``.
-        out: The file, unless one is given.
-
-    Returns:
-        The process's exit status.
+        task: Package with records.
+        make_bench: Function ``make_bench(records, every=)``.
+        out: File of the results, unless one is given.
     """
-    try:
-        records = task.read_recordings(settings.data or task.DATA)
-    except FileNotFoundError as error:
-        print(f"{error}, as in --data DIR", file=sys.stderr)
-        return 2
+    records = measured(task.read_recordings, settings.data or task.DATA)
     rows = run_stages(
         make_bench(records, every=settings.every or task.recordings.EVERY),
         settings.out or out,
@@ -148,7 +125,6 @@ def run_settings(
         reports=settings.reports,
     )
     print(table(rows, "V"))
-    return 0
 
 
 def run_stages(
@@ -165,43 +141,36 @@ def run_stages(
     Args:
         bench: The machine.
         path: JSON file of the results.
-        clean: Clean sets.
-        full: Sets that the model of the first verdict makes.
-        seed: Of all draws.
+        clean: Number of clean sets.
+        full: Number of sets that the model of the first verdict makes.
+        seed: Seed of all draws.
         reports: Folder for whole reports.
     """
-    rows: dict[str, Any] = json.loads(path.read_text()) if path.is_file() else {}
-
-    def keep(name: str, row: dict[str, Any]) -> None:
-        rows[name] = row
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(rows, indent=1) + "\n")
-        if "line" in row:
-            text = f"{name}: {row['line']}, {row['cpu_seconds']:.0f} CPU s"
-            print(text, flush=True)
-
+    rows = stages(path)
     judged: dict[str, tuple[str, ...]] = {"recorded": ()}
     judged |= {f"without {' + '.join(gone)}": gone for gone in bench.removals}
-    stages = [*judged]
-    stages += [f"clean {FIRST_REPLAYED + k}" for k in range(clean)]
-    stages += [f"full {FIRST_REPLAYED + k}" for k in range(full)]
-    for name in stages:
-        if name not in rows:
-            kind, number = name.split(" ")[0], name.split(" ")[-1]
-            trials = None
-            if name not in judged:
-                helps = (*rows["recorded"]["helps"],) if kind == "full" else ()
-                trials = bench.replay(int(number), helps)
-            folder = None if reports is None else reports / name.replace(" ", "_")
-            gone = judged.get(name, ())
-            keep(name, judge(bench, gone=gone, trials=trials, seed=seed, folder=folder))
-    fits = rows.get("least squares", {})
+    names = [*judged]
+    names += [f"clean {FIRST_REPLAYED + k}" for k in range(clean)]
+    names += [f"full {FIRST_REPLAYED + k}" for k in range(full)]
+    for name in [name for name in names if name not in rows]:
+        trials = None
+        if name not in judged:
+            kind, number = name.split(" ")
+            helps = (*rows["recorded"]["helps"],) if kind == "full" else ()
+            trials = bench.replay(int(number), helps)
+        folder = None if reports is None else reports / name.replace(" ", "_")
+        gone = judged.get(name, ())
+        row = judge(bench, gone=gone, trials=trials, seed=seed, folder=folder)
+        rows[name] = row
+        keep(path, rows)
+        print(f"{name}: {row['line']}, {row['cpu_seconds']:.0f} CPU s", flush=True)
+    fits = rows.setdefault("least squares", {})
     wanted = {(), *bench.given, *[(*rows[name]["helps"],) for name in judged]}
-    for names in sorted(wanted):
-        label = " + ".join(names) or "none"
+    for given in sorted(wanted):
+        label = " + ".join(given) or "none"
         if label not in fits:
-            fits[label] = bench.least_squares(names)
-            keep("least squares", fits)
+            fits[label] = bench.least_squares(given)
+            keep(path, rows)
     return rows
 
 
@@ -218,9 +187,9 @@ def judge(
     Args:
         bench: The machine.
         gone: Names of effects that are not declared.
-        trials: In place of the recorded ones.
-        seed: Of all draws.
-        folder: Where the whole report goes.
+        trials: Trials in place of the recorded ones.
+        seed: Seed of all draws.
+        folder: Folder for the whole report.
     """
     effects = [effect for effect in bench.effects if effect.name not in gone]
     model, count = counted(bench.model)
@@ -229,7 +198,7 @@ def judge(
         model,
         bench.prior,
         bench.trials if trials is None else trials,
-        effects=[*effects, *bench.nuisances],
+        effects=effects,
         seed=seed,
         evaluate=False,  # held-out records are scored in free run, below
         plan=False,
@@ -237,94 +206,73 @@ def judge(
     seconds = time.process_time() - begin
     if folder is not None:
         report.save(folder)
-    found = read_report(report, bench.prior.event_shape[0])
-    row = {
-        **found.row,
-        "helps": [*found.helps],
-        "text": found.text,
-        "cpu_seconds": seconds,
-        "trial_simulations": count(),
-    }
+    row = read_report(report)
+    row |= {"cpu_seconds": seconds, "trial_simulations": count()}
     if trials is None:
-        chosen = [e for n in found.helps for e in effects if e.name == n]
-        row["before"] = bench.score(found.before, [])
-        row["after"] = bench.score(found.after, chosen)
+        helps, evidences = report.tracing.chosen, report.tracing.evidences
+        chosen = [e for name in helps for e in effects if e.name == name]
+        best = evidences.get(" + ".join(helps) or NONE, evidences[NONE])
+        # Columns beyond these are those of nuisances.
+        dim = bench.prior.event_shape[0]
+        num = dim + sum(effect.phi_dim for effect in chosen)
+        row["before"] = bench.score(center(evidences[NONE], dim), [])
+        row["after"] = bench.score(center(best, num), chosen)
     return row
-
-
-def as_row(fit: Fit, errors: Errors) -> dict[str, Any]:
-    """Return a least-squares fit as plain figures."""
-    return {"parameters": fit.parameters.tolist(), "fitted": fit.rmse, "held": errors}
 
 
 def table(rows: dict[str, Any], unit: str) -> str:
     """Return the stages and the least-squares fits in Markdown.
 
     Args:
-        rows: Of :func:`run_stages`.
-        unit: Of the errors.
+        rows: Stages by name.
+        unit: Unit of the errors.
     """
-    records = [*rows["recorded"]["before"]]
-    head = " / ".join(records)
-    lines = [
-        f"| stage | verdict | P(cause) | before, {unit}: {head} | after | simulated "
-        "trials | CPU s |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for name, row in rows.items():
-        if name == "least squares" or name.split(" ")[0] in REPLAYS:
-            continue
-        likely = {n: p for n, p in row["cause"].items() if p > 0.05 and row["alarm"]}
-        causes = ", ".join(f"{n} {p:.2f}" for n, p in likely.items())
-        lines.append(
-            f"| {name} | {said(row)} | {causes} | {_errors(row.get('before'))} | "
-            f"{_errors(row.get('after'))} | {row['trial_simulations']:,} | "
-            f"{row['cpu_seconds']:.0f} |"
+    head = " / ".join(rows["recorded"]["before"])
+    judged = {k: row for k, row in rows.items() if "before" in row}
+    cells = [
+        (
+            *(name, said(row), causes(row) if row["alarm"] else ""),
+            *(_errors(row["before"]), _errors(row["after"])),
+            *(f"{row['trial_simulations']:,}", f"{row['cpu_seconds']:.0f}"),
         )
-    lines += _replays(rows)
+        for name, row in judged.items()
+    ]
+    header = ["stage", "verdict", "P(cause)", f"before, {unit}: {head}", "after"]
+    header += ["simulated trials", "CPU s"]
+    parts = [Table(header, cells + _replays(rows)).markdown()]
     if any(name.startswith("without ") for name in rows):
-        lines += ["", aliases(rows)]
-    lines += ["", f"| least squares | fitted, {unit} | {head} |", "|---|---|---|"]
-    for name, row in rows.get("least squares", {}).items():
-        lines.append(f"| {name} | {row['fitted']:.3f} | {_errors(row['held'])} |")
-    return "\n".join(lines)
+        parts.append(aliases(rows))
+    fits = [
+        (name, f"{row['fitted']:.3f}", _errors(row["held"]))
+        for name, row in rows["least squares"].items()
+    ]
+    parts.append(Table(("least squares", f"fitted, {unit}", head), fits).markdown())
+    return "\n\n".join(parts)
 
 
-def said(row: dict[str, Any]) -> str:
-    """Return the verdict of a stage, and what else helps to predict."""
-    beside = [name for name in row["helps"] if name not in row["named"]]
-    helps = f", {' + '.join(beside)} helps" if beside else ""
-    return f"{row['verdict']}{helps}"
-
-
-def _replays(rows: dict[str, Any]) -> list[str]:
-    """Return a line for each kind of replay: its verdicts, and how often."""
-    lines = []
+def _replays(rows: dict[str, Any]) -> list[tuple[str, ...]]:
+    """Return cells for each kind of replay: its verdicts, and how often."""
+    cells = []
     for kind, what in REPLAYS.items():
         own = {k: row for k, row in rows.items() if k.split(" ")[0] == kind}
         if not own:
             continue
         verdicts = Counter(str(row["verdict"]) for row in own.values())
-        said = ", ".join(f"{v} ({n})" for v, n in verdicts.most_common())
+        told = ", ".join(f"{v} ({n})" for v, n in verdicts.most_common())
         seeds = sorted(int(k.split(" ")[-1]) for k in own)
         count, seconds = (
             np.median([row[key] for row in own.values()])
             for key in ("trial_simulations", "cpu_seconds")
         )
-        lines.append(
-            f"| {len(own)} replays of {what}, seeds {seeds[0]} to {seeds[-1]} | {said} "
-            f"| | | | {count:,.0f} | {seconds:.0f} |"
-        )
-    return lines
+        name = f"{len(own)} replays of {what}, seeds {seeds[0]} to {seeds[-1]}"
+        cells.append((name, told, "", "", "", f"{count:,.0f}", f"{seconds:.0f}"))
+    return cells
 
 
 def aliases(rows: dict[str, Any]) -> str:
     """Return how often an effect was named that stands for one that was removed.
 
     One counts that the verdict with the whole library does not rest on.
-
-    Args:
-        rows: Of :func:`run_stages`.
     """
     removed = {k: row for k, row in rows.items() if k.startswith("without ")}
     real = {*rows["recorded"]["helps"]}
@@ -332,22 +280,16 @@ def aliases(rows: dict[str, Any]) -> str:
     for name, row in removed.items():
         if new := [n for n in row["named"] if n not in real]:
             found.append(f"{' + '.join(new)} ({name})")
-            told += bool(SHARE_LEFT.search(row["text"]))
-    said = f": {'; '.join(found)}; the share left said in {told}" if found else ""
-    return f"Aliases named: {len(found)} of {len(removed)} removals{said}."
+            told += shares_left(row)
+    words = f": {'; '.join(found)}; the share left said in {told}" if found else ""
+    return f"Aliases named: {len(found)} of {len(removed)} removals{words}."
 
 
-def _errors(errors: Errors | None) -> str:
-    return "" if errors is None else " / ".join(f"{e:.3f}" for e in errors.values())
+def _errors(errors: Errors) -> str:
+    return " / ".join(f"{e:.3f}" for e in errors.values())
 
 
 def with_error(x: Tensor, sd: float, seed: int) -> np.ndarray:
-    """Return readings with a sensor's error.
-
-    Args:
-        x: Without it.
-        sd: Of the error.
-        seed: Of its draw.
-    """
+    """Return readings with a sensor's error of a standard deviation."""
     generator = torch.Generator().manual_seed(seed)
     return (x + sd * torch.randn(x.shape, generator=generator, dtype=x.dtype)).numpy()

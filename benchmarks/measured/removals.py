@@ -16,8 +16,6 @@ removed. An *alias* is an effect that is named then. Each row is added to
 
 from __future__ import annotations
 
-import json
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -25,15 +23,17 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any, Literal
 
-from benchmarks.measured.record_stages import SHARE_LEFT
+from benchmarks.measured.ball_drops import DATA as BALLS
+from benchmarks.measured.ball_drops import jobs_without_drag
+from benchmarks.measured.verdicts import causes, read_report, said, shares_left
+from benchmarks.rows import keep, measured, stages
 from sbi_active.criticism import Criticism, Effect
-from sbi_active.tasks import ball_drops, servo_pendulum  # pyright: ignore
-from sbi_active.tasks.ball_drops import DRAG  # pyright: ignore
+from sbi_active.display.table import Table
+from sbi_active.tasks.servo_pendulum import ServoPendulumTask  # pyright: ignore
 from sbi_active.tasks.servo_pendulum.task import DATA as SERVO  # pyright: ignore
 
 __all__ = ["main", "removed", "table"]
 
-BALLS = Path("../shared/data/ball_drops")
 RESULT = Path(__file__).parent / "results" / "removals.json"
 #: The servo's stages, by the name that its rows have here and there.
 STAGES = {"servo": "powered", "servo, motor off": "motor off"}
@@ -69,27 +69,17 @@ def removed(
     begin = time.process_time()
     loop = Criticism(model, prior, trials, effects=effects, seed=seed)
     report = loop.report(evaluate=False, plan=False)
-    tracing, text = loop.trace(), str(report).split("\n\n")[0]
-    misfit = tracing.misfit
-    named = tracing.chosen if misfit is None else misfit.named
-    return {
-        "verdict": tracing.verdict,
-        "named": [*named],
-        "helps": [*tracing.chosen],
-        "cause": {}
-        if misfit is None
-        else {k: float(v) for k, v in misfit.cause.items()},
-        "probabilities": {n: float(p) for n, p in tracing.probabilities.items()},
-        "share_said": SHARE_LEFT.search(text) is not None,
-        "text": text,
+    row = read_report(report)
+    return row | {
+        "share_said": shares_left(row),
         "cpu_seconds": time.process_time() - begin,
         "trial_simulations": loop.rivals.simulator.num_simulations,
     }
 
 
 def _servo(data: Path) -> Iterator[Job]:
-    task = servo_pendulum.ServoPendulumTask(data=data)
-    rows = json.loads(RESULT.with_name("servo_pendulum.json").read_text())
+    task = ServoPendulumTask(data=data)
+    rows = stages(RESULT.with_name("servo_pendulum.json"))
     effects = task.effects()
     others = [e.name for e in effects if e.name != CAUSE]
     sets = [(BESIDE,)]
@@ -103,18 +93,13 @@ def _servo(data: Path) -> Iterator[Job]:
 
 
 def _balls(data: Path) -> Iterator[Job]:
-    drops = ball_drops.read_drops(data)
-    left = [e for e in ball_drops.make_effects() if e.family != DRAG]
-    for ball in DROPPED:
-        trials = ball_drops.trials_of([d for d in drops if d.ball == ball])
-        model, prior = ball_drops.make_simulator(), ball_drops.make_prior()
-        yield "balls", ball, model, prior, trials, left
+    for job in jobs_without_drag(data, DROPPED):
+        yield "balls", *job
 
 
 def table(rows: dict[str, dict[str, Any]]) -> str:
     """Return the rows in Markdown, and how many aliases were named in each set."""
-    head = "| removed | verdict | P(cause) | simulated trials | CPU s |"
-    lines: list[str] = []
+    parts = []
     for which, title in (
         ("servo", "servo, from"),
         ("servo, motor off", "servo with a motor-off trial, from"),
@@ -123,27 +108,24 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
         own = {k: row for k, row in rows.items() if k.startswith(f"{which}: ")}
         if not own:
             continue
-        lines += [head.replace("removed", f"{title} library"), "|---|---|---|---|---|"]
-        for key, row in own.items():
-            causes = ", ".join(f"{n} {p:.2f}" for n, p in row["cause"].items())
-            name = key.removeprefix(f"{which}: ").replace("_", " ")
-            verdict = row["verdict"]
-            if row["helps"] and not row["named"]:
-                verdict += f", {' + '.join(row['helps'])} helps"
-            lines.append(
-                f"| {name} | {verdict} | {causes} | {row['trial_simulations']:,} | "
-                f"{row['cpu_seconds']:.0f} |"
+        cells = [
+            (
+                key.removeprefix(f"{which}: ").replace("_", " "),
+                *(said(row), causes(row), f"{row['trial_simulations']:,}"),
+                f"{row['cpu_seconds']:.0f}",
             )
+            for key, row in own.items()
+        ]
+        header = [f"{title} library", "verdict", "P(cause)", "simulated trials"]
         real = {CAUSE} if which in STAGES else set()
         alias = [row for row in own.values() if {*row["named"]} - real]
         told = sum(row["share_said"] for row in alias)
-        lines += [
-            "",
+        parts += [
+            Table([*header, "CPU s"], cells).markdown(),
             f"Aliases named: {len(alias)} of {len(own)} removals; the share left said "
             f"in {told}.",
-            "",
         ]
-    return "\n".join(lines)
+    return "\n\n".join(parts)
 
 
 @dataclass(frozen=True)
@@ -165,26 +147,15 @@ class Settings:
     seed: int = 0
 
 
-def main(arguments: Settings) -> int:
+def main(arguments: Settings) -> None:
     """Run the removals that are missing from the results, and print the tables."""
-    rows: dict[str, Any] = {}
-    if arguments.out.is_file():
-        rows = json.loads(arguments.out.read_text())
+    rows = stages(arguments.out)
     if arguments.set and not arguments.summary:
         jobs, data = (_servo, SERVO) if arguments.set == "servo" else (_balls, BALLS)
-        try:
-            todo = [*jobs(arguments.data or data)]
-        except FileNotFoundError as error:
-            print(f"{error}, as in --data DIR", file=sys.stderr)
-            return 2
-        for which, name, *parts in todo:
+        for which, name, *parts in measured(lambda: [*jobs(arguments.data or data)]):
             key = f"{which}: {name}"
-            if key in rows:
-                continue
-            rows[key] = removed(*parts, seed=arguments.seed)
-            arguments.out.parent.mkdir(parents=True, exist_ok=True)
-            arguments.out.write_text(json.dumps(rows, indent=1) + "\n")
-            spent = rows[key]["cpu_seconds"]
-            print(f"{key}: {rows[key]['verdict']}, {spent:.0f} CPU s", flush=True)
+            if key not in rows:
+                rows[key] = removed(*parts, seed=arguments.seed)
+                keep(arguments.out, rows)
+                print(f"{key}: {rows[key]['verdict']}", flush=True)
     print(table(rows))
-    return 0

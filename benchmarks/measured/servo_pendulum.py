@@ -8,44 +8,117 @@
   trial to make next.
 - ``motor off``: that trial as well, the other three motor-off trials held out; beside
   it plain least squares given the effect, on the same split.
-- ``powered, iid`` and ``motor off, iid``: the same with independent errors forced.
 - ``clean 0``, ``clean 1``, ...: ``--replay clean`` simulates the trials of ``motor
   off`` without friction, at the bare model's least-squares parameters, with errors of
   the size and correlation that are left in the recordings with the effect found.
 
-``--fit 0 2`` judges these trials alone, and ``--figures DIR`` draws.
+``--fit 0 2`` judges these trials alone. Rows of independent errors, forced, are of an
+earlier version.
 """
 
 from __future__ import annotations
 
-import json
-import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from benchmarks.measured.servo_least_squares import FRICTIONS, Fit, fit
-from benchmarks.measured.servo_rates import RATES, by_rate
-from benchmarks.measured.servo_tables import tables
+from benchmarks.measured.least_squares import best_in_box
+from benchmarks.measured.verdicts import causes, read_report, said, spreads
+from benchmarks.rows import keep, measured, stages
 from sbi_active.criticism import Criticism
-from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, ModelKey, Tracing
-from sbi_active.criticism.steps import predict
+from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED
+from sbi_active.display.table import Table
 from sbi_active.simulation import AutocorrelatedNoise
-from sbi_active.tasks.servo_pendulum import ServoPendulumTask  # pyright: ignore
-from sbi_active.tasks.servo_pendulum.noise import servo_noise  # pyright: ignore
+from sbi_active.tasks.servo_pendulum import (  # pyright: ignore
+    Recordings,
+    ServoPendulumTask,
+)
+from sbi_active.tasks.servo_pendulum.model import (  # pyright: ignore
+    PRIOR_HIGH,
+    PRIOR_LOW,
+    angles,
+)
 from sbi_active.tasks.servo_pendulum.task import DATA  # pyright: ignore
 
-__all__ = ["judge", "main", "simulated"]
+__all__ = ["Fit", "fit", "judge", "main", "simulated", "tables"]
 
+Array = NDArray[Any]
+Row = dict[str, Any]
 RESULT = Path(__file__).parent / "results" / "servo_pendulum.json"
 NUM_CLEAN = 3
 QUANTUM = 2 * np.pi / 4096  # rad, of the encoder
 CATCH_ALLS = (NONE, UNEXPLAINED, SCATTER)
+SHOWN = 0.005  # probability of a model of several effects from which it is shown
+#: Keyword of the simulator and largest strength, by the name of the effect.
+FRICTIONS = {
+    "Coulomb": ("coulomb", 0.3),
+    "load-dependent": ("load", 1.0),
+    "torque-dependent": ("torque", 1.0),
+    "viscous": ("viscous", 0.1),
+}
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A least-squares fit to some recorded trials.
+
+    Attributes:
+        parameters: Theta and the strengths.
+        residual: Recorded minus predicted angles of all trials, rad, shape (t, k).
+    """
+
+    parameters: Array
+    residual: Array
+
+    def rmse(self, trials: Sequence[int]) -> float:
+        """Return the root mean square over some trials, rad."""
+        return float(np.sqrt((self.residual[[*trials]] ** 2).mean()))
+
+
+def fit(
+    task: ServoPendulumTask,
+    trials: Sequence[int],
+    names: Sequence[str] = (),
+    *,
+    seed: int = 0,
+) -> Fit:
+    """Return the least-squares fit of the simulator with some effects.
+
+    Args:
+        task: Task that holds the recordings.
+        trials: Numbers of the trials that are fitted.
+        names: Names of the effects.
+        seed: Seed of the starts.
+    """
+    r, num = task.recordings, len(task.recordings)
+
+    def residual(z: Array, rows: Sequence[int]) -> Array:
+        each = np.repeat(z, len(rows), axis=0)
+        friction = {FRICTIONS[n][0]: each[:, 5 + j] for j, n in enumerate(names)}
+        x = angles(
+            *(each[:, :5], r.kp, r.goal, r.enabled, r.start),
+            np.tile([*rows], len(z)),
+            every=r.every,
+            **friction,
+        )
+        return r.angle[[*rows]] - x.reshape(len(z), len(rows), -1)
+
+    z, _ = best_in_box(
+        lambda z: residual(z, trials).reshape(len(z), -1),
+        np.array([*PRIOR_LOW, *[0.0 for _ in names]]),
+        np.array([*PRIOR_HIGH, *[FRICTIONS[n][1] for n in names]]),
+        starts=4,
+        evaluations=30,
+        difference=1e-5,
+        seed=seed,
+    )
+    return Fit(z, residual(z[None], range(num))[0])
 
 
 def judge(
@@ -55,22 +128,21 @@ def judge(
     *,
     seed: int = 0,
     folder: Path | None = None,
-) -> dict[str, Any]:
+) -> Row:
     """Return what some recorded trials say.
 
     Args:
-        task: Holds the recordings.
-        fitted: Rows that are fitted.
-        held_out: Rows that are only scored.
-        seed: Of all draws.
-        folder: Where the whole report goes.
+        task: Task that holds the recordings.
+        fitted: Numbers of the trials that are fitted.
+        held_out: Numbers of the trials that are only scored.
+        seed: Seed of all draws.
+        folder: Folder for the whole report.
     """
     begin = time.process_time()
-    trials = task.trials(fitted, held_out)
     loop = Criticism(
         task.simulator,
         task.prior,
-        trials,
+        task.trials(fitted, held_out),
         effects=task.effects(),
         actions=task.actions,
         seed=seed,
@@ -78,30 +150,21 @@ def judge(
     report = loop.report(evaluate=len(held_out) > 0)
     if folder is not None:
         report.save(folder)
-    tracing, detection = loop.trace(), loop.detect()
-    row: dict[str, Any] = {
+    evidences, model = report.tracing.evidences, report.tracing.model
+    row = read_report(report) | {
         "fitted": [*fitted],
         "held_out": [*held_out],
-        "verdict": tracing.verdict,
-        "model": tracing.model,
-        "cause": {} if tracing.misfit is None else dict(tracing.misfit.cause),
-        "alarm": detection.alarm,
-        "log_bayes_factor": detection.log_bayes_factor,
-        "robust": tracing.robust,
-        "probabilities": tracing.probabilities,
-        "credible_set": [*tracing.credible_set],
-        "near": [sorted(group) for group in tracing.near],
-        "log_evidence": {k: e.log_evidence for k, e in tracing.evidences.items()},
-        "parameters": {name: _summary(tracing, name) for name in {NONE, tracing.model}},
-        "singles": {n: _summary(tracing, n) for n in loop.rivals.effects},
-        "warnings": [*report.warnings],
+        "model": model,
+        "parameters": {
+            name: spreads(evidences[name])
+            for name in {NONE, model, *loop.rivals.effects}
+            if name in evidences
+        },
         "seconds": time.process_time() - begin,
         "simulations": loop.rivals.simulator.num_simulations,
     }
-    chosen = report.next_action
-    if chosen is not None:
-        row["gain"] = chosen.information_gain.tolist()
-        row["next"] = None
+    if (chosen := report.next_action) is not None:
+        row |= {"gain": chosen.information_gain.tolist(), "next": None}
         if chosen.action is not None:
             row["next"] = int(task.find(torch.from_numpy(chosen.action)[None])[0])
     if held_out:
@@ -111,7 +174,6 @@ def judge(
             "before": report.evaluation.before["rmse"].tolist(),
             "after": report.evaluation.after["rmse"].tolist(),
         }
-        row["draws"] = _predicted(loop, trials.held_out)
     return row
 
 
@@ -125,8 +187,8 @@ def simulated(
         bare: Fit without friction, whose parameters are simulated.
         full: Fit with the effect found, whose residuals give the size and the
             correlation of the errors.
-        rows: Trials that they are taken from.
-        seed: Of the errors.
+        rows: Numbers of the trials that they are taken from.
+        seed: Seed of the errors.
     """
     r = task.recordings
     left = full.residual[[*rows]]
@@ -136,48 +198,15 @@ def simulated(
     theta = torch.from_numpy(bare.parameters)[None].expand(len(r), -1)
     mean = task.angles(theta, torch.from_numpy(r.action))
     seeds = torch.arange(len(r)) + 1_000 * seed
-    x = AutocorrelatedNoise(sd, tau).sample(
-        mean, seeds, times=torch.from_numpy(r.times)
-    )
+    noise = AutocorrelatedNoise(sd, tau)
+    x = noise.sample(mean, seeds, times=torch.from_numpy(r.times))
     angle = np.round(x.numpy() / QUANTUM) * QUANTUM
     return ServoPendulumTask(data=replace(r, angle=angle), noise=task.noise)
 
 
-def _summary(tracing: Tracing, name: str) -> dict[str, list[float]]:
-    """Return mean and standard deviation of each parameter of a model."""
-    if name not in tracing.evidences:
-        return {}
-    e = tracing.evidences[name]
-    return {
-        n: [float(z.mean()), float(z.std())]
-        for n, z in zip(e.names, e.draws.T, strict=True)
-    }
-
-
-def _predicted(loop: Criticism, held_out: Any) -> dict[str, Any]:
-    """Return mean predictions of held-out trials, and the RMSE of posterior draws."""
-    found: dict[str, Any] = {}
-    tracing = loop.trace()
-    x = held_out.x.numpy()
-    kinds = {"before": ModelKey(), "after": tracing.key}
-    for when, key in kinds.items():
-        p = predict(loop.rivals, held_out, key=key)
-        mean = p.mean.reshape(len(p.mean), *x.shape)
-        rmse = np.sqrt(((mean - x) ** 2).mean((1, 2)))
-        found[when] = {
-            "mean": mean.mean(0).tolist(),
-            "rmse": np.quantile(rmse, [0.05, 0.5, 0.95]).tolist(),
-        }
-    return found
-
-
-def _least_squares(
-    task: ServoPendulumTask, row: dict[str, Any], seed: int
-) -> dict[str, Any]:
+def least_squares(task: ServoPendulumTask, row: Row, seed: int) -> Row:
     """Return training and held-out RMSE of plain fits on the split of a stage."""
-    sets = [(), *((name,) for name in FRICTIONS)]
-    if row["model"] not in (NONE, *CATCH_ALLS):
-        sets.append((*row["model"].split(" + "),))
+    sets = [(), *((name,) for name in FRICTIONS), named(row)]
     found = {}
     for names in dict.fromkeys(sets):
         one = fit(task, row["fitted"], names, seed=seed)
@@ -190,7 +219,12 @@ def _least_squares(
     return found
 
 
-def _chosen(row: dict[str, Any], off: Sequence[int]) -> int:
+def named(row: Row) -> tuple[str, ...]:
+    """Return the effects of a row's model."""
+    return () if row["model"] in CATCH_ALLS else (*row["model"].split(" + "),)
+
+
+def next_of(row: Row, off: Sequence[int]) -> int:
     """Return the motor-off trial that a stage asks for, or would ask for first."""
     if row.get("next") in off:
         return int(row["next"])
@@ -203,12 +237,11 @@ class Settings:
 
     Args:
         data: Folder of the measured set.
-        replay: Sets to replay.
+        replay: Kind of the sets.
         clean: Number of clean sets.
         fit: Numbers of the trials to fit alone.
         out: File of the results.
         reports: Folder for whole reports.
-        figures: Folder for the figures.
         seed: Seed of the engine.
     """
 
@@ -218,78 +251,132 @@ class Settings:
     fit: Sequence[int] | None = None
     out: Path = RESULT
     reports: Path | None = None
-    figures: Path | None = None
     seed: int = 0
 
 
-def main(arguments: Settings) -> int:
-    """Run the stages that are missing from the results, and print the tables."""
-    try:
-        task = ServoPendulumTask(data=arguments.data)
-    except FileNotFoundError as error:
-        print(f"{error}, as in --data DIR", file=sys.stderr)
-        return 2
-    rows: dict[str, Any] = {}
-    if arguments.out.is_file():
-        rows = json.loads(arguments.out.read_text())
-    for name, row in _stages(task, rows, arguments):
-        rows[name] = row
-        arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        arguments.out.write_text(json.dumps(rows, indent=1) + "\n")
-        print(f"{name}: {row['verdict']}, {row['seconds']:.0f} CPU s", flush=True)
-    print(tables(rows, task.recordings))
-    if arguments.figures is not None:
-        from benchmarks.measured.servo_figures import draw
-
-        draw(rows, task.recordings, arguments.figures)
-    return 0
-
-
-def _stages(task: ServoPendulumTask, rows: dict[str, Any], arguments: Any) -> Any:
+def missing(
+    task: ServoPendulumTask, rows: dict[str, Row], chosen: Settings
+) -> Iterator[tuple[str, Row]]:
     """Yield the name and the row of each stage that is missing."""
-    seed = arguments.seed
+    seed = chosen.seed
     off = np.flatnonzero(task.recordings.motor_off).tolist()
     on = [i for i in range(len(task.recordings)) if i not in off]
 
-    def run(name: str, *parts: Any) -> dict[str, Any]:
-        folder = arguments.reports and arguments.reports / name.replace(", ", "_")
-        rows[name] = judge(*parts, seed=seed, folder=folder)
-        return rows[name]
+    def run(name: str, *parts: Any) -> tuple[str, Row]:
+        folder = chosen.reports and chosen.reports / name.replace(", ", "_")
+        return name, judge(*parts, seed=seed, folder=folder)
 
-    if arguments.fit:
-        name = f"trials {', '.join(map(str, arguments.fit))}"
-        yield name, run(name, task, arguments.fit)
+    if chosen.fit:
+        yield run(f"trials {', '.join(map(str, chosen.fit))}", task, chosen.fit)
         return
     if "powered" not in rows:
-        yield "powered", run("powered", task, on)
-    extra = _chosen(rows["powered"], off)
-    held = [i for i in off if i != extra]
-    split = [*on, extra]
+        yield run("powered", task, on)
+    extra = next_of(rows["powered"], off)
+    split, held = [*on, extra], [i for i in off if i != extra]
     if "motor off" not in rows:
-        yield "motor off", run("motor off", task, split, held)
+        yield run("motor off", task, split, held)
     row = rows["motor off"]
     if "least squares" not in row:
-        row["least squares"] = _least_squares(task, row, seed)
-        yield "motor off", row
-    if "rates" not in row:
-        fine = ServoPendulumTask(data=arguments.data, rate=RATES[0])
-        fits = {k: f["parameters"] for k, f in row["least squares"].items()}
-        row["rates"] = by_rate(fine, on, fits)
-        yield "motor off", row
-    if arguments.replay == "clean":
-        model = rows["motor off"]["model"]
-        names = () if model in (NONE, *CATCH_ALLS) else (*model.split(" + "),)
-        wanted = [i for i in range(arguments.clean) if f"clean {i}" not in rows]
-        if wanted:
-            bare, full = fit(task, split, seed=seed), fit(task, split, names, seed=seed)
-            for i in wanted:
-                clean = simulated(task, bare, full, split, seed=i)
-                yield f"clean {i}", run(f"clean {i}", clean, split, held)
-        return
-    iid = ServoPendulumTask(data=task.recordings, noise=servo_noise(correlated=False))
-    for name, parts in (
-        ("powered, iid", (on, ())),
-        ("motor off, iid", (split, held)),
-    ):
-        if name not in rows:
-            yield name, run(name, iid, *parts)
+        yield "motor off", row | {"least squares": least_squares(task, row, seed)}
+    wanted = range(chosen.clean if chosen.replay == "clean" else 0)
+    wanted = [i for i in wanted if f"clean {i}" not in rows]
+    if wanted:
+        bare, full = (fit(task, split, n, seed=seed) for n in ((), named(row)))
+        for i in wanted:
+            clean = simulated(task, bare, full, split, seed=i)
+            yield run(f"clean {i}", clean, split, held)
+
+
+def main(arguments: Settings) -> None:
+    """Run the stages that are missing from the results, and print the tables."""
+    task = measured(lambda: ServoPendulumTask(data=arguments.data))
+    rows = stages(arguments.out)
+    for name, row in missing(task, rows, arguments):
+        rows[name] = row
+        keep(arguments.out, rows)
+        print(f"{name}: {row['verdict']}, {row['seconds']:.0f} CPU s", flush=True)
+    print(tables(rows, task.recordings))
+
+
+def tables(rows: dict[str, Row], recordings: Recordings) -> str:
+    """Return what each stage says, in Markdown.
+
+    Args:
+        rows: Stages by name.
+        recordings: Recordings, for the names of trials.
+    """
+    cells = [
+        (
+            *(name, len(row["fitted"])),
+            said(row) if "helps" in row else row["verdict"],
+            *(causes(row), ", ".join(row["credible_set"])),
+            f"{row['log_bayes_factor']:.1f}",
+            *(_next(row, recordings), f"{row['seconds']:.0f}"),
+        )
+        for name, row in rows.items()
+    ]
+    header = ["stage", "trials", "verdict", "P(cause)", "90 % set", "log BF"]
+    parts = [Table([*header, "next trial", "CPU s"], cells).markdown()]
+    parts += [
+        _models(name, row)
+        for name, row in rows.items()
+        if name in ("powered", "motor off") or name.startswith("trials")
+    ]
+    if "motor off" in rows:
+        row = rows["motor off"]
+        parts += [_errors(row, recordings), _parameters(row)]
+    return "\n\n".join(parts)
+
+
+def _next(row: Row, recordings: Recordings) -> str:
+    if "gain" not in row:
+        return ""
+    if row["next"] is None:
+        return "none"
+    return f"{_trial(row['next'], recordings)} ({max(row['gain']):.2f} nats)"
+
+
+def _models(stage: str, row: Row) -> str:
+    """Return the models of a stage, the likeliest first."""
+    null = row["log_evidence"][NONE]
+    cells = [
+        (name, f"{p:.2f}", f"{row['log_evidence'][name] - null:.1f}")
+        for name, p in row["probabilities"].items()
+        if p >= SHOWN or " + " not in name
+    ]
+    return Table((f"{stage}: model", "P", "log BF"), cells).markdown()
+
+
+def _errors(row: Row, recordings: Recordings) -> str:
+    """Return the held-out errors beside plain least squares."""
+    scores = row["before_after"]
+    place = [metric.lower() for metric in scores["metric"]].index("rmse")
+    cells = []
+    for when, what in (("before", "bare model"), ("after", row["model"])):
+        own = [f"{v:.3f}" for v in row["rmse"][when]]
+        cells.append((f"{when}: {what}", "", f"{scores[when][place]:.4f}", *own))
+    for name, found in row["least squares"].items():
+        sizes = f"{found['train']:.4f}", f"{found['held_out']:.4f}"
+        own = [f"{v:.3f}" for v in found["each"]]
+        cells.append((f"least squares: {name}", *sizes, *own))
+    each = [_trial(i, recordings) for i in row["held_out"]]
+    return Table(("RMSE, rad", "fitted", "held out", *each), cells).markdown()
+
+
+def _parameters(row: Row) -> str:
+    both = row["parameters"][NONE], row["parameters"].get(row["model"], {})
+    cells = [
+        (
+            name,
+            *(
+                f"{m[name][0]:.4g} +- {m[name][1]:.2g}" if name in m else ""
+                for m in both
+            ),
+        )
+        for name in dict.fromkeys(name for model in both for name in model)
+    ]
+    return Table(("parameter", "bare model", row["model"]), cells).markdown()
+
+
+def _trial(number: int, recordings: Recordings) -> str:
+    return f"{recordings.trajectory[number]} {recordings.kp[number]:.0f}"

@@ -36,7 +36,13 @@ from torch import Tensor
 from benchmarks.pouring.bank import ROWS_A_FILE, Drawn, fill
 from benchmarks.pouring.bank import read as read_bank
 from benchmarks.pouring.grid_belief import SIDE, GridBelief
-from benchmarks.pouring.learned import ByAction, Earlier, components, kept, looked_at
+from benchmarks.pouring.learned import (
+    ByAction,
+    Earlier,
+    components,
+    learned_of,
+    looked_at,
+)
 from benchmarks.pouring.likelihood import ImageLikelihood, observed
 from benchmarks.pouring.power import best_power, grid, told_by
 from benchmarks.pouring.run import RESULTS, TEMPERED
@@ -364,7 +370,7 @@ def main(arguments: Settings) -> None:
     if not arguments.summary:
         if arguments.bank is None:
             raise SystemExit("expected --bank FOLDER; got none; make one, see bank.py")
-        learned = kept(arguments.bank, arguments.learned)
+        learned = learned_of(arguments.bank, arguments.learned)
         for target in [arguments.target] if arguments.target else ["1", "2"]:
             run_missing(
                 arguments.bank, learned, target, arguments.rows, arguments.results

@@ -2,12 +2,10 @@
 
     python -m benchmarks pouring.bank FOLDER --rows 2300             # 27 actions
     python -m benchmarks pouring.bank FOLDER --part likely --rows 150
-    python -m benchmarks pouring.bank FOLDER --part repeats --rows 100
     python -m benchmarks pouring.bank FOLDER --report
 
 A part ``likely`` pours at the actions that designs choose most alone, and is learned
-from as ``prior`` is; ``repeats`` pours each theta five times at one action, half of
-them at those, and tunes alone.
+from as ``prior`` is.
 
 Resumable: files of 50 rows each, written whole. Row i of a part is a function of the
 part's name and i alone, so that any number of processes may fill one folder, each with
@@ -35,8 +33,7 @@ from sbi_active.tasks.pouring import Pours
 
 ROWS_A_FILE = 50
 EFFECT = "effect_"  # before the names of effects in a file
-PARTS = ("prior", "likely", "repeats")
-AT_A_THETA = 5  # pours, of part "repeats"
+PARTS = ("prior", "likely")
 #: Actions that designed campaigns choose most.
 LIKELY = ((20, 0, 0.5), (20, 0, 2), (20, -30, 5), (140, -30, 5), (140, 0, 2))
 
@@ -92,12 +89,6 @@ def draw(task: Any, part: str, number: int) -> Drawn:
     likely = torch.tensor(LIKELY, dtype=action.dtype)
     if part == "likely":
         action = likely.repeat(-(-ROWS_A_FILE // len(likely)), 1)[:ROWS_A_FILE]
-    elif part == "repeats":
-        num = ROWS_A_FILE // AT_A_THETA
-        again = likely[torch.arange(num) % len(likely)]
-        some = torch.where(torch.arange(num)[:, None] < num // 2, action[:num], again)
-        theta = theta[:num].repeat_interleave(AT_A_THETA, 0)
-        action = some.repeat_interleave(AT_A_THETA, 0)
     return Drawn(theta, action, row_seeds(seed, ROWS_A_FILE))
 
 

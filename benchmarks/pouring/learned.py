@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pickle
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -22,21 +22,24 @@ from benchmarks.pouring.likelihood import (
     thumbnails,
 )
 from benchmarks.pouring.power import cross_validated
-from benchmarks.pouring.reference import abc_log_prob
 from sbi_active.seeding import forked_generators
 from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import images_of, mesh_coverage
 
 __all__ = [
+    "ByAction",
     "Earlier",
     "Learned",
-    "ByAction",
-    "by_nearest",
+    "both_summaries",
+    "gains_of",
     "kept",
     "learn",
+    "learned_of",
     "looked_at",
-    "summarized",
+    "told_of",
 ]
+
+T = TypeVar("T")
 
 NUM_OUTER, NUM_ALL = 100, 300  # draws behind an expected gain
 NUM_COMPONENTS = 36
@@ -53,16 +56,12 @@ class Learned:
     Attributes:
         likelihood: Learned from them.
         num: Pours behind it.
-        told: Log posterior density of each left-out pour's theta, shape (num,).
-        mass: Of what is denser, shape (num,).
         mean: Of thumbnails, shape (900,), where the summary is components.
         axes: Shape (900, k).
     """
 
     likelihood: ImageLikelihood
     num: int
-    told: np.ndarray
-    mass: np.ndarray
     mean: np.ndarray
     axes: np.ndarray
 
@@ -91,21 +90,8 @@ class ByAction:
         """Return gains by delta and action, nats, and their errors, on common draws."""
         with forked_generators(seed):
             theta = belief.sample(torch.Size([NUM_ALL])).double().numpy()
-        values = np.array(
-            [
-                [
-                    own.likelihood.gain(
-                        theta,
-                        NUM_OUTER,
-                        np.random.default_rng(seed),
-                        earlier[delta, place],
-                    )
-                    for place, own in enumerate(by_action)
-                ]
-                for delta, by_action in enumerate(self.learned)
-            ]
-        )
-        return values.mean(2), values.std(2) / np.sqrt(NUM_OUTER)
+        every = [[(own, theta) for own in by_action] for by_action in self.learned]
+        return gains_of(every, earlier, seed)
 
     def log_likelihood(
         self, theta: np.ndarray, image: Tensor, delta: int, place: int, earlier: Earlier
@@ -113,18 +99,47 @@ class ByAction:
         """Return log densities of an image, shape (n,), and remember it.
 
         Args:
-            theta: Spread as the prior is, shape (n, d).
-            image: Shape (22500,).
-            delta: Of the summary.
-            place: Of the action.
+            theta: Parameters, spread as the prior is, shape (n, d).
+            image: Image, shape (22500,).
+            delta: Number of the summary.
+            place: Number of the action.
             earlier: Statistics of earlier trials, to which its own are added.
         """
         own = self.learned[delta][place]
-        seen = own.seen(image, delta)
-        found = own.likelihood.at(theta, seen, earlier[delta, place])
-        if seen is not None and len(seen):
-            earlier[delta, place].append(seen)
-        return doubted(found, own.likelihood.power)
+        return told_of(own, theta, image, delta, earlier[delta, place])
+
+
+def gains_of(
+    every: Sequence[Sequence[tuple[Learned, np.ndarray]]], earlier: Earlier, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return gains by delta and action, nats, and their errors, on common outcomes.
+
+    Args:
+        every: What is learned, and draws that it takes, by delta and action.
+        earlier: Statistics of earlier trials.
+        seed: Seed of the outcomes.
+    """
+    values = [
+        [
+            own.likelihood.gain(
+                theta, NUM_OUTER, np.random.default_rng(seed), earlier[delta, place]
+            )
+            for place, (own, theta) in enumerate(by_action)
+        ]
+        for delta, by_action in enumerate(every)
+    ]
+    return np.mean(values, 2), np.std(values, 2) / np.sqrt(NUM_OUTER)
+
+
+def told_of(
+    own: Learned, theta: np.ndarray, image: Tensor, delta: int, earlier: list[Any]
+) -> np.ndarray:
+    """Return log densities of an image at theta, and add its statistics to earlier."""
+    seen = own.seen(image, delta)
+    found = own.likelihood.at(theta, seen, earlier)
+    if seen is not None and len(seen):
+        earlier.append(seen)
+    return doubted(found, own.likelihood.power)
 
 
 def looked_at(images: Tensor) -> tuple[np.ndarray, np.ndarray]:
@@ -142,47 +157,44 @@ def summaries_of(rows: Rows, task: Any) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(mesh), np.concatenate(small)
 
 
-def summarized(folder: Path, task: Any) -> Iterator[tuple[Any, ...]]:
-    """Yield delta, action, theta, summaries, whether empty, and components."""
+def learn(folder: Path, task: Any) -> ByAction:
+    """Return what is learned of a bank, of those actions that it has pours of."""
     rows = read_parts(folder, PARTS)
     mesh, small = summaries_of(rows, task)
     theta = rows.theta.double().numpy()
+    found: list[list[Learned]] = [[], []]
+    actions = []
     for action in task.actions.values:
         mine = (rows.action == action).all(1).numpy()
         if not mine.any():
             continue
-        is_empty = ~mesh[mine].any(1)
-        mean, axes = components(small[mine], NUM_COMPONENTS)
-        both = (small[mine] - mean) @ axes, np.sqrt(mesh[mine])
-        for delta, summary in enumerate(both):
-            yield delta, action, theta[mine], summary, is_empty, (mean, axes)
-
-
-def learn(folder: Path, task: Any) -> ByAction:
-    """Return what is learned of a bank, of those actions that it has pours of."""
-    found: list[list[Learned]] = [[], []]
-    actions = []
-    for delta, action, theta, summary, is_empty, basis in summarized(folder, task):
-        fitted, told, mass = cross_validated(theta, summary, is_empty)
-        found[delta].append(Learned(fitted, len(theta), told, mass, *basis))
-        if not delta:
-            actions.append(action)
+        actions.append(action)
+        for own, one in zip(
+            found, both_summaries(mesh[mine], small[mine]), strict=True
+        ):
+            fitted = cross_validated(theta[mine], *one[:2])
+            own.append(Learned(fitted, int(mine.sum()), *one[2:]))
     return ByAction(found, torch.stack(actions))
 
 
-def by_nearest(folder: Path, task: Any) -> list[list[np.ndarray]]:
-    """Return what nearest pours alone tell of left-out ones, by delta and action."""
-    found: list[list[np.ndarray]] = [[], []]
-    for delta, _, theta, summary, *_ in summarized(folder, task):
-        found[delta].append(abc_log_prob(theta, summary))
-    return found
+def both_summaries(mesh: np.ndarray, small: np.ndarray) -> Iterator[tuple[Any, ...]]:
+    """Yield components and mesh coverage, each with emptiness, and the components."""
+    is_empty = ~mesh.any(1)
+    mean, axes = components(small, NUM_COMPONENTS)
+    yield (small - mean) @ axes, is_empty, mean, axes
+    yield np.sqrt(mesh), is_empty, mean, axes
 
 
-def kept(bank: Path, path: Path | None) -> ByAction:
-    """Return what is learned of a bank, from a file of our own where there is one."""
+def learned_of(bank: Path, path: Path | None) -> ByAction:
+    """Return what is learned of a bank, from a file where there is one."""
+    return kept(path, lambda: learn(bank, get_task("pouring")))
+
+
+def kept(path: Path | None, make: Callable[[], T]) -> T:
+    """Return what a file of our own holds, which is made where it is missing."""
     if path is not None and path.exists():
         return pickle.loads(path.read_bytes())
-    learned = learn(bank, get_task("pouring"))
+    made = make()
     if path is not None:
-        path.write_bytes(pickle.dumps(learned))
-    return learned
+        path.write_bytes(pickle.dumps(made))
+    return made

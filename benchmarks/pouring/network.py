@@ -15,8 +15,7 @@ are those of all pours, since one network is shown all actions.
 
 from __future__ import annotations
 
-import pickle
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +38,7 @@ from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.seeding import forked_generators
 from sbi_active.tasks import get_task
 
-__all__ = ["ByNetwork", "kept_networks"]
+__all__ = ["ByNetwork", "learn_networks"]
 
 HIDDEN, NUM_ITERATIONS, BATCH = (64, 64), 1_000, 30  # the paper's, section 5.4
 NUM_OUTER, NUM_ALL = 40, 100  # draws behind a gain; the paper's M is 100
@@ -110,14 +109,11 @@ def learn_networks(folder: Path) -> ByNetwork:
     rows = read_parts(folder, PARTS)
     mesh, small = summaries_of(rows, task)
     mean, axes = components(small, NUM_COMPONENTS)
-    settings = MixtureDensity.faithful()
-    settings = MixtureDensity(
-        **{
-            **settings.__dict__,
-            "hidden_features": HIDDEN,
-            "num_iterations": NUM_ITERATIONS,
-            "batch_size": BATCH,
-        }
+    settings = replace(
+        MixtureDensity.faithful(),
+        hidden_features=HIDDEN,
+        num_iterations=NUM_ITERATIONS,
+        batch_size=BATCH,
     )
     networks = []
     for summary in ((small - mean) @ axes, np.sqrt(mesh)):
@@ -127,13 +123,3 @@ def learn_networks(folder: Path) -> ByNetwork:
             inference.append_simulations(rows.theta, x, action=rows.action).train()
             networks.append(inference.build_posterior())
     return ByNetwork(networks, task.actions.values, mean, axes, len(rows))
-
-
-def kept_networks(bank: Path, path: Path | None) -> ByNetwork:
-    """Return the networks, from a file of our own where there is one."""
-    if path is not None and path.exists():
-        return pickle.loads(path.read_bytes())
-    learned = learn_networks(bank)
-    if path is not None:
-        path.write_bytes(pickle.dumps(learned))
-    return learned

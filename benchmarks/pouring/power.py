@@ -37,19 +37,13 @@ def grid(num: int) -> Array:
     return np.stack(np.meshgrid(line, line, line, indexing="ij"), -1).reshape(-1, 3)
 
 
-def cross_validated(
-    theta: Array, summary: Array, is_empty: Array
-) -> tuple[ImageLikelihood, Array, Array]:
-    """Return the likelihood with its power, and how left-out pours are told by it.
+def cross_validated(theta: Array, summary: Array, is_empty: Array) -> ImageLikelihood:
+    """Return the likelihood with the power that tells left-out pours best.
 
     Args:
-        theta: Shape (n, 3).
-        summary: Shape (n, q).
+        theta: Parameters, shape (n, 3).
+        summary: Summaries, shape (n, q).
         is_empty: Whether no cube is in view, shape (n,).
-
-    Returns:
-        The likelihood; the log posterior density of each left-out pour's theta from the
-        prior, (n,); and the mass of what is denser than it, (n,).
     """
     cells, n = grid(NUM_CELLS), len(theta)
     log_p = np.zeros((n, len(cells)))
@@ -62,11 +56,8 @@ def cross_validated(
         log_p[out] = fitted.at_each(cells, seen)
     place = np.minimum((theta * NUM_CELLS).astype(int), NUM_CELLS - 1)
     index = np.ravel_multi_index(tuple(place.T), (NUM_CELLS,) * 3)
-    own = log_p[np.arange(len(log_p)), index]
-    power = best_power(log_p, own)
-    told, mass = told_by(power * log_p, power * own)
-    whole = ImageLikelihood.fit(theta, summary, is_empty)
-    return replace(whole, power=power), told, mass
+    power = best_power(log_p, log_p[np.arange(len(log_p)), index])
+    return replace(ImageLikelihood.fit(theta, summary, is_empty), power=power)
 
 
 def best_power(log_p: Array, own: Array) -> float:

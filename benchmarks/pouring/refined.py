@@ -40,7 +40,7 @@ from benchmarks.pouring.around import (
 from benchmarks.pouring.bank import Rows, read_parts
 from benchmarks.pouring.bank import read as read_bank
 from benchmarks.pouring.grid_belief import GridBelief
-from benchmarks.pouring.learned import PARTS, ByAction, kept
+from benchmarks.pouring.learned import PARTS, ByAction, learned_of
 from benchmarks.pouring.power import best_power
 from benchmarks.pouring.run import RESULTS
 from benchmarks.rows import append, read
@@ -256,7 +256,7 @@ def main(arguments: Settings) -> None:
     if not arguments.summary:
         if arguments.bank is None:
             raise SystemExit("expected --bank FOLDER; got none; make one, see bank.py")
-        learned = kept(arguments.bank, arguments.learned)
+        learned = learned_of(arguments.bank, arguments.learned)
         for target in [arguments.target] if arguments.target else ["1", "2"]:
             run_missing(arguments.bank, learned, target, arguments)
     print(summarize(read(arguments.results / "refined.csv")))

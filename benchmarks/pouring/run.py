@@ -2,7 +2,6 @@
 
     python -m benchmarks pouring --bank FOLDER                  # both targets
     python -m benchmarks pouring --bank FOLDER --table coverage --rounds 3
-    python -m benchmarks pouring --bank FOLDER --table bank     # left-out pours
     python -m benchmarks pouring --summary
 
 Resumable: a trial that stands in the CSV is not run again. One row a round, one file a
@@ -29,14 +28,9 @@ import numpy as np
 import torch
 
 from benchmarks.pouring.grid_belief import GridBelief
-from benchmarks.pouring.learned import ByAction, Earlier, by_nearest, kept
-from benchmarks.pouring.network import ByNetwork, kept_networks
-from benchmarks.pouring.summary import (
-    bank_table,
-    coverage_table,
-    reference_table,
-    summarize,
-)
+from benchmarks.pouring.learned import ByAction, Earlier, kept, learned_of
+from benchmarks.pouring.network import ByNetwork, learn_networks
+from benchmarks.pouring.summary import coverage_table, summarize
 from benchmarks.rows import append, read
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task
@@ -125,7 +119,7 @@ class Settings:
         summary: Whether to run nothing, and print the table of the rows.
     """
 
-    table: Literal["paper", "coverage", "bank"] = "paper"
+    table: Literal["paper", "coverage"] = "paper"
     bank: Path = Path()
     learned: Path | None = None
     target: Literal["1", "2"] | None = None
@@ -145,9 +139,9 @@ def known(method: str, arguments: Settings) -> ByAction | ByNetwork:
     """Return what a method has learned of the bank."""
     path = arguments.learned
     if method not in BY_NETWORK:
-        return kept(arguments.bank, path)
+        return learned_of(arguments.bank, path)
     own = None if path is None else path.with_suffix(".networks")
-    return kept_networks(arguments.bank, own)
+    return kept(own, lambda: learn_networks(arguments.bank))
 
 
 def make_task(target: str, seed: int) -> Any:
@@ -197,11 +191,6 @@ def main(arguments: Settings) -> None:
     targets = [arguments.target] if arguments.target else ["1", "2"]
     targets = ["prior"] if is_coverage else targets
     if not arguments.summary:
-        if arguments.table == "bank":
-            told = kept(arguments.bank, arguments.learned).learned
-            nearest = by_nearest(arguments.bank, get_task("pouring"))
-            print(bank_table(told), reference_table(told, nearest), sep="\n\n")
-            return
         for method in arguments.methods:
             learned = known(method, arguments)
             for target in targets:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -11,11 +10,9 @@ from scipy import stats
 from sbi_active.display.table import Table
 
 __all__ = [
-    "bank_table",
     "column",
     "coverage_table",
     "label",
-    "reference_table",
     "summarize",
 ]
 
@@ -153,57 +150,3 @@ def coverage_table(cells: Cells) -> str:
             table.append([*entry, f"{log_p.mean():.2f}"])
     header = ["", "round", "truths", "in 50 % region", "in 90 % region", "mean log p"]
     return Table(header, table).text() if table else "no trials yet"
-
-
-def bank_table(learned: Sequence[Sequence[Any]]) -> str:
-    """Return how well left-out pours of a bank are told, by summary.
-
-    Args:
-        learned: By delta and action, with ``told``, ``mass`` and ``likelihood.power``.
-    """
-    table = []
-    for label, actions in zip(("PCA", "mesh coverage"), learned, strict=True):
-        told = [one.told.mean() for one in actions]
-        mass = np.concatenate([one.mass for one in actions])
-        num = len(mass)
-        table.append(
-            [
-                label,
-                str(num),
-                f"{np.mean(told):.2f}",
-                f"{np.min(told):.2f} .. {np.max(told):.2f}",
-                f"{(mass <= 0.5).mean():.3f}",
-                f"{(mass <= 0.9).mean():.3f}",
-                f"{np.mean([one.likelihood.power for one in actions]):.2f}",
-            ]
-        )
-    header = ["", "pours", "mean log p", "by action", "in 50 % region"]
-    return Table([*header, "in 90 % region", "mean power"], table).text()
-
-
-def reference_table(
-    learned: Sequence[Sequence[Any]], nearest: Sequence[Sequence[np.ndarray]]
-) -> str:
-    """Return how far left-out pours are from what their nearest pours tell.
-
-    Args:
-        learned: By delta and action, with ``told``.
-        nearest: Log densities of the same pours by the nearest ones, likewise.
-    """
-    table = []
-    for k, label in enumerate(("PCA", "mesh coverage")):
-        abc = np.concatenate([*nearest[k]])
-        gap = abc - np.concatenate([one.told for one in learned[k]])
-        pairs = zip(nearest[k], learned[k], strict=True)
-        worst = max(float(a.mean() - one.told.mean()) for a, one in pairs)
-        table.append(
-            [
-                label,
-                f"{abc.mean():.2f} +- {abc.std() / np.sqrt(len(abc)):.2f}",
-                f"{gap.mean():+.2f} +- {gap.std() / np.sqrt(len(gap)):.2f}",
-                f"{worst:+.2f}",
-            ]
-        )
-    return Table(
-        ["", "ABC, mean log p", "less ours", "at worst, an action"], table
-    ).text()

@@ -31,7 +31,6 @@ Resumable: a problem that has a row is not run again.
 
 from __future__ import annotations
 
-import csv
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -45,6 +44,7 @@ from sbi.utils import BoxUniform
 from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal
 
+from benchmarks.rows import append, read
 from sbi_active import ASBI, RefinementOptions
 from sbi_active.inference import Belief
 from sbi_active.seeding import derive_seed, forked_generators
@@ -192,11 +192,8 @@ def row_of(
 
 def rows(prior: str, num_histories: int | None) -> list[dict[str, str]]:
     """Return the rows of a prior and a number of simulations so far."""
-    if not RESULTS.exists():
-        return []
     kind = prior, str(num_histories or "")
-    with RESULTS.open(newline="") as file:
-        return [r for r in csv.DictReader(file) if (r["prior"], r["histories"]) == kind]
+    return [r for r in read(RESULTS) if (r["prior"], r["histories"]) == kind]
 
 
 def problems(prior: str, seeds: range) -> Iterator[tuple[int, int, int]]:
@@ -214,18 +211,10 @@ def run(prior: str, num_histories: int | None, seeds: range) -> None:
         (int(r["dim"]), int(r["size"]), int(r["seed"]))
         for r in rows(prior, num_histories)
     }
-    is_new = not RESULTS.exists()
-    RESULTS.parent.mkdir(exist_ok=True)
-    with RESULTS.open("a", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        if is_new:
-            writer.writeheader()
-        for dim, size, seed in problems(prior, seeds):
-            if (dim, size, seed) in done:
-                continue
+    for dim, size, seed in problems(prior, seeds):
+        if (dim, size, seed) not in done:
             row = row_of(prior, num_histories, dim, size, seed)
-            writer.writerow(row)
-            file.flush()
+            append(RESULTS, COLUMNS, [row])
             print(" ".join(str(value) for value in row.values()), flush=True)
 
 

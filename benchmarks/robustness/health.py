@@ -16,7 +16,6 @@ as too few simulations leave the belief off, are listed as such. Resumable:
 
 from __future__ import annotations
 
-import csv
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -29,6 +28,7 @@ from scipy.stats import beta
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
+from benchmarks.rows import append, read
 from sbi_active import (
     BoxActions,
     Campaign,
@@ -155,31 +155,13 @@ def campaign(q: int, lost: str, index: int) -> dict[str, Any]:
     return row
 
 
-def read(path: Path = RESULTS) -> list[dict[str, str]]:
-    """Return the rows so far."""
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def _key(row: dict[str, Any]) -> tuple[str, str, str]:
-    return str(row["numbers"]), row["lost"], str(row["campaign"])
-
-
 def fill(path: Path, cells: list[tuple[int, str]], campaigns: range) -> None:
     """Run the campaigns that have no row yet."""
-    done = {_key(row) for row in read(path)}
-    path.parent.mkdir(exist_ok=True)
-    with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        if not done:
-            writer.writeheader()
-        for index in campaigns:
-            for q, lost in cells:
-                if (str(q), lost, str(index)) not in done:
-                    writer.writerow(campaign(q, lost, index))
-                    file.flush()
+    done = {(row["numbers"], row["lost"], row["campaign"]) for row in read(path)}
+    for index in campaigns:
+        for q, lost in cells:
+            if (str(q), lost, str(index)) not in done:
+                append(path, COLUMNS, [campaign(q, lost, index)])
 
 
 def interval(count: int, n: int) -> tuple[float, float]:

@@ -13,7 +13,6 @@ Resumable: a set that stands in ``results/outliers.csv`` is not run again.
 
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,6 +21,7 @@ import torch
 
 from benchmarks.criticism.cases import draw_case
 from benchmarks.criticism.worlds import get_world
+from benchmarks.rows import append, read
 from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.report.summary import suspects
 from sbi_active.seeding import derive_seed
@@ -85,34 +85,20 @@ def measure(name: str, size: int, number: int) -> dict[str, object]:
     }
 
 
-def rows() -> list[dict[str, str]]:
-    """Return the sets that were run."""
-    if not RESULTS.exists():
-        return []
-    with RESULTS.open(newline="") as file:
-        return [*csv.DictReader(file)]
-
-
 def run() -> None:
     """Run the sets that have no row yet."""
-    done = {(r["world"], int(r["size"]), int(r["case"])) for r in rows()}
-    new = not RESULTS.exists()
-    RESULTS.parent.mkdir(exist_ok=True)
-    with RESULTS.open("a", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        if new:
-            writer.writeheader()
-        for world, size, num in SETTINGS:
-            for number in range(num):
-                if (world, size, number) not in done:
-                    writer.writerow(measure(world, size, number))
-                    file.flush()
+    done = {(r["world"], int(r["size"]), int(r["case"])) for r in read(RESULTS)}
+    for world, size, num in SETTINGS:
+        for number in range(num):
+            if (world, size, number) not in done:
+                append(RESULTS, COLUMNS, [measure(world, size, number)])
 
 
 def shares() -> Iterator[str]:
     """Yield the shares of each setting."""
+    rows = read(RESULTS)
     for world, size, _ in SETTINGS:
-        some = [r for r in rows() if (r["world"], int(r["size"])) == (world, size)]
+        some = [r for r in rows if (r["world"], int(r["size"])) == (world, size)]
         if not some:
             continue
         effects = sum(r["verdict"] not in CATCH_ALLS for r in some)

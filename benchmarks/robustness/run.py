@@ -6,38 +6,50 @@
 
 Each case runs in a process of its own with a time limit, and counts as survived where
 the library gives the right numbers, or the error that names the fault; a wrong number,
-another error, a hang or a dead process counts as not survived. Resumable: a case that
-stands in ``results/AREA.csv`` is not run again; ``--fresh`` runs an area anew.
+another error, a hang or a dead process counts as not survived. Areas with attacks of
+their own are modules here. What was tried in the others has become tests: an attack is
+a test function of a folder, and a case is what it is called with. Rows of these that
+are committed are of the attacks as they stood here (2026-11-27).
+
+Resumable: a case that stands in ``results/AREA.csv`` is not run again; ``--fresh`` runs
+an area anew.
 """
 
 from __future__ import annotations
 
-import csv
 import importlib
+import subprocess
+import sys
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
+from xml.etree import ElementTree
 
-from benchmarks.robustness.attacks import Attack, attempt
+from benchmarks.robustness.attacks import ROOT, Attack, attempt
+from benchmarks.rows import append, read
 
-AREAS = (
-    "engine",
-    "bank",
-    "campaign",
-    "criticism",
-    "effects_and_reports",
-    "parameters",
-    "threads_and_locks",
-    "crafted_files",
-    "command_line",
-    "tables",
-    "mujoco_robots",
-    "priors",
-    "process_state",
-)
+#: Areas, and the tests that hold them; none where attacks stand in a module here.
+AREAS: dict[str, tuple[str, ...]] = {
+    "engine": ("tests/simulation/workers", "tests/simulation/test_*.py"),
+    "bank": ("tests/simulation/bank",),
+    "campaign": ("tests/campaign/test_*.py", "tests/campaign/checks"),
+    "criticism": ("tests/criticism/test_*.py",),
+    "effects_and_reports": ("tests/criticism/effects", "tests/criticism/report"),
+    "parameters": (),
+    "threads_and_locks": ("tests/campaign/storage",),
+    "crafted_files": ("tests/campaign/storage",),
+    "command_line": ("tests/cli",),
+    "tables": ("tests/criticism/data",),
+    "mujoco_robots": ("tests/mujoco",),
+    "priors": (),
+    "process_state": (),
+}
 RESULTS = Path(__file__).parent / "results"
 COLUMNS = ["attack", "case", "survived", "answer", "cpu_seconds"]
+LONGEST = 3_600.0  # s that all tests of an area may take
+Row = dict[str, object]
 
 
 def attacks_on(area: str) -> list[Attack]:
@@ -46,43 +58,65 @@ def attacks_on(area: str) -> list[Attack]:
 
 
 def rows_of(area: str) -> list[dict[str, str]]:
-    """Return the committed rows of an area; those of attacks that are gone are not."""
-    path = RESULTS / f"{area}.csv"
-    if not path.exists():
-        return []
-    known = {(a.name, str(case)) for a in attacks_on(area) for case in a.cases}
-    with path.open(newline="") as file:
-        return [
-            row for row in csv.DictReader(file) if (row["attack"], row["case"]) in known
-        ]
+    """Return the committed rows of an area."""
+    return read(RESULTS / f"{area}.csv")
+
+
+def attacked(area: str, done: set[tuple[str, str]]) -> Iterator[Row]:
+    """Yield the rows of the cases of a module that are not done."""
+    for attack in attacks_on(area):
+        for case in attack.cases:
+            if (attack.name, str(case)) not in done:
+                outcome = attempt(attack, case)
+                yield {
+                    "attack": attack.name,
+                    "case": case,
+                    "survived": outcome.survived,
+                    "answer": outcome.answer,
+                    "cpu_seconds": f"{outcome.cpu_seconds:.1f}",
+                }
+
+
+def by_tests(patterns: tuple[str, ...]) -> Iterator[Row]:
+    """Yield a row for each test of some files or folders, those skipped left out."""
+    paths = [str(path) for p in patterns for path in sorted(Path(ROOT).glob(p))]
+    with tempfile.TemporaryDirectory() as folder:
+        report = Path(folder, "report.xml")
+        subprocess.run(
+            [sys.executable, "-m", "pytest", "-q", f"--junitxml={report}", *paths],
+            cwd=ROOT,
+            stdout=subprocess.DEVNULL,
+            timeout=LONGEST,
+            check=False,
+        )
+        cases = ElementTree.parse(report).getroot().iter("testcase")
+    for test in cases:
+        if test.find("skipped") is None:
+            fault = test.find("failure")
+            fault = test.find("error") if fault is None else fault
+            name, _, case = test.attrib["name"].partition("[")
+            yield {
+                "attack": f"{test.attrib['classname']} {name}",
+                "case": case.removesuffix("]"),
+                "survived": fault is None,
+                "answer": "" if fault is None else fault.attrib["message"][:200],
+                "cpu_seconds": test.attrib["time"],
+            }
 
 
 def run(area: str, *, fresh: bool) -> None:
     """Run the cases of an area that have no row yet."""
-    rows = [] if fresh else rows_of(area)
-    done = {(row["attack"], row["case"]) for row in rows}
-    RESULTS.mkdir(exist_ok=True)
-    with (RESULTS / f"{area}.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-        for attack in attacks_on(area):
-            for case in attack.cases:
-                if (attack.name, str(case)) in done:
-                    continue
-                outcome = attempt(attack, case)
-                writer.writerow(
-                    {
-                        "attack": attack.name,
-                        "case": case,
-                        "survived": outcome.survived,
-                        "answer": outcome.answer,
-                        "cpu_seconds": f"{outcome.cpu_seconds:.1f}",
-                    }
-                )
-                file.flush()
-                word = "survived" if outcome.survived else f"NOT: {outcome.answer}"
-                print(f"{area}: {attack.name} [{case}]: {word}", flush=True)
+    path = RESULTS / f"{area}.csv"
+    if fresh:
+        path.unlink(missing_ok=True)
+    done = {(row["attack"], row["case"]) for row in rows_of(area)}
+    patterns = AREAS[area]
+    if patterns and done:
+        return
+    for row in by_tests(patterns) if patterns else attacked(area, done):
+        append(path, COLUMNS, [row])
+        word = "survived" if row["survived"] else f"NOT: {row['answer']}"
+        print(f"{area}: {row['attack']} [{row['case']}]: {word}", flush=True)
 
 
 def summary() -> Iterator[str]:

@@ -10,8 +10,8 @@
 # this page makes a stand-in: a pendulum in plain Python with friction that its model
 # does not know. With the recordings, `python -m benchmarks measured.servo_pendulum
 # --data DIR` does the same on the real machine: see
-# [the servo](../measured_servo.md) for what came out, and
-# [ball and hoop](../measured_hoop.md) for a machine from its raw file on.
+# [the servo](../measured.md#servo) for what came out, and
+# [ball and hoop](../measured.md#motor-with-a-heavy-hoop) for a machine from its raw file on.
 
 # %%
 import torch

@@ -4,7 +4,7 @@
 # From an MJCF to a belief and to what the model lacks: parameters are quantities of the
 # model by their names, effects are enumerated from it.
 #
-# A leg of a Go2 was treated so on recorded data, see [its page](../measured_go2.md).
+# A leg of a Go2 was treated so on recorded data, see [its page](../measured.md#legs-of-a-quadruped).
 # Here the robot is a pendulum, small enough for a page. Data in the form of
 # `mujoco.sysid` enter by `sbi_active.mujoco.from_sysid`
 # ([how](../robots.md#from-mujoco-sysid)).

@@ -30,7 +30,7 @@ from torch import Tensor
 from torch.distributions import Distribution, Normal, Uniform
 
 from sbi_active.simulation import AutocorrelatedNoise, SimulatorModel
-from sbi_active.tasks.bare import bare_simulator
+from sbi_active.tasks.machines import bare_simulator
 from sbi_active.tasks.product import Product
 from sbi_active.tasks.stepping import between, is_on, lagged, row
 

@@ -14,9 +14,10 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.distributions import Beta, Distribution, HalfNormal, Independent, Normal
+from torch.distributions import Beta, Independent
 
 from sbi_active.criticism import Context, Effect
+from sbi_active.tasks.machines import half_normal, normal
 
 __all__ = ["make_effects"]
 
@@ -43,7 +44,7 @@ def make_effects() -> list[Effect]:
         Effect.keyword(
             "viscosity",
             "viscosity",
-            prior=_half_normal(0.3),
+            prior=half_normal(0.3),
             units="Pa s",
             family="medium",
             describe="The medium drags in proportion to the speed. "
@@ -52,7 +53,7 @@ def make_effects() -> list[Effect]:
         Effect.keyword(
             "air",
             "air_density",
-            prior=_half_normal(1.2),
+            prior=half_normal(1.2),
             units="kg/m^3",
             family="medium",
             describe="The medium drags with the square of the speed. "
@@ -61,7 +62,7 @@ def make_effects() -> list[Effect]:
         Effect.keyword(
             "tilt",
             "tilt",
-            prior=_normal(1.0),
+            prior=normal(1.0),
             units="deg",
             family="table",
             describe="The table slopes down ahead by phi. At 1 deg: +85/+86/+85 mm.",
@@ -69,7 +70,7 @@ def make_effects() -> list[Effect]:
         Effect(
             "speed gain",
             hook="action",
-            prior=_normal(0.05),
+            prior=normal(0.05),
             null=0.0,
             apply=lambda speed, phi, action, context: speed * (1 + phi),
             family="speed",
@@ -79,7 +80,7 @@ def make_effects() -> list[Effect]:
         Effect(
             "speed offset",
             hook="action",
-            prior=_normal(0.1),
+            prior=normal(0.1),
             null=0.0,
             apply=lambda speed, phi, action, context: speed + phi,
             units="m/s",
@@ -90,7 +91,7 @@ def make_effects() -> list[Effect]:
         Effect.keyword(
             "aim",
             "aim",
-            prior=_normal(0.01),
+            prior=normal(0.01),
             units="m",
             family="alignment",
             describe="The pusher's path is shifted by phi along y. "
@@ -99,7 +100,7 @@ def make_effects() -> list[Effect]:
         Effect.keyword(
             "center of mass",
             "center_of_mass",
-            prior=_normal(0.01),
+            prior=normal(0.01),
             units="m",
             family="alignment",
             describe="The cube's center of mass is off by phi along y. "
@@ -108,7 +109,7 @@ def make_effects() -> list[Effect]:
         Effect.keyword(
             "pusher friction",
             "extra_pusher_friction",
-            prior=_normal(0.15),
+            prior=normal(0.15),
             units="",
             family="pusher",
             describe="The pusher's surface has friction .5 + phi. "
@@ -117,7 +118,7 @@ def make_effects() -> list[Effect]:
         Effect.keyword(
             "force",
             "force",
-            prior=_normal(0.3),
+            prior=normal(0.3),
             units="N",
             family="force",
             describe="A constant force, of a cable, pulls the cube ahead. "
@@ -126,7 +127,7 @@ def make_effects() -> list[Effect]:
         Effect(
             "camera bias",
             hook="observation",
-            prior=_normal(0.01),
+            prior=normal(0.01),
             null=0.0,
             apply=_shift,
             units="m",
@@ -135,7 +136,7 @@ def make_effects() -> list[Effect]:
         Effect(
             "camera scale",
             hook="observation",
-            prior=_normal(0.02),
+            prior=normal(0.02),
             null=0.0,
             apply=_stretch,
             describe="The camera reads x and y times 1 + phi. At 0.02: +19/+47/+72 mm.",
@@ -143,7 +144,7 @@ def make_effects() -> list[Effect]:
         Effect.keyword(
             "time stamp",
             "delay",
-            prior=_normal(0.03),
+            prior=normal(0.03),
             units="s",
             family="observation",
             describe="The position is taken late by phi. At 0.05 s: +5/+76/+137 mm.",
@@ -162,11 +163,3 @@ def _stretch(x: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor
 def _columns(phi: Tensor, *shares: float) -> Tensor:
     """Return phi (n, 1) spread over the coordinates, shape (n, 3)."""
     return phi * torch.tensor(shares, dtype=phi.dtype)
-
-
-def _normal(sd: float) -> Distribution:
-    return Independent(Normal(torch.zeros(1), torch.full((1,), sd)), 1)
-
-
-def _half_normal(sd: float) -> Distribution:
-    return Independent(HalfNormal(torch.full((1,), sd)), 1)

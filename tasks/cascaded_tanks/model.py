@@ -40,7 +40,7 @@ from sbi.utils import BoxUniform
 from torch import Tensor
 
 from sbi_active.simulation import AutocorrelatedNoise, SimulatorModel
-from sbi_active.tasks.bare import bare_simulator
+from sbi_active.tasks.machines import bare_simulator
 from sbi_active.tasks.stepping import between, is_on, lagged, row
 
 __all__ = [

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution, HalfNormal, Independent, Normal
 
 from sbi_active.criticism import Context, Effect
+from sbi_active.tasks.machines import half_normal, normal
 from sbi_active.tasks.pouring.raster import NUM_PIXELS, PIXEL
 
 __all__ = ["make_effects"]
@@ -20,13 +20,13 @@ def make_effects() -> list[Effect]:
         ['linear damping', 'angular damping']
     """
     dynamics = [
-        ("linear damping", "linear_damping", _half_normal(0.5), "1/s", "medium"),
-        ("angular damping", "angular_damping", _half_normal(0.5), "1/s", "medium"),
-        ("tilt", "tilt", _normal(1.0), "deg", "ground"),
-        ("bucket position", "bucket_y", _normal(0.01), "m", "bucket"),
-        ("bucket height", "bucket_height", _normal(0.01), "m", "bucket"),
-        ("cohesion", "cohesion", _half_normal(0.5), "", "particles"),
-        ("lag", "lag", _half_normal(0.1), "s", "bucket"),
+        ("linear damping", "linear_damping", half_normal(0.5), "1/s", "medium"),
+        ("angular damping", "angular_damping", half_normal(0.5), "1/s", "medium"),
+        ("tilt", "tilt", normal(1.0), "deg", "ground"),
+        ("bucket position", "bucket_y", normal(0.01), "m", "bucket"),
+        ("bucket height", "bucket_height", normal(0.01), "m", "bucket"),
+        ("cohesion", "cohesion", half_normal(0.5), "", "particles"),
+        ("lag", "lag", half_normal(0.1), "s", "bucket"),
     ]
     effects = [
         Effect.keyword(name, keyword, prior=prior, units=units, family=family)
@@ -37,7 +37,7 @@ def make_effects() -> list[Effect]:
         Effect(
             "camera offset",
             hook="observation",
-            prior=_normal(0.006),
+            prior=normal(0.006),
             null=0.0,
             apply=_shift,
             units="m",
@@ -47,7 +47,7 @@ def make_effects() -> list[Effect]:
         Effect(
             "camera gain",
             hook="observation",
-            prior=_normal(0.05),
+            prior=normal(0.05),
             null=0.0,
             apply=lambda x, phi, action, context: x * (1 + phi),
             family="camera",
@@ -72,11 +72,3 @@ def _shift(x: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
         read = torch.where(seen & (weight > 0), pictures.gather(2, index), zero)
         parts.append(read * weight)
     return (parts[0] + parts[1]).reshape(x.shape)
-
-
-def _normal(sd: float) -> Distribution:
-    return Independent(Normal(torch.zeros(1), torch.full((1,), sd)), 1)
-
-
-def _half_normal(sd: float) -> Distribution:
-    return Independent(HalfNormal(torch.full((1,), sd)), 1)

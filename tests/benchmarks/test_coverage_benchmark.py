@@ -3,7 +3,6 @@
 import importlib.util
 
 import mujoco
-import numpy as np
 import pandas as pd
 import pytest
 
@@ -15,27 +14,8 @@ if not hasattr(sysid, "Parameter"):
     )
 
 from benchmarks.__main__ import main as run  # noqa: E402
-from benchmarks.robots.coverage import missing, table  # noqa: E402
-from benchmarks.robots.machines import MACHINES, recorded  # noqa: E402
-
-
-def test_conditions_differ_in_what_they_say():
-    machine = MACHINES["spring-mass"]
-    sets = {c: recorded(machine, c, 3) for c in ("white", "AR .98", "friction 1")}
-    x = {c: s.sequences.sensordata[0].data for c, s in sets.items()}
-    assert (sets["white"].truth == sets["friction 1"].truth).all()
-    assert (
-        recorded(machine, "white", 3).sequences.sensordata[0].data == x["white"]
-    ).all()
-    with pytest.raises(AssertionError):
-        np.testing.assert_allclose(x["white"], x["friction 1"], atol=0.05)
-    errors = x["AR .98"] - x["white"]  # of one motion, the white ones out of the same
-    assert np.abs(errors).max() < 10 * max(machine.noise)
-    # What is fitted has no friction, and its parameters are not the truth.
-    model = sets["friction 1"].sequences.spec.compile()
-    assert model.dof_frictionloss.max() == 0
-    low, high = sets["white"].params.get_bounds()
-    assert ((low < sets["white"].truth) & (sets["white"].truth < high)).all()
+from benchmarks.robots.coverage import missing  # noqa: E402
+from benchmarks.robots.machines import MACHINES  # noqa: E402
 
 
 def test_rows_are_run_once_and_told(tmp_path, capsys):
@@ -61,27 +41,6 @@ def test_rows_are_run_once_and_told(tmp_path, capsys):
     assert "| ours  | 1      | 1.00 (0.34 to 1.00)" in capsys.readouterr().out
     run(["robots.coverage", "--summary", "--out", str(out)])
     assert "| friction 1  | 0.00    | 1.00   | 1.00" in capsys.readouterr().out
-
-
-def test_the_table_counts():
-    rows = pd.DataFrame(
-        {
-            "machine": "m",
-            "condition": "c",
-            "seed": [1, 1, 2, 2],
-            "way": "ours",
-            "parameter": ["a", "b"] * 2,
-            "truth": 0.0,
-            "low": [-1.0, -1.0, 1.0, -3.0],
-            "high": [1.0, 1.0, 2.0, 3.0],
-            "cpu_seconds": [1.0, 1.0, 3.0, 3.0],
-        }
-    )
-    (row,) = table(rows).to_dict("records")
-    assert row["sets"] == 2
-    assert row["coverage"].startswith("0.75")
-    assert row["by parameter (median half width)"] == "a 0.50 (0.75), b 1.00 (2)"
-    assert row["CPU s"] == "2.00"
 
 
 @pytest.mark.parametrize("name", [*MACHINES])

@@ -1,6 +1,5 @@
 """The worlds with misfit: what they are made of, and how they are scored."""
 
-import csv
 import json
 
 import pytest
@@ -8,15 +7,12 @@ import torch
 
 from benchmarks.misfit import run
 from benchmarks.misfit.cases import draw_case
-from benchmarks.misfit.discrepancies import draw_discrepancy, smooth_series
-from benchmarks.misfit.machines import GROUPS, LAYOUTS, get_machine
-from benchmarks.misfit.refit import least_squares
+from benchmarks.misfit.machines import GROUPS, get_machine
 from benchmarks.misfit.scores import COLUMNS
 from benchmarks.misfit.summary import summary
-from benchmarks.misfit.truth import excess, respond
+from benchmarks.misfit.truth import respond
 from sbi_active.seeding import forked_generators
 
-OWN = GROUPS["own"]
 EVERY = [name for names in GROUPS.values() for name in names]
 
 
@@ -42,42 +38,6 @@ def test_an_effect_vanishes_at_its_null_and_moves_x_beyond(name):
         assert moved.square().mean().sqrt() > 0.5 * machine.noise_sd, effect.name
 
 
-@pytest.mark.parametrize("name", OWN)
-def test_no_effect_is_flat_at_its_null(name):
-    """A thousandth of an effect does a thousandth of what it does, nearly."""
-    machine = get_machine(name)
-    theta, action = rows_of(machine)
-    trial = torch.arange(len(theta))
-    bare = respond(machine, theta, action, trial)
-    for effect in machine.library:
-        unit = effect.prior.base_dist.scale.double().expand(len(theta), 1)
-        sizes = [
-            (respond(machine, theta, action, trial, [effect], [s * unit]) - bare).norm()
-            / s
-            for s in (1e-3, 0.3)
-        ]
-        assert 0.3 < sizes[0] / sizes[1] < 3.5, effect.name
-
-
-@pytest.mark.parametrize("name", EVERY)
-def test_what_is_hidden_moves_x_and_a_fit_starts_right(name):
-    machine = get_machine(name)
-    theta, action = rows_of(machine, 2 * machine.num_trials)
-    theta, trial = theta[:1], torch.arange(machine.num_trials)
-    each = theta.expand(len(trial), -1)
-    clean = respond(machine, each, action, trial).flatten()[None] / machine.noise_sd
-    assert excess(machine, theta, action, trial, clean) < 1e-6
-    for form in (*machine.forms, *machine.unseen_forms):
-        x = machine.fn(
-            each,
-            action[trial],
-            hidden={f"form {form}": torch.full_like(each[:, 0], 0.3)},
-        )
-        moved = x.flatten() / machine.noise_sd - clean[0]
-        assert moved.isfinite().all(), form
-        assert moved.abs().max() > 0.1, form
-
-
 @pytest.mark.parametrize(("group", "number"), [("own", 0), ("own", 1), ("letters", 1)])
 def test_sizes_are_what_the_refitted_bare_model_leaves(group, number):
     truth = draw_case(group, "M", number).truth
@@ -86,69 +46,6 @@ def test_sizes_are_what_the_refitted_bare_model_leaves(group, number):
     assert draw_case(group, "C", number).truth.excess() < 1e-6
     (size,) = (only := draw_case(group, "CE", number).truth).sizes
     assert only.excess() == pytest.approx(size, rel=0.35)
-
-
-def test_a_removed_effect_leaves_the_truth_as_it_is():
-    declared, removed = (draw_case("own", kind, 1) for kind in ("E", "R"))
-    torch.testing.assert_close(declared.problem.trials.x, removed.problem.trials.x)
-    names = {e.name for e in declared.problem.effects}
-    assert names - {e.name for e in removed.problem.effects} == {*removed.truth.names}
-
-
-def test_a_case_is_a_function_of_its_number_and_layouts_go_round():
-    first, again = draw_case("own", "CE", 4), draw_case("own", "CE", 4)
-    torch.testing.assert_close(first.problem.trials.x, again.problem.trials.x)
-    shapes = {tuple(draw_case("own", "C", n).problem.trials.x.shape) for n in (1, 4, 7)}
-    assert shapes == {*LAYOUTS}
-    held, fitted = first.truth.held_out, first.truth.fitted
-    assert not {*held.tolist()} & {*fitted.tolist()}
-
-
-def test_judging_seeds_have_forms_that_tuning_seeds_lack():
-    machine = get_machine("pendulum")
-    _, action = rows_of(machine, 20)
-    with forked_generators(0):
-        known, fresh = (
-            [draw_discrepancy(machine, action, is_judged=late) for _ in range(60)]
-            for late in (False, True)
-        )
-    assert {d.kind for d in known} == {"process", "force", "wandering", "form"}
-    names = [{d.detail for d in part if d.kind == "form"} for part in (known, fresh)]
-    assert min(map(len, names)) >= 2
-    assert not names[0] & names[1]
-    assert any("rough" in d.detail for d in fresh)
-
-
-def test_series_are_smooth_and_share_what_they_should():
-    grid = torch.linspace(0, 1, 50, dtype=torch.float64)
-    with forked_generators(0):
-        series = smooth_series(grid, 4_000, 0.2, shared=0.5)
-        alone = smooth_series(grid, 4_000, 0.2)
-        many = torch.stack(
-            [smooth_series(grid, 2, 0.2, shared=0.5) for _ in range(800)]
-        )
-    assert alone.std() == pytest.approx(1.0, abs=0.05)
-    assert series.diff(dim=1).abs().max() < 1
-    together = (many[:, 0] * many[:, 1]).mean()
-    assert together == pytest.approx(0.5, abs=0.1)
-
-
-def test_least_squares_finds_a_line_within_bounds():
-    t = torch.linspace(0, 1, 30, dtype=torch.float64)
-    target = torch.stack([2 + 3 * t, 2 - 3 * t])
-    infinite = torch.full((2,), torch.inf, dtype=torch.float64)
-    z, residual = least_squares(
-        lambda z: z[:, :1] + z[:, 1:] * t,
-        target,
-        torch.zeros(2, 2, dtype=torch.float64),
-        low=torch.tensor([-10.0, 0.0], dtype=torch.float64),
-        high=infinite,
-        scale=torch.ones(2, dtype=torch.float64),
-        weak=infinite,
-    )
-    assert z[0].tolist() == pytest.approx([2.0, 3.0], rel=1e-5)
-    assert z[1].tolist() == pytest.approx([0.5, 0.0])  # the slope stays at its edge
-    assert residual[0].abs().max() < 1e-4
 
 
 def test_a_case_is_run_once_and_its_row_is_whole(tmp_path, monkeypatch, capsys):
@@ -162,96 +59,3 @@ def test_a_case_is_run_once_and_its_row_is_whole(tmp_path, monkeypatch, capsys):
     assert float(row["held_true"]) < float(row["held_bare"])
     assert {*json.loads(row["cause"])} == {e.name for e in get_machine("A").library}
     assert any("CE: right" in line for line in summary([row]))
-
-
-def scored(kind, true, cause, *, bare=4.0, full=1.0, helps=(), **more):
-    row = dict.fromkeys(COLUMNS, "")
-    return row | {
-        "kind": kind,
-        "machine": "spring",
-        "true": json.dumps(true),
-        "equivalent": json.dumps(true),
-        "held_bare": str(bare),
-        "held_true": str(full),
-        "held_verdict": str(bare),
-        "held_single": "3.0",
-        "helps": json.dumps(helps),
-        "instead": "{}",
-        "cause": json.dumps(cause),
-        "trial_simulations": "1",
-        "cpu_seconds": "1",
-        **more,
-    }
-
-
-def test_the_summary_counts_what_was_right(tmp_path):
-    rows = [
-        scored("E", ["drift"], {"drift": 0.95, "bias": 0.1}, theta_covered="3/4"),
-        scored("E", ["drift"], {"drift": 0.2, "bias": 0.7}, helps=["drift"]),
-        scored("E", ["drift"], {"drift": 0.7, "bias": 0.0}, full=2.8),
-        scored("R", ["drift"], {"bias": 0.6}, helps=["bias"]),
-        scored("P", ["lag", "bias"], {"lag": 0.9, "bias": 0.1}, helps=["lag", "bias"]),
-        scored("C", [], {"bias": 0.0}),
-    ]
-    path = tmp_path / "rows.csv"
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        writer.writerows(rows)
-    with path.open() as file:
-        text = "\n".join(summary([*csv.DictReader(file)]))
-    assert "| E, gain >= 50 %: right | 0.500 (1/2)" in text
-    assert "| E, gain 20 to 50 %: right | 1.000 (1/1)" in text
-    assert "| E: a wrong name | 0.333 (1/3)" in text
-    assert "| R: any name | 1.000 (1/1)" in text
-    assert "| P, where both matter: both | 0.000 (0/1)" in text
-    assert text.count("1.000 (1/1) [0.207, 1.000] |") >= 3
-    assert "intervals of theta with misfit: 0.750 (3/4)" in text
-    assert "claims of 0.9 to 1: mean 0.93, right 1.000 (2/2)" in text
-    own = [
-        [0.05**2, 0.1**2, 0.8**2, 0.7**2, 0.3**2, 0],
-        [0.6**2],
-        [0.1**2, 0.9**2],
-        [0],
-    ]
-    alike = sum(sum(squares) / len(squares) for squares in own) / len(own)
-    assert f"over 10 effects; each kind counted alike: {alike:.3f}" in text
-
-
-def test_each_of_two_effects_needs_a_place_of_its_own():
-    def text(helps, **instead):
-        row = scored("P", ["lag", "bias"], {"lag": 0.1}, helps=helps)
-        return "\n".join(summary([row | {"instead": json.dumps(instead)}]))
-
-    exact, stated = (
-        f"| P, where both matter: both{or_place} | 0.000 (0/1) [0.000, 0.793] | "
-        for or_place in ("", ", or in a stated place")
-    )
-    found = text(["lag", "gain"], gain=["bias", "drift"])
-    assert exact + "0.000" in found
-    assert stated + "1.000" in found
-    assert "may stand in the place of one that helps: mean 1.00" in found
-    assert stated + "0.000" in text(["lag"], lag=["bias"])
-    assert stated + "1.000" in text(["lag", "bias"], lag=["bias"])
-
-
-def test_what_nothing_separates_from_a_true_effect_is_right_in_a_pair_too():
-    def both(helps, machine="A"):
-        row = scored("P", ["action offset", "drift"], {"drift": 0.1}, helps=helps)
-        text = "\n".join(summary([row | {"machine": machine}]))
-        return "both matter: both | 0.000 (0/1) [0.000, 0.793] | 1.000" in text
-
-    assert both(["action offset", "drift"])
-    assert both(["bias", "drift"])
-    assert not both(["bias", "action offset"])  # one of them twice
-    assert not both(["bias", "drift"], machine="B")
-
-
-def test_a_pair_that_was_lost_is_compared_by_its_held_out_error():
-    def text(helps, error):
-        row = scored("P", ["lag", "bias"], {"lag": 0.1}, helps=helps)
-        return "\n".join(summary([row | {"held_true": "2", "held_verdict": error}]))
-
-    assert "of both: median 1.05, at most 1.1 in 1.000 (1/1)" in text(["lag"], "2.1")
-    assert "of both: median 2.00, at most 1.1 in 0.000 (0/1)" in text(["lag"], "4")
-    assert "both are always said to help" in text(["lag", "bias"], "4")

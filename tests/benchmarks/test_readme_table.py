@@ -32,14 +32,3 @@ beside = ""
     printed = capsys.readouterr()
     assert printed.out.endswith("| training | 43 | |\n")
     assert "training: expected ratio at" in printed.err
-
-
-def test_a_figure_that_is_no_number_is_missed(tmp_path, monkeypatch):
-    monkeypatch.setitem(readme.FIGURES, "training", lambda: {"ratio": float("nan")})
-    stated = tmp_path / "stated.toml"
-    stated.write_text(
-        '[[row]]\nfigures = "training"\nwhat = ""\nresult = ""\nbeside = ""\n'
-        "most = { ratio = 30 }"
-    )
-    _, misses = readme.table(stated)
-    assert misses == ["training: expected ratio at most 30; got nan"]

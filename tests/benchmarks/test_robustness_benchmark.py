@@ -1,14 +1,14 @@
 """The benchmark of attacks counts what it should count."""
 
-import importlib
 import os
 import signal
 import time
+from pathlib import Path
 
 import pytest
 
 from benchmarks.robustness.attacks import Attacks, attempt
-from benchmarks.robustness.run import AREAS, attacks_on
+from benchmarks.robustness.run import AREAS, ROOT, attacks_on, by_tests
 
 ATTACKS = Attacks()
 
@@ -39,7 +39,15 @@ def test_only_what_returns_is_survived(case, answer):
 
 
 @pytest.mark.parametrize("area", AREAS)
-def test_an_area_names_each_attack_once(area):
-    names = [attack.name for attack in attacks_on(area)]
-    assert len(names) == len(set(names))
-    assert importlib.import_module(f"benchmarks.robustness.{area}").__doc__
+def test_an_area_has_tests_or_attacks_of_different_names(area):
+    patterns = AREAS[area]
+    assert all(any(Path(ROOT).glob(pattern)) for pattern in patterns)
+    if not patterns:
+        names = [attack.name for attack in attacks_on(area)]
+        assert len(names) == len(set(names)) > 0
+
+
+def test_a_test_is_an_attack_and_its_parameters_are_a_case():
+    rows = [*by_tests(("tests/benchmarks/test_bits_benchmark.py",))]
+    assert {row["survived"] for row in rows} == {True}
+    assert rows[0]["attack"].endswith("test_bits_benchmark test_a_last_bit_counts")

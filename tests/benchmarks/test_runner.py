@@ -1,8 +1,6 @@
 """One command runs every benchmark."""
 
 import re
-import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -14,12 +12,6 @@ import pytest
 from benchmarks.__main__ import HERE, benchmarks, main, module_of, parser_of
 
 ROOT = Path(__file__).parents[2]
-
-
-def test_a_name_is_a_module_or_a_folder():
-    assert module_of("oracles") == "benchmarks.oracles.run"
-    assert module_of("oracles.calibration") == "benchmarks.oracles.calibration"
-    assert module_of("benchmarks.flag.run") == "benchmarks.flag.run"
 
 
 def test_options_are_arguments():
@@ -125,22 +117,6 @@ def test_all_are_listed(capsys):
     for name, line in benchmarks().items():
         assert re.search(rf"^{re.escape(name)} +{re.escape(line)}$", printed, re.M)
         assert line, name
-
-
-def test_a_table_is_printed(capsys):
-    assert main(["table", "cost/doors.json", "--only", "nothing*"]) == 0
-    assert capsys.readouterr().out.startswith("| what | value |")
-
-
-def test_it_runs_as_a_process():
-    done = subprocess.run(
-        [sys.executable, "-m", "benchmarks", "oracles", "--summary"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert "| compartments_10 |" in done.stdout
 
 
 def test_every_command_that_is_written_down_names_a_benchmark():

@@ -5,8 +5,7 @@ import pandas as pd
 import pytest
 import torch
 
-from benchmarks.robots.models import SPRING_MASS
-from benchmarks.robustness.mujoco_robots import held_arm
+from benchmarks.robots.models import SPRING_MASS, held_arm
 from sbi_active.mujoco import from_mjcf
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.robustness.mujoco_robots import held_arm
+from benchmarks.robots.models import held_arm
 from sbi_active import BoxActions
 from sbi_active.actions.signals import SignalActions
 from sbi_active.actions.waveforms import step

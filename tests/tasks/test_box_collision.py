@@ -1,4 +1,3 @@
-import math
 import sys
 
 import pytest
@@ -33,12 +32,6 @@ def test_is_the_paper_s(task):
     assert bool(task.prior.support.check(task.prior.sample((9,))).all())
 
 
-def test_a_pusher_that_stands_still_moves_nothing(task):
-    x = task.simulator.mean(task.theta_true[None], torch.zeros(1, 1))
-    # The cube sinks into the table by a fraction of a millimeter.
-    assert torch.allclose(x, torch.tensor([[0.0, 0.0, 0.075]]).double(), atol=3e-4)
-
-
 def test_momentum_passes_to_the_cube(task):
     """A light, slippery cube leaves faster than the pusher, never twice as fast."""
     from sbi_active.tasks.box_collision.scene import Scene  # pyright: ignore
@@ -56,54 +49,11 @@ def test_momentum_passes_to_the_cube(task):
     assert momentum - lost * 0.25 - 1e-3 < total < momentum
 
 
-def test_density_changes_the_impact(task):
-    """The contacts know of the new mass: a heavier cube moves less."""
-    theta = torch.tensor([[0.5, 0.5, d] for d in (0.2, 0.5, 1.0)])
-    x = task.simulator.mean(theta, torch.full((3, 1), 3.0))[:, 0]
-    assert bool((x[:-1] > x[1:]).all())
-
-
-def test_every_parameter_matters(task):
-    theta = torch.tensor([[0.5, 0.5, 0.5]]).repeat(4, 1)
-    theta[1:] += 0.2 * torch.eye(3)
-    x = task.simulator.mean(theta, torch.full((4, 1), 5.0))[:, 0]
-    assert bool((x[1:] < x[0] - 0.01).all())
-
-
-def test_fast_pushes_leave_the_table(task):
-    theta, _ = rows(60)
-    share = []
-    for speed in (3.0, 7.0, 15.0):
-        x = task.simulator.mean(theta, torch.full((60, 1), speed))
-        assert bool((x.isnan().any(1) == x.isnan().all(1)).all())
-        share.append(float(x.isnan().any(1).double().mean()))
-    assert share[0] < 0.2 < share[1] < 0.8 < share[2]
-
-
-def test_the_fastest_pusher_does_not_pass_through(task):
-    x = task.simulator.mean(torch.ones(1, 3), torch.full((1, 1), 20.0))
-    assert 0.3 < float(x[0, 0]) < 1.0
-
-
-def test_a_central_push_shows_one_number_and_an_off_center_one_more(task):
-    theta, _ = rows(40)
-    action = torch.full((40, 1), 4.0)
-    straight = task.simulator.mean(theta, action)
-    straight = straight[straight.isfinite().all(1)]
-    assert float(straight[:, 1].abs().max()) < 1e-6
-    # A few cubes are still rocking.
-    assert float((straight[:, 2] - 0.075).abs().median()) < 3e-4
-    turned = get_task("box_collision", variant="off_center").simulator
-    turned = turned.mean(theta, action)
-    turned = turned[turned.isfinite().all(1)]
-    assert float(turned[:, 1].std()) > 0.02
-
-
 def test_early_exit_keeps_the_outcome():
     from sbi_active.tasks.box_collision.scene import Scene  # pyright: ignore
 
     early, full = Scene(), Scene(early_exit=False)
-    theta, action = rows(150)
+    theta, action = rows(75)
     slippery = [[0.05, 0.1, 0.3]] * 20  # fast ones leave, slow ones just stay
     theta, speeds = theta.tolist() + slippery, action[:, 0].tolist()
     speeds += [1.0 + 0.1 * i for i in range(20)]
@@ -117,7 +67,7 @@ def test_early_exit_keeps_the_outcome():
             assert abs(x - exact).max() < 5e-4  # a tenth of the noise
     assert full.steps == 400
     assert steps < 0.5 * 400 * len(speeds)
-    assert 50 < num_left < 140
+    assert 25 < num_left < 80
 
 
 def test_observations_are_bit_identical(task):
@@ -134,17 +84,6 @@ def test_observations_are_bit_identical(task):
 
 def permuted(task, theta, action, order):
     return task.simulator.mean(theta[order], action[order]).nan_to_num()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("num_workers", [2, 4])
-def test_workers_change_nothing(task, num_workers):
-    theta, action = rows(300)
-    one = simulate(task.simulator, theta, action, seed=3)
-    more = simulate(task.simulator, theta, action, seed=3, workers=num_workers)
-    assert torch.equal(one.x.nan_to_num(), more.x.nan_to_num())
-    assert torch.equal(one.status, more.status)
-    assert 0 < int(one.valid.sum()) < 300
 
 
 def test_threads_have_a_scene_each(task):
@@ -167,21 +106,6 @@ def test_the_paper_s_code_for_what_left_the_table():
         simulate(task.simulator, theta, action, seed=0, check_noise=True)
 
 
-def test_an_outcome_off_the_table_is_invalid():
-    task = get_task("box_collision", target=2)
-    theta, action = task.theta_true[None], torch.tensor([[10.0]])
-    rows = simulate(task.simulator, theta, action, seed=0)
-    assert rows.counts == {"ok": 0, "invalid": 1, "missing": 0}
-
-
-def test_noise_is_of_the_declared_size(task):
-    theta, action = task.theta_true.expand(400, 3), torch.full((400, 1), 5.0)
-    error = simulate(task.simulator, theta, action, seed=1).x
-    error = error - task.simulator.mean(theta[:1], action[:1])
-    sd = float(error.std())
-    assert abs(sd - 0.005) < 4 * 0.005 / math.sqrt(2 * 1200)
-
-
 class Point:
     def __init__(self, *theta):
         self.theta = torch.tensor(theta)
@@ -199,7 +123,6 @@ def test_reproduction_error_counts_the_code_of_a_fall():
     distance = float((x + 1).norm())
     error = task.reproduction_error(stays, 5.0, num_samples=2)
     assert error == pytest.approx(distance)
-    assert task.reproduction_table(stays)[5.0] == pytest.approx(1e3 * distance)
 
 
 @pytest.mark.parametrize(
@@ -227,8 +150,3 @@ def test_missing_mujoco_says_how_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(ImportError, match=r"pip install 'sbi-active\[mujoco\]'"):
         get_task("box_collision")
-
-
-def test_another_truth(task):
-    other = task.with_truth((0.3, 0.4, 0.5))
-    assert other.theta_true.tolist() == pytest.approx([0.3, 0.4, 0.5])

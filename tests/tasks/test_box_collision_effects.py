@@ -41,10 +41,6 @@ def evaluate(name, phi, theta, action):
     return simulator.evaluate(theta, {name: phi}, action)
 
 
-def test_every_effect_has_a_sign_here():
-    assert set(EFFECTS) == set(SIGNS)
-
-
 @pytest.mark.parametrize("name", EFFECTS)
 def test_vanishes_exactly_at_its_null(name):
     theta = torch.tensor([[0.8, 0.8, 0.8], [0.4, 0.5, 0.6], [0.2, 0.2, 0.2]])
@@ -65,28 +61,6 @@ def test_moves_the_cube_as_it_should(name):
     x = simulator.evaluate(theta, {name: torch.full((1, 1), strength)}, action)
     shift = float((x - wide.mean(theta, action))[0, axis])
     assert sign * shift > TASK.noise  # a shift that one trial can show
-
-
-@pytest.mark.parametrize("name", EFFECTS)
-def test_draws_of_its_prior_run(name):
-    torch.manual_seed(0)
-    effect = EFFECTS[name]
-    phi = effect.sample(6).float()
-    assert phi.shape == (6, 1)
-    assert bool(effect.log_prob(phi).isfinite().all())
-    theta = TASK.prior.sample((6,))
-    x = evaluate(name, phi, theta, torch.full((6, 1), 4.0))
-    assert bool(x.isfinite().any())
-
-
-def test_a_shifted_aim_is_the_off_center_variant():
-    theta, action = torch.full((1, 3), 0.5), torch.tensor([[4.0]])
-    variant = get_task("box_collision", variant="off_center")
-    expected = variant.simulator.mean(theta, action)[0]
-    x = evaluate("aim", torch.full((1, 1), -0.03), theta, action)[0]
-    # The same collision seen from 3 cm aside.
-    moved = x + torch.tensor([0.0, 0.03, 0.0])
-    assert float((moved - expected).abs().max()) < 2e-3
 
 
 def test_the_camera_leaves_the_code_of_a_fall():

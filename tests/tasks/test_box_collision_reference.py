@@ -4,13 +4,10 @@ import pytest
 import torch
 
 from sbi_active import GaussianNoise, SimulatorModel
-from sbi_active.campaign import Trial
-from sbi_active.tasks import get_task  # pyright: ignore
 
 pytest.importorskip("mujoco")
 from sbi_active.tasks.box_collision import (  # noqa: E402
     BoxCollisionReference,
-    exact_posterior,
 )
 
 SD = 0.02
@@ -79,16 +76,6 @@ def test_agrees_with_a_grid(speeds):
     assert reference.num_simulations <= 24_000 + 1 * len(speeds)
 
 
-def test_what_is_given_up_weighs_nothing():
-    action, x = trials(2.0, 4.0, 12.0)
-    reference = BoxCollisionReference(MODEL, action, x, num_effective=200)
-    assert reference.num_simulations < 3 * len(reference.theta)
-    draws = reference._draws
-    log_weight = draws.log_ratio + log_likelihood(reference.theta, action, x)
-    assert abs(reference.log_evidence - float(log_weight.logsumexp(0))) < 1e-3
-    assert bool((reference.weight - log_weight.softmax(0)).abs().max() < 1e-4)
-
-
 def test_goes_on_from_fewer_trials():
     action, x = trials(3.0, 5.0, 4.0)
     first = BoxCollisionReference(MODEL, action[:2], x[:2], num_effective=300)
@@ -99,23 +86,6 @@ def test_goes_on_from_fewer_trials():
     assert first.num_simulations == spent
     error = math.hypot(both.log_evidence_se, alone.log_evidence_se)
     assert abs(both.log_evidence - alone.log_evidence) < 4 * error
-
-
-def test_a_speed_that_was_simulated_costs_nothing():
-    action, x = trials(3.0, 5.0, 5.0)
-    first = BoxCollisionReference(MODEL, action[:2], x[:2], num_effective=400)
-    again = BoxCollisionReference(MODEL, action, x, num_effective=100, past=first)
-    assert again.num_simulations < 0.1 * first.num_simulations
-    log_weight = again._draws.log_ratio + log_likelihood(again.theta, action, x)
-    assert abs(again.log_evidence - float(log_weight.logsumexp(0))) < 1e-3
-
-
-def test_a_past_of_another_simulator_is_refused():
-    action, x = trials(3.0)
-    past = BoxCollisionReference(MODEL, action, x, num_effective=50)
-    other = SimulatorModel(slide, noise=GaussianNoise(0.1))
-    with pytest.raises(ValueError, match="expected a past posterior with this"):
-        BoxCollisionReference(other, action, x, past=past)
 
 
 @pytest.mark.slow
@@ -129,18 +99,6 @@ def test_standard_errors_cover():
     se = torch.tensor([r.log_evidence_se for r in references]).square().mean().sqrt()
     # A standard deviation of 20 numbers is off by 1 / sqrt(40) of itself.
     assert abs(float(log_evidence.std() / se) - 1) < 4 / 40**0.5
-
-
-def test_trials_of_a_campaign():
-    task = get_task("box_collision", theta_true=(0.2, 0.2, 0.2))
-    fell = Trial(0, torch.tensor([8.0]), torch.full((3,), torch.nan), "invalid")
-    lost = Trial(1, torch.tensor([3.0]), None, "missing")
-    posterior = exact_posterior(task, [fell, lost], num_particles=100)
-    assert posterior.action.tolist() == [[8.0]]
-    assert posterior.effective_sample_size >= 100
-    # All that is known: the share of the prior that leaves the table at 8 m/s.
-    share = math.exp(posterior.log_evidence)
-    assert abs(share - 0.63) < 0.05 + 4 * share * posterior.log_evidence_se
 
 
 def test_without_trials_it_is_the_prior():
@@ -184,50 +142,3 @@ def test_impossible_trials_are_refused():
     x = torch.tensor([[math.nan] * 3, [0.0, 0.0, 0.075]])
     with pytest.raises(ValueError, match="expected a draw of the prior that explains"):
         BoxCollisionReference(MODEL, action, x, num_simulations=2_000)
-
-
-def test_bad_input():
-    bare = SimulatorModel(slide, noise=GaussianNoise(0.0))
-    with pytest.raises(ValueError, match="expected noise > 0"):
-        BoxCollisionReference(bare, torch.ones(1, 1), torch.ones(1, 3))
-    with pytest.raises(ValueError, match=r"expected action \(t, 1\) and x \(t, 3\)"):
-        BoxCollisionReference(MODEL, torch.ones(2, 1), torch.ones(1, 3))
-
-
-def test_a_rough_posterior_is_warned_of():
-    def rough(theta, action):
-        x = torch.sin(4e5 * theta.double().sum(-1))
-        return torch.stack([x, x, x], -1)
-
-    model = SimulatorModel(rough, noise=GaussianNoise(1e-3))
-    with pytest.warns(UserWarning, match="the posterior rests on .* effective draws"):
-        BoxCollisionReference(
-            model, torch.ones(1, 1), torch.zeros(1, 3), num_simulations=2_000
-        )
-
-
-def test_the_task_gives_it_where_there_is_a_budget():
-    task = get_task("box_collision", reference_budget=600)
-    action = torch.tensor([[5.0]])
-    x = task.real_system(action[0], seed=0)[None]
-    reference = task.reference(action, x)
-    assert 600 <= reference.num_simulations < 600 + 20
-    assert float(reference.log_prob(task.theta_true[None])) > 0  # more than the prior
-    assert get_task("box_collision").reference(action, x) is None
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("case", [(1, (5.0, 6.0)), (2, (1.5, 12.0))])
-def test_agrees_with_draws_from_the_prior_in_the_scene(case):
-    target, speeds = case
-    task = get_task("box_collision", target=target)
-    action = torch.tensor(speeds)[:, None]
-    x = torch.stack([task.real_system(xi, seed=i) for i, xi in enumerate(action)])
-    adaptive = BoxCollisionReference(task.simulator, action, x, num_simulations=8_000)
-    theta = torch.rand(6_000, 3, generator=torch.Generator().manual_seed(9))
-    log_weight = adaptive.log_prob(theta) + adaptive.log_evidence
-    log_evidence = float(log_weight.logsumexp(0)) - math.log(len(theta))
-    weight = log_weight.softmax(0)
-    se = (float(weight.square().sum()) + adaptive.log_evidence_se**2) ** 0.5
-    assert se < 0.25
-    assert abs(adaptive.log_evidence - log_evidence) < 4 * se

@@ -34,14 +34,6 @@ def draw(backend, *speeds):
 
 
 @pytest.mark.slow
-def test_without_a_display_it_names_the_package_to_install(tmp_path):
-    done = draw("glfw", (tmp_path / "a.png", 4.0))
-    assert done.returncode == 1
-    assert "expected an offscreen renderer" in done.stderr
-    assert "apt-get install libegl1" in done.stderr
-
-
-@pytest.mark.slow
 def test_draws_a_film_and_the_picture_that_it_ends_with(tmp_path):
     film, last, slow = (tmp_path / name for name in ("a.gif", "a.png", "b.png"))
     done = draw("egl", (film, 4.0), (last, 4.0), (slow, 2.0))

@@ -30,24 +30,6 @@ def test_mean_is_the_formula_row_by_row():
     assert (BACKGROUND, SOFTENING, NOISE_SD) == (0.1, 1e-4, 0.5)
 
 
-def test_sources_can_be_exchanged():
-    theta, action = normal(50, 4, seed=0), normal(50, 2, seed=1)
-    exchanged = theta[:, [2, 3, 0, 1]]
-    torch.testing.assert_close(mean(theta, action), mean(exchanged, action))
-    other = theta[:, [2, 1, 0, 3]]  # mixes the sources' coordinates: another model
-    assert (mean(theta, action) - mean(other, action)).abs().max() > 0.1
-
-
-def test_mean_is_differentiable_and_keeps_dtype_and_leading_dimensions():
-    theta = normal(5, 4, seed=0).requires_grad_()
-    action = normal(5, 2, seed=1).requires_grad_()
-    assert torch.autograd.gradcheck(mean, (theta, action))
-    pairs = mean(theta[:, None], action[:3])
-    assert pairs.shape == (5, 3, 1)
-    torch.testing.assert_close(pairs[:, 1], mean(theta, action[1:2].expand(5, 2)))
-    assert mean(theta.detach().float(), action.detach().float()).dtype == torch.float32
-
-
 def test_log_likelihood_is_a_normal_s():
     task = get_task("location_finding")
     theta, action, x = (
@@ -59,16 +41,6 @@ def test_log_likelihood_is_a_normal_s():
     torch.testing.assert_close(task.log_likelihood(x, theta, action), expected)
     torch.testing.assert_close(task.simulator.log_prob(x, theta, action), expected)
     assert task.exact_likelihood
-
-
-def test_task_offers_prior_names_and_another_truth():
-    task = get_task("location_finding", num_sources=3)
-    assert task.prior.sample((2,)).shape == (2, 6)
-    assert task.parameter_names[-1] == "source_3_y"
-    assert task.actions.values.shape == (625, 2)
-    other = task.with_truth([0.0] * 6)
-    assert other.num_sources == 3
-    assert other.theta_true.tolist() == [0.0] * 6
 
 
 def test_real_system_is_the_model_at_the_truth():
@@ -92,10 +64,3 @@ def test_real_system_is_the_model_at_the_truth():
 def test_bad_options(options, text):
     with pytest.raises(ValueError, match=text):
         get_task("location_finding", **options)
-
-
-@pytest.mark.parametrize("shapes", [((3, 3), (3, 2)), ((4,), (1, 2)), ((3, 4), (3, 3))])
-def test_mean_rejects_wrong_shapes(shapes):
-    theta, action = (torch.zeros(shape) for shape in shapes)
-    with pytest.raises(ValueError, match=r"expected theta \(n, 2 K\)"):
-        mean(theta, action)

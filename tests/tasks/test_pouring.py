@@ -1,5 +1,4 @@
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -9,8 +8,7 @@ from sbi_active import simulate
 from sbi_active.tasks import get_task  # pyright: ignore
 
 pytest.importorskip("pybullet")
-from sbi_active.tasks.pouring import images_of  # noqa: E402
-from sbi_active.tasks.pouring.materials import Particles, cubes  # noqa: E402
+from sbi_active.tasks.pouring.materials import cubes  # noqa: E402
 from sbi_active.tasks.pouring.scene import pour  # noqa: E402
 
 LOW = torch.tensor([20.0, 0.0, 5.0])  # the cheapest action that shows much
@@ -68,21 +66,6 @@ def test_cubes_come_to_rest_on_the_ground():
     assert poses[:, 1].mean() > 0  # poured toward +y
 
 
-def test_an_image_shows_every_cube_in_view(task):
-    theta, action = rows(2)
-    seeds = torch.arange(2)
-    poses = task.pours.poses(theta, action, seeds)
-    x = task.simulator(theta, action, seeds)
-    assert x.shape == (2, 22_500)
-    assert x.dtype == torch.float32
-    inside = (np.abs(poses[:, :, :2]) < 0.147).all(2).sum(1)
-    area = 4e-6 * (x > 0).sum(1)  # m^2, a cube covers 16 to 32 mm^2
-    assert (area <= 34e-6 * 12).all()
-    assert (area >= 12e-6 * torch.as_tensor(inside)).all()
-    # Stored poses give the same image, to the last bit.
-    assert torch.equal(images_of(poses.copy(), task.pours.particles), x)
-
-
 def test_outcomes_are_bit_identical(task):
     theta, action = rows(5)
     x = simulate(task.simulator, theta, action, seed=3).x
@@ -97,29 +80,6 @@ def test_outcomes_are_bit_identical(task):
     assert not torch.equal(simulate(again, theta, action, seed=4).x, x)
 
 
-@pytest.mark.slow
-def test_workers_change_nothing(task):
-    theta, action = rows(12)
-    one, two = (
-        simulate(task.simulator, theta, action, seed=3, workers=n, batch_size=3).x
-        for n in (1, 2)
-    )
-    assert torch.equal(one, two)
-
-
-def test_worlds_do_not_pile_up(task):
-    """Far more runs than engines that PyBullet can hold at a time would fail."""
-    import pybullet
-
-    theta, action = rows(1)
-    before = pybullet.connect(pybullet.DIRECT)
-    pybullet.disconnect(before)
-    task.simulator(theta, action, torch.zeros(1, dtype=torch.int64))
-    after = pybullet.connect(pybullet.DIRECT)
-    pybullet.disconnect(after)
-    assert after == before
-
-
 def test_every_parameter_changes_where_cubes_lie(task):
     base = torch.full((4, 3), 0.5)
     base[1:] += 0.4 * torch.eye(3)
@@ -127,30 +87,6 @@ def test_every_parameter_changes_where_cubes_lie(task):
     poses = task.pours.poses(base, LOW.expand(4, 3), seeds)
     for changed in poses[1:]:
         assert np.abs(changed[:, :2] - poses[0, :, :2]).mean() > 0.005
-
-
-def test_a_springy_pour_spreads_wider(task):
-    theta = torch.tensor([[0.5, 0.5, 0.05], [0.5, 0.5, 0.95]]).repeat_interleave(3, 0)
-    poses = task.pours.poses(theta, LOW.expand(6, 3), torch.arange(6))
-    spread = poses[:, :, :2].std(1).mean(1)
-    assert spread[3:].min() > spread[:3].max()
-
-
-@pytest.mark.slow
-def test_costs_what_is_promised():
-    task = get_task("pouring")
-    action = task.actions.values
-    theta = torch.rand(27, 3, generator=torch.Generator().manual_seed(0))
-    start = time.process_time()
-    poses = task.pours.poses(theta, action, torch.arange(27))
-    assert (time.process_time() - start) / 27 < 0.5  # .27 measured on a quiet machine
-    x = images_of(poses, task.pours.particles)
-    summaries = task.summaries(x)
-    start = time.process_time()
-    x = images_of(poses, task.pours.particles)
-    for summary in summaries.values():
-        summary(x)
-    assert (time.process_time() - start) / 27 < 5e-3
 
 
 @pytest.mark.parametrize(
@@ -182,12 +118,6 @@ def test_bad_options(options, text):
 def test_bad_rows(task, theta, action, text):
     with pytest.raises(ValueError, match=text):
         task.simulator(torch.tensor([theta]), torch.tensor([action]).float())
-
-
-def test_particles_that_do_not_fit_the_bucket():
-    with pytest.raises(ValueError, match="expected particles that fit a bucket"):
-        Particles(np.full((900, 3), 0.006)).lattice()
-    assert Particles(np.full((1000, 3), 0.0025)).lattice()[:, 2].max() < 0.05
 
 
 def test_missing_pybullet_says_how_to_install_it(monkeypatch):

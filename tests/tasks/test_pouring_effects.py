@@ -1,12 +1,9 @@
-import numpy as np
 import pytest
 import torch
-from PIL import Image, ImageSequence
 
 from sbi_active.tasks import get_task  # pyright: ignore
 
 pytest.importorskip("pybullet")
-from sbi_active.tasks.pouring import render  # noqa: E402
 
 CONTEXT = None  # no effect here looks at it
 
@@ -55,25 +52,3 @@ def test_the_camera_shifts_and_stretches(task):
     pictures, before = moved.reshape(2, 150, 150), x.reshape(2, 150, 150)
     assert torch.allclose(pictures[:, :, 3:], before[:, :, :-3], atol=1e-5)
     assert float(pictures[:, :, :3].abs().max()) == 0
-
-
-def test_a_tilt_moves_cubes_downhill(task):
-    theta = torch.tensor([[0.3, 0.1, 0.3]]).expand(4, 3)
-    action, seeds = torch.tensor([[20.0, 0.0, 5.0]]).expand(4, 3), torch.arange(4)
-    level = task.pours.poses(theta, action, seeds)[:, :, 1].mean()
-    down = task.pours.poses(theta, action, seeds, tilt=6.0)[:, :, 1].mean()
-    assert down > level + 0.005
-
-
-def test_draws_a_film_and_a_picture(tmp_path):
-    film = render([0.5] * 3, [20, 0, 5], tmp_path / "a.gif", num_cubes=4)
-    with Image.open(film) as pictures:
-        shown = [np.asarray(f.convert("L"), float) for f in ImageSequence.Iterator(
-            pictures)]  # fmt: skip
-    assert len(shown) > 15
-    assert np.abs(shown[-1] - shown[0]).mean() > 1
-    last = render([0.5] * 3, [20, 0, 5], tmp_path / "a.png", num_cubes=4)
-    with Image.open(last) as picture:
-        assert picture.size == (320, 320)
-    with pytest.raises(ValueError, match="expected a path ending in .gif or .png"):
-        render([0.5] * 3, [20, 0, 5], tmp_path / "a.mp4")

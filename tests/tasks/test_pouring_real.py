@@ -8,8 +8,6 @@ pytest.importorskip("pybullet")
 from sbi_active.tasks.pouring import intersection_volume  # noqa: E402
 from sbi_active.tasks.pouring.real import COMPARED_AT, DENSITIES  # noqa: E402
 
-LOW = torch.tensor([15.0, 0.0, 1.6])
-
 
 @pytest.fixture(scope="module", params=["beads", "gravel"])
 def task(request):
@@ -56,34 +54,6 @@ def test_materials_are_not_the_model():
     assert volume / 2 < 2 * np.pi * beads.half.prod(1).sum() < 1.2 * volume
 
 
-def test_a_pour_of_the_material_follows_its_seed(task):
-    x = task.real_system(LOW, seed=3)
-    assert x.shape == (22_500,)
-    assert torch.equal(task.real_system(LOW, seed=3), x)
-    assert not torch.equal(task.real_system(LOW, seed=4), x)
-
-
-def test_all_eight_parameters_change_where_cubes_lie():
-    task = get_task("pouring_real", cubes=6)
-    base = torch.full((9, 8), 0.4)
-    base[1:] += 0.5 * torch.eye(8)
-    # Static friction acts where some still move and most rest: in a slow pour.
-    slow = torch.tensor([15.0, 0.0, 0.2])
-    static = task.pours.poses(base[:2], slow.expand(2, 3), torch.tensor([0, 0]))
-    assert np.abs(static[1] - static[0]).max() > 1e-4
-    others = base[[0, *range(2, 9)]]
-    seeds = torch.zeros(8, dtype=torch.int64)
-    poses = task.pours.poses(others, LOW.expand(8, 3), seeds)
-    for changed in poses[1:]:
-        assert np.abs(changed - poses[0]).max() > 1e-4
-
-
-def test_dampings_are_parameters_and_no_effects(task):
-    names = [effect.name for effect in task.effects()]
-    assert "tilt" in names
-    assert not [name for name in names if "damping" in name]
-
-
 def test_intersection_volume_is_what_two_heaps_share():
     real = torch.zeros(22_500)
     real[:10] = 4.0
@@ -105,8 +75,3 @@ def test_intersection_volume_is_what_two_heaps_share():
 def test_bad_options(options, text):
     with pytest.raises(ValueError, match=text):
         get_task("pouring_real", **options)
-
-
-def test_there_is_no_truth_to_choose():
-    with pytest.raises(ValueError, match="expected a material; got a truth"):
-        get_task("pouring_real", cubes=8).with_truth([0.5] * 8)

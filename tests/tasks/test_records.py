@@ -71,19 +71,6 @@ def test_a_piece_runs_before_its_readings_count():
     assert pieces.start[1] == made.output[60]
 
 
-def test_a_record_of_whole_pieces_lacks_its_last_reading_alone():
-    pieces = cut(record(0.1, (-1, 1), 240), 80, every=8)
-    assert len(pieces) == 3
-    assert np.isnan(pieces.output).sum() == 1
-    assert np.isnan(pieces.output[-1, -1])
-
-
-@pytest.mark.parametrize(("length", "every"), [(500, 1), (80, 7)])
-def test_a_length_that_does_not_fit_is_refused(length, every):
-    with pytest.raises(ValueError, match="expected pieces of at most 240 samples"):
-        cut(record(0.1, (-1, 1)), length, every=every)
-
-
 def write(path, **columns):
     pd.DataFrame(columns).to_csv(path, index=False)
     return path
@@ -156,14 +143,6 @@ def test_dry_friction_holds_the_hoop_and_never_turns_it_around():
     assert x[1].min() >= 0
 
 
-def test_a_delay_of_whole_steps_shifts_the_command():
-    made = record(0.1, (-1, 1), 241)
-    late = Record("late", 0.1, np.roll(made.voltage, 3), made.output)
-    late.voltage[:3] = made.voltage[0]
-    x = spin(HOOP, **cut(made, 240).rows(1), delay=0.3)
-    torch.testing.assert_close(x, spin(HOOP, **cut(late, 240).rows(1)))
-
-
 def test_a_lag_is_exact_for_a_step_and_has_a_slope_below_a_step():
     drive = torch.cat([torch.zeros(1, 2), torch.ones(50, 2)]).double()
     steps = torch.tensor([5.0, 1e-3], dtype=torch.float64)
@@ -172,22 +151,6 @@ def test_a_lag_is_exact_for_a_step_and_has_a_slope_below_a_step():
     filled = 5 * (1 - torch.exp(-ends / 5))  # integral of what still lacks
     torch.testing.assert_close((drive - x)[:, 0].cumsum(0), filled)
     assert (drive - x)[1, 1] == pytest.approx(1e-3)
-
-
-def test_tanks_keep_their_water():
-    """What is pumped less what flows out is what is there, both areas alike."""
-    theta = torch.tensor([[0.05, 0.05, 1e-9, 0.04]], dtype=torch.float64)
-    voltage = torch.full((1, 100), 2.0)
-    out = levels(
-        theta,
-        torch.tensor([[0.0, 1.0, 0.1]]),
-        inputs={"voltage": voltage},
-        times=torch.tensor([400.0]),
-    )
-    upper = 4.0  # (.1 / .05)^2, which makes the slope below; it sinks to 2.56
-    for _ in range(40_000):
-        upper += 0.01 * (0.08 - 0.05 * upper**0.5)
-    assert float(out) == pytest.approx(1.0 + 400 * 0.08 - (upper - 4.0), rel=1e-4)
 
 
 def test_overflow_keeps_levels_at_their_rims():

@@ -5,11 +5,7 @@ import pandas as pd
 import pytest
 import torch
 
-from benchmarks.__main__ import main as run
 from sbi_active.criticism import Criticism
-from sbi_active.criticism.data import Measurements
-from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.rivals import declared_noise
 from sbi_active.simulation import AutocorrelatedNoise
 from sbi_active.tasks import get_task  # pyright: ignore
 from sbi_active.tasks.servo_pendulum import (  # pyright: ignore
@@ -17,10 +13,7 @@ from sbi_active.tasks.servo_pendulum import (  # pyright: ignore
     ServoPendulumTask,
     read_recordings,
 )
-from sbi_active.tasks.servo_pendulum.noise import servo_noise  # pyright: ignore
-from sbi_active.tasks.servo_pendulum.task import DATA  # pyright: ignore
 
-FOLDER = DATA.resolve()  # before a test changes the working directory
 THETA = torch.tensor([[0.45, 5.0, 0.0045, 0.0015, -0.02]], dtype=torch.float64)
 TIME = np.arange(0.004, 6.01, 0.005)
 
@@ -67,28 +60,13 @@ def test_the_equations_agree_with_mujoco_at_an_eighth_of_the_step(
     task, friction, tolerance
 ):
     pytest.importorskip("mujoco")
-    from sbi_active.tasks.servo_pendulum.scene import (  # pyright: ignore
-        mujoco_angles,
-    )
+    from tests.tasks.servo_scene import mujoco_angles
 
     own = every_trial(task, **friction)
     assert np.ptp(own[1:3], axis=1).min() > 0.2  # they swing
     for trial in (1, 2):
         x = mujoco_angles(THETA[0].numpy(), task.recordings, trial, **friction)
         assert np.abs(own[trial] - x).max() < tolerance
-
-
-def test_viscous_friction_is_back_emf_until_the_motor_is_off(task):
-    kt, resistance = THETA[0, 0], THETA[0, 1]
-    b = 0.01
-    more = kt + b * resistance / kt  # the same torque a volt, more back-EMF
-    other = THETA.clone()
-    other[0, 0], other[0, 1] = more, resistance * more / kt
-    viscous, electric = every_trial(task, viscous=b), every_trial(task, other)
-    off = task.recordings.motor_off
-    assert off.tolist() == [False, True, False, True]
-    assert np.abs(viscous - electric)[~off].max() < 1e-9
-    assert np.abs(viscous - electric)[off].max() > 0.1
 
 
 def test_a_free_pendulum_keeps_its_energy_without_friction_alone():
@@ -124,15 +102,6 @@ def test_effects_vanish_at_zero(task):
         assert np.abs(every_trial(task, **{keyword: 0.05}) - bare).max() > 0.01
 
 
-def test_a_row_does_not_depend_on_the_others(task):
-    theta = task.prior.sample((40,)).double()
-    action = task.actions.sample((40,), seed=0)
-    load = torch.rand(40)
-    x = task.angles(theta, action, load=load)
-    few = task.angles(theta[7:9], action[7:9], load=load[7:9])
-    assert torch.equal(x[7:9], few)
-
-
 def test_an_action_that_was_not_recorded(task):
     with pytest.raises(ValueError, match=r"expected the action of a recorded.*300"):
         task.angles(THETA, torch.tensor([[300.0, 0.0]]))
@@ -147,63 +116,6 @@ def test_the_real_system_replays(task):
     trials = task.trials([0, 2], [1])
     assert trials.role == ["fit", "fit", "held out"]
     assert trials.index.tolist() == [0, 2, 1]
-
-
-def test_noise_of_unknown_size_covers_its_ranges():
-    noise = servo_noise()
-    assert noise.posterior is not None
-    draws = noise.posterior.sample((4_000,))
-    low, middle, high = draws.log().quantile(
-        torch.tensor([0.0, 0.5, 1.0]).double(), dim=0
-    )
-    assert low.exp().tolist() == pytest.approx([0.005, 0.02], rel=0.02)
-    assert high.exp().tolist() == pytest.approx([0.5, 6.0], rel=0.02)
-    # A uniform's median has the standard error width / 2 / sqrt(n).
-    error = (high - low) / 2 / 4_000**0.5
-    assert bool(((middle - (low + high) / 2).abs() < 4 * error).all())
-    independent = servo_noise(correlated=False).sample(torch.zeros(500, 30))
-    product = independent[:, 1:] * independent[:, :-1] / independent.square().mean()
-    assert abs(float(product.mean())) < 4 * float(product.std()) / 500**0.5
-
-
-def test_the_loop_sums_the_servo_noise_out(task):
-    """Its likelihood is the sum over the declared prior's cells."""
-    trials = task.trials([1])
-    measured = Measurements.of(trials)
-    residual = 0.05 * torch.sin(3 * torch.from_numpy(task.recordings.times))[None]
-    own = declared_noise(servo_noise(), measured).log_likelihood(residual.numpy())
-    posterior = servo_noise().posterior
-    times = (posterior.shared.edges[1:] * posterior.shared.edges[:-1]).sqrt()
-    sds = posterior.sd.nodes[0]
-    parts = [
-        AutocorrelatedNoise(sd, tau).log_prob(
-            residual, torch.zeros_like(residual), times=trials.sample_times
-        )
-        for sd in sds.tolist()
-        for tau in times.tolist()
-    ]
-    expected = torch.stack(parts).logsumexp(0) - math.log(len(parts))
-    assert float(own[0]) == pytest.approx(float(expected), abs=1e-6)
-    # As noise of a simulator it has 256 draws of the prior for its parameters; the grid
-    # has the middle of each cell, which is worth up to 5 %.
-    draws = posterior.sample((4_000,))
-    each = AutocorrelatedNoise(0.05, 1.0).log_prob(
-        residual.expand(4_000, -1),
-        torch.zeros(4_000, 30).double(),
-        times=trials.sample_times,
-        parameters=draws,
-    )
-    share = (each - expected).exp()
-    marginal = servo_noise().log_prob(
-        residual, torch.zeros_like(residual), times=trials.sample_times
-    )
-    error = float(share.std()) / 256**0.5
-    assert abs(float((marginal - expected).exp()) - 1) < 4 * error + 0.05
-
-
-def test_a_truth_of_the_wrong_size(task):
-    with pytest.raises(ValueError, match="expected theta_true of 5 numbers"):
-        task.with_truth([1.0, 2.0])
 
 
 # Reading what was recorded
@@ -254,11 +166,6 @@ def edited(folder, name, change):
     return folder
 
 
-def test_a_folder_without_recordings(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"recorded trials in .*trials\.csv"):
-        read_recordings(tmp_path)
-
-
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
@@ -277,23 +184,6 @@ def test_a_folder_without_recordings(tmp_path):
 def test_recordings_that_do_not_fit(folder, name, change, message):
     with pytest.raises(ValueError, match=message):
         read_recordings(edited(folder, name, change))
-
-
-def test_the_benchmark_says_where_it_looked(tmp_path, capsys):
-    assert (
-        run(
-            [
-                "measured.servo_pendulum",
-                "--data",
-                str(tmp_path),
-                "--out",
-                str(tmp_path / "out.json"),
-            ]
-        )
-        == 2
-    )
-    assert "got no such file; give the folder" in capsys.readouterr().err
-    assert not (tmp_path / "out.json").exists()
 
 
 # The closed loop
@@ -336,23 +226,3 @@ def test_coulomb_friction_is_found():
     assert tracing.verdict == "Coulomb"
     mean, sd = tracing.estimates[0].mean[0], tracing.estimates[0].sd[0]
     assert abs(mean - 0.06) < 4 * sd
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not FOLDER.is_dir(), reason="needs the recorded trials")
-def test_dry_friction_is_what_the_recorded_servo_has():
-    task = ServoPendulumTask(data=FOLDER)
-    off = np.flatnonzero(task.recordings.motor_off).tolist()
-    assert len(task.recordings) == 16
-    assert len(off) == 4
-    trials = task.trials([0, 3, 12, off[1]])
-    loop = Criticism(task.simulator, task.prior, trials, effects=task.effects())
-    assert loop.detect().alarm
-    found = loop.rivals
-
-    def log_z(name):
-        return found.fit(ModelKey((name,))).evidence.log_evidence
-
-    dry = max(log_z(n) for n in ("Coulomb", "load-dependent"))
-    assert dry > log_z("torque-dependent") + 20
-    assert dry > log_z("viscous") + 20

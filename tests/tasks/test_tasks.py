@@ -58,12 +58,6 @@ def test_reproduction_error_of_a_point_and_of_the_exact_posterior():
     assert error == pytest.approx(float(torch.tensor(3.0).exp()))
 
 
-def test_another_truth():
-    task = get_task("numerical", variant="sinh").with_truth([1.0, 2.0])
-    assert task.theta_true.tolist() == [1.0, 2.0]
-    assert task.variant == "sinh"
-
-
 @pytest.mark.parametrize(
     ("options", "text"),
     [

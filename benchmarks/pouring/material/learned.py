@@ -7,7 +7,6 @@ the rate beside theta, and a belief by weights on points of the prior.
 
 from __future__ import annotations
 
-import pickle
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -22,19 +21,15 @@ from torch import Tensor
 from benchmarks.pouring.bank import read, read_parts
 from benchmarks.pouring.learned import (
     NUM_ALL,
-    NUM_COMPONENTS,
-    NUM_OUTER,
     Earlier,
     Learned,
+    both_summaries,
+    gains_of,
     summaries_of,
+    told_of,
 )
-from benchmarks.pouring.likelihood import (
-    ImageLikelihood,
-    components,
-    doubted,
-    observed,
-)
-from benchmarks.pouring.power import best_power, told_by
+from benchmarks.pouring.likelihood import ImageLikelihood, observed
+from benchmarks.pouring.power import best_power
 from sbi_active.inference.regression.process import GaussianProcess, ProcessSettings
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.tasks import get_task
@@ -42,7 +37,7 @@ from sbi_active.tasks.pouring import images_of, intersection_volume
 from sbi_active.tasks.pouring.real import COMPARED_AT, HEIGHTS, RATES
 from sbi_active.tasks.pouring.task import PLACES
 
-__all__ = ["ByPlace", "Overlap", "PointBelief", "compared_pours", "kept", "learn"]
+__all__ = ["ByPlace", "Overlap", "PointBelief", "compared_pours", "learn"]
 
 Array = NDArray[Any]
 
@@ -115,21 +110,12 @@ class ByPlace:
     ) -> tuple[Array, Array]:
         """Return gains by delta and action, nats, and their errors, on common draws."""
         theta = belief.sample(NUM_ALL, seed)
-        values = np.array(
-            [
-                [
-                    self.at(delta, number).likelihood.gain(
-                        beside(theta, action.double().numpy()),
-                        NUM_OUTER,
-                        np.random.default_rng(seed),
-                        earlier[delta, number],
-                    )
-                    for number, action in enumerate(self.actions)
-                ]
-                for delta in range(len(self.learned))
-            ]
-        )
-        return values.mean(2), values.std(2) / np.sqrt(NUM_OUTER)
+        rows = [beside(theta, a.double().numpy()) for a in self.actions]
+        every = [
+            [(self.at(delta, number), row) for number, row in enumerate(rows)]
+            for delta in range(len(self.learned))
+        ]
+        return gains_of(every, earlier, seed)
 
     def at(self, delta: int, number: int) -> Learned:
         """Return what is learned for an action."""
@@ -147,19 +133,15 @@ class ByPlace:
             number: Of the action.
             earlier: Statistics of earlier trials, to which its own are added.
         """
-        own = self.at(delta, number)
-        seen = own.seen(image, delta)
         known = beside(theta, self.actions[number].double().numpy())
-        found = own.likelihood.at(known, seen, earlier[delta, number])
-        if seen is not None and len(seen):
-            earlier[delta, number].append(seen)
-        return doubted(found, own.likelihood.power)
+        own = self.at(delta, number)
+        return told_of(own, known, image, delta, earlier[delta, number])
 
 
 def cross_validated(
     theta: Array, action: Array, summary: Array, is_empty: Array
-) -> tuple[ImageLikelihood, Array, Array]:
-    """Return the likelihood of a place, and how left-out pours are told by it.
+) -> ImageLikelihood:
+    """Return the likelihood of a place, with the power that tells left-out pours best.
 
     Args:
         theta: Shape (n, 8).
@@ -180,10 +162,8 @@ def cross_validated(
             seen = [observed(fitted, summary[i], bool(is_empty[i])) for i in mine]
             log_p[mine] = fitted.at_each(beside(draws, one), seen)
             own[mine] = np.diag(fitted.at_each(both[mine], seen))
-    power = best_power(log_p, own)
-    told, mass = told_by(power * log_p, power * own)
     whole = ImageLikelihood.fit(both, summary, is_empty, num_wanted=NUM_PARAMETERS)
-    return replace(whole, power=power), told, mass
+    return replace(whole, power=best_power(log_p, own))
 
 
 def learn(folder: Path) -> ByPlace:
@@ -195,25 +175,12 @@ def learn(folder: Path) -> ByPlace:
     found: list[dict[float, Learned]] = [{}, {}]
     for place in PLACES:
         mine = action[:, 1] == place
-        is_empty = np.asarray(~mesh[mine].any(1))
-        mean, axes = components(small[mine], NUM_COMPONENTS)
-        both = (small[mine] - mean) @ axes, np.sqrt(mesh[mine])
-        for delta, summary in enumerate(both):
-            learned = cross_validated(theta[mine], action[mine], summary, is_empty)
-            found[delta][place] = Learned(
-                learned[0], int(mine.sum()), *learned[1:], mean, axes
-            )
+        for own, one in zip(
+            found, both_summaries(mesh[mine], small[mine]), strict=True
+        ):
+            fitted = cross_validated(theta[mine], action[mine], *one[:2])
+            own[place] = Learned(fitted, int(mine.sum()), *one[2:])
     return ByPlace(found, task.actions.values)
-
-
-def kept(bank: Path, path: Path | None) -> ByPlace:
-    """Return what is learned of a bank, from a file of our own where there is one."""
-    if path is not None and path.exists():
-        return pickle.loads(path.read_bytes())
-    learned = learn(bank)
-    if path is not None:
-        path.write_bytes(pickle.dumps(learned))
-    return learned
 
 
 @dataclass(frozen=True)

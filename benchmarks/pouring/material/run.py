@@ -28,13 +28,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.pouring.learned import Earlier
+from benchmarks.pouring.learned import Earlier, kept
 from benchmarks.pouring.material.learned import (
     ByPlace,
     Overlap,
     PointBelief,
     compared_pours,
-    kept,
+    learn,
 )
 from benchmarks.pouring.material.summary import checks_table, summarize
 from benchmarks.pouring.run import TEMPERED
@@ -183,7 +183,8 @@ def main(arguments: Settings) -> None:
     if not arguments.summary:
         if arguments.bank is None:
             raise SystemExit("expected --bank FOLDER; got none; make one, see bank.py")
-        learned = kept(arguments.bank, arguments.learned)
+        folder = arguments.bank
+        learned = kept(arguments.learned, lambda: learn(folder))
         run_missing(arguments.bank, learned, arguments)
     print(summarize(read(arguments.results / "intervol.csv")))
     print(checks_table(read(arguments.results / "intervol_poured.csv")))

@@ -4,10 +4,20 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks.robustness.tables import long
 from sbi_active.criticism import Trials
 
 LONG = "time,action_v,x_h,trial\n"
+
+
+def long(**changes):
+    """Return a long table of two trials with two samples each."""
+    columns = {
+        "trial": ["a"] * 2 + ["b"] * 2,
+        "time": [0.0, 1.0, 0.0, 1.0],
+        "action_v": 1.0,
+        "x_h": [0.1, 0.2, 0.3, 0.4],
+    }
+    return pd.DataFrame({**columns, **changes})
 
 
 def test_a_number_sign_within_a_cell_is_data(tmp_path):

@@ -11,8 +11,6 @@ from sbi_active.tasks.box_collision.scene import load_mujoco
 from sbi_active.tasks.servo_pendulum.model import GRAVITY, LENGTH, MASS, STEP, SUPPLY
 from sbi_active.tasks.servo_pendulum.recordings import Recordings
 
-__all__ = ["SUBSTEPS", "mujoco_angles"]
-
 #: Steps of MuJoCo in one of the equations.
 SUBSTEPS = 8
 
