@@ -78,7 +78,7 @@ def test_overview(run, capsys):
     assert len(style.inference.trials) == 2
     assert loop.report.verdict == "bias"
     assert "Verdict: bias (P" in printed
-    assert "P holds among the\ndeclared effects alone" in printed
+    assert "P holds among the declared effects alone" in " ".join(printed.split())
 
 
 def test_simulations(run, capsys):

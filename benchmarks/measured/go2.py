@@ -69,7 +69,7 @@ def line_of(tracing: Tracing) -> str:
     """Return the first line of a report on a verdict."""
     if tracing.misfit is None:
         return f"Verdict: {tracing.verdict}"
-    return misfit_line(tracing.verdict, tracing.misfit)
+    return f"Verdict: {misfit_line(tracing.verdict, tracing.misfit)}"
 
 
 def judge(
