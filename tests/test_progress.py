@@ -8,7 +8,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import Normal
 
-from sbi_active import GaussianNoise, SimulatorModel, progress
+from sbi_active import SimulatorModel, StudentTNoise, progress
 from sbi_active.criticism import Effect, Trials, close_loop
 from sbi_active.progress import stage
 
@@ -83,7 +83,7 @@ def loop(**options):
         time.sleep(0.001)
         return theta * action
 
-    model = SimulatorModel(slow, noise=GaussianNoise(0.1))
+    model = SimulatorModel(slow, noise=StudentTNoise(0.1, 9.0))  # of which samples tell
     action = torch.linspace(-1, 1, 6)[:, None]
     prior = BoxUniform(-5 * torch.ones(1), 5 * torch.ones(1))
     trials = Trials(action, 2 * action + 1)
