@@ -31,7 +31,7 @@ import torch
 from benchmarks.robots.models import ARM, CART_POLE, PENDULUM, SPRING_MASS
 from sbi_active import BoxActions
 from sbi_active.mujoco import from_mjcf
-from sbi_active.mujoco.effects.powers import PowerForce
+from sbi_active.mujoco.effects.changes import PowerForce
 from sbi_active.mujoco.models.spec import mujoco_of
 from sbi_active.threads import single_thread
 

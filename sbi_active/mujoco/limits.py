@@ -13,8 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.mujoco.models.machine import Machine
-from sbi_active.mujoco.models.names import names_of, require_name
-from sbi_active.mujoco.models.quantities import is_scalar
+from sbi_active.mujoco.models.names import names_of, require_name, scalar_joints
 from sbi_active.mujoco.robot import Robot
 from sbi_active.mujoco.sensors import (
     ActuatorSensor,
@@ -98,7 +97,7 @@ class MotionLimits:
             forces: Mapping[str, Any] = _ranges(model, "actuator", *own)
         else:
             forces = torque
-        joints = [j for j in names_of(model, "joint") if is_scalar(model, j)]
+        joints = scalar_joints(model)
         actuators = names_of(model, "actuator")
         #: Sensor to add, label, lowest and highest value.
         watched = [

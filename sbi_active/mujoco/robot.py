@@ -22,10 +22,10 @@ from sbi_active.mujoco.models.names import (
     meaning,
     names_of,
     require_name,
+    scalar_joints,
     start_places,
 )
 from sbi_active.mujoco.models.parameters import Bounded, bounded
-from sbi_active.mujoco.models.quantities import is_scalar
 from sbi_active.mujoco.models.spec import Source
 from sbi_active.mujoco.recordings import require_in_range, trials_of
 from sbi_active.mujoco.sensors import added_sensors, channels_of
@@ -202,9 +202,7 @@ def from_spec(spec_or_path: Any) -> SimulatorModel:
     """Return the simulator of a model without parameters, by all its joints."""
     source = Source(spec_or_path)
     model = source.compile()
-    sensors = names_of(model, "sensor") or [
-        name for name in names_of(model, "joint") if is_scalar(model, name)
-    ]
+    sensors = names_of(model, "sensor") or scalar_joints(model)
     source = added_sensors(source, model, sensors)
     machine = Machine(source, ())
     channels = channels_of(machine.model, sensors)

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sbi_active.mujoco.models.names import names_of, require_name
-from sbi_active.mujoco.models.quantities import is_hinge, is_scalar
+from sbi_active.mujoco.models.names import names_of, require_name, scalar_joints
+from sbi_active.mujoco.models.quantities import units_of
 from sbi_active.mujoco.models.spec import Source, mujoco_of
 from sbi_active.mujoco.simulator import Channel
 
@@ -67,7 +67,7 @@ def added_sensors(source: Source, model: Any, sensors: Sequence[str] | None) -> 
         ValueError: If there is neither a sensor nor a joint of a name, or none at all.
     """
     own = names_of(model, "sensor")
-    joints = [j for j in names_of(model, "joint") if is_scalar(model, j)]
+    joints = scalar_joints(model)
     if sensors is None:
         if not own:
             raise ValueError(
@@ -113,7 +113,7 @@ def _unit(model: Any, i: int) -> str:
     kind, position = int(model.sensor_type[i]), int(kinds.mjSENS_JOINTPOS)
     if kind in (position, int(kinds.mjSENS_JOINTVEL)):
         joint = names_of(model, "joint")[int(model.sensor_objid[i])]
-        unit = "rad" if is_hinge(model, joint) else "m"
+        unit = units_of(model, joint)["L"]
         return unit if kind == position else f"{unit}/s"
     fixed = {
         kinds.mjSENS_ACCELEROMETER: "m/s^2",

@@ -7,10 +7,10 @@ import torch
 
 from benchmarks.robots.models import ARM, BALL, PENDULUM, TIMES
 from sbi_active import BoxActions
-from sbi_active.criticism import AugmentedSimulator, Trials
+from sbi_active.criticism import AugmentedSimulator, Effect, Trials
+from sbi_active.criticism.effects.effect import UnderKey
 from sbi_active.mujoco import from_mjcf, mjcf_effects
-from sbi_active.mujoco.effects.acting import force_effect, half_normal
-from sbi_active.mujoco.effects.powers import PowerForce
+from sbi_active.mujoco.effects.changes import PowerForce
 from tests.mujoco.test_robot import pendulum
 
 
@@ -22,6 +22,17 @@ def robot():
 @pytest.fixture(scope="module")
 def effects(robot):
     return {effect.name: effect for effect in mjcf_effects(robot)}
+
+
+def under(keyword, change):
+    """Return an effect that is a change of the model, or a force."""
+    return Effect(
+        keyword,
+        hook="dynamics",
+        prior=torch.distributions.HalfNormal(torch.ones(1).double()),
+        null=0.0,
+        apply=UnderKey(keyword, change),
+    )
 
 
 def run(robot, effect, phi, angle=1.0):
@@ -113,9 +124,7 @@ def test_a_force_of_the_caller_does_what_a_field_does(robot, effects, what, powe
         pytest.skip("this MuJoCo has no polynomial springs and dampers")
     word = {2: "quadratic", 3: "cubic"}[power]
     native = run(robot, effects[f"hinge {word} {what}"], [0.05, 0.2])
-    force = force_effect(
-        "force", PowerForce(((0, 0, 0.0),), what, power), prior=half_normal(1.0)
-    )
+    force = under("force", PowerForce(((0, 0, 0.0),), what, power))
     # MuJoCo takes a part of its own at the end of a step, and a force at its begin.
     assert run(robot, force, [0.05, 0.2]) == pytest.approx(native, abs=0.03)
     bare = robot.simulator.mean(
@@ -209,14 +218,12 @@ def test_two_transmissions_and_a_force_together():
         robot, include=["elbow series elasticity", "shoulder backlash"]
     )
     # A torque on the shoulder, the first joint: with the inserted ones it is elsewhere.
-    pull = force_effect(
-        "pull", PowerForce(((0, 0, 1.0),), "stiffness", 1), prior=half_normal(1.0)
-    )
+    pull = under("force", PowerForce(((0, 0, 1.0),), "stiffness", 1))
     model = AugmentedSimulator(robot.simulator, [*found, pull])
     theta = torch.full((1, 1), 0.1, dtype=torch.float64)
     action = torch.zeros(1, 1, dtype=torch.float64)
     phi = {e.name: torch.full((1, 1), 2 * e.apply.key.least).double() for e in found}
-    rest = {"pull": torch.full((1, 1), 2.0, dtype=torch.float64)}
+    rest = {"force": torch.full((1, 1), 2.0, dtype=torch.float64)}
     bare = model.evaluate(theta, {}, action)
     pulled = model.evaluate(theta, rest, action) - bare
     both = model.evaluate(theta, {**phi, **rest}, action)

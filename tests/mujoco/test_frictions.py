@@ -8,8 +8,8 @@ import torch
 from benchmarks.robots.models import PENDULUM
 from sbi_active.criticism import AugmentedSimulator, close_loop
 from sbi_active.mujoco import from_mjcf, mjcf_effects
-from sbi_active.mujoco.effects.acting import half_normal, model_effect
-from sbi_active.mujoco.effects.frictions import FrictionChange
+from sbi_active.mujoco.effects.changes import FrictionChange
+from tests.mujoco.test_effects import under
 from tests.mujoco.test_robot import pendulum
 
 THETA = {"hinge.damping": (0.0, 0.1)}
@@ -54,7 +54,7 @@ def test_they_are_offered_with_their_units_and_say_on_what_they_depend(effects):
 def test_a_friction_that_follows_nothing_is_that_of_the_field(robot, effects):
     loss = effects["hinge friction loss"]
     same = FrictionChange(("hinge",), "speed", speed=1e12)  # of any speed
-    follows = model_effect("follows", same, prior=half_normal(0.2))
+    follows = under("model", same)
     field = run(robot, [[0.2]], [1.0, -0.6], [loss])
     assert run(robot, [[0.2]], [1.0, -0.6], [follows]) == pytest.approx(field, abs=1e-9)
     # Two frictions of one joint add up.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,33 +13,16 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect
 from sbi_active.criticism.effects.patterns import as_patterns, picked, unmatched
-from sbi_active.mujoco.effects.actuators import of_actuators
-from sbi_active.mujoco.effects.joints import of_joints
-from sbi_active.mujoco.effects.nominal import Nominal, nominal
-from sbi_active.mujoco.effects.sensors import of_sensors
-from sbi_active.mujoco.effects.surroundings import (
-    of_bodies,
-    of_contacts,
-    of_surroundings,
-)
-from sbi_active.mujoco.effects.ties import (
-    actuator_groups,
-    body_groups,
-    joint_groups,
-)
-from sbi_active.mujoco.effects.writing import QuantityChange, is_parameter
-from sbi_active.mujoco.models.names import names_of, require_name
+from sbi_active.mujoco.effects.changes import QuantityChange
+from sbi_active.mujoco.effects.elements import elements
+from sbi_active.mujoco.effects.nominal import nominal
+from sbi_active.mujoco.effects.table import rows
+from sbi_active.mujoco.models.names import require_name
 from sbi_active.mujoco.robot import Robot, from_spec
 from sbi_active.mujoco.simulator import MujocoFunction
 from sbi_active.simulation import SimulatorModel
 
 __all__ = ["likely_effects", "mjcf_effects"]
-
-#: Change of x by a prior deviation, in deviations of x, that counts as none.
-NOTHING = 1e-9
-#: Patterns of effects that robots most often have, and of others that these fit.
-LIKELY = ("* friction loss", "* quadratic damping", "* stiffness", "* lag")
-UNLIKELY = ("* sensor lag", "* cubic *", "* quadratic stiffness", "all *")
 
 
 def mjcf_effects(
@@ -85,15 +68,12 @@ def mjcf_effects(
     Raises:
         ValueError: If a pattern fits no effect.
     """
-    simulator, actions, trials = _simulator(model, actions, trials)
-    sizes, call = nominal(simulator, trials, actions)
-    every = [*_all(simulator, sizes, trials)]
+    simulator, every, call = _offered(model, trials, actions)
     wanted, without = as_patterns(include), as_patterns(exclude)
     for pattern in unmatched(every, [*wanted, *without]):
         names = [e.name for e in every]
         require_name(pattern, names, "effect, or a pattern of some,")
-    kept = picked(every, wanted, without)
-    return _that_matter(simulator, kept, call)
+    return _that_matter(simulator, picked(every, wanted, without), call)
 
 
 def likely_effects(robot: Robot, trials: Trials) -> list[Effect]:
@@ -103,57 +83,49 @@ def likely_effects(robot: Robot, trials: Trials) -> list[Effect]:
         robot: Robot from its MJCF.
         trials: Trials whose actions and inputs say how it moves.
     """
-    simulator, actions, trials = _simulator(robot, None, trials)
-    sizes, call = nominal(simulator, trials, actions)
-    kept = picked(_all(simulator, sizes, trials), LIKELY, UNLIKELY)
-    return _that_matter(simulator, kept, call)
+    simulator, every, call = _offered(robot, trials, None)
+    likely = ("* friction loss", "* quadratic damping", "* stiffness", "* lag")
+    fitted_by_these = ("* sensor lag", "* cubic *", "* quadratic stiffness", "all *")
+    return _that_matter(simulator, picked(every, likely, fitted_by_these), call)
 
 
-def _simulator(model: Any, actions: Any, trials: Any) -> tuple[Any, Any, Any]:
+def _offered(
+    model: Any, trials: Trials | None, actions: ActionSpace | None
+) -> tuple[SimulatorModel, list[Effect], dict[str, Any]]:
+    """Return the simulator, all effects of its model, and rows to try them on."""
+    simulator = model
     if isinstance(model, Robot):
-        return model.simulator, actions or model.actions, trials or model.trials
-    if not isinstance(model, SimulatorModel):
-        return from_spec(model), actions, trials
-    if not isinstance(model.fn, MujocoFunction):
+        simulator = model.simulator
+        actions, trials = actions or model.actions, trials or model.trials
+    elif not isinstance(model, SimulatorModel):
+        simulator = from_spec(model)
+    if not isinstance(simulator.fn, MujocoFunction):
         raise TypeError(
             "expected a simulator of from_mjcf or from_sysid; got another; pass the "
             "MJCF, or write down its effects"
         )
-    return model, actions, trials
-
-
-def _all(
-    simulator: SimulatorModel, sizes: Nominal, trials: Trials | None
-) -> Iterator[Effect]:
-    function = simulator.fn
-    assert isinstance(function, MujocoFunction)
-    model = function.model
+    sizes, call = nominal(simulator, trials, actions)
     driven: list[str] = []
     if trials is not None and trials.inputs is not None:
         driven = [*trials.inputs]
     elif simulator.inputs is not None:
         driven = [*simulator.inputs.inputs(simulator.inputs.sample((1,), seed=0))]
-    for group in joint_groups(model):
-        yield from of_joints(group, sizes)
-    for group in actuator_groups(model):
-        known = [name for name in driven if name in names_of(model, "actuator")]
-        yield from of_actuators(group, sizes, driven=known)
-    sds = getattr(simulator.noise, "sd", None)
-    yield from of_sensors(
-        function.channels, sizes, None if sds is None else torch.as_tensor(sds)
-    )
-    for group in body_groups(model):
-        yield from of_bodies(group, sizes)
-    yield from of_surroundings(sizes)
-    yield from of_contacts(sizes)
+    sd = getattr(simulator.noise, "sd", None)
+    noise = None if sd is None else torch.as_tensor(sd).reshape(-1).tolist()
+    channels = simulator.fn.channels
+    every = [
+        row.effect(element)
+        for element in elements(channels, sizes, driven=driven, noise=noise)
+        for row in rows()
+    ]
+    return simulator, [effect for effect in every if effect is not None], call
 
 
 def _that_matter(
     simulator: SimulatorModel, effects: Sequence[Effect], call: dict[str, Any]
 ) -> list[Effect]:
     """Return the effects that are no parameter and change the readings."""
-    function = simulator.fn
-    assert isinstance(function, MujocoFunction)
+    function: MujocoFunction = simulator.fn  # pyright: ignore[reportAssignmentType]
     bare = SimulatorModel(
         function, sample_times=simulator.sample_times, inputs=simulator.inputs
     )
@@ -162,21 +134,20 @@ def _that_matter(
         index=torch.arange(len(theta), dtype=torch.float64),
         **{k: v for k, v in call.items() if k not in ("theta", "action")},
     )
+    declared = {p.quantity for p in function.machines[0].parameters}
     new = []
     for effect in effects:
         change = getattr(effect.apply, "key", None)
-        known = function.machines[0].parameters
-        if not (isinstance(change, QuantityChange) and is_parameter(known, change)):
+        is_new = not isinstance(change, QuantityChange)
+        if is_new or not {*change.quantities} <= declared:
             new.append(effect)
     augmented = AugmentedSimulator(bare, new)
     x = augmented.evaluate(theta, {}, action, context=context)
-    scale = float(np.nanstd(x.double().numpy())) or 1.0
+    least = 1e-9 * (float(np.nanstd(x.double().numpy())) or 1.0)
     kept = []
     for effect in new:
-        draws = effect.declared_draws()[: len(theta)].to(theta.dtype)
-        phi = {effect.name: draws}
+        phi = {effect.name: effect.declared_draws()[: len(theta)].to(theta.dtype)}
         changed = augmented.evaluate(theta, phi, action, context=context)
-        moved = (changed - x).abs()
-        if bool((moved.nan_to_num(torch.inf) > NOTHING * scale).any()):
+        if bool(((changed - x).abs().nan_to_num(torch.inf) > least).any()):
             kept.append(effect)
     return kept

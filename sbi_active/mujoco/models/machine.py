@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.mujoco.models.changes import Insertion, ModelChange, StateChange
-from sbi_active.mujoco.models.fields import copied, restore
 from sbi_active.mujoco.models.names import names_of, start_places
 from sbi_active.mujoco.models.parameters import Bounded, Writer, renew, writer_of
+from sbi_active.mujoco.models.quantities import copied, restore
 from sbi_active.mujoco.models.spec import Source, mujoco_of, quiet
 
 __all__ = ["Machine", "Model", "Rows"]
@@ -100,9 +100,10 @@ class Model:
             theta: Parameters, shape (d,).
             changes: Parameters by change, shape (k,).
         """
-        model = self.writer.model(theta)
-        if model is None:
-            names = {*self.writer.fields}.union(*(c.fields() for c in changes))
+        if self.writer.compiled is not None:
+            model = self.writer.compiled(theta)
+        else:
+            names = {*self.writer.parts}.union(*(c.fields() for c in changes))
             self.originals |= copied(self.base, names - {*self.originals})
             while len(self.pool) <= number:
                 self.pool.append(copy.copy(self.base))
@@ -143,7 +144,7 @@ class Machine:
         writer = writer_of(
             source.exact, self.model, self.parameters, edit=edit, text=source.spec
         )
-        self._writer = writer if writer.fields or not self.parameters else None
+        self._writer = writer if writer.compiled is None else None
         self._models: dict[tuple[Insertion, ...], Model] = {}
 
     def __getstate__(self) -> dict[str, Any]:

@@ -15,6 +15,7 @@ __all__ = [
     "meaning",
     "names_of",
     "require_name",
+    "scalar_joints",
     "start_places",
 ]
 
@@ -55,6 +56,14 @@ def element_id(model: Any, kind: str, name: str) -> int:
     known = names_of(model, kind)
     require_name(name, known, kind)
     return known.index(name)
+
+
+def scalar_joints(model: Any) -> list[str]:
+    """Return the names of hinges and slides."""
+    types = mujoco_of().mjtJoint
+    scalar = int(types.mjJNT_HINGE), int(types.mjJNT_SLIDE)
+    each = zip(names_of(model, "joint"), model.jnt_type, strict=True)
+    return [name for name, kind in each if int(kind) in scalar]
 
 
 def require_name(name: str, known: Iterable[str], what: str) -> None:

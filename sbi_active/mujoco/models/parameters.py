@@ -13,22 +13,23 @@ every distinct theta is compiled.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.mujoco.models.fields import Entry, field_of, set_to
 from sbi_active.mujoco.models.quantities import (
     FRAMES,
-    NEVER_NEGATIVE,
+    Entry,
     Quantity,
+    field_of,
     find_quantity,
     is_movable,
-    loosen,
+    set_to,
 )
 from sbi_active.mujoco.models.spec import mujoco_of
 
@@ -36,12 +37,6 @@ __all__ = ["Bounded", "Writer", "bounded", "renew", "writer_of"]
 
 Array = NDArray[Any]
 
-#: Relative error of a number that is taken for affine, beside compiling.
-AFFINE = 1e-9
-#: Places at which that is tried.
-NUM_TRIED = 4
-#: Relative size below which a coefficient is rounding.
-ROUNDING = 1e-11
 #: What ``mj_setConst`` makes of the other fields.
 DERIVED = (
     "body_subtreemass",
@@ -78,22 +73,29 @@ class Bounded:
     edit: Callable[[Any, float], Any] | None = None
 
 
-class Writer(Protocol):
+@dataclass(frozen=True)
+class Writer:
     """Puts parameters into models of one shape.
 
     Attributes:
-        fields: Names of those that it writes.
+        parts: Numbers that are affine in the parameters: by field their flat places,
+            c and A.
+        compiled: Function that compiles a model for parameters (d,), where some are not
+            affine; None where all are.
     """
 
-    fields: tuple[str, ...]
-
-    def model(self, theta: Array) -> Any | None:
-        """Return a model of its own for parameters (d,), None if it writes them."""
-        ...
+    parts: Mapping[str, tuple[Array, Array, Array]] = field(default_factory=dict)
+    compiled: Callable[[Array], Any] | None = None
 
     def write(self, model: Any, theta: Array) -> None:
         """Write parameters (d,) into a model whose fields are as compiled."""
-        ...
+        for name, (places, constant, slope) in self.parts.items():
+            values = constant + slope @ theta
+            now = field_of(model, name)
+            if isinstance(now, np.ndarray):
+                now.reshape(-1)[places] = values
+            else:
+                set_to(model, Entry(name, ()), float(values[0]))
 
 
 def bounded(model: Any, parameters: Mapping[str, Any]) -> tuple[Bounded, ...]:
@@ -132,24 +134,21 @@ def bounded(model: Any, parameters: Mapping[str, Any]) -> tuple[Bounded, ...]:
             found.append(Bounded(name, low, high, edit=rest[0]))
             continue
         quantity = find_quantity(model, rest[0] if rest else name)
-        if quantity.attribute in NEVER_NEGATIVE and low < 0:
+        if low < 0 and not quantity.known.is_signed:
             raise ValueError(
                 f"expected bounds of {str(quantity)!r} from 0 on; got {low:g} to "
                 f"{high:g}; raise the lower one"
             )
-        if quantity.attribute.startswith("com_"):
-            _require_movable(model, quantity.name)
-        unit = quantity.unit(model)
-        found.append(Bounded(name, low, high, unit, quantity))
+        if quantity.attribute.startswith("com_") and not is_movable(
+            model, quantity.name
+        ):
+            raise ValueError(
+                f"expected a body whose center of mass can be written; got "
+                f"{quantity.name!r}, which MuJoCo compiles as simple; give it "
+                "simple='false' in the MJCF"
+            )
+        found.append(Bounded(name, low, high, quantity.unit(model), quantity))
     return tuple(found)
-
-
-def _require_movable(model: Any, body: str) -> None:
-    if not is_movable(model, body):
-        raise ValueError(
-            f"expected a body whose center of mass can be written; got {body!r}, which "
-            "MuJoCo compiles as simple; give it simple='false' in the MJCF"
-        )
 
 
 def writer_of(
@@ -171,8 +170,7 @@ def writer_of(
             that are compiled there; None takes ``spec``.
     """
     if edit is None and all(p.edit is None for p in parameters):
-        quantities = [p.quantity for p in parameters if p.quantity is not None]
-        return _Quantities(quantities, model)
+        return _of_quantities(parameters, model)
 
     def compiled(theta: Array, source: Callable[[], Any] = spec) -> Any:
         edited = source()
@@ -182,19 +180,16 @@ def writer_of(
             if parameter.edit is not None:
                 parameter.edit(edited, float(value))
         changed = edited.compile()
-        for parameter, value in zip(parameters, theta, strict=True):
-            if parameter.quantity is not None:
-                for entry in parameter.quantity.entries(changed):
-                    set_to(changed, entry, float(value) * entry.factor)
-                if parameter.quantity.attribute.startswith("com_"):
-                    loosen(changed, parameter.quantity.name)
+        _of_quantities(parameters, changed).write(changed, theta)
         renew(changed, mujoco_of().MjData(changed))
         return changed
 
     low = np.array([p.low for p in parameters])
     high = np.array([p.high for p in parameters])
     found = _affine(compiled, low, high)
-    return found or _Compiled(partial(compiled, source=text or spec))
+    if found is not None and _agrees(found, compiled, low, high):
+        return found
+    return Writer(compiled=partial(compiled, source=text or spec))
 
 
 def renew(model: Any, data: Any) -> None:
@@ -207,120 +202,115 @@ def renew(model: Any, data: Any) -> None:
         data: Data of such a model, to work in.
     """
     mean = float(model.dof_M0.mean()) if model.nv else 0.0
-    is_own = abs(model.stat.meaninertia - mean) <= AFFINE * mean
+    is_own = abs(model.stat.meaninertia - mean) <= 1e-9 * mean
     mujoco_of().mj_setConst(model, data)
     if model.nv and is_own:  # and not given in the MJCF
         model.stat.meaninertia = float(model.dof_M0.mean())
 
 
-class _Quantities:
-    """Writes each parameter into the numbers that follow its quantity."""
-
-    def __init__(self, quantities: Sequence[Quantity], model: Any) -> None:
-        self.entries = [q.entries(model) for q in quantities]
-        self.moved = [q.name for q in quantities if q.attribute.startswith("com_")]
-        fields = {e.field: None for each in self.entries for e in each}
-        self.fields = (*fields, *(FRAMES if self.moved else ()))
-
-    def model(self, theta: Array) -> None:
-        return None
-
-    def write(self, model: Any, theta: Array) -> None:
-        for each, value in zip(self.entries, theta.tolist(), strict=True):
-            for entry in each:
-                set_to(model, entry, value * entry.factor)
-        for body in self.moved:
-            loosen(model, body)
-
-
-class _Affine:
-    """Writes numbers that are affine in the parameters."""
-
-    def __init__(self, parts: Mapping[str, tuple[Array, Array, Array]]) -> None:
-        self.parts = dict(parts)  # by field: flat places, c, A
-        self.fields = tuple(parts)
-
-    def model(self, theta: Array) -> None:
-        return None
-
-    def write(self, model: Any, theta: Array) -> None:
-        for name, (places, constant, slope) in self.parts.items():
-            values = constant + slope @ theta
-            field = field_of(model, name)
-            if isinstance(field, np.ndarray):
-                field.reshape(-1)[places] = values
-            else:
-                set_to(model, Entry(name, ()), float(values[0]))
-
-
-class _Compiled:
-    """Compiles every theta."""
-
-    fields = ()
-
-    def __init__(self, compiled: Callable[[Array], Any]) -> None:
-        self._compiled = compiled
-
-    def model(self, theta: Array) -> Any:
-        return self._compiled(theta)
-
-    def write(self, model: Any, theta: Array) -> None:
-        """Nothing is left to write."""
+def _of_quantities(parameters: Sequence[Bounded], model: Any) -> Writer:
+    """Return the writer of those parameters that are quantities of a model."""
+    num = len(parameters)
+    slopes: dict[str, dict[int, Array]] = {}
+    quantities = [p.quantity for p in parameters]
+    for j, quantity in enumerate(quantities):
+        for entry in [] if quantity is None else quantity.entries(model):
+            shape = np.shape(field_of(model, entry.field))
+            place = int(np.ravel_multi_index(entry.index, shape)) if shape else 0
+            slopes.setdefault(entry.field, {})[place] = entry.factor * np.eye(num)[j]
+    parts = {
+        name: (np.array([*own]), np.zeros(len(own)), np.array([*own.values()]))
+        for name, own in slopes.items()
+    }
+    loose = copy.copy(model)
+    for quantity in quantities:
+        if quantity is not None and quantity.loosen(loose):
+            for name in FRAMES:
+                frames = field_of(loose, name)
+                places = np.flatnonzero(frames != field_of(model, name))
+                zeros = np.zeros((len(places), num))
+                parts[name] = places, frames[places].astype(float), zeros
+    return Writer(parts)
 
 
 def _affine(
-    compiled: Callable[[Array], Any], low: Array, high: Array
-) -> _Affine | None:
-    """Return the writer of affine numbers, None if some are not."""
+    compiled: Callable[[Array], Any],
+    low: Array,
+    high: Array,
+    *,
+    rounding: float = 1e-11,
+) -> Writer | None:
+    """Return the writer of affine numbers, None if numbers come or go.
+
+    Args:
+        compiled: Function that compiles a model for parameters.
+        low: Lowest parameters.
+        high: Highest parameters.
+        rounding: Relative size below which a coefficient counts as rounding. A
+            thousand times the precision of floats, and a hundredth of what
+            :func:`_agrees` sees.
+    """
     middle, half = 0.5 * (low + high), 0.25 * (high - low)
     base = _numbers(compiled(middle))
-    steps = []
-    for j in range(len(low)):
-        unit = np.eye(len(low))[j] * half
-        steps.append((_numbers(compiled(middle + unit)), 2 * half[j]))
-        steps[-1] += (_numbers(compiled(middle - unit)),)
-    if any({*s[0]} != {*base} for s in steps):
-        return None
+    units = np.diag(half)
+    ups = [_numbers(compiled(middle + unit)) for unit in units]
+    downs = [_numbers(compiled(middle - unit)) for unit in units]
     parts = {}
     for name, value in base.items():
-        every = [value, *[s[0][name] for s in steps], *[s[2][name] for s in steps]]
-        if any(v.shape != value.shape for v in every):
+        every = [numbers.get(name) for numbers in (*ups, *downs)]
+        if any(v is None or v.shape != value.shape for v in every):
             return None
         moved = np.any([v != value for v in every], 0)
         if not moved.any() or name.startswith(DERIVED):
             continue
         places = np.flatnonzero(moved)
-        slope = np.stack(
-            [(up[name] - down[name])[places] / width for up, width, down in steps], -1
-        )
+        differences = [
+            up[name] - down[name] for up, down in zip(ups, downs, strict=True)
+        ]
+        slope = np.stack(differences, -1)[places] / (2 * half)
         scale = np.abs(slope).max() or 1.0
-        slope = np.where(np.abs(slope) < ROUNDING * scale, 0.0, slope)
+        slope = np.where(np.abs(slope) < rounding * scale, 0.0, slope)
         rounded = np.round(slope, 12)
-        slope = np.where(np.abs(slope - rounded) <= ROUNDING * scale, rounded, slope)
+        slope = np.where(np.abs(slope - rounded) <= rounding * scale, rounded, slope)
         constant = value[places] - slope @ middle
         size = np.abs(value[places]) + np.abs(slope) @ np.abs(middle)
-        constant = np.where(np.abs(constant) <= ROUNDING * size, 0.0, constant)
+        constant = np.where(np.abs(constant) <= rounding * size, 0.0, constant)
         parts[name] = places, constant, slope
-    found = _Affine(parts)
-    return found if _agrees(found, compiled, low, high) else None
+    return Writer(parts)
 
 
 def _agrees(
-    writer: _Affine, compiled: Callable[[Array], Any], low: Array, high: Array
+    writer: Writer,
+    compiled: Callable[[Array], Any],
+    low: Array,
+    high: Array,
+    *,
+    places: int = 4,
+    tolerance: float = 1e-9,
 ) -> bool:
-    """Compare with compiling at places that were not used."""
+    """Compare with compiling at places that were not used.
+
+    Args:
+        writer: Writer to judge.
+        compiled: Function that compiles a model for parameters.
+        low: Lowest parameters.
+        high: Highest parameters.
+        places: Number of places. What is not affine fails at the first.
+        tolerance: Relative error of numbers that are alike; compiling keeps about 12
+            digits.
+    """
     mujoco = mujoco_of()
     model = compiled(0.5 * (low + high))
     rng = np.random.default_rng(0)
-    for _ in range(NUM_TRIED):
+    for _ in range(places):
         theta = rng.uniform(low, high)
         writer.write(model, theta)
         renew(model, mujoco.MjData(model))
         here, there = _numbers(model), _numbers(compiled(theta))
         for name, value in there.items():
             # What is computed from masses keeps fewer digits.
-            allowed = AFFINE * (np.abs(value).max() if value.size else 0.0)
-            if not np.allclose(here[name], value, rtol=AFFINE, atol=allowed):
+            allowed = tolerance * (np.abs(value).max() if value.size else 0.0)
+            if not np.allclose(here[name], value, rtol=tolerance, atol=allowed):
                 return False
     return True
 

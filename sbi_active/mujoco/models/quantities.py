@@ -1,190 +1,147 @@
 r"""Quantities of a model by their MJCF names, and the fields of ``mjModel`` behind.
 
 A quantity is ``element.attribute``, as in "hinge.damping" or "bob.mass", or
-"option.density". Each is one number q of which fields are multiples, so that it is
-written without another compilation; MuJoCo's ``mj_setConst`` then renews what follows
-from masses.
-
-================= ============================================= ====================
-kind              attribute                                     fields
-================= ============================================= ====================
-joint             damping, stiffness, armature, frictionloss    dof_damping,
-                                                                jnt_stiffness,
-                                                                dof_armature,
-                                                                dof_frictionloss
-joint             springref                                     qpos_spring
-body              mass (inertia in proportion)                  body_mass,
-                                                                body_inertia
-body              com_x, com_y, com_z                           body_ipos
-actuator          gear                                          actuator_gear
-actuator          gain (of a servo kp and its bias with it)     actuator_gainprm,
-                                                                actuator_biasprm
-actuator          kv (of a servo)                               actuator_biasprm
-actuator          timeconst                                     actuator_dynprm
-geom              friction, torsional_friction,                 geom_friction
-                  rolling_friction
-geom              timeconst, dampratio                          geom_solref
-tendon            stiffness, damping, frictionloss              tendon_stiffness,
-                                                                ...
-option            gravity, density, viscosity                   opt.gravity, ...
-================= ============================================= ====================
+"option.density"; :data:`ATTRIBUTES` lists them. Each is one number q of which fields
+are multiples, so that it is written without another compilation; MuJoCo's
+``mj_setConst`` then renews what follows from masses.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from sbi_active.mujoco.models.fields import Entry, field_of
-from sbi_active.mujoco.models.names import element_id, names_of, require_name
+from sbi_active.mujoco.models.names import (
+    element_id,
+    names_of,
+    require_name,
+    scalar_joints,
+)
 from sbi_active.mujoco.models.spec import mujoco_of
 
 __all__ = [
     "ATTRIBUTES",
     "FRAMES",
-    "NEVER_NEGATIVE",
+    "Entry",
     "Quantity",
+    "add_to",
+    "copied",
+    "field_of",
     "find_quantity",
-    "is_hinge",
     "is_movable",
-    "is_scalar",
-    "loosen",
+    "joint_of_actuator",
+    "restore",
+    "set_to",
+    "units_of",
 ]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A number of a model that follows a quantity.
+
+    Attributes:
+        field: Name in ``mjModel``, as in "dof_damping" or "opt.density".
+        index: Index of the number in the field; () for a field that is one number.
+        factor: Factor by which the quantity is multiplied.
+    """
+
+    field: str
+    index: tuple[int, ...]
+    factor: float = 1.0
+
+
+def field_of(model: Any, name: str) -> Any:
+    """Return a field: a view of the model's memory, or a number."""
+    for part in name.split("."):
+        model = getattr(model, part)
+    return model
+
+
+def set_to(model: Any, entry: Entry, value: float) -> None:
+    """Write a number."""
+    *owner, name = entry.field.split(".")
+    own = field_of(model, ".".join(owner)) if owner else model
+    if entry.index:
+        getattr(own, name)[entry.index] = value
+    else:
+        setattr(own, name, value)
+
+
+def add_to(model: Any, entry: Entry, value: float) -> None:
+    """Add to a number."""
+    now = field_of(model, entry.field)
+    set_to(model, entry, float(now[entry.index] if entry.index else now) + value)
+
+
+def copied(model: Any, names: Iterable[str]) -> dict[str, Any]:
+    """Return copies of fields, by name."""
+    return {name: np.array(field_of(model, name)) for name in sorted({*names})}
+
+
+def restore(model: Any, fields: dict[str, Any]) -> None:
+    """Write fields back as they were copied."""
+    for name, value in fields.items():
+        if value.ndim:
+            field_of(model, name)[...] = value
+        else:
+            set_to(model, Entry(name, ()), value.item())
+
 
 Entries = Callable[[Any, int], list[Entry]]
 
 
 @dataclass(frozen=True)
-class Quantity:
-    """One number of a model.
+class Attribute:
+    """An attribute of a kind of element.
 
     Attributes:
-        kind: Kind of the element: "joint", "body", "actuator", "geom", "tendon",
-            "option".
-        name: Name of the element; "option" for those of the whole model.
-        attribute: Attribute of the element, as in the table above.
+        fields: Fields of ``mjModel`` that are written.
+        entries: Function of a model and the element's number that returns the numbers
+            that follow the attribute.
+        unit: Unit in SI; N, L and I in braces are those of the joint.
+        is_signed: Whether MuJoCo's equations have a meaning for it below zero.
     """
 
-    kind: str
-    name: str
-    attribute: str
-
-    def __str__(self) -> str:
-        return f"{self.name}.{self.attribute}"
-
-    def entries(self, model: Any) -> list[Entry]:
-        """Return the numbers of a model that follow it."""
-        i = 0 if self.kind == "option" else element_id(model, self.kind, self.name)
-        return ATTRIBUTES[self.kind][self.attribute](model, i)
-
-    def value(self, model: Any) -> float:
-        """Return the value in the model."""
-        first = self.entries(model)[0]
-        now = field_of(model, first.field)
-        return float(now[first.index] if first.index else now) / first.factor
-
-    def unit(self, model: Any) -> str:
-        """Return its unit in SI, as far as the model tells it."""
-        if self.kind in ("joint", "actuator"):
-            joint = (
-                self.name if self.kind == "joint" else joint_of_actuator(model, self)
-            )
-            if joint is None:
-                return ""
-            turns = is_hinge(model, joint)
-            return _UNITS[self.kind].get(self.attribute, ("", ""))[0 if turns else 1]
-        return _OTHER_UNITS.get((self.kind, self.attribute), "")
+    fields: tuple[str, ...]
+    entries: Entries
+    unit: str = ""
+    is_signed: bool = True
 
 
-def joint_of_actuator(model: Any, quantity: Quantity) -> str | None:
-    """Return the joint that an actuator drives, None if it is something else."""
-    mujoco = mujoco_of()
-    i = element_id(model, "actuator", quantity.name)
-    joints = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT
-    if int(model.actuator_trntype[i]) not in map(int, joints):
-        return None
-    return names_of(model, "joint")[int(model.actuator_trnid[i, 0])]
-
-
-def is_hinge(model: Any, joint: str) -> bool:
-    """Return whether a joint turns rather than slides."""
-    kind = int(model.jnt_type[element_id(model, "joint", joint)])
-    return kind != int(mujoco_of().mjtJoint.mjJNT_SLIDE)
-
-
-def is_scalar(model: Any, joint: str) -> bool:
-    """Return whether a joint is a hinge or a slide."""
-    types = mujoco_of().mjtJoint
-    kind = int(model.jnt_type[element_id(model, "joint", joint)])
-    return kind in (int(types.mjJNT_HINGE), int(types.mjJNT_SLIDE))
-
-
-def find_quantity(model: Any, text: str) -> Quantity:
-    """Return the quantity that is called "element.attribute".
+def _at(
+    field: str,
+    *place: int,
+    unit: str = "",
+    by: str = "",
+    factor: float = 1.0,
+    is_signed: bool = True,
+) -> Attribute:
+    """Return an attribute that is one number of a field.
 
     Args:
-        model: Compiled model.
-        text: Name of the quantity; "joint:element.attribute" where elements of two
-            kinds share a name and an attribute.
-
-    Raises:
-        ValueError: If there is no such element or attribute, with the nearest ones.
+        field: Name of the field.
+        *place: Further indices behind the element's.
+        unit: Unit in SI.
+        by: Field that says where the element's numbers are; "" for its number.
+        factor: Factor by which the attribute is multiplied.
+        is_signed: Whether it may be below zero.
     """
-    wanted, _, rest = text.rpartition(":")
-    name, dot, attribute = rest.rpartition(".")
-    every = [
-        Quantity(kind, name_, each)
-        for kind in ATTRIBUTES
-        for name_ in (["option"] if kind == "option" else names_of(model, kind))
-        for each in ATTRIBUTES[kind]
-        if kind != "joint" or is_scalar(model, name_)
-    ]
-    found = [
-        q
-        for q in every
-        if (q.name, q.attribute) == (name, attribute) and wanted in ("", q.kind)
-    ]
-    if not dot or not found:
-        require_name(rest, map(str, every), "quantity, 'element.attribute',")
-    if len(found) > 1:
-        kinds = ", ".join(f"{q.kind}:{q}" for q in found)
-        raise ValueError(
-            f"expected one quantity {text!r}; got {len(found)}; pass one of {kinds}"
-        )
-    return found[0]
+
+    def entries(model: Any, i: int) -> list[Entry]:
+        first = int(getattr(model, by)[i]) if by else i
+        return [Entry(field, (first, *place), factor)]
+
+    return Attribute((field,), entries, unit, is_signed)
 
 
-def is_movable(model: Any, body: str) -> bool:
-    """Return whether a body's center of mass can be written.
-
-    The inertia matrix of a body that is compiled as simple has no room for it.
-    """
-    return not int(model.body_simple[element_id(model, "body", body)])
-
-
-#: Fields that say that a frame is another's, and no longer hold for a center of mass.
-FRAMES = ("body_sameframe", "geom_sameframe")
-
-
-def loosen(model: Any, body: str) -> None:
-    """Tell MuJoCo that a body's center of mass may be anywhere, in place."""
-    i = element_id(model, "body", body)
-    same = mujoco_of().mjtSameFrame
-    own = model.geom_bodyid == i
-    inertial = int(same.mjSAMEFRAME_INERTIA), int(same.mjSAMEFRAME_INERTIAROT)
-    model.geom_sameframe[own & np.isin(model.geom_sameframe, inertial)] = 0
-    model.body_sameframe[i] = 0
-
-
-def _dof(field: str) -> Entries:
-    return lambda model, i: [Entry(field, (int(model.jnt_dofadr[i]),))]
-
-
-def _damping(model: Any, i: int) -> list[Entry]:
-    return [Entry("dof_damping", (int(model.jnt_dofadr[i]),))]
+def _option(name: str, unit: str) -> Attribute:
+    return Attribute(
+        (f"opt.{name}",), lambda model, i: [Entry(f"opt.{name}", ())], unit
+    )
 
 
 def _mass(model: Any, i: int) -> list[Entry]:
@@ -212,87 +169,171 @@ def _gravity(model: Any, i: int) -> list[Entry]:
     ]
 
 
-def _at(field: str, *place: int, factor: float = 1.0) -> Entries:
-    return lambda model, i: [Entry(field, (i, *place), factor)]
+#: Fields that say that a frame is another's, and no longer hold for a center of mass.
+FRAMES = ("body_sameframe", "geom_sameframe")
 
 
-#: Attributes of each kind of element, and the numbers of a model behind them.
-ATTRIBUTES: dict[str, dict[str, Entries]] = {
+def _center(k: int) -> Attribute:
+    return Attribute(("body_ipos", *FRAMES), _at("body_ipos", k).entries, "m")
+
+
+GAIN = "actuator_gainprm", "actuator_biasprm"
+#: Attributes of each kind of element, by their MJCF names.
+ATTRIBUTES: dict[str, dict[str, Attribute]] = {
     "joint": {
-        "damping": _dof("dof_damping"),
-        "armature": _dof("dof_armature"),
-        "frictionloss": _dof("dof_frictionloss"),
-        "stiffness": _at("jnt_stiffness"),
-        "springref": lambda model, i: [
-            Entry("qpos_spring", (int(model.jnt_qposadr[i]),))
-        ],
+        "damping": _at("dof_damping", by="jnt_dofadr", unit="{N} s/{L}"),
+        "armature": _at("dof_armature", by="jnt_dofadr", unit="{I}", is_signed=False),
+        "frictionloss": _at(
+            "dof_frictionloss", by="jnt_dofadr", unit="{N}", is_signed=False
+        ),
+        "stiffness": _at("jnt_stiffness", unit="{N}/{L}"),
+        "springref": _at("qpos_spring", by="jnt_qposadr", unit="{L}"),
     },
     "body": {
-        "mass": _mass,
-        **{
-            f"com_{axis}": _at("body_ipos", k) for k, axis in enumerate(("x", "y", "z"))
-        },
+        # The inertia in proportion.
+        "mass": Attribute(("body_mass", "body_inertia"), _mass, "kg", is_signed=False),
+        "com_x": _center(0),
+        "com_y": _center(1),
+        "com_z": _center(2),
     },
     "actuator": {
         "gear": _at("actuator_gear", 0),
-        "gain": _gain,
-        "kp": _gain,
-        "kv": _at("actuator_biasprm", 2, factor=-1.0),
-        "timeconst": _at("actuator_dynprm", 0),
+        "gain": Attribute(GAIN, _gain),  # of a servo kp, and its bias with it
+        "kp": Attribute(GAIN, _gain, "{N}/{L}"),
+        "kv": _at("actuator_biasprm", 2, factor=-1.0, unit="{N} s/{L}"),
+        "timeconst": _at("actuator_dynprm", 0, unit="s"),
     },
     "geom": {
-        "friction": _at("geom_friction", 0),
-        "torsional_friction": _at("geom_friction", 1),
-        "rolling_friction": _at("geom_friction", 2),
-        "timeconst": _at("geom_solref", 0),
+        "friction": _at("geom_friction", 0, is_signed=False),
+        "torsional_friction": _at("geom_friction", 1, unit="m", is_signed=False),
+        "rolling_friction": _at("geom_friction", 2, unit="m", is_signed=False),
+        "timeconst": _at("geom_solref", 0, unit="s"),
         "dampratio": _at("geom_solref", 1),
     },
     "tendon": {
         "stiffness": _at("tendon_stiffness"),
         "damping": _at("tendon_damping"),
-        "frictionloss": _at("tendon_frictionloss"),
+        "frictionloss": _at("tendon_frictionloss", is_signed=False),
     },
     "option": {
-        "gravity": _gravity,
-        "density": lambda model, i: [Entry("opt.density", ())],
-        "viscosity": lambda model, i: [Entry("opt.viscosity", ())],
+        "gravity": Attribute(("opt.gravity",), _gravity, "m/s^2"),
+        "density": _option("density", "kg/m^3"),
+        "viscosity": _option("viscosity", "Pa s"),
     },
 }
 
-#: Attributes that MuJoCo's equations have no meaning for below zero.
-NEVER_NEGATIVE = frozenset(
-    {
-        "armature",
-        "friction",
-        "frictionloss",
-        "mass",
-        "rolling_friction",
-        "torsional_friction",
-    }
-)
 
-#: Units on hinges and on slides.
-_UNITS = {
-    "joint": {
-        "damping": ("N m s/rad", "N s/m"),
-        "stiffness": ("N m/rad", "N/m"),
-        "armature": ("kg m^2", "kg"),
-        "frictionloss": ("N m", "N"),
-        "springref": ("rad", "m"),
-    },
-    "actuator": {
-        "kp": ("N m/rad", "N/m"),
-        "kv": ("N m s/rad", "N s/m"),
-        "timeconst": ("s", "s"),
-    },
-}
-_OTHER_UNITS = {
-    ("body", "mass"): "kg",
-    **{("body", f"com_{axis}"): "m" for axis in ("x", "y", "z")},
-    ("geom", "torsional_friction"): "m",
-    ("geom", "rolling_friction"): "m",
-    ("geom", "timeconst"): "s",
-    ("option", "gravity"): "m/s^2",
-    ("option", "density"): "kg/m^3",
-    ("option", "viscosity"): "Pa s",
-}
+@dataclass(frozen=True)
+class Quantity:
+    """One number of a model.
+
+    Attributes:
+        kind: Kind of the element: "joint", "body", "actuator", "geom", "tendon",
+            "option".
+        name: Name of the element; "option" for those of the whole model.
+        attribute: Attribute of the element, as in :data:`ATTRIBUTES`.
+    """
+
+    kind: str
+    name: str
+    attribute: str
+
+    def __str__(self) -> str:
+        return f"{self.name}.{self.attribute}"
+
+    @property
+    def known(self) -> Attribute:
+        """What is known of the attribute."""
+        return ATTRIBUTES[self.kind][self.attribute]
+
+    def entries(self, model: Any) -> list[Entry]:
+        """Return the numbers of a model that follow it."""
+        i = 0 if self.kind == "option" else element_id(model, self.kind, self.name)
+        return self.known.entries(model, i)
+
+    def unit(self, model: Any) -> str:
+        """Return its unit in SI, as far as the model tells it."""
+        if self.kind not in ("joint", "actuator"):
+            return self.known.unit
+        joint = self.name
+        if self.kind == "actuator":
+            joint = joint_of_actuator(model, self.name)
+        return "" if joint is None else self.known.unit.format(**units_of(model, joint))
+
+    def loosen(self, model: Any) -> bool:
+        """Tell MuJoCo, in place, that a center of mass that is written is elsewhere.
+
+        Returns:
+            Whether it is a center of mass.
+        """
+        if not self.attribute.startswith("com_"):
+            return False
+        i = element_id(model, "body", self.name)
+        same = mujoco_of().mjtSameFrame
+        own = model.geom_bodyid == i
+        inertial = int(same.mjSAMEFRAME_INERTIA), int(same.mjSAMEFRAME_INERTIAROT)
+        model.geom_sameframe[own & np.isin(model.geom_sameframe, inertial)] = 0
+        model.body_sameframe[i] = 0
+        return True
+
+
+def find_quantity(model: Any, text: str) -> Quantity:
+    """Return the quantity that is called "element.attribute".
+
+    Args:
+        model: Compiled model.
+        text: Name of the quantity; "joint:element.attribute" where elements of two
+            kinds share a name and an attribute.
+
+    Raises:
+        ValueError: If there is no such element or attribute, with the nearest ones.
+    """
+    wanted, _, rest = text.rpartition(":")
+    name, dot, attribute = rest.rpartition(".")
+    names = {kind: names_of(model, kind) for kind in ATTRIBUTES if kind != "option"}
+    names |= {"joint": scalar_joints(model), "option": ["option"]}
+    every = [
+        Quantity(kind, own, each)
+        for kind, attributes in ATTRIBUTES.items()
+        for own in names[kind]
+        for each in attributes
+    ]
+    found = [
+        q
+        for q in every
+        if (q.name, q.attribute) == (name, attribute) and wanted in ("", q.kind)
+    ]
+    if not dot or not found:
+        require_name(rest, map(str, every), "quantity, 'element.attribute',")
+    if len(found) > 1:
+        kinds = ", ".join(f"{q.kind}:{q}" for q in found)
+        raise ValueError(
+            f"expected one quantity {text!r}; got {len(found)}; pass one of {kinds}"
+        )
+    return found[0]
+
+
+def units_of(model: Any, joint: str) -> dict[str, str]:
+    """Return the units of force, length and inertia of a joint: N, L and I."""
+    kind = int(model.jnt_type[element_id(model, "joint", joint)])
+    if kind == int(mujoco_of().mjtJoint.mjJNT_SLIDE):
+        return {"N": "N", "L": "m", "I": "kg"}
+    return {"N": "N m", "L": "rad", "I": "kg m^2"}
+
+
+def joint_of_actuator(model: Any, actuator: str) -> str | None:
+    """Return the joint that an actuator drives, None if it is something else."""
+    mujoco = mujoco_of()
+    i = element_id(model, "actuator", actuator)
+    joints = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT
+    if int(model.actuator_trntype[i]) not in map(int, joints):
+        return None
+    return names_of(model, "joint")[int(model.actuator_trnid[i, 0])]
+
+
+def is_movable(model: Any, body: str) -> bool:
+    """Return whether a body's center of mass can be written.
+
+    The inertia matrix of a body that is compiled as simple has no room for it.
+    """
+    return not int(model.body_simple[element_id(model, "body", body)])

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.mujoco.models.changes import StateChange
-from sbi_active.mujoco.models.fields import field_of
 from sbi_active.mujoco.models.machine import Model, Rows
 from sbi_active.mujoco.models.names import element_id, start_places
+from sbi_active.mujoco.models.quantities import field_of
 from sbi_active.mujoco.models.spec import mujoco_of
 
 __all__ = ["begin", "held_states", "readings", "start_states"]

@@ -1,0 +1,234 @@
+"""Elements that effects belong to: those that are alike together, and one by one."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+
+from sbi_active.criticism.effects.generic_series import typical_delay
+from sbi_active.mujoco.effects.nominal import Nominal
+from sbi_active.mujoco.models.names import element_id, names_of, scalar_joints
+from sbi_active.mujoco.models.quantities import (
+    is_movable,
+    joint_of_actuator,
+    units_of,
+)
+from sbi_active.mujoco.simulator import Channel
+
+__all__ = ["Element", "elements"]
+
+
+@dataclass(frozen=True)
+class Element:
+    """An element of a model, or several that share each phi.
+
+    Attributes:
+        kind: Kind, the first column of ``table.md``.
+        label: Label that effects are named by.
+        names: Names of the elements.
+        sizes: Sizes by which priors are scaled, by name.
+        words: Units and numbers in braces of the table, by name.
+        given: What changes of the element take, by name.
+    """
+
+    kind: str
+    label: str
+    names: tuple[str, ...] = ()
+    sizes: Mapping[str, float] = field(default_factory=dict)
+    words: Mapping[str, str] = field(default_factory=dict)
+    given: Mapping[str, Any] = field(default_factory=dict)
+
+
+def elements(
+    channels: Sequence[Channel],
+    sizes: Nominal,
+    *,
+    driven: Sequence[str],
+    noise: Sequence[float] | None,
+) -> Iterator[Element]:
+    """Yield all elements of a model.
+
+    Args:
+        channels: Channels of x.
+        sizes: Sizes of the model.
+        driven: Actuators whose inputs are signals over time.
+        noise: Standard deviation of each channel's noise; None if it is not known.
+    """
+    model = sizes.model
+    delay = typical_delay(torch.as_tensor(sizes.times))
+    for names in _alike(*_joints(model)):
+        yield _joint(names, sizes)
+    for names in _alike(*_actuators(model)):
+        yield _actuator(names, sizes, delay, is_driven={*names} <= {*driven})
+    late = float(np.float32(delay))  # as that of any simulator's sensor
+    for k, channel in enumerate(channels):
+        reading = float(sizes.reading[k])
+        sd = 0.01 * reading if noise is None else noise[k % len(noise)]
+        yield Element(
+            "sensor",
+            f"{channel.name} sensor",
+            sizes={"reading": reading, "noise": sd, "delay": late},
+            words={"unit": channel.unit},
+            given={"channel": k if len(channels) > 1 else None},
+        )
+    for names in _alike(*_bodies(model)):
+        yield _body(names, model)
+    yield Element("gravity", "gravity")
+    yield Element("medium", "medium", ("option",))
+    if sizes.has_contacts:
+        yield Element("contact", "contact", words={"who": "every contact"})
+        touching = [
+            name
+            for i, name in enumerate(names_of(model, "geom"))
+            if model.geom_contype[i] or model.geom_conaffinity[i]
+        ]
+        if 1 < len(touching) <= 6:
+            for name in touching:
+                yield Element("contact", name, (name,), words={"who": name})
+
+
+def _joint(names: tuple[str, ...], sizes: Nominal) -> Element:
+    model = sizes.model
+    joints = [element_id(model, "joint", name) for name in names]
+    dofs = model.jnt_dofadr[joints]
+    position, speed = sizes.position[dofs].mean(), float(sizes.velocity[dofs].mean())
+    force = 0.2 * float(sizes.force[dofs].mean())
+    low, high = (tuple(each[dofs].tolist()) for each in (sizes.lowest, sizes.highest))
+    turning = 0.1 * speed  # where static friction has fallen to 1 / e
+    given = {"model": model, "low": low, "high": high, "speed": turning}
+    if all(model.body_jntnum[model.jnt_bodyid[joints]] == 1):
+        behind = sizes.inertia[dofs] - model.dof_armature[dofs]
+        given["behind"] = tuple(np.maximum(behind, 1e-12).tolist())
+        given["play"] = 0.2 * 0.05 * float(position)  # the least that is simulated
+    return Element(
+        "joint",
+        _common(names),
+        names,
+        sizes={
+            "force": force,
+            "load": force / 0.2,
+            "position": float(position),
+            "speed": speed,
+            "inertia": float(sizes.inertia[dofs].mean()),
+            "zero": min(0.1 * float(position), 0.1),
+        },
+        words={
+            **units_of(model, names[0]),
+            "low": ", ".join(f"{value:.3g}" for value in low),
+            "high": ", ".join(f"{value:.3g}" for value in high),
+            "speed": f"{turning:.2g}",
+        },
+        given=given,
+    )
+
+
+def _actuator(
+    names: tuple[str, ...], sizes: Nominal, delay: float, *, is_driven: bool
+) -> Element:
+    places = [element_id(sizes.model, "actuator", name) for name in names]
+    joint = joint_of_actuator(sizes.model, names[0])
+    return Element(
+        "actuator",
+        _common(names),
+        names,
+        sizes={
+            "force": float(sizes.actuator_force[places].mean()),
+            "speed": float(sizes.actuator_velocity[places].mean()),
+            "delay": delay,
+        },
+        words={} if joint is None else units_of(sizes.model, joint),
+        given={"is_driven": is_driven},
+    )
+
+
+def _body(names: tuple[str, ...], model: Any) -> Element:
+    i = element_id(model, "body", names[0])
+    mass = float(model.body_mass[i])
+    radius = float(np.sqrt(model.body_inertia[i].sum() / (2 * mass)))
+    # The axes of symmetric bodies need not be mirrored alike.
+    is_free = len(names) == 1 and is_movable(model, names[0])
+    return Element(
+        "body",
+        _common(names),
+        names,
+        sizes={"mass": mass, "radius": radius},
+        given={"is_movable": is_free},
+    )
+
+
+# What is alike: elements of one class, with numbers that differ by no more than 5 %.
+
+
+def _joints(model: Any) -> tuple[list[str], list[Any]]:
+    names, features = scalar_joints(model), []
+    for name in names:
+        i = element_id(model, "joint", name)
+        dof, body = int(model.jnt_dofadr[i]), int(model.jnt_bodyid[i])
+        numbers = [model.dof_M0[dof], model.body_mass[body]]
+        numbers += [np.ptp(model.jnt_range[i]), *np.abs(model.jnt_axis[i])]
+        features.append(((model.jnt_type[i], _depth(model, body)), numbers))
+    return names, features
+
+
+def _actuators(model: Any) -> tuple[list[str], list[Any]]:
+    """Return actuators, alike where they do the same to joints that are alike."""
+    groups, joints = _alike(*_joints(model)), names_of(model, "joint")
+    names, features = names_of(model, "actuator"), []
+    for i in range(len(names)):
+        joint = int(model.actuator_trnid[i, 0])
+        driven = joints[joint] if 0 <= joint < len(joints) else ""
+        place = next((k for k, group in enumerate(groups) if driven in group), -1)
+        numbers = [*model.actuator_gainprm[i, :3], *model.actuator_biasprm[i, :3]]
+        numbers.append(abs(model.actuator_gear[i, 0]))
+        features.append(((model.actuator_trntype[i], place), numbers))
+    return names, features
+
+
+def _bodies(model: Any) -> tuple[list[str], list[Any]]:
+    names, features = [], []
+    for i, name in enumerate(names_of(model, "body")):
+        if i and model.body_weldid[i] != 0 and model.body_mass[i] > 0:
+            names.append(name)
+            numbers = [model.body_mass[i], *model.body_inertia[i]]
+            features.append(((_depth(model, i),), numbers))
+    return names, features
+
+
+def _alike(names: Sequence[str], features: Sequence[Any]) -> list[tuple[str, ...]]:
+    """Return groups of elements that are alike, then each element."""
+    groups: list[list[int]] = []
+    for i, (own, numbers) in enumerate(features):
+        for group in groups:
+            other, others = features[group[0]]
+            if own == other and np.allclose(numbers, others, rtol=0.05, atol=1e-9):
+                group.append(i)
+                break
+        else:
+            groups.append([i])
+    tied = [tuple(names[i] for i in group) for group in groups if len(group) > 1]
+    return [*tied, *((name,) for name in names)]
+
+
+def _common(names: Sequence[str]) -> str:
+    """Return a label for elements, that of several as in "all calf_joint"."""
+    if len(names) == 1:
+        return names[0]
+    end = os.path.commonprefix([name[::-1] for name in names])[::-1]
+    begin = os.path.commonprefix([*names])
+    shared = max(end, begin, key=len).strip("_- ./")
+    is_word = re.search(r"[A-Za-z]", shared)
+    return f"all {shared}" if is_word else f"all of {', '.join(names)}"
+
+
+def _depth(model: Any, body: int) -> int:
+    depth = 0
+    while body:
+        body = int(model.body_parentid[body])
+        depth += 1
+    return depth
