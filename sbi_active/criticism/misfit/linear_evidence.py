@@ -39,6 +39,7 @@ from sbi_active.criticism.steps.tracing import (
     probabilities_of,
     verdict_of,
 )
+from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.support import support_bounds, support_of
 
@@ -57,6 +58,38 @@ def is_linear(rivals: RivalSet) -> bool:
     """
     told = rivals.measurements.is_sequence or not rivals.can_fail
     return told and rivals.is_smooth and not rivals.roughness.any()
+
+
+def bends(search: Search, *, num: int = 16, most: float = 0.5) -> bool:
+    """Return whether the simulator leaves a linear model where its posterior lies.
+
+    Linear evidence is then another number than the simulator's.
+
+    Args:
+        search: Search, whose single effects are fitted.
+        num: Number of posterior draws of each that are simulated.
+        most: Standard deviation over the draws of the log density ratio of simulator
+            and linear model up to which a model counts as linear, nats. With twice as
+            much the evidence may be off by a nat; with half, more models are sampled.
+    """
+    search.fit_singles()
+    rng = np.random.default_rng(derive_seed(search.rivals.seed, "bends"))
+    for key, c in search.found.items():
+        m = c.model
+        if len(key.effects) > 1:
+            continue
+        use = np.ones(search.errors.num_folds, bool)
+        own = search.errors.posterior(m, c.grams, use, process=False)
+        values, vectors = eigh(own.cov)
+        spread = vectors * np.sqrt(np.maximum(values, 0))
+        u = own.mean + rng.standard_normal((num, len(m.u))) @ spread.T
+        u = np.clip(u, m.low, m.high)
+        residual = search.rivals.rival(key).residual(u)[0] / search.unit
+        linear = m.residual + (u - m.u) @ m.jacobian.T
+        ratio = ((residual**2).sum(1) - (linear**2).sum(1)) / 2
+        if not ratio.std() < most:  # NaN: what is not simulated
+            return True
+    return False
 
 
 @dataclass

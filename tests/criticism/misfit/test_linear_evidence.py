@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import HalfNormal
+from torch.distributions import HalfNormal, Normal
 
-from sbi_active import BoxActions, SimulatorModel, StudentTNoise
+from sbi_active import BoxActions, GaussianNoise, SimulatorModel, StudentTNoise
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
@@ -166,3 +166,34 @@ def test_what_is_asked_first_does_not_matter(hidden):
     assert np.array_equal(other.residuals().refitted, early.refitted, equal_nan=True)
     report = one.report(evaluate=False)
     assert str(one.report(evaluate=False)) == str(report)
+
+
+def curved(*names):
+    """A loop on a curve whose actions are off, beside some declared effects."""
+    action = torch.linspace(-1, 3, 8, dtype=torch.float64)[:, None]
+    model = SimulatorModel(
+        lambda theta, a: theta * torch.exp(3 - a), noise=GaussianNoise(1.0)
+    )
+    every = {
+        "offset": ("action", lambda a, phi, action, context: a + phi),
+        "bias": ("observation", lambda x, phi, action, context: x + phi),
+    }
+    effects = [
+        Effect(name, hook=hook, prior=Normal(0.0, 1.0), null=0.0, apply=apply)
+        for name, (hook, apply) in every.items()
+        if name in names
+    ]
+    rng = np.random.default_rng(4)
+    x = 2 * torch.exp(3 - action) + 2 + torch.as_tensor(rng.standard_normal((8, 1)))
+    prior = BoxUniform(torch.zeros(1), 5 * torch.ones(1))
+    return Criticism(model, prior, Trials(action, x), effects=effects, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("names", "engines"),
+    [(("bias",), {"linear"}), (("bias", "offset"), {"importance", "laplace"})],
+)
+def test_models_that_bend_where_their_posterior_lies_are_sampled(names, engines):
+    tracing = curved(*names).trace()
+    assert tracing.verdict == "bias"
+    assert {e.engine for e in tracing.evidences.values()} <= engines
