@@ -260,16 +260,18 @@ def _add_report(
 def _spread(draws: np.ndarray, num: int, rng: np.random.Generator) -> np.ndarray:
     r"""Return draws of which none repeats, by a kernel that keeps mean and covariance.
 
-    A weighted sample that was resampled repeats its points, and tails of ties have no
-    Pareto shape. With h Silverman's width for the points that differ,
+    A weighted sample that was resampled repeats its points, as do more draws than
+    there are, and tails of ties have no Pareto shape. With h Silverman's width for the
+    points that differ,
 
     .. math::
         \theta' = \bar\theta + \sqrt{1 - h^2}\, (\theta - \bar\theta) + h L z .
     """
     different = len(np.unique(draws, axis=0))
-    picked = draws[rng.integers(len(draws), size=num)]
+    repeats = different < max(len(draws), num)
+    picked = draws[rng.choice(len(draws), size=num, replace=repeats)]
     dim = draws.shape[1]
-    if different == len(draws) or different <= dim:
+    if not repeats or different <= dim:
         return picked
     h = (4 / ((dim + 2) * different)) ** (1 / (dim + 4))
     h = min(h, 1.0)

@@ -13,8 +13,7 @@ import pytest
 import torch
 
 from sbi_active.campaign.learning.learner import Learner
-from sbi_active.design import designer
-from sbi_active.search import GradientSearch
+from sbi_active.design import GradientSearch, designer
 
 ROOT = Path(__file__).parents[1]
 FILE = re.compile(r"# (\w+)\.py\n")

@@ -34,7 +34,7 @@ from benchmarks.rows import append, read
 AREAS: dict[str, tuple[str, ...]] = {
     "engine": ("tests/simulation/workers", "tests/simulation/test_*.py"),
     "bank": ("tests/simulation/bank",),
-    "campaign": ("tests/campaign/test_*.py", "tests/campaign/checks"),
+    "campaign": ("tests/campaign/test_*.py",),
     "criticism": ("tests/criticism/test_*.py",),
     "effects_and_reports": ("tests/criticism/effects", "tests/criticism/report"),
     "parameters": (),

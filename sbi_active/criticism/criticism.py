@@ -27,7 +27,7 @@ from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summari
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit.evaluation import evaluate_linear
-from sbi_active.criticism.misfit.linear_evidence import LinearEvidence, bends, is_linear
+from sbi_active.criticism.misfit.linear_evidence import LinearEvidence, is_linear
 from sbi_active.criticism.misfit.record import detected, traced
 from sbi_active.criticism.misfit.rule import Rule
 from sbi_active.criticism.misfit.second_look import beside_misfit
@@ -207,11 +207,9 @@ class Criticism:
                     self._look()
                     return self.misfit()
             self._found = Sampled(self.rivals, groups)
-            if self._misfit is None and self._linear is not None:
-                timed = self.rivals.measurements.is_sequence
-                follows = is_linear(self.rivals) and (timed or not bends(self._linear))
-                if self._is_large or follows:
-                    self._found = LinearEvidence(self._linear, self.rivals, groups)
+            search = self._linear if self._misfit is None else None
+            if search is not None and (self._is_large or is_linear(search)):
+                self._found = LinearEvidence(search, self.rivals, groups)
             self._is_searched = True
         return self._misfit
 

@@ -126,7 +126,7 @@ def compared(monkeypatch):
 
     def close_loop(simulator, prior, trials, **options):
         calls.append(SimpleNamespace(simulator=simulator, trials=trials, **options))
-        return "a report"
+        return SimpleNamespace(to_dict=dict)
 
     monkeypatch.setattr(criticize, "close_loop", close_loop)
     return calls

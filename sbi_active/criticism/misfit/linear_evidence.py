@@ -51,13 +51,17 @@ NUM_LOUDER = 200
 FEWEST_TRIALS = 3
 
 
-def is_linear(rivals: RivalSet) -> bool:
+def is_linear(search: Search) -> bool:
     """Return whether linear models follow the simulator.
 
     They follow no jumps, and do not tell which trials have an outcome.
     """
-    told = rivals.measurements.is_sequence or not rivals.can_fail
-    return told and rivals.is_smooth and not rivals.roughness.any()
+    rivals = search.rivals
+    timed = rivals.measurements.is_sequence
+    told = timed or not rivals.can_fail
+    if not told or not rivals.is_smooth or rivals.roughness.any():
+        return False
+    return timed or not bends(search)
 
 
 def bends(search: Search, *, num: int = 16, most: float = 0.5) -> bool:
