@@ -186,6 +186,8 @@ def _write(path: Path, text: str) -> None:
 
 def _generate(app: Sphinx) -> None:
     PAGES.mkdir(parents=True, exist_ok=True)
+    for page_of_before in {*PAGES.glob("*.md")} - {PAGES / f"{p}.md" for p in PACKAGES}:
+        page_of_before.unlink()
     for package in PACKAGES:
         _write(PAGES / f"{package}.md", page(package))
     _write(PAGES / "names.txt", overview())
