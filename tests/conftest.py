@@ -1,5 +1,11 @@
+import signal
+
 import pytest
 import torch
+
+# A shell that starts the tests in the background has SIGINT ignored, which children
+# inherit: those that a test interrupts would never end.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(autouse=True)
