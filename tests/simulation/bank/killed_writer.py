@@ -1,14 +1,12 @@
 """Kills processes that simulate into a bank, and says what was left of it.
 
 Run as ``killed_writer.py FOLDER NUM_MOMENTS SEED NUM_WORKERS``; one line of JSON a
-moment. Worker processes take their time to start, so that with more than one the
-moments are counted from the first report.
+moment, each in its part of the rows that a process reports, and anywhere in a batch.
 """
 
 import json
 import os
 import random
-import select
 import signal
 import sys
 import time
@@ -57,8 +55,12 @@ def run(store=None, num_workers=1):
     )
 
 
-def kill_after(seconds, path, num_workers):
-    """Return what a process had reported as stored when it was killed."""
+def kill_after(num_rows, seconds, path, num_workers):
+    """Return what a process had reported as stored when it was killed.
+
+    It is killed some seconds after it reported more than a number of rows, so that a
+    loaded machine changes when that is, and not how far the process is.
+    """
     read, write = os.pipe()
     child = os.fork()
     if child == 0:
@@ -67,15 +69,18 @@ def kill_after(seconds, path, num_workers):
         run(Reporting(bank, write), num_workers)
         os._exit(0)
     os.close(write)
-    if num_workers > 1:
-        select.select([read], [], [])
-    time.sleep(seconds)
-    os.kill(child, signal.SIGKILL)
-    status = os.waitpid(child, 0)[1]
+    reported, killed = [], False
     with os.fdopen(read) as pipe:
-        lines = [line for line in pipe.read().splitlines(keepends=True) if line[-1:]]
-    reported = [json.loads(line) for line in lines if line.endswith("\n")]
-    return reported, os.WIFSIGNALED(status)
+        while True:
+            if not killed and sum(len(index) for _, index in reported) > num_rows:
+                time.sleep(seconds)
+                os.kill(child, signal.SIGKILL)
+                killed = True
+            line = pipe.readline()
+            if not line.endswith("\n"):  # cut, or none is left
+                break
+            reported.append(json.loads(line))
+    return reported, os.WIFSIGNALED(os.waitpid(child, 0)[1])
 
 
 def main(folder, num_moments, seed, num_workers):
@@ -89,9 +94,12 @@ def main(folder, num_moments, seed, num_workers):
     moments = random.Random(seed)
     for moment in range(num_moments):
         path = folder / str(moment)
-        reported, was_killed = kill_after(
-            moments.uniform(0, duration), path, num_workers
-        )
+        share = (moment + moments.random()) / num_moments
+        num_rows = share * (ROWS + 2 * BATCH) - 2 * BATCH
+        if num_workers > 1:  # they take their time to start, and are let report first
+            num_rows = max(num_rows, 0)
+        seconds = moments.uniform(0, 2 * BATCH / ROWS * duration)
+        reported, was_killed = kill_after(num_rows, seconds, path, num_workers)
         log = path / "store.db-wal"
         record = {
             "killed": was_killed,
