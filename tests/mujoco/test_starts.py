@@ -11,6 +11,39 @@ from sbi_active.actions.signals import SignalActions
 from sbi_active.actions.waveforms import step
 from sbi_active.mujoco import from_mjcf
 
+TENDON = """
+<mujoco>
+  <option timestep="0.002"/>
+  <worldbody>
+    <body>
+      <joint name="hinge" axis="0 1 0" damping="0.1"/>
+      <geom type="capsule" fromto="0 0 0 0.4 0 0" size="0.02"/>
+      <body pos="0.4 0 0">
+        <joint name="slide" type="slide" axis="1 0 0" damping="1"/>
+        <geom size="0.05"/>
+      </body>
+    </body>
+  </worldbody>
+  <tendon>
+    <fixed name="strap" stiffness="1" damping="0.2" springlength="0.1">
+      <joint joint="hinge" coef="0.5"/>
+      <joint joint="slide" coef="-1"/>
+    </fixed>
+  </tendon>
+  <actuator>
+    <general name="motor" tendon="strap" dyntype="filter" dynprm="0.1" gainprm="3"/>
+  </actuator>
+  <sensor>
+    <jointpos joint="hinge"/>
+    <tendonpos tendon="strap"/>
+    <actuatorfrc actuator="motor"/>
+  </sensor>
+  <keyframe>
+    <key name="wound" qpos="0.3 -0.1" qvel="0 0.2" act="0.6"/>
+  </keyframe>
+</mujoco>
+"""
+
 
 def held(name: str, **options) -> list[float]:
     robot = from_mjcf(
@@ -62,6 +95,33 @@ def test_a_keyframe_holds_beside_forces_that_are_stepped():
         force={push: torch.zeros(1, 1).double()},
     )
     assert x[0].tolist() == pytest.approx(by_hand(key=True), abs=1e-9)
+
+
+def test_tendons_and_activations_move_as_in_a_bare_loop():
+    robot = from_mjcf(
+        TENDON,
+        {"strap.stiffness": (0.0, 5.0), "motor.timeconst": (0.05, 0.5)},
+        actions=BoxActions([-1.0], [1.0], names=["motor control"]),
+        times=np.linspace(0.1, 1.0, 10),
+        noise=0.01,
+        start="wound",
+    )
+    theta = torch.tensor([[2.0, 0.3], [0.5, 0.1]], dtype=torch.float64)
+    action = torch.tensor([[0.8], [-0.4]], dtype=torch.float64)
+    x = robot.simulator.mean(theta, action).reshape(2, 10, 3)
+    for row, (stiffness, time_constant) in enumerate(theta.tolist()):
+        model = mujoco.MjModel.from_xml_string(TENDON)
+        model.tendon_stiffness[0] = stiffness
+        model.actuator_dynprm[0, 0] = time_constant
+        data = mujoco.MjData(model)
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+        data.ctrl[0] = action[row, 0]
+        rows = []
+        for _ in range(501):
+            mujoco.mj_step(model, data)
+            rows.append(data.sensordata.copy())  # of the step's beginning
+        assert x[row].numpy() == pytest.approx(np.array(rows)[50::50], abs=1e-12)
+    assert float((x[0] - x[1]).abs().min()) > 1e-3
 
 
 @pytest.mark.parametrize("name", ["servo", "hinge"])
