@@ -125,8 +125,19 @@ def changing_blocks(theta, action):
     return x
 
 
+KEPT = []
+
+
+def keeping(theta, action, seeds):
+    for old in KEPT:
+        old.fill_(torch.nan)
+    KEPT[:] = [*KEPT[-8:], theta, action]
+    return theta + action + row_normals(seeds, 1).float()
+
+
 SIMULATORS = [
     changing,
+    keeping,
     changing_blocks,
     SimulatorModel(changing),
     SimulatorModel(changing, noise=GaussianNoise(1.0)),

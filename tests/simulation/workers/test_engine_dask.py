@@ -19,6 +19,7 @@ from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning
 from sbi_active.simulation.workers import DaskPool, Schedule, pickled
 from sbi_active.simulation.workers.cluster import _answer_apart
+from sbi_active.simulation.workers.settings import Workers
 
 dask = pytest.importorskip("dask")
 distributed = pytest.importorskip(
@@ -111,6 +112,14 @@ def test_a_worker_killed_in_the_middle_loses_nothing(
     assert result.tracebacks == {}
     assert torch.equal(result.x, expected)
     assert killed[0] not in client.run(os.getpid).values()
+
+
+def test_time_limits_need_the_processes_of_this_machine(client, rows):
+    with (
+        joblib.parallel_config(backend="dask"),
+        pytest.raises(ValueError, match="expected the processes of this machine"),
+    ):
+        simulate(seeded, *rows, seed=0, workers=Workers(2, time_limit=1.0))
 
 
 @pytest.mark.slow
