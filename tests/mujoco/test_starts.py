@@ -106,6 +106,7 @@ def test_tendons_and_activations_move_as_in_a_bare_loop():
         noise=0.01,
         start="wound",
     )
+    assert robot.prior.units == ("", "s")
     theta = torch.tensor([[2.0, 0.3], [0.5, 0.1]], dtype=torch.float64)
     action = torch.tensor([[0.8], [-0.4]], dtype=torch.float64)
     x = robot.simulator.mean(theta, action).reshape(2, 10, 3)

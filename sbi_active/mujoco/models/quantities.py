@@ -253,12 +253,12 @@ class Quantity:
 
     def unit(self, model: Any) -> str:
         """Return its unit in SI, as far as the model tells it."""
-        if self.kind not in ("joint", "actuator"):
-            return self.known.unit
-        joint = self.name
+        unit, joint = self.known.unit, self.name
+        if "{" not in unit:
+            return unit
         if self.kind == "actuator":
             joint = joint_of_actuator(model, self.name)
-        return "" if joint is None else self.known.unit.format(**units_of(model, joint))
+        return "" if joint is None else unit.format(**units_of(model, joint))
 
     def loosen(self, model: Any) -> bool:
         """Tell MuJoCo, in place, that a center of mass that is written is elsewhere.
