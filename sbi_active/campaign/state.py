@@ -99,8 +99,8 @@ class Trial:
     def _repr_html_(self) -> str:
         gain, error = map(number, self.expected_gain)
         pairs = [
-            ("action", _first(self.action)),
-            ("outcome", _first(self.x) if self.status == "ok" else ""),
+            ("action", _first(self.action, self.design and self.design.labels)),
+            ("outcome", _first(self.x) if self.status != "invalid" else ""),
             ("chosen for", self.target),
             ("expected to tell", f"{gain} ± {error or '?'} nats" if gain else ""),
             ("told", _with(self.information_gained, "nats")),
@@ -177,11 +177,15 @@ def _with(value: float | None, unit: str = "") -> str:
     return f"{number(value)} {unit}".strip() if value is not None else ""
 
 
-def _first(values: Tensor | None, most: int = 6) -> str:
-    """Return the first numbers of an action or an outcome."""
-    numbers = [] if values is None else values.flatten().tolist()
-    shown = ", ".join(f"{v:.4g}" for v in numbers[:most])
+def _first(
+    values: Tensor | None, labels: Sequence[str] | None = None, most: int = 6
+) -> str:
+    """Return the first numbers of an action or an outcome, after their labels."""
+    numbers = [] if values is None else [f"{v:.4g}" for v in values.flatten().tolist()]
+    if labels and len(labels) == len(numbers):
+        numbers = [f"{a} {v}" for a, v in zip(labels, numbers, strict=True)]
     left = len(numbers) - most
+    shown = ", ".join(numbers[:most])
     return f"{shown} and {left} more" if left > 0 else shown
 
 

@@ -112,12 +112,14 @@ def test_a_trial_says_what_was_asked_and_told(campaign):
     told, pending = campaign.state.trials
     page = page_of(told)
     assert "Trial 0: ok" in page.texts
+    assert f"speed {EVIL} [m/s] {float(told.action):.4g}" in page.texts
     assert f"{told.information_gained:.3g} nats" in page.texts
     assert f"{float(told.x[0]):.4g}" in page.text
     assert "Trial 1: pending" in page_of(pending).texts
     assert "outcome" not in page_of(pending).texts
-    away = Trial(3, torch.ones(1), status="withdrawn", reason=EVIL)
-    assert EVIL in page_of(away).texts
+    x = torch.tensor([0.125])
+    away = page_of(Trial(3, torch.ones(1), x=x, status="withdrawn", reason=EVIL))
+    assert {EVIL, "0.125"} <= {*away.texts}
 
 
 def test_a_belief_has_each_parameter_and_what_speaks_against_it():
