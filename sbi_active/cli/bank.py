@@ -112,8 +112,9 @@ def inspect(folder: Path) -> int:
     print(f"rows: {bank.counts}; on disk: {bank.num_bytes / 2**20:.2f} MiB")
     print("checksums: ok")
     if len(bank):
-        counts = bank.columns("label")["label"].bincount().tolist()
-        for label, count in zip(bank.labels, counts, strict=True):
+        labels = bank.labels
+        counts = bank.columns("label")["label"].bincount(minlength=len(labels))
+        for label, count in zip(labels, counts.tolist(), strict=True):
             print(f"drawn from {_shown(label) or 'an unknown proposal'}: {count}")
     return 0
 

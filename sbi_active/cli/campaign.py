@@ -84,6 +84,8 @@ def criticize(
     campaign: Campaign, *, effects: str | None, out: Path | None = None
 ) -> Answer:
     """Return the report of a comparison of the simulator with the trials."""
+    if out is not None:  # else all is computed before this fails
+        out.mkdir(parents=True, exist_ok=True)
     report = campaign.criticize(library_of(campaign, effects_of([effects])))
     text = [str(report)]
     if out is not None:

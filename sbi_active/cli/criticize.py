@@ -74,6 +74,8 @@ def criticize(trials: Path, *, json: bool = False, **given: Any) -> Answer | Non
     space = actions or DiscreteActions(measured.action.unique(dim=0).float())
     known = space if measured.inputs is None else measured
     own = [*effects, *effects_of([given["effects"]])]
+    if given["out"] is not None:  # else all is computed before this fails
+        given["out"].mkdir(parents=True, exist_ok=True)
     report = close_loop(
         simulator,
         prior,

@@ -11,9 +11,6 @@ from typing import Any
 
 from sbi_active.messages import Explained
 
-#: Bytes of a header that are read at most; the settings in one have far fewer.
-LARGEST_TEXT = 256 * 2**20
-
 #: Lists and objects within each other; a fingerprint has about 30 at most.
 DEEPEST = 100
 
