@@ -14,8 +14,6 @@ from sbi_active.inference import (
     ASBI,
     LFIRE,
     ActiveInference,
-    MixtureDensity,
-    RatioClassifier,
     SeqBED,
     SeqBED_LFIRE,
 )
@@ -28,7 +26,6 @@ class Method:
     Attributes:
         designs: Whether actions are chosen for information, or drawn at random.
         build: Function that makes the trainer of a prior and a campaign's options.
-        estimator: Estimator that is trained by default.
         faithful: Options of the setting of the method's authors that differ from those
             of :meth:`.CampaignOptions.faithful`.
         refines: Whether its beliefs are refined, where the options ask for it.
@@ -36,7 +33,6 @@ class Method:
 
     designs: bool
     build: Callable[[Distribution, CampaignOptions], ActiveInference]
-    estimator: Any
     faithful: dict[str, Any]
     refines: bool = False
 
@@ -89,11 +85,11 @@ _SEQBED = {
 
 #: Name of a method: what it is.
 METHODS = {
-    "asbi": Method(True, _asbi, MixtureDensity(), {}, refines=True),
-    "nsbi": Method(False, _asbi, MixtureDensity(), {}, refines=True),
-    "alhi": Method(True, _alhi, MixtureDensity(), _ALHI),
-    "nlhi": Method(False, _alhi, MixtureDensity(), _ALHI),
-    "seqbed": Method(True, _seqbed, RatioClassifier(), _SEQBED),
+    "asbi": Method(True, _asbi, {}, refines=True),
+    "nsbi": Method(False, _asbi, {}, refines=True),
+    "alhi": Method(True, _alhi, _ALHI),
+    "nlhi": Method(False, _alhi, _ALHI),
+    "seqbed": Method(True, _seqbed, _SEQBED),
 }
 
 
