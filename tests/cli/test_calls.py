@@ -119,6 +119,7 @@ CALLS = [
     # A campaign has its own of these.
     (2, "for a campaign", "criticize camp --noise 0.1"),
     (2, "for a campaign", "criticize camp --task numerical"),
+    (2, "Not a directory", "criticize camp --out bom.csv/report"),  # said at once
     (2, "no_such_module", "criticize camp --effects no_such_module:effects"),
     (1, "no library", "criticize camp --effects odd.py:effects"),
     (2, "expected a list of Effect", "criticize camp --effects odd.py:listed"),
