@@ -56,10 +56,10 @@ class Table:
         values = draws.double().numpy()
         low, high = np.quantile(values, [0.05, 0.95], axis=0)
         columns = zip(names, values.mean(0), values.std(0), low, high, strict=True)
-        rows = [
-            (name, f"{mean:.4g}", f"{sd:.2g}", f"{a:.4g} to {b:.4g}")
-            for name, mean, sd, a, b in columns
-        ]
+        rows = []
+        for name, mean, sd, *ends in columns:
+            middle, a, b = within(mean, *ends)
+            rows.append((name, middle, f"{sd:.2g}", f"{a} to {b}"))
         return cls(("parameter", "mean", "sd", "central 90 %"), rows)
 
     def text(self) -> str:
@@ -83,6 +83,29 @@ class Table:
 def number(value: float | None) -> str:
     """Return a number in a few digits, "" for none."""
     return "" if value is None or value != value else f"{value:.3g}"
+
+
+def within(
+    middle: float, low: float, high: float, *, most: int = 7
+) -> tuple[str, str, str]:
+    """Return a number and its interval in digits that tell the three apart.
+
+    Args:
+        middle: Number within the interval.
+        low: Lower end.
+        high: Upper end.
+        most: Digits at most, where there is little room.
+
+    Example:
+        >>> within(0.3, 0.1, 0.6), within(273.152, 273.13, 273.17)
+        (('0.3', '0.1', '0.6'), ('273.152', '273.13', '273.17'))
+    """
+    digits, width = 4, high - low
+    if np.isfinite(middle) and width > 0:
+        ratio = max(abs(middle) / width, 1e-9)
+        digits = int(np.clip(np.ceil(np.log10(ratio)) + 2, 4, most))
+    middle_text, *ends = (f"{v:.{digits}g}" for v in (middle, low, high))
+    return middle_text, ends[0], ends[1]
 
 
 def _lines(header: Sequence[Any], rows: Iterable[Sequence[Any]]) -> Iterator[str]:

@@ -14,6 +14,7 @@ from torch.distributions import Distribution
 from sbi_active.campaign.health import health_after
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.design.drawing import draw, labels_of
+from sbi_active.display.table import within
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 
@@ -183,7 +184,7 @@ def _belief(
         ends = min(ends[0], truth), max(ends[1], truth)
     room = 0.08 * (ends[1] - ends[0]) or 1e-6 + 0.01 * abs(ends[0])
     ax.set_ylim(ends[0] - room, ends[1] + room)
-    middle, low, high = (f"{v:.4g}" for v in levels[-1, [2, 0, 4]])
+    middle, low, high = within(*levels[-1, [2, 0, 4]].tolist(), most=5)
     shown = name if len(name) <= 24 else f"{name[:12]}…{name[-11:]}"
     ax.set_title(f"{shown}\n{middle} ({low} to {high})", fontsize=8)
     ax.locator_params(axis="y", nbins=5)
