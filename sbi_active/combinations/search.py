@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.optimize import minimize_scalar
 
 from sbi_active.combinations.formula import SIMPLE, Combination, Term
@@ -28,6 +29,10 @@ WORTH_A_SHIFT = 0.5
 SHIFTS = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0, 2.0, 4.0)  # in ranges of the parameter
 MOST_TRIPLES = 20  # parameters up to which all triples are tried
 DEPENDENT = 0.1  # share of a direction that is new, below which it is none
+#: Width, in prior deviations, that a combination of known ones may have: rounded
+#: weights leave each of them slightly off what is known, and the differences of many
+#: would add up to a direction of which nothing is.
+TOGETHER = 0.5
 
 
 #: Returns the covariance of the terms, not weighed, and that under the prior: (m, m).
@@ -84,7 +89,9 @@ def search(
         row[at] = combination.weight * slopes * deviation[at]
         row /= np.linalg.norm(row)
         rest = row - sum((r @ row) * r for r in rows)
-        if np.linalg.norm(rest) > DEPENDENT:
+        if np.linalg.norm(rest) <= DEPENDENT:
+            return
+        if _widest([*(c for c, _ in found), combination], moments) <= TOGETHER:
             rows.append(rest / np.linalg.norm(rest))
             found.append((combination, own))
 
@@ -108,6 +115,13 @@ def search(
                 combination = rounded(terms, vector, c, s, floor)
                 keep(combination, _own_width(combination, moments))
     return found
+
+
+def _widest(combinations: Sequence[Combination], moments: Moments) -> float:
+    """Return the width of the least known sum of combinations."""
+    weight = block_diag(*(c.weight for c in combinations))
+    parts = moments([t for c in combinations for t in c.terms])
+    return float(_eigenvectors(*(weight @ m @ weight.T for m in parts))[0][-1])
 
 
 def _own_width(combination: Combination, moments: Moments) -> float:

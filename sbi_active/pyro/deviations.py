@@ -28,9 +28,9 @@ from sbi_active.pyro.predictive import Predictive
 
 Array = NDArray[Any]
 
-NUM_GRID = 1_000  # of deviations: the least, and how many
+NUM_GRID = 1_000  # deviations
 REACH, NUM_KNOTS = 6.0, 1_201  # of the coordinates
-SHARE = 0.1  # what a channel says alone: its power, and its share
+SHARE = 0.1  # of what a channel says alone
 
 
 class Coordinates:

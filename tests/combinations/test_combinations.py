@@ -54,12 +54,12 @@ def gaussian(num, num_trials, seed, sd=0.05):
 
     def moments(terms):
         at = [t.index for t in terms]
-        return covariance[np.ix_(at, at)], np.eye(len(at))
+        return covariance[np.ix_(at, at)], np.eye(num)[np.ix_(at, at)]
 
     return moments, covariance
 
 
-@pytest.mark.parametrize("num", [2, 5, 20])
+@pytest.mark.parametrize("num", [2, 5, 12, 20])
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
 def test_what_is_found_is_known_and_new(num, share):
     for seed in range(3):

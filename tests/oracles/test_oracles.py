@@ -16,8 +16,9 @@ import torch
 
 from sbi_active import Campaign, DiscreteActions, RefinementOptions
 from sbi_active.inference import refine
+from sbi_active.inference.declared.simulated_belief import SimulatedBelief
 from tests.oracles import controls
-from tests.oracles.judging import Judged, judged
+from tests.oracles.judging import Found, Judged, judged
 from tests.oracles.problem import gauss
 from tests.oracles.problems import PROBLEMS
 from tests.oracles.reference import answer, answers
@@ -143,3 +144,20 @@ def test_a_discrete_parameter_gets_its_probability():
     assert float(is_on.double().mean()) == pytest.approx(
         answers()["payload"].regions[1].probability, abs=0.05
     )
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("order", [[3, 2, 1, 0], [2, 3, 0, 1]])
+def test_a_trial_that_failed_may_come_at_any_time(order):
+    """A mode by the trials with outcomes may be impossible by the one without."""
+    own, past, belief = PROBLEMS["invalid"](), None, None
+    simulator = own.simulator(is_declared=True)
+    action, x = (part[order] for part in trials_of(own))
+    for k in range(1, 5):
+        belief = refine(simulator, own.prior, action[:k], x[:k], past=past, seed=3)
+        assert isinstance(belief, SimulatedBelief)
+        past = belief.histories
+    assert belief is not None
+    torch.manual_seed(0)
+    found = Found(theta=belief.sample((5_000,)).double().numpy())
+    assert not judged(own, answers()["invalid"], found).faults()

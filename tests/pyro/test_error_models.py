@@ -33,6 +33,15 @@ def test_a_gross_channel_is_told_and_goes_back_to_the_predictive():
 
 
 @pytest.mark.slow
+def test_channels_that_contradict_each_other_are_both_under_suspicion():
+    """Alone each is right; together one of them is wrong, and the chains say so."""
+    draws = predictive(1_000, 2, correlation=0.99)
+    found = denoise(torch.tensor([1.0, -1.0]), draws, SpikeAndSlab(), seed=0)
+    assert (found.probability > 0.1).all()
+    assert float(found.probability.sum()) > 0.95
+
+
+@pytest.mark.slow
 def test_a_channel_that_was_not_observed_follows_the_others():
     draws = predictive(1_000, 2, correlation=0.99)
     found = denoise(torch.tensor([1.5, torch.nan]), draws, SpikeAndSlab(), seed=0)

@@ -203,7 +203,10 @@ class LikelihoodGain(InformationGainEstimator):
         return contrastive
 
     def _contributions(
-        self, model: Any, simulations: CandidateSimulations, belief: Distribution | None
+        self,
+        model: LikelihoodModel,
+        simulations: CandidateSimulations,
+        belief: Distribution | None,
     ) -> Tensor:
         user = type(self).__name__
         critic = Critic(model, "log_likelihood", user, self.batch_size)

@@ -1,10 +1,4 @@
-r"""Narrow proposals along what trials leave open.
-
-A parameter that another can stand in for leaves a curved ridge, on which a normal
-approximation at a mode has few of its draws, and a few components fitted to draws have
-not many more.
-
-Importance sampling from mixtures that are fitted to all draws so far.
+r"""Importance sampling from mixtures that are fitted to all draws so far.
 
 Each draw is weighted under the mixture of all proposals,
 
@@ -18,6 +12,10 @@ Where few draws count, the next proposal is fitted to
 
 with the largest :math:`\beta` that leaves enough of them, up to 1: of a response that
 jumps, the draws of the prior are led to the posterior so.
+
+A parameter that another can stand in for leaves a curved ridge, on which a normal
+approximation at a mode has few of its draws, and a few components fitted to draws have
+not many more: there narrow proposals lie along the ridge.
 
 References:
     Cornuet, Marin, Mira & Robert, Scand. J. Stat. 2012 (adaptive multiple importance

@@ -239,7 +239,11 @@ def _around(
     at = np.clip(at, c.low, c.high)
     log_p = potential.log_prior(at) + potential.log_likelihood(at)
     peak, log_p = log_p[:k, None], log_p[k:].reshape(sides.shape)
-    fall = np.maximum(peak - log_p, 1e-2)
+    # Residuals, which modes are of, say nothing of trials without an outcome, so that a
+    # mode itself may be impossible: what is as impossible is no part of it.
+    fall = np.full(sides.shape, np.inf)
+    np.subtract(peak, log_p, out=fall, where=np.isfinite(log_p))
+    fall = np.maximum(fall, 1e-2)
     # Beyond a valley there are other modes.
     within = np.maximum.accumulate(fall, axis=1) < settings.valley
     within &= is_inside[k:].reshape(sides.shape)
