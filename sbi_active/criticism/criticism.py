@@ -208,7 +208,7 @@ class Criticism:
                     return self.misfit()
             self._found = Sampled(self.rivals, groups)
             search = self._linear if self._misfit is None else None
-            if search is not None and (self._is_large or is_linear(search)):
+            if search is not None and is_linear(search):
                 self._found = LinearEvidence(search, self.rivals, groups)
             self._is_searched = True
         return self._misfit

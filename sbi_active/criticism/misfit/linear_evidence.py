@@ -34,6 +34,7 @@ from sbi_active.criticism.results import (
 from sbi_active.criticism.rivals.noise_grid import inflations
 from sbi_active.criticism.steps.combinations import log_prior
 from sbi_active.criticism.steps.detection import LEVEL, REFUTED, THRESHOLD
+from sbi_active.criticism.steps.equivalence import is_large
 from sbi_active.criticism.steps.tracing import (
     log_bayes_factor,
     log_priors,
@@ -51,14 +52,18 @@ NUM_LOUDER = 200
 
 
 def is_linear(search: Search) -> bool:
-    """Return whether linear models follow the simulator.
+    """Return whether linear models follow the simulator, or have to.
 
-    They follow no jumps, and do not tell which trials have an outcome.
+    They follow no jumps, and do not tell which trials have an outcome. Samples of a
+    large library would take too long.
     """
     rivals = search.rivals
     timed = rivals.measurements.is_sequence
-    told = timed or not rivals.can_fail
-    if not told or not rivals.is_smooth or rivals.roughness.any():
+    if not timed and rivals.can_fail:
+        return False
+    if is_large(rivals.library):
+        return True
+    if not rivals.is_smooth or rivals.roughness.any():
         return False
     return timed or not bends(search)
 

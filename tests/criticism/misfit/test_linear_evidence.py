@@ -227,6 +227,34 @@ LOUDER = Effect(
 )
 
 
+def test_outcomes_are_told_by_samples_however_large_the_library():
+    """A ball that flies too far is not seen, without a time axis."""
+
+    def seen(theta, action):
+        x = theta * action
+        return x.where(x.abs() < 3, torch.nan)
+
+    def turned(k):
+        return Effect(
+            f"turned {k}",
+            hook="action",
+            prior=Normal(0.0, 0.5),
+            null=0.0,
+            apply=lambda a, phi, action, context: a + phi * torch.cos(k * a),
+        )
+
+    action = torch.linspace(-2, 2, 20, dtype=torch.float64)[:, None]
+    error = torch.randn(20, 1, generator=torch.manual_seed(0)).double()
+    trials = Trials(action, seen(2.0, action + 0.4 * torch.cos(3 * action)) + error / 9)
+    model = SimulatorModel(seen, noise=GaussianNoise(1 / 9))
+    prior = BoxUniform(torch.zeros(1), 5 * torch.ones(1))
+    loop = Criticism(model, prior, trials, effects=[turned(k) for k in range(25)])
+    tracing = loop.trace()
+    assert loop.rivals.can_fail
+    assert tracing.verdict == "turned 3"
+    assert tracing.evidences["turned 3"].engine != "linear"
+
+
 @pytest.mark.parametrize(
     ("size", "effects", "verdict"),
     [
@@ -241,6 +269,7 @@ def test_a_larger_noise_is_chosen_again_without_each_trial(size, effects, verdic
     assert tracing.verdict == verdict
     assert tracing.evidences[verdict].engine == "linear"
     evaluation = loop.evaluate()
+    assert evaluation is not None
     assert evaluation.selected.count(verdict) > 12
     rows = evaluation.table.set_index("metric")
     assert rows.loc["log predictive density", "ratio"] > 1
