@@ -26,7 +26,7 @@ from sbi_active.criticism.effects.joint_prior import joint_prior
 from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summarize
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.screening import linear_models
-from sbi_active.criticism.misfit.evaluation import evaluate_linear
+from sbi_active.criticism.misfit.evaluation import chooses_again, evaluate_linear
 from sbi_active.criticism.misfit.linear_evidence import LinearEvidence, is_linear
 from sbi_active.criticism.misfit.record import detected, traced
 from sbi_active.criticism.misfit.rule import Rule
@@ -208,7 +208,7 @@ class Criticism:
                     return self.misfit()
             self._found = Sampled(self.rivals, groups)
             search = self._linear if self._misfit is None else None
-            if search is not None and (self._is_large or is_linear(search)):
+            if search is not None and is_linear(search):
                 self._found = LinearEvidence(search, self.rivals, groups)
             self._is_searched = True
         return self._misfit
@@ -326,8 +326,7 @@ class Criticism:
         if int(self.trials.valid.sum()) < FEWEST_TRIALS:
             return None
         found = self._found if tracing.misfit is None else self._misfit
-        is_known = self._linear is not None and self._linear.sensor.is_known
-        if is_known and found is not None and not isinstance(found, Sampled):
+        if chooses_again(found, tracing.key):
             return evaluate_linear(found, trials.fit)
         return evaluate_left_out(
             trials.fit, self._fold, show_progress=self.show_progress

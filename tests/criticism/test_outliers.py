@@ -163,6 +163,16 @@ def test_a_true_effect_stays_named_beside_the_outlier():
     assert found.probabilities["outlier"] < 1e-3
 
 
+def test_an_effect_for_which_one_doubtful_trial_speaks_is_not_named():
+    xi = torch.tensor([-2.0, -1.0, -1.5, 0.5, 2.0, 2.5, -1.0, 5.0])
+    x = measured(xi, seed=3)
+    x[7] += 9.0
+    found = criticism(x, xi=xi).trace()
+    assert found.verdict == "outlier"
+    assert suspects(found) == (7.0,)
+    assert 7.0 in found.needed or not found.instead_of
+
+
 def test_without_an_alarm_no_trial_is_suspected():
     found = criticism(measured()).trace()
     assert found.verdict == "none"

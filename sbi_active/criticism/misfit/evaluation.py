@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +13,32 @@ from sbi_active.criticism.misfit.linear_evidence import LinearEvidence
 from sbi_active.criticism.misfit.verdict import Misfit
 from sbi_active.criticism.results import UNEXPLAINED, Evaluation, ModelKey
 from sbi_active.criticism.rivals.error_models import LOG_2PI
+from sbi_active.criticism.steps.equivalence import is_large
 from sbi_active.criticism.steps.evaluation import joined, scores, summary
 from sbi_active.criticism.steps.predictive import NUM_DRAWS, Prediction
 from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.seeding import derive_seed
 
 Array = NDArray[Any]
+
+
+def chooses_again(found: object, key: ModelKey) -> TypeGuard[LinearEvidence | Misfit]:
+    """Return whether a choice among linear models stands for one among all models.
+
+    By the sensor's error they know of no larger noise and no gross error, which the
+    verdict of numbers without a time axis most often has to exclude: one without each
+    trial can choose these too.
+
+    Args:
+        found: Evidence of the models, or the models of which every one misses.
+        key: Key of the model that all trials point to.
+    """
+    if not isinstance(found, LinearEvidence):
+        return isinstance(found, Misfit)
+    search, rivals = found.search, found.rivals
+    if not (search.sensor.is_known and rivals.measurements.is_sequence):
+        return False
+    return key in search.found or is_large(rivals.library)  # which takes long
 
 
 def evaluate_linear(

@@ -21,6 +21,7 @@ from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.errors import WIDTHS, Mixture, Posterior, summed
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.record import detection_of, keep_draws
+from sbi_active.criticism.misfit.verdict import FEWEST_TRIALS
 from sbi_active.criticism.results import (
     CATCH_ALLS,
     OUTLIER,
@@ -33,6 +34,7 @@ from sbi_active.criticism.results import (
 from sbi_active.criticism.rivals.noise_grid import inflations
 from sbi_active.criticism.steps.combinations import log_prior
 from sbi_active.criticism.steps.detection import LEVEL, REFUTED, THRESHOLD
+from sbi_active.criticism.steps.equivalence import is_large
 from sbi_active.criticism.steps.tracing import (
     log_bayes_factor,
     log_priors,
@@ -47,19 +49,21 @@ Array = NDArray[Any]
 
 #: Draws of an effect on the noise, over which its evidence is a mean.
 NUM_LOUDER = 200
-#: Trials of which one can be told to be the one that errs: two agree against it.
-FEWEST_TRIALS = 3
 
 
 def is_linear(search: Search) -> bool:
-    """Return whether linear models follow the simulator.
+    """Return whether linear models follow the simulator, or have to.
 
-    They follow no jumps, and do not tell which trials have an outcome.
+    They follow no jumps, and do not tell which trials have an outcome. Samples of a
+    large library would take too long.
     """
     rivals = search.rivals
     timed = rivals.measurements.is_sequence
-    told = timed or not rivals.can_fail
-    if not told or not rivals.is_smooth or rivals.roughness.any():
+    if not timed and rivals.can_fail:
+        return False
+    if is_large(rivals.library):
+        return True
+    if not rivals.is_smooth or rivals.roughness.any():
         return False
     return timed or not bends(search)
 
@@ -88,10 +92,10 @@ def bends(search: Search, *, num: int = 16, most: float = 0.5) -> bool:
         spread = vectors * np.sqrt(np.maximum(values, 0))
         u = own.mean + rng.standard_normal((num, len(m.u))) @ spread.T
         u = np.clip(u, m.low, m.high)
-        residual = search.rivals.rival(key).residual(u)[0] / search.unit
-        linear = m.residual + (u - m.u) @ m.jacobian.T
-        ratio = ((residual**2).sum(1) - (linear**2).sum(1)) / 2
-        if not ratio.std() < most:  # NaN: what is not simulated
+        residual = search.rivals.rival(key).residual(u)[0]
+        linear = search.unit * (m.residual + (u - m.u) @ m.jacobian.T)
+        log_p = search.sensor.noise.log_likelihood
+        if not (log_p(residual) - log_p(linear)).std() < most:  # NaN: not simulated
             return True
     return False
 
@@ -163,13 +167,19 @@ class LinearEvidence:
     def _chi_square(self, key: ModelKey) -> tuple[float, float]:
         """Return a model's chi-square and its tail, by all that is declared.
 
-        Where the correlation of errors is declared it counts; where it is unknown,
-        numbers count as independent.
+        Of effects on the noise it is the smallest among draws of their posterior. Where
+        the correlation of errors is declared it counts; where it is unknown, numbers
+        count as independent.
         """
-        model, cells = self.search.model(key), self.search.errors.cells
-        square, freedom, p = model.chi_square
-        if len(cells) == 1 and cells[0].rho.any():
-            square = float((cells[0].whiten(model.residual) ** 2).sum())
+        cells = self.search.errors.cells
+        model = self.search.model(self._predicting(key))
+        residual, (square, freedom, p) = model.residual[None], model.chi_square
+        if is_louder := bool(self._louder(key)):
+            residual = residual / self._louder_draws(key)[1]
+        if is_correlated := len(cells) == 1 and cells[0].rho.any():
+            residual = cells[0].whiten(residual)
+        if is_louder or is_correlated:
+            square = float((residual**2).sum(1).min())
             p = float(chi2.sf(square, freedom))
         return square, p
 
@@ -233,6 +243,14 @@ class LinearEvidence:
         phi = np.concatenate([part.numpy() for part in parts], 1)
         return phi, np.maximum(scale, 1e-12)
 
+    def _louder_draws(self, key: ModelKey) -> tuple[Array, Array]:
+        """Return posterior draws of a set's effects on the noise, and its factors."""
+        rng = np.random.default_rng(derive_seed(self.rivals.seed, "louder"))
+        share = self._mixture(key).share.reshape(-1, NUM_LOUDER).sum(0)
+        drawn = rng.choice(NUM_LOUDER, size=NUM_LOUDER, p=share / share.sum())
+        phi, scale = self._scales(self._louder(key), 1.0)
+        return phi[drawn], scale[drawn]
+
     def larger(
         self, singles: Mapping[str, float], prior: Mapping[str, float]
     ) -> dict[ModelKey, float]:
@@ -262,7 +280,7 @@ class LinearEvidence:
     def is_refuted(self, key: ModelKey, detection: Detection) -> bool:
         """Return whether the sensor leaves no room for what a model leaves over."""
         names = self._predicting(key)
-        return bool(names.effects) and self.p_value(names) < REFUTED  # NaN: never
+        return bool(names.effects) and self.p_value(key) < REFUTED  # NaN: never
 
     def log_with_process(self, key: ModelKey) -> float:
         """Return the log evidence of effects with a residual process beside them."""
@@ -271,14 +289,11 @@ class LinearEvidence:
     def record(self, key: ModelKey) -> Evidence:
         """Return the record of a model, and keep its draws."""
         own, model = self._mixture(key), self.search.model(self._predicting(key))
-        phi = None
-        if louder := self._louder(key):
-            rng = np.random.default_rng(derive_seed(self.rivals.seed, "louder"))
-            share = own.share.reshape(-1, NUM_LOUDER).sum(0)
-            drawn = rng.choice(NUM_LOUDER, size=NUM_LOUDER, p=share / share.sum())
-            phi = self._scales(louder, 1.0)[0][drawn]
         given = self.rivals, key, model, own.mean, own.cov, own.log_evidence
-        return keep_draws(*given, louder=phi, unit=self.search.unit)
+        if not self._louder(key):
+            return keep_draws(*given, unit=self.search.unit)
+        phi, square = self._louder_draws(key)[0], self._chi_square(key)[0]
+        return keep_draws(*given, louder=phi, chi_square=square)
 
     def outliers(self) -> dict[float, float]:
         """Return the probability that each trial is the one with a gross error."""
@@ -309,7 +324,7 @@ class LinearEvidence:
         """Return the tail probability of a model's chi-square; NaN without a size."""
         if not self.search.sensor.is_known:
             return float("nan")
-        return self._chi_square(self._predicting(key))[1]
+        return self._chi_square(key)[1]
 
     def log_process(self, key: ModelKey) -> float:
         """Return the log Bayes factor of a residual process beside a model, nats."""

@@ -164,6 +164,7 @@ def keep_draws(
     *,
     best: Array | None = None,
     louder: Array | None = None,
+    chi_square: float | None = None,
     unit: Array | None = None,
 ) -> Evidence:
     """Return a linear model's record, and keep its draws as its posterior sample.
@@ -178,6 +179,7 @@ def keep_draws(
         best: Point from which other trials are predicted, shape (d,); None takes the
             draws.
         louder: Draws of effects on the noise, natural values, shape (n, k).
+        chi_square: Chi-square with these effects; None takes the fitted model's.
         unit: Unit of the model's residuals, shape (N,), where draws are to be weighed
             by the simulator; None leaves them.
     """
@@ -211,10 +213,10 @@ def keep_draws(
         num_simulations=rivals.simulator.num_simulations - before,
         names=rivals.names_of(rival),
         draws=rival.coordinates.to_z(u)[:, :own],
-        best_chi_square=model.chi_square[0],
+        best_chi_square=model.chi_square[0] if chi_square is None else chi_square,
         best=None if at is None else rival.coordinates.to_z(at[None])[0, :own],
     )
-    weighs = linear if unit is not None and louder is None else None
+    weighs = None if unit is None else linear
     rivals.fits[key] = Fit(rival, sample, evidence, at, mode, weighs)
     return evidence
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -36,6 +35,7 @@ from sbi_active.criticism.rivals.validity import surprising_outcomes
 from sbi_active.criticism.steps.detection import REFUTED, TOO_SMALL
 from sbi_active.messages import Message
 from sbi_active.seeding import forked_generators
+from sbi_active.simulation.signatures import parameters_of
 
 #: A condition, and the sentence that is said where it holds.
 Row = tuple[object, str]
@@ -333,7 +333,7 @@ def _may_be_force(report: Contents) -> bool:
     families = [e.family for e in report.tracing.estimates]
     if not is_left or any(f.startswith((FAMILY, COUPLING)) for f in families):
         return False
-    return "force" in inspect.signature(report.simulator.fn).parameters
+    return "force" in [p.name for p in parameters_of(report.simulator.fn)]
 
 
 def _correlation(own: Residuals) -> float:

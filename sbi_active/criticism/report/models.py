@@ -28,6 +28,8 @@ CONDITION = (
     "P holds among the declared effects alone: an effect that nobody declared may pass "
     "for them."
 )
+#: What an effect that helps, and is not named as the cause, is good for.
+PREDICTS = "use it to predict inside the tried range, and do not read phi as physics"
 
 
 def effects(report: Contents) -> Section:
@@ -163,6 +165,7 @@ def _helping(misfit: Misfit) -> Iterator[str]:
             f"{100 * misfit.remains[name]:.0f} % of the excess of the fit without it "
             "remains"
             + (f"; guesses in its place gain {nats:.0f} nats over it" * (nats > 1))
+            + (f"; {PREDICTS}" * (name not in misfit.named))
         )
     for name, others in misfit.instead.items():
         yield (

@@ -166,15 +166,13 @@ def _record(report: Contents) -> Section:
     evidences, detection = report.tracing.evidences, report.detection
     spent = sum(e.num_simulations for e in evidences.values())
     moved = sorted(name for name, e in evidences.items() if e.engine == "smc")
-    is_linear = report.tracing.misfit is not None
+    linear = [name for name, e in evidences.items() if e.engine == "linear"]
+    beside = " with a residual process in each" * (report.tracing.misfit is not None)
     told = [
         (True, f"evidence cost {spent:,} simulated trials"),
+        (linear, f"evidence by linearized models{beside}"),
         (
-            is_linear,
-            "evidence by linearized models with a residual process in each",
-        ),
-        (
-            not is_linear and len(moved) < len(evidences),
+            len(moved) + len(linear) < len(evidences),
             "evidence by least squares and importance sampling",
         ),
         (

@@ -82,11 +82,17 @@ def _missing(report: Contents) -> str:
         SCATTER: "they scatter more than the declared noise",
         OUTLIER: f"{which} does not agree with the others",
     }.get(verdict, f"it lacks {_described(report, tracing.chosen)}")
+    withheld = f"{tracing.instead_of} is not named, as the warnings say"
     if tracing.beside:
         most = ModelKey(tracing.beside)
         found = f"{most} explains most of what it misses, and not all"
     elif tracing.instead_of:
-        found = f"{tracing.instead_of} is not named, as the warnings say"
+        found = f"{found}; {withheld}" if verdict == OUTLIER else withheld
+    elif tracing.stand_in:
+        what = _described(report, tracing.chosen)
+        found = f"{what} stands in for {UNDECLARED}"
+    elif tracing.chosen and tracing.bounds.p_value > LEVEL:
+        found += f"; but {narrow_prior(tracing)}"
     others = [name for name in report.credible_set if name != verdict]
     shares = [
         f"{label(tracing, n)} ({stated(report.probabilities[n])})" for n in others

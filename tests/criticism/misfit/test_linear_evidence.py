@@ -17,7 +17,8 @@ from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.sensor import sensor_of
 from sbi_active.criticism.misfit.linear_evidence import LinearEvidence
-from sbi_active.criticism.results import OUTLIER, UNEXPLAINED, ModelKey
+from sbi_active.criticism.results import OUTLIER, SCATTER, UNEXPLAINED, ModelKey
+from sbi_active.criticism.steps.detection import REFUTED
 from sbi_active.criticism.steps.tracing import log_priors, trace
 from tests.criticism.forces.test_forces import MODEL, PRIOR, SD, measured
 from tests.criticism.misfit.oscillator import EFFECTS
@@ -197,3 +198,81 @@ def test_models_that_bend_where_their_posterior_lies_are_sampled(names, engines)
     tracing = curved(*names).trace()
     assert tracing.verdict == "bias"
     assert {e.engine for e in tracing.evidences.values()} <= engines
+
+
+def scattered(size, *effects):
+    """A loop on numbers without a time axis, of errors with some size each."""
+    action = torch.linspace(-2, 2, 16, dtype=torch.float64)[:, None]
+    draws = torch.Generator().manual_seed(1)
+    error = torch.randn(16, 1, generator=draws, dtype=torch.float64)
+    model = SimulatorModel(lambda theta, xi: theta * xi, noise=GaussianNoise(0.1))
+    prior = BoxUniform(-5 * torch.ones(1), 5 * torch.ones(1))
+    trials = Trials(action, action + size(action) * error)
+    return Criticism(model, prior, trials, effects=effects, seed=0)
+
+
+BIAS = Effect(
+    "bias",
+    hook="observation",
+    prior=Normal(0.0, 1.0),
+    null=0.0,
+    apply=lambda x, phi, action, context: x + phi,
+)
+LOUDER = Effect(
+    "louder",
+    hook="noise",
+    prior=HalfNormal(2.0),
+    null=0.0,
+    apply=lambda sd, phi, action, context: sd * (1 + phi[:, :1] * action.abs()),
+)
+
+
+def test_outcomes_are_told_by_samples_however_large_the_library():
+    """A ball that flies too far is not seen, without a time axis."""
+
+    def seen(theta, action):
+        x = theta * action
+        return x.where(x.abs() < 3, torch.nan)
+
+    def turned(k):
+        return Effect(
+            f"turned {k}",
+            hook="action",
+            prior=Normal(0.0, 0.5),
+            null=0.0,
+            apply=lambda a, phi, action, context: a + phi * torch.cos(k * a),
+        )
+
+    action = torch.linspace(-2, 2, 20, dtype=torch.float64)[:, None]
+    error = torch.randn(20, 1, generator=torch.manual_seed(0)).double()
+    trials = Trials(action, seen(2.0, action + 0.4 * torch.cos(3 * action)) + error / 9)
+    model = SimulatorModel(seen, noise=GaussianNoise(1 / 9))
+    prior = BoxUniform(torch.zeros(1), 5 * torch.ones(1))
+    loop = Criticism(model, prior, trials, effects=[turned(k) for k in range(25)])
+    tracing = loop.trace()
+    assert loop.rivals.can_fail
+    assert tracing.verdict == "turned 3"
+    assert tracing.evidences["turned 3"].engine != "linear"
+
+
+@pytest.mark.parametrize(
+    ("size", "effects", "verdict"),
+    [
+        (lambda action: 0.5, [BIAS], SCATTER),
+        (lambda action: 0.1 + 0.3 * action.abs(), [BIAS, LOUDER], "louder"),
+    ],
+)
+def test_a_larger_noise_is_chosen_again_without_each_trial(size, effects, verdict):
+    """Left-out trials do not refute it, and what it lets expect is not left over."""
+    loop = scattered(size, *effects)
+    tracing = loop.trace()
+    assert tracing.verdict == verdict
+    assert tracing.evidences[verdict].engine == "linear"
+    evaluation = loop.evaluate()
+    assert evaluation is not None
+    assert evaluation.selected.count(verdict) > 12
+    rows = evaluation.table.set_index("metric")
+    assert rows.loc["log predictive density", "ratio"] > 1
+    assert loop.judged(evaluation).verdict == verdict
+    if tracing.chosen:
+        assert not loop.detect().refutes(tracing.evidences[verdict], REFUTED)

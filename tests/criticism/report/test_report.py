@@ -11,7 +11,7 @@ from sbi.utils import BoxUniform
 
 from sbi_active import AutocorrelatedNoise, SimulatorModel
 from sbi_active.criticism import Trials, joint_prior
-from sbi_active.criticism.contradictions import MissedTrial, SevereTest
+from sbi_active.criticism.contradictions import Bounds, MissedTrial, SevereTest
 from sbi_active.criticism.report.summary import sentences
 from sbi_active.criticism.report.words import with_error
 from sbi_active.criticism.under_misfit import Misfit, ModelError, Odds
@@ -100,6 +100,48 @@ def test_the_sentences_of_what_names_no_effect(verdict, missing, advice):
     assert advice in following
     assert "P holds among" not in flat(made)
     assert "stop" not in flat(made).lower() or verdict == "none"
+
+
+@pytest.mark.parametrize(
+    ("verdict", "changes", "said"),
+    [
+        (
+            "outlier",
+            {"instead_of": "drag", "outliers": {3.0: 0.95}, "needed": (3.0,)},
+            "trial 3 does not agree with the others; drag is not named",
+        ),
+        (
+            "drag",
+            {"stand_in": ("its form is free",)},
+            "drag (a force against the speed) stands in for something undeclared",
+        ),
+        (
+            "drag",
+            {"bounds": Bounds(p_value=0.5)},
+            "it lacks drag (a force against the speed); but no permitted action tells",
+        ),
+    ],
+)
+def test_the_first_sentence_says_what_limits_the_verdict(verdict, changes, said):
+    made = report(tracing=tracing(verdict, **changes))
+    assert said in sentences(made)[0]
+
+
+@pytest.mark.parametrize(
+    ("engines", "said"),
+    [
+        (("linear", "linear"), ["linearized models"]),
+        (("linear", "laplace"), ["linearized models", "importance sampling"]),
+        (("laplace", "laplace"), ["importance sampling"]),
+    ],
+)
+def test_the_record_says_how_evidence_was_found(engines, said):
+    own = tracing()
+    every = dict.fromkeys(own.evidences, engines[1]) | {"none": engines[0]}
+    made = {n: replace(e, engine=every[n]) for n, e in own.evidences.items()}
+    record = flat(report(tracing=replace(own, evidences=made))).split(" Record ")[1]
+    for words in ("linearized models", "importance sampling"):
+        assert (words in record) == (words in said)
 
 
 def test_residuals_stand_beside_the_sensor_s_error_in_the_units_of_x():

@@ -78,3 +78,13 @@ def test_what_raises_an_error_that_is_printed_does_not_help(left_out, held_out, 
     assert f"{told}." in text
     before, after = left_out if where.startswith("left") else held_out
     assert f"on {where}: RMSE {before} before and {after} after" in text
+
+
+def test_channels_count_in_sensor_deviations():
+    # Position in meters falls by half, a force in newtons rises by a tenth.
+    errors = np.array([0.2, 30.0]), np.array([0.1, 33.0])
+    fine, coarse = (0.001, 10.0), (0.1, 1.0)
+    assert unless_refuted(under_misfit(errors, sensor=fine), None).chosen
+    made = unless_refuted(under_misfit(errors, sensor=coarse), None)
+    assert not made.chosen
+    assert made.refuted_on == "left-out trials in sensor deviations"
