@@ -84,9 +84,7 @@ def parser_of(main: Callable[..., Any], name: str) -> argparse.ArgumentParser:
     owner = options_of(main)
     described: dict[str, str] = {}
     for each in (*reversed(getattr(owner, "__mro__", ())), owner):
-        lines = re.findall(
-            r"^ {4}(\w+): (.+(?:\n {8}.+)*)", inspect.getdoc(each) or "", re.M
-        )
+        lines = re.findall(ARGUMENT, inspect.getdoc(each) or "", re.M)
         described |= {key: " ".join(text.split()) for key, text in lines}
     parser = argparse.ArgumentParser(
         prog=f"python -m benchmarks {name}",

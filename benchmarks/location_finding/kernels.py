@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
-from typing_extensions import override
 
 from sbi_active.inference.sampling.student_mixture import (
     Defended,
@@ -87,22 +85,3 @@ class KernelProposal(Defended):
         factor = WIDTH * np.linalg.cholesky(covariance)
         kernels = KernelMixture(location, factor)
         return KernelProposal(kernels, base, SHARE_OF_BASE)
-
-
-@dataclass(frozen=True)
-class EitherProposal(Proposal):
-    """Two proposals, each as likely."""
-
-    first: Proposal
-    second: Proposal
-
-    @override
-    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
-        num = int(rng.binomial(num_samples, 0.5))
-        parts = self.first.sample(num, rng), self.second.sample(num_samples - num, rng)
-        return np.concatenate(parts)
-
-    @override
-    def log_prob(self, z: Array) -> Array:
-        both = np.logaddexp(self.first.log_prob(z), self.second.log_prob(z))
-        return both - np.log(2.0)

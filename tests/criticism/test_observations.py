@@ -21,7 +21,9 @@ from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals import (
     DISAGREEMENT,
     NUM_REPLICATES,
+    UNKNOWN_RATES,
     TrialSimulator,
+    log_outcomes,
 )
 from sbi_active.criticism.steps import predict
 
@@ -305,3 +307,17 @@ def test_summaries_need_noise_that_is_known():
 
 
 # Random simulators without declared noise
+
+
+def test_flags_have_the_probability_of_the_rates():
+    p = np.array([[1.0, 1.0, 0.0], [1.0, 0.5, 0.25]])
+    valid = np.array([True, False, False])
+    e = DISAGREEMENT
+    got = np.exp(log_outcomes(p, valid)) * (1 - e) ** 3
+    assert got[0] == pytest.approx((1 - e) * e * (1 - e))
+    assert got[1] == pytest.approx((1 - e) * 0.5 * (0.75 * (1 - e) + 0.25 * e))
+    assert log_outcomes(p[:1], p[0] == 1)[0] == pytest.approx(0.0)
+    each = [np.exp(log_outcomes(p, valid, (rate,))) for rate in UNKNOWN_RATES]
+    np.testing.assert_allclose(
+        np.exp(log_outcomes(p, valid, UNKNOWN_RATES)), np.mean(each, 0)
+    )

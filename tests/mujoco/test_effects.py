@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.robots.models import ARM, BALL, PENDULUM, TIMES
+from benchmarks.robots.models import ARM, PENDULUM, TIMES
 from sbi_active import BoxActions
 from sbi_active.criticism import AugmentedSimulator, Effect, Trials
 from sbi_active.criticism.effects.effect import UnderKey
 from sbi_active.mujoco import from_mjcf, mjcf_effects
 from sbi_active.mujoco.effects.changes import PowerForce
+from tests.mujoco.machines import BALL
 from tests.mujoco.test_robot import pendulum
 
 

@@ -5,8 +5,9 @@ import pandas as pd
 import pytest
 import torch
 
-from benchmarks.robots.models import SPRING_MASS, held_arm
+from benchmarks.robots.models import SPRING_MASS
 from sbi_active.mujoco import from_mjcf
+from tests.mujoco.machines import held_arm
 
 
 def logs(num=2):

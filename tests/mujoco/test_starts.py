@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.robots.models import held_arm
 from sbi_active import BoxActions
 from sbi_active.actions.signals import SignalActions
 from sbi_active.actions.waveforms import step
 from sbi_active.mujoco import from_mjcf
+from tests.mujoco.machines import held_arm
 
 TENDON = """
 <mujoco>

@@ -96,3 +96,15 @@ def test_least_squares_given_the_effect_finds_it(kind):
     assert second_drop_error(*pair, kind) < 1e-3
     assert forecast_error(*pair, kind, until=0.8) < 1e-2
     assert second_drop_error(*pair, "gravity alone") > 0.5
+
+
+def test_the_drag_sees_the_air_that_moves():
+    drag, wind = torch.tensor([2.0, 2.0, 2.0]).double(), torch.tensor([0.0, 1.0, -1.0])
+    theta = LEVEL.repeat(3, 1)
+    still, up, down = fall(
+        theta, theta, times=TIMES[None], drag=drag, wind=wind.double()
+    )
+    assert (up[5:] > still[5:]).all()  # rising air holds the ball longer
+    assert (down[5:] < still[5:]).all()
+    bare = fall(theta, theta, times=TIMES[None], wind=wind.double())
+    assert torch.equal(bare[0], bare[1])

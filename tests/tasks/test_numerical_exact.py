@@ -221,3 +221,12 @@ def test_greedy_campaigns_at_the_reference_values() -> None:
 def test_bad_trials(action, x, variant: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         ExactPosterior(action, x, variant=variant)
+
+
+def test_gain_of_a_gaussian_posterior() -> None:
+    posterior = posterior_of("repeated")  # far inside the box, so a plain Gaussian
+    design = np.stack([np.exp(3 - posterior.action), posterior.action], 1)
+    new = np.stack([np.exp(3 - ACTIONS), ACTIONS], 1)
+    variance = np.einsum("ai,ij,aj->a", new, np.linalg.inv(design.T @ design), new)
+    gain = posterior.expected_information_gain(ACTIONS).numpy()
+    assert gain == pytest.approx(0.5 * np.log1p(variance), abs=1e-5)

@@ -200,3 +200,27 @@ def test_linear_gaussian_limit(monkeypatch):
     )
     exact = float(marginal.log_prob(x))
     assert abs(posterior.log_evidence - exact) < 4 * posterior.log_evidence_se
+
+
+def test_gain_lies_between_contrastive_bounds():
+    """sPCE below, sNMC above (Foster et al. 2020), from the prior alone."""
+    action = ACTIONS[[2, 9, 16]].double()
+    prior = OscillatorReference([], [])
+    gain, error = prior.expected_information_gain(action)
+    n, m = 400, 20_000
+    contrast = uniform(m, PRIOR_LOW, PRIOR_HIGH, 20)
+    truth = uniform(n, PRIOR_LOW, PRIOR_HIGH, 21)
+    noise = torch.randn(
+        n, 6, generator=torch.Generator().manual_seed(22), dtype=torch.float64
+    )
+    for k, xi in enumerate(action):
+        x = mean(truth, xi[None]) + NOISE_SD * noise
+        distance = torch.cdist(x, mean(contrast, xi[None])) / NOISE_SD
+        log_other = -0.5 * distance.square()
+        log_self = -0.5 * noise.square().sum(-1)
+        everyone = torch.cat([log_self[:, None], log_other], 1)
+        lower = log_self - everyone.logsumexp(-1) + math.log(m + 1)
+        upper = log_self - log_other.logsumexp(-1) + math.log(m)
+        slack = 4 * math.hypot(float(upper.std()) / math.sqrt(n), float(error[k]))
+        assert float(upper.mean() - lower.mean()) < 1.0
+        assert lower.mean() - slack < gain[k] < upper.mean() + slack

@@ -160,3 +160,27 @@ def test_overflow_keeps_levels_at_their_rims():
     kept = levels(TANKS, **rows, **full, overflow=1.0)
     assert high > 20
     assert float(kept) == pytest.approx(10.0, abs=0.01)
+
+
+def test_tanks_keep_their_water():
+    """What is pumped less what flows out is what is there, both areas alike."""
+    theta = torch.tensor([[0.05, 0.05, 1e-9, 0.04]], dtype=torch.float64)
+    voltage = torch.full((1, 100), 2.0)
+    out = levels(
+        theta,
+        torch.tensor([[0.0, 1.0, 0.1]]),
+        inputs={"voltage": voltage},
+        times=torch.tensor([400.0]),
+    )
+    upper = 4.0  # (.1 / .05)^2, which makes the slope below; it sinks to 2.56
+    for _ in range(40_000):
+        upper += 0.01 * (0.08 - 0.05 * upper**0.5)
+    assert float(out) == pytest.approx(1.0 + 400 * 0.08 - (upper - 4.0), rel=1e-4)
+
+
+def test_a_delay_of_whole_steps_shifts_the_command():
+    made = record(0.1, (-1, 1), 241)
+    late = Record("late", 0.1, np.roll(made.voltage, 3), made.output)
+    late.voltage[:3] = made.voltage[0]
+    x = spin(HOOP, **cut(made, 240).rows(1), delay=0.3)
+    torch.testing.assert_close(x, spin(HOOP, **cut(late, 240).rows(1)))

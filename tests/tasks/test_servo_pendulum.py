@@ -226,3 +226,16 @@ def test_coulomb_friction_is_found():
     assert tracing.verdict == "Coulomb"
     mean, sd = tracing.estimates[0].mean[0], tracing.estimates[0].sd[0]
     assert abs(mean - 0.06) < 4 * sd
+
+
+def test_viscous_friction_is_back_emf_until_the_motor_is_off(task):
+    kt, resistance = THETA[0, 0], THETA[0, 1]
+    b = 0.01
+    more = kt + b * resistance / kt  # the same torque a volt, more back-EMF
+    other = THETA.clone()
+    other[0, 0], other[0, 1] = more, resistance * more / kt
+    viscous, electric = every_trial(task, viscous=b), every_trial(task, other)
+    off = task.recordings.motor_off
+    assert off.tolist() == [False, True, False, True]
+    assert np.abs(viscous - electric)[~off].max() < 1e-9
+    assert np.abs(viscous - electric)[off].max() > 0.1

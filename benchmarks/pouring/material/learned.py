@@ -189,13 +189,11 @@ class Overlap:
 
     Attributes:
         process: Of the intersection volume, mm summed over pixels, without the chaos.
-        mean_of_prior: Mean over the pours behind it, which are from the prior.
         explained: Share of the variance of left-out pours.
         num: Pours behind it.
     """
 
     process: GaussianProcess
-    mean_of_prior: float
     explained: float
     num: int
 
@@ -209,7 +207,7 @@ class Overlap:
             settings=ProcessSettings(degree=1),
         )
         missed = float((process.left_out**2).mean() / volume.var())
-        return Overlap(process, float(volume.mean()), 1 - missed, len(theta))
+        return Overlap(process, 1 - missed, len(theta))
 
     def mean(self, belief: PointBelief) -> float:
         """Return the expectation under a belief: InterVol of all its draws."""

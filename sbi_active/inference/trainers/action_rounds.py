@@ -103,7 +103,7 @@ class ActionRounds(ActiveInference):
     r"""Rows by round of the belief they were drawn from, and the trials in between.
 
     It is mixed in before a trainer of sbi's, whose private hooks it overrides
-    (``tests/inference/trainers/test_sbi_hooks.py`` lists them). Without actions that
+    (``tests/inference/trainers/test_active.py`` lists them). Without actions that
     trainer does what it always does. A round with them is that of Algorithm 1: this
     round's rows, a network built anew, plain maximum likelihood.
 

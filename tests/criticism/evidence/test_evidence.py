@@ -5,7 +5,7 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 from scipy.stats import multivariate_normal
-from torch.distributions import Independent, Normal
+from torch.distributions import HalfNormal, Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials
@@ -151,3 +151,30 @@ def test_the_order_of_a_few_trials_is_no_structure():
     assert order(4) is None
     assert order(5, "unknown") is None
     np.testing.assert_allclose(order(5), [0, 0.25, 0.5, 0.75, 1])
+
+
+def test_a_draw_that_rounds_to_beyond_its_prior_takes_no_evidence_away():
+    own = {f: getattr(CURVE, f) for f in ("hook", "null", "apply")}
+    prior = Independent(HalfNormal(torch.tensor([0.7])), 1)
+    key, some = ModelKey(("curve",)), rivals()
+    some.effects["curve"] = Effect("curve", prior=prior, **own)
+    fit = some.fit(key)
+    before, _ = log_evidence(some, key)
+    weights = fit.sample.weight
+    least = np.where(weights > 0, weights, np.inf).argmin()
+    fit.sample.u[least, -1] = fit.rival.coordinates.low[-1] - 1e-9
+    after, _ = log_evidence(some, key)
+    assert after == pytest.approx(before, abs=0.2)
+
+
+def test_the_posterior_is_the_exact_one():
+    evidence = rivals().fit().evidence
+    design = np.stack([XI**0, XI], 1)
+    precision = design.T @ design / 0.25 + np.diag([0.25, 1.0])
+    mean = np.linalg.solve(precision, design.T @ X[:, 0].double().numpy() / 0.25)
+    sd = np.sqrt(np.diag(np.linalg.inv(precision)))
+    assert evidence.effective_sample_size >= 60
+    # Four hundred are drawn from these with replacement, which adds to the variance.
+    error = 4 * sd * np.sqrt(1 / 100 + 1 / 400)
+    assert np.all(np.abs(evidence.draws.mean(0) - mean) < error)
+    assert np.all(np.abs(evidence.draws.std(0) - sd) < error)

@@ -197,3 +197,34 @@ def test_what_doubles_the_error_helps_whatever_a_t_test_says():
     assert choose(several, "a").key == ModelKey(("a",))
     mild = scored(0.0, np.array([9.0, 9.5, 9.0, 30.0]))
     assert choose({**several, ModelKey(): mild}, "a").key == ModelKey()
+
+
+def test_a_model_that_predicts_left_out_trials_worse_is_not_admitted():
+    """A fast effect has the evidence, a slow one beside it the prediction."""
+    found = choose(
+        models(none=(0.0, 80.0), a=(60.0, 75.0), b=(2.0, 40.0), a_b=(61.0, 20.0)), "ab"
+    )
+    assert [*found.probabilities] == [ModelKey(("a", "b"))]
+    assert found.key == ModelKey(("a", "b"))
+    assert found.cause["a"] < 0.5 < found.better["a"]  # since b alone leaves half
+
+
+def test_without_a_time_axis_a_model_within_a_fifth_is_compared_and_no_other():
+    even, far = 4 * WIGGLE, 4 * WIGGLE[::-1].copy()
+    far[0] = 60.0
+    several = models(none=(0.0, 101.0), b=(0.0, 4.0)) | {
+        ModelKey(("b",)): scored(0.0, even),
+        ModelKey(("a",)): scored(8.0, far),
+    }
+    assert choose(several, "ab", timed=False).key == ModelKey(("b",))
+    near = {**several, ModelKey(("a",)): scored(8.0, 1.18**2 * even)}
+    assert choose(near, "ab", timed=False).key == ModelKey(("a",))
+    assert choose(near, "ab").key == ModelKey(("b",))  # surely worse
+
+
+def test_a_second_effect_needs_a_bayes_factor_of_five_without_a_time_axis():
+    several = models(none=(0.0, 101.0), a=(20.0, 10.0), b=(5.0, 60.0))
+    few, many = (several | models(a_b=(20.0 + gain, 9.5)) for gain in (1.5, 1.7))
+    assert starts(few, "ab", timed=False)[0] == ModelKey(("a",))
+    assert starts(many, "ab", timed=False)[0] == ModelKey(("a", "b"))
+    assert starts(few, "ab")[0] == ModelKey(("a", "b"))

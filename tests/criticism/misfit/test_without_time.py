@@ -132,3 +132,10 @@ def test_a_model_that_one_effect_refutes_has_intervals_that_know_of_it():
     mean, sd = draws.mean(0), draws.std(0)
     assert abs(mean[0] - THETA[0]) > 10 * SENSOR  # the quadratic's mean is in it
     assert (abs(mean - THETA) < 2 * sd).all()
+
+
+def test_a_model_that_fits_is_no_misfit():
+    found = loop(trials(quadratic=QUADRATIC))
+    assert found.trace().verdict == "quadratic"
+    assert found.misfit() is None
+    assert found.trace().misfit is None

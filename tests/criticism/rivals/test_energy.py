@@ -86,3 +86,16 @@ def test_what_is_no_force_has_no_bounds():
     low, high = dissipative_bounds(effect)
     assert low.tolist() == [-np.inf] * 2
     assert high.tolist() == [np.inf] * 2
+
+
+@pytest.mark.slow
+def test_without_the_bound_it_would_be(pushed, forces, monkeypatch):
+    free = lambda e: (np.full(e.phi_dim, -np.inf), np.full(e.phi_dim, np.inf))  # noqa: E731
+    monkeypatch.setattr(
+        "sbi_active.criticism.rivals.coordinates.dissipative_bounds", free
+    )
+    kinds = ["v|v| of hinge", "v of hinge", "sin 2q of hinge", "q^3 of hinge"]
+    loop = Criticism(
+        model(0.003), PRIOR, pushed, effects=[forces[name] for name in kinds]
+    )
+    assert "v|v| of hinge" in loop.trace().chosen

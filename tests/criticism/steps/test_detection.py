@@ -3,8 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 from sbi.utils import BoxUniform
+from scipy.stats import kstest
 from torch.distributions import Normal
 
 from sbi_active import GaussianNoise, SimulatorModel, StudentTNoise
@@ -94,3 +96,15 @@ def test_what_an_effect_leaves_over_is_undeclared_beside_it():
     assert "cubic, probably the cause" in str(made).splitlines()[0]
     after = made.residuals_after.refitted
     assert np.nanstd(after) < np.nanstd(made.residuals.refitted)
+
+
+@pytest.mark.slow
+def test_the_chi_square_of_clean_data_is_one():
+    gen, p = torch.Generator().manual_seed(0), []
+    for _ in range(24):
+        theta = 2 * torch.rand(1, 2, generator=gen) - 1
+        action = 4 * torch.rand(8, 1, generator=gen) - 2
+        x = line(theta.expand(8, -1), action)
+        x = x + NOISE * torch.randn(x.shape, generator=gen)
+        p.append(criticism(x, action).detect().p_value)
+    assert kstest(p, "uniform").pvalue > 0.01

@@ -91,3 +91,15 @@ def test_residuals_are_standardized_by_the_normal_predictive(fitted, names):
     )
     assert made.noise == "declared"
     assert made.correlation == 0
+
+
+def test_each_trial_is_predicted_from_those_before_it():
+    x = measured()
+    made = find_residuals(rivals(x))
+    design, own = columns(()), x[:, 0].double().numpy()
+    for t in range(12):
+        precision = design[:t].T @ design[:t] / NOISE**2 + np.eye(2)
+        covariance = np.linalg.inv(precision)
+        mean = design[t] @ covariance @ design[:t].T @ own[:t] / NOISE**2
+        sd = np.sqrt(design[t] @ covariance @ design[t] + NOISE**2)
+        assert made.prequential[t, 0] == pytest.approx((own[t] - mean) / sd, abs=0.2)

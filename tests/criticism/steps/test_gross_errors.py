@@ -29,3 +29,10 @@ def test_a_trial_without_a_measurement_is_none_of_them():
     x = measured()
     x[3] = torch.nan
     assert {*found(x)} == {*np.arange(12.0)} - {3.0}
+
+
+def test_of_trials_that_agree_none_stands_out():
+    shares = found(measured())
+    assert [*shares.values()] == sorted(shares.values(), reverse=True)
+    assert max(shares.values()) < 0.5
+    assert {*shares} == {*np.arange(12.0)}

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
+from scipy.stats import norm
 from torch.distributions import HalfNormal, Independent
 
 from sbi_active import AutocorrelatedNoise, GaussianNoise, SimulatorModel
@@ -20,6 +21,7 @@ from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR
 from tests.criticism.misfit.oscillator import trials as oscillations
 from tests.criticism.steps.linear_world import (
     ACTION,
+    NOISE,
     columns,
     measured,
     posterior,
@@ -145,3 +147,22 @@ def test_what_no_model_predicts_refutes_none(fitted):
     assert rmse["after"] > rmse["before"]
     assert [trial.position for trial in evaluation.missed if trial.by_both] == [0]
     assert unless_refuted(tracing, evaluation).verdict == "curve"
+
+
+def test_trials_that_agree_are_not_named():
+    told = [
+        report_of(slid(drag=d, seed=s)).evaluation for d in (0, 0.3) for s in (1, 2)
+    ]
+    assert not any(evaluation.missed for evaluation in told)
+
+
+def test_the_tail_is_that_of_the_normal_predictive(fitted):
+    some, tracing = fitted
+    x = measured(curve=0.5, seed=1)
+    x[5] = x[5] + 0.8
+    (missed,) = evaluate_held_out(some, tracing, Trials(ACTION, x)).missed
+    mean, covariance = posterior(measured(curve=0.5), ("curve",))
+    design = columns(("curve",))[5]
+    sd = np.sqrt(design @ covariance @ design + NOISE**2)
+    z = abs(float(x[5]) - design @ mean) / sd
+    assert np.log(missed.p_value) == pytest.approx(np.log(2 * norm.sf(z)), rel=0.2)

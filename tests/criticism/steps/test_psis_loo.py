@@ -9,7 +9,11 @@ from torch.distributions import Independent, MultivariateNormal, Normal
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
-from sbi_active.criticism.steps.leave_one_out import leave_one_out
+from sbi_active.criticism.steps.leave_one_out import (
+    NUM_DRAWS,
+    LeaveOneOut,
+    leave_one_out,
+)
 
 PRIOR = Independent(Normal(torch.zeros(2), torch.tensor([2.0, 1.0])), 1)
 NOISE = 0.5
@@ -59,8 +63,35 @@ def test_densities_are_those_of_refits():
         good = np.setdiff1d(np.arange(len(x)), one.unreliable)
         assert len(good) >= 5
         # Weights of a variance up to some ten among 400 draws: a standard error of
-        # sqrt(10 / 400) = .16 where k is near the limit, and far less elsewhere.
+        # sqrt(10 / 400) = .16. Beyond k = .5 weights have no variance.
+        known = np.flatnonzero(one.pareto_k < 0.5)
+        assert len(known) >= 5
+        np.testing.assert_allclose(one.density[known], expected[known], atol=4 * 0.16)
         np.testing.assert_allclose(one.density[good], expected[good], atol=5 * 0.16)
         error = 4 * 0.05 * math.sqrt(len(good))
         assert one.density[good].sum() == pytest.approx(expected[good].sum(), abs=error)
     assert found[1].total > found[0].total + 5
+
+
+def test_a_trial_that_decides_the_posterior_is_unreliable():
+    line = 0.8 + 0.4 * ACTION
+    x = line.clone()
+    x[-1] += 15.0
+    loop = criticism(x)
+    (one,) = leave_one_out(loop.rivals, loop.trace())[:1]
+    assert 9 in one.unreliable
+    clean = criticism(line)
+    (one,) = leave_one_out(clean.rivals, clean.trace())
+    assert 9 not in one.unreliable
+
+
+def test_the_largest_shape_grows_with_the_draws():
+    def limit(num: int) -> float:
+        zero = np.zeros(2)
+        return LeaveOneOut(
+            name="none", density=zero, pareto_k=zero, num_draws=num
+        ).largest_k
+
+    assert limit(100) == pytest.approx(0.5)
+    assert limit(NUM_DRAWS) == pytest.approx(1 - 1 / math.log10(NUM_DRAWS))
+    assert limit(100_000) == 0.7

@@ -1,5 +1,7 @@
 """Probabilities and verdicts, against the exact evidences of a linear world."""
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 import torch
@@ -157,3 +159,17 @@ def test_effects_that_the_trials_do_not_separate_count_as_one():
     assert tracing.credible_set[0] == "unexplained"
     assert p["curve"] + p["twin"] > p["unexplained"]
     assert tracing.verdict == max(group, key=p.__getitem__)
+
+
+@pytest.mark.parametrize("kink", [0.2, 0.32])
+def test_inclusion_and_the_credible_set_add_probabilities_up(kink):
+    tracing, _ = traced(measured(curve=0.14, kink=kink), compare=False)
+    p = tracing.probabilities
+    for name, total in tracing.inclusion.items():
+        parts = [p[k] for k, e in tracing.evidences.items() if name in e.key.effects]
+        assert total == pytest.approx(sum(parts))
+    num = len(tracing.credible_set)
+    sums = [sum(p[n] for n in names) for names in combinations(p, num)]
+    assert sum(p[n] for n in tracing.credible_set) == pytest.approx(max(sums))
+    assert max(sums) >= 0.9
+    assert max(sum(p[n] for n in names) for names in combinations(p, num - 1)) < 0.9

@@ -41,6 +41,24 @@ def linear(dim: int, num: int, seed: int = 0):
     return model, torch.zeros(1, 1), x, exact
 
 
+@pytest.mark.parametrize("num", [30, 3])
+def test_linear_models_have_their_exact_density(num):
+    dim = 12
+    model, action, x, exact = linear(dim, num)
+    prior = MultivariateNormal(torch.zeros(dim), torch.eye(dim))
+    belief = refine(model, prior, action, x, seed=1)
+    assert isinstance(belief, SimulatedBelief)
+    with forked_generators(0):
+        theta = exact.sample(torch.Size([200]))
+        draws = belief.sample((5_000,)).double()
+    gap = exact.log_prob(theta) - belief.log_prob(theta.float()).double()
+    assert float(gap.abs().max()) < 0.25
+    spread = (draws - exact.mean) @ torch.linalg.inv(exact.scale_tril).T
+    assert float(spread.median(0).values.abs().max()) < 0.25
+    assert float((spread.abs() < 1.645).double().mean()) == pytest.approx(0.9, abs=0.02)
+    assert belief.diagnostics.assumptions["enough_draws"].holds
+
+
 def test_uninformed_parameters_keep_their_prior():
     dim, known = 10, 4
     model, action, x, _ = linear(known, 8)
@@ -189,3 +207,22 @@ def test_a_curved_response_between_the_bounds_of_forty_parameters():
     assert belief.log_evidence == pytest.approx(log_evidence, abs=1.5)
     assert not belief.diagnostics.trustworthy
     assert not belief.diagnostics.assumptions["enough_draws"].holds
+
+
+def test_correlated_priors_are_not_split():
+    dim = 8
+    cov = 0.5 * torch.eye(dim) + 0.5
+    prior = MultivariateNormal(torch.zeros(dim), cov)
+
+    def mean(theta, action):
+        return theta[:, :1]
+
+    simulator = SimulatorModel(mean, noise=GaussianNoise(0.1))
+    belief = refine(
+        simulator, prior, torch.zeros(1, 1), torch.full((1, 1), 2.0), seed=0
+    )
+    assert isinstance(belief, SimulatedBelief)
+    assert not belief.free.any()
+    with forked_generators(0):
+        draws = belief.sample((4_000,))
+    assert float(draws[:, 5].mean()) == pytest.approx(1.0, abs=0.15)

@@ -236,3 +236,21 @@ def test_factor_survives_rounding():
     factor = precision_factor(precision)
     error = (factor @ factor.mT - precision).abs().amax((1, 2))
     assert (error / precision.abs().amax((1, 2))).max() < 1e-12
+
+
+@pytest.mark.parametrize("variant", ["linear", "sinh"])
+def test_units_of_theta_change_log_prob_by_the_determinant_only(variant):
+    theta, x, action = numerical(variant)
+    condition = torch.cat([x, action], 1)
+    matrix = torch.tensor([[2.0, 0.0], [0.3, 100.0]], dtype=torch.float64)
+    moved = (theta.double() @ matrix.mT + 7).float()
+    log_q = []
+    for rows in (theta, moved):
+        torch.manual_seed(1)
+        net = MixtureDensity(hidden_features=(16,)).build(rows, condition, 1)
+        with torch.no_grad():
+            log_q.append(net.log_prob(rows[:200], condition[:200])[0])
+    shift = log_q[0] - log_q[1] - float(matrix.logdet())
+    # Rows of theta are float32, and the likeliest are known to 1e-4 of their range.
+    assert shift.abs().median() < 5e-3
+    assert shift.abs().quantile(0.9) < 0.05

@@ -59,3 +59,10 @@ def test_systematic_resampling_rounds_the_expected_number_up_or_down(offset):
 def test_rounding_of_the_last_weight_leaves_the_indices_in_range():
     weight = np.full(10, 0.1) * (1 - 1e-12)
     assert systematic(weight, 5, np.nextafter(1, 0)).max() == 9
+
+
+def test_systematic_resampling_is_unbiased():
+    weight = np.array([0.05, 0.6, 0.35])
+    offsets = (np.arange(1_000) + 0.5) / 1_000
+    count = sum(np.bincount(systematic(weight, 3, o), minlength=3) for o in offsets)
+    assert count / 3_000 == pytest.approx(weight, abs=1e-3)

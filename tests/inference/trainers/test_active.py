@@ -162,11 +162,16 @@ STATE = (
 @pytest.mark.parametrize("trainer", PARENTS)
 def test_methods_take_what_sbi_takes_in_the_same_order(trainer):
     for name in ("__init__", "append_simulations", "train", "build_posterior"):
-        theirs = [*inspect.signature(getattr(PARENTS[trainer], name)).parameters]
+        given = inspect.signature(getattr(PARENTS[trainer], name)).parameters
+        theirs = [*given]
         ours = inspect.signature(getattr(trainer, name)).parameters
         assert [*ours][: len(theirs)] == theirs
         extra = [p for n, p in ours.items() if n not in theirs]
         assert all(p.kind is inspect.Parameter.KEYWORD_ONLY for p in extra)
+        if name == "build_posterior":
+            assert [p.default for p in given.values()] == [
+                ours[n].default for n in theirs
+            ]
 
 
 @pytest.mark.parametrize("trainer", PARENTS)

@@ -229,3 +229,18 @@ def test_truncated_proposals_of_the_belief_pass_and_others_do_not():
     inference.append_simulations(theta, x, proposal=restricted, action=action)
     with pytest.raises(ValueError, match="expected proposal to be the belief"):
         inference.append_simulations(theta, x, proposal=packed, action=action)
+
+
+def test_a_calibration_kernel_weighs_rows():
+    """Rows with x < 0 get no weight: the network is fitted to the others alone."""
+    theta, x, action = rows(600)
+    left = x[:, 0] < 0
+    theta[left] += 100.0
+    inference = ASBI(PRIOR, MixtureDensity(hidden_features=(16,), num_iterations=60))
+    inference.append_simulations(theta, x, action=action)
+    inference.train(calibration_kernel=lambda c: (c[:, 0] >= 0).float())
+    with torch.no_grad():
+        found = inference.build_posterior().log_posterior(theta, x, action)
+    # With all rows alike both means are about -2.
+    assert float(found[~left].mean()) > -3
+    assert float(found[left].mean()) < -4
