@@ -54,18 +54,14 @@ NUM_LOUDER = 200
 def is_linear(search: Search) -> bool:
     """Return whether linear models follow the simulator, or have to.
 
-    They follow no jumps, and do not tell which trials have an outcome. Samples of a
-    large library would take too long.
+    They follow no jumps, and without a time axis neither which trials have an outcome
+    nor a bend. Samples of trajectories of a large library would take too long.
     """
     rivals = search.rivals
-    timed = rivals.measurements.is_sequence
-    if not timed and rivals.can_fail:
-        return False
-    if is_large(rivals.library):
-        return True
-    if not rivals.is_smooth or rivals.roughness.any():
-        return False
-    return timed or not bends(search)
+    jumps = not rivals.is_smooth or bool(rivals.roughness.any())
+    if rivals.measurements.is_sequence:
+        return is_large(rivals.library) or not jumps
+    return not (rivals.can_fail or jumps or bends(search))
 
 
 def bends(search: Search, *, num: int = 16, most: float = 0.5) -> bool:
