@@ -356,13 +356,9 @@ class Criticism:
 
     def _fold(self, trials: Trials) -> tuple[RivalSet, Tracing]:
         model, _, effects = self._parts
-        part = Criticism(
-            *(model, self.prior, trials),
-            effects=effects,
-            summaries=0,
-            thin=False,
-            seed=self.seed,
-        )
+        kept = {"warm_up": self._warm_up, "rule": self.rule, "seed": self.seed}
+        parts = model, self.prior, trials
+        part = Criticism(*parts, effects=effects, summaries=0, thin=False, **kept)
         part._equivalent = self.equivalent()
         detection = part.detect()
         return part.rivals, trace(part._found, detection, compare=False)
