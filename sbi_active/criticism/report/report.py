@@ -27,6 +27,10 @@ from sbi_active.display.notebook import card, items, table
 from sbi_active.display.table import Table, number
 from sbi_active.messages import Message
 
+#: Parts of the reasons of a verdict where every model misses, in :meth:`to_dict`.
+MISFIT = ("helps", "named", "cause", "better", "remains", "instead", "left_out")
+MISFIT += ("sensor", "passes", "size", "time_scale", "weights")
+
 
 class Report(Contents):
     """Report of the closed loop, see :class:`.Contents`.
@@ -66,7 +70,7 @@ class Report(Contents):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report as JSON has it: numbers, texts, and all sections."""
-        made = page(self)
+        made, misfit, holds = page(self), self.tracing.misfit, self.has_probabilities
         plan = None if self.next_action is None else asdict(self.next_action)
         tables = {
             "before_after": self.before_after,
@@ -80,8 +84,10 @@ class Report(Contents):
                 "summary": sentences(self),
                 "warnings": cautions_with_codes(self),
                 "chosen": self.tracing.chosen,
-                "probabilities": self.probabilities,
-                "credible_set": self.credible_set,
+                # By the fitted trials alone they would contradict the verdict.
+                "probabilities": self.probabilities if holds else None,
+                "credible_set": self.credible_set if holds else None,
+                "misfit": misfit and {name: getattr(misfit, name) for name in MISFIT},
                 "equivalent": self.equivalent,
                 **{name: table.to_dict("records") for name, table in tables.items()},
                 "next_action": plan,

@@ -193,7 +193,7 @@ def _next(report: Contents) -> str:
     if report.severe_tests:
         return f"Measure next {', or '.join(_tests(report))}: this tests the verdict."
     if report.verdict == NONE:
-        return "Nothing asks for another trial."
+        return "Nothing asks for another trial." if plan else "No trial was planned."
     return {
         UNEXPLAINED: "Before the next trial, declare what else may be missing.",
         SCATTER: "Measure next an action again, to see how large the scatter is.",

@@ -58,6 +58,7 @@ def declared_noise(
     else:
         with forked_generators(seed, "noise"):
             rows = noise.posterior.sample(torch.Size([NUM_DRAWS])).double()
+        rows = rows.reshape(NUM_DRAWS, -1)  # of one parameter they may be numbers
     cells: list[NoiseCell] = []
     weight = -np.log(len(rows))
     for row in rows:

@@ -102,6 +102,19 @@ def test_the_sentences_of_what_names_no_effect(verdict, missing, advice):
     assert "stop" not in flat(made).lower() or verdict == "none"
 
 
+def test_without_a_plan_nothing_is_said_of_further_trials():
+    made = report(tracing=tracing("none"), evaluation=None, next_action=None)
+    assert sentences(made)[3] == "No trial was planned."
+
+
+def test_a_dictionary_has_no_probabilities_where_they_contradict_the_verdict():
+    plain = report().to_dict()
+    assert plain["probabilities"] == pytest.approx(report().probabilities)
+    assert plain["misfit"] is None
+    withdrawn = report(tracing=tracing("unexplained", instead_of="drag")).to_dict()
+    assert withdrawn["probabilities"] is withdrawn["credible_set"] is None
+
+
 @pytest.mark.parametrize(
     ("verdict", "changes", "said"),
     [
