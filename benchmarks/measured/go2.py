@@ -305,7 +305,7 @@ def tables(rows: Mapping[str, Any]) -> str:
         for what, (mean, sd) in row["parameters"].items()
         if "," not in name
     ]
-    header = ("stage", "verdict", "P(cause)", "simulated trials", "CPU s")
+    header = ("stage", "verdict", "excess left", "simulated trials", "CPU s")
     parts = [
         Table(header, verdicts),
         Table(("RMSE, mrad: hip / thigh / knee", *PARTS), errors),

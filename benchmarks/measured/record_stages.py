@@ -237,7 +237,7 @@ def table(rows: dict[str, Any], unit: str) -> str:
         )
         for name, row in judged.items()
     ]
-    header = ["stage", "verdict", "P(cause)", f"before, {unit}: {head}", "after"]
+    header = ["stage", "verdict", "excess left", f"before, {unit}: {head}", "after"]
     header += ["simulated trials", "CPU s"]
     parts = [Table(header, cells + _replays(rows)).markdown()]
     if any(name.startswith("without ") for name in rows):

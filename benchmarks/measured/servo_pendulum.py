@@ -315,7 +315,7 @@ def tables(rows: dict[str, Row], recordings: Recordings) -> str:
         )
         for name, row in rows.items()
     ]
-    header = ["stage", "trials", "verdict", "P(cause)", "90 % set", "log BF"]
+    header = ["stage", "trials", "verdict", "excess left", "90 % set", "log BF"]
     parts = [Table([*header, "next trial", "CPU s"], cells).markdown()]
     parts += [
         _models(name, row)

@@ -12,7 +12,6 @@ from torch import Tensor
 from sbi_active.criticism import Report
 from sbi_active.criticism.results import NONE, Evidence, Tracing
 
-LIKELY = 0.05  # probability of a cause from which it is shown
 #: What a report's first paragraph says of an effect that is named.
 SHARE_LEFT = re.compile(r"\d+ %\s+of\s+the\s+excess")
 
@@ -20,13 +19,18 @@ SHARE_LEFT = re.compile(r"\d+ %\s+of\s+the\s+excess")
 def row_of(tracing: Tracing) -> dict[str, Any]:
     """Return a verdict as plain figures."""
     misfit, helps = tracing.misfit, tracing.chosen
-    cause = tracing.inclusion if misfit is None else misfit.cause
+    support = {} if misfit is None else misfit.support
     model = tracing.evidences.get(" + ".join(helps) or NONE, tracing.evidences[NONE])
     return {
         "verdict": tracing.verdict,
         "named": [*(helps if misfit is None else misfit.named)],
         "helps": [*helps],
-        "cause": {name: float(cause.get(name, 0.0)) for name in tracing.inclusion},
+        "open_forms": {} if misfit is None else misfit.open_forms,
+        "inclusion": {name: float(p) for name, p in tracing.inclusion.items()},
+        "support": {
+            name: [own.inclusion, own.gained, own.remains]
+            for name, own in support.items()
+        },
         "probabilities": {n: float(p) for n, p in tracing.probabilities.items()},
         "credible_set": [*tracing.credible_set],
         "near": [sorted(group) for group in tracing.near],
@@ -68,13 +72,15 @@ def center(evidence: Evidence, columns: int | None = None) -> Tensor:
 def said(row: Mapping[str, Any]) -> str:
     """Return the verdict of a row, and what else helps to predict."""
     beside = [name for name in row["helps"] if name not in row["named"]]
-    return row["verdict"] + (f", {' + '.join(beside)} helps" if beside else "")
+    forms = [f"{n}: {family}" for n, family in row.get("open_forms", {}).items()]
+    told = row["verdict"] + (f" (form open, {', '.join(forms)})" if forms else "")
+    return told + (f", {' + '.join(beside)} helps" if beside else "")
 
 
 def causes(row: Mapping[str, Any]) -> str:
-    """Return the likely causes of a row with their probabilities."""
-    likely = {n: p for n, p in row["cause"].items() if p > LIKELY}
-    return ", ".join(f"{n} {p:.2f}" for n, p in likely.items())
+    """Return the share of the excess that each effect that helps leaves."""
+    support = row.get("support", {})
+    return ", ".join(f"{n} {100 * left:.0f} %" for n, (*_, left) in support.items())
 
 
 def shares_left(row: Mapping[str, Any]) -> bool:

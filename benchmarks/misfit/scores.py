@@ -18,7 +18,7 @@ COLUMNS = [
     *["case", "machine", "trials", "kind", "true", "equivalent", "sizes", "strengths"],
     *["discrepancy", "detail", "size", "excess", "theta"],
     *["held_bare", "held_true", "held_single", "held_verdict"],
-    *["verdict", "alarm", "named", "helps", "instead", "cause"],
+    *["verdict", "alarm", "named", "helps", "instead", "support"],
     *["theta_covered", "phi_covered", "trial_simulations", "cpu_seconds", "failure"],
 ]
 
@@ -62,7 +62,9 @@ def score_case(case: Case, number: int) -> dict[str, object]:
         "named": json.dumps([*outcome.named]),
         "helps": json.dumps([*outcome.helps]),
         "instead": json.dumps({k: [*names] for k, names in outcome.instead.items()}),
-        "cause": json.dumps({k: round(p, 5) for k, p in outcome.cause.items()}),
+        "support": json.dumps(
+            {k: [round(v, 4) for v in own] for k, own in outcome.support.items()}
+        ),
         **_covered(truth, outcome),
         "trial_simulations": count(),
         "cpu_seconds": seconds,

@@ -12,7 +12,6 @@ import numpy as np
 
 from benchmarks.criticism.intervals import rate
 from benchmarks.misfit.machines import get_machine
-from sbi_active.criticism.under_misfit import OddsSettings
 from sbi_active.display.table import Table
 
 __all__ = ["summary"]
@@ -21,8 +20,6 @@ Row = Mapping[str, str]
 #: Gains of the true effect, 1 - held-out error with it / without.
 LARGE, SOME = 0.5, 0.2
 MATTERS = 0.9  # error of a pair to that of its better member, from which both matter
-CLAIM = 0.9
-BINS = ((0.9, 1.01), (0.5, 0.9), (0.1, 0.5), (0.0, 0.1))
 
 
 def summary(rows: Sequence[Row]) -> list[str]:
@@ -39,12 +36,12 @@ def summary(rows: Sequence[Row]) -> list[str]:
         return lines
     groups = _groups(rows)
     cells = [
-        (name, *(rate([hit(r, column) for r in own]) for column in ("cause", "helps")))
+        (name, *(rate([hit(r, column) for r in own]) for column in ("named", "helps")))
         for name, (own, hit) in _measures(groups).items()
     ]
-    lines += ["", Table(("measure", "P(cause) > .5", "helps"), cells).markdown()]
+    lines += ["", Table(("measure", "named", "helps"), cells).markdown()]
     lines += ["", _places(rows), _lost_pairs(groups.get("P matters", []))]
-    lines += ["", *_calibration(rows), "", *_coverage(groups), "", *_harm(rows)]
+    lines += ["", *_coverage(groups), "", *_harm(rows)]
     return [*lines, "", *_cost(rows)]
 
 
@@ -92,11 +89,8 @@ def _measures(
 
 
 def _said(row: Row, column: str) -> set[str]:
-    """Return the effects that are said to be a cause, or to help."""
-    if column == "helps":
-        return {*json.loads(row["helps"])}
-    named = OddsSettings().named
-    return {name for name, p in json.loads(row["cause"]).items() if p > named}
+    """Return the effects that are named as a cause, or said to help."""
+    return {*json.loads(row[column])}
 
 
 def _true(row: Row) -> set[str]:
@@ -167,40 +161,6 @@ def _lost_pairs(rows: Sequence[Row]) -> str:
         f"verdict over that of both: median {np.median(ratio):.2f}, at most 1.1 in "
         f"{rate(ratio <= 1.1)}"
     )
-
-
-def _calibration(rows: Sequence[Row]) -> list[str]:
-    """Return the Brier score of P(cause) and what claims are worth."""
-    pairs = np.array(
-        [
-            (p, name in _true(row))
-            for row in rows
-            for name, p in json.loads(row["cause"]).items()
-        ],
-        dtype=float,
-    )
-    claimed, right = pairs.T
-    square = (claimed - right) ** 2
-    kinds = np.array([row["kind"] for row in rows for _ in json.loads(row["cause"])])
-    alike = np.mean([square[kinds == kind].mean() for kind in np.unique(kinds)])
-    lines = [
-        f"Brier score of P(cause): {square.mean():.3f} over {len(pairs)} effects; each "
-        f"kind counted alike: {alike:.3f}"
-    ]
-    for low, high in BINS:
-        at = (claimed >= low) & (claimed < high)
-        mean = f"{claimed[at].mean():.2f}" if at.any() else "-"
-        text = f"claims of {low:g} to {min(high, 1):g}: mean {mean}, right "
-        lines.append(text + rate(right[at] > 0))
-    wrong = [
-        f"{row['kind']} {row['case']} ({row['discrepancy'] or 'no discrepancy'})"
-        for row in rows
-        if any(
-            p >= CLAIM and name not in _true(row)
-            for name, p in json.loads(row["cause"]).items()
-        )
-    ]
-    return [*lines, f"wrong claims of {CLAIM:g} and more: {', '.join(wrong) or 'none'}"]
 
 
 def _coverage(groups: Mapping[str, list[Row]]) -> list[str]:

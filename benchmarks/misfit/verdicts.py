@@ -22,7 +22,8 @@ class Outcome:
     Attributes:
         line: The verdict in its words.
         alarm: Whether the bare model is said to miss.
-        cause: Probability that an effect is a cause, by declared effect.
+        support: Inclusion probability, nats gained and share of the excess that
+            remains, by effect that helps; empty where a model fits to the sensor.
         named: Effects given as a cause.
         helps: Effects said to predict better, those named among them.
         instead: Effects said to be possible in the place of one that helps.
@@ -32,7 +33,7 @@ class Outcome:
 
     line: str
     alarm: bool
-    cause: Mapping[str, float]
+    support: Mapping[str, tuple[float, float, float]]
     named: tuple[str, ...]
     helps: tuple[str, ...]
     instead: Mapping[str, Sequence[str]] = field(default_factory=dict)
@@ -42,8 +43,7 @@ class Outcome:
 def read_report(report: Report, effects: Sequence[str]) -> Outcome:
     """Return what a report says.
 
-    Where a model fits to the sensor's error, what is named is what helps, and an effect
-    is the cause with the probability of belonging to the model.
+    Where a model fits to the sensor's error, what is named is what helps.
 
     Args:
         report: Of ``close_loop``.
@@ -60,13 +60,13 @@ def read_report(report: Report, effects: Sequence[str]) -> Outcome:
             for name, low, high in zip(evidence.names, *ends, strict=True)
         }
     misfit = tracing.misfit
-    cause = dict(tracing.inclusion) if misfit is None else misfit.cause
+    support = {} if misfit is None else misfit.support
     return Outcome(
         line=str(report).splitlines()[0],
         alarm=alarm,
-        cause={
-            name: float(cause.get(name, 0.0)) if alarm else 0.0
-            for name in tracing.inclusion
+        support={
+            name: (own.inclusion, own.gained, own.remains)
+            for name, own in support.items()
         },
         named=tracing.chosen if misfit is None else misfit.named,
         helps=tracing.chosen,

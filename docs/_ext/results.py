@@ -86,7 +86,7 @@ TABLES = {
     ),
     "Verdicts where every model is wrong": (
         "misfit --summary",
-        "misfit.odds --summary",
+        "misfit.metamorphic --summary --first 5200",
         "misfit.start_states --summary",
     ),
     "Forces that nobody declared": ("forces --summary",),

@@ -12,13 +12,13 @@ from sbi_active.tasks.machines import keyword_effects
 __all__ = ["make_effects"]
 
 TABLE = """
-Coulomb | coulomb | | N m | 0.07
+Coulomb | coulomb | friction | N m | 0.07
     dry friction of constant size
-load-dependent | load | | | 0.3
+load-dependent | load | friction | | 0.3
     dry friction that is a share of the gravity load
-torque-dependent | torque | | | 0.3
+torque-dependent | torque | friction | | 0.3
     dry friction that is a share of the motor's torque; none while the motor is off
-viscous | viscous | | N m s/rad | 0.02
+viscous | viscous | friction | N m s/rad | 0.02
     friction in proportion to the speed; while the motor is on, \
 the same as more back-EMF
 """

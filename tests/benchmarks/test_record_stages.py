@@ -74,7 +74,7 @@ def test_stages_name_what_is_there_and_are_run_once(tmp_path, capsys):
     assert recorded["verdict"] == "bend"
     assert recorded["before"]["far"] > 1
     assert recorded["after"]["far"] < 0.05
-    assert "bend" not in rows["without bend"]["cause"]
+    assert "bend" not in rows["without bend"]["inclusion"]
     assert rows["clean 2000"]["verdict"] == "none"
     assert rows["full 2000"]["verdict"] == "bend"
     assert {*rows["least squares"]} == {"none", "bias", "bend"}

@@ -266,9 +266,9 @@ def _found(
     return Found(
         models=models,
         helps=choice.key.effects,
-        cause=choice.cause,
-        better=choice.better,
-        odds=choice.odds,
+        named=choice.named,
+        support=choice.support,
+        open_forms=_open_forms(misfit),
         sensor=np.sqrt(_by_channel(search.unit**2, m.channel)),
         passes=misfit.passes(choice.key),
         size=last.posterior.size,
@@ -276,8 +276,20 @@ def _found(
         left_out="trials" if search.errors.is_by_trial else "parts of trials",
         weights={str(key): weight for key, weight in weights.items()},
         instead=choice.instead,
-        least=misfit.rule.odds.named,
     )
+
+
+def _open_forms(misfit: Misfit) -> dict[str, str]:
+    """Return the declared families of the effects that are named, if more is missing.
+
+    Laws of friction, for example, imitate each other: while something undeclared is
+    left, another form of the family, declared or not, may be what is there.
+    """
+    if misfit.passes(misfit.choice.key):
+        return {}
+    effects = misfit.rivals.effects
+    named = [effects[name] for name in misfit.choice.named]
+    return {e.name: str(e.family) for e in named if e.family != e.hook}
 
 
 def _scored(misfit: Misfit, key: ModelKey, held_out: Trials | None) -> ModelError:

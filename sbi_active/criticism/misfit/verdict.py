@@ -96,8 +96,8 @@ class Misfit:
         """Return whether it says more than a verdict of numbers without a time axis.
 
         All models have numbers that scatter more than declared, each for itself: beside
-        them effects that help have odds of 100, or one is probably the cause. Several
-        effects, which fit much, give way to a probable cause.
+        them effects that help have a Bayes factor of 100, or one is probably the cause.
+        Several effects, which fit much, give way to a probable cause.
         """
         choice = self.choice
         if verdict == UNEXPLAINED:
@@ -105,8 +105,7 @@ class Misfit:
         own, bare = (self.search.found[k].log_p for k in (choice.key, ModelKey()))
         if verdict == SCATTER and own - bare > np.log(self.rule.decisive):
             return True
-        surely = [n for n in choice.key.effects if choice.better[n] > self.rule.sure]
-        return any(choice.cause[n] > self.rule.odds.named for n in surely)
+        return any(choice.support[n].better > self.rule.sure for n in choice.named)
 
     @cached_property
     def weights(self) -> dict[ModelKey, float]:

@@ -157,15 +157,15 @@ def _admitted(report: Contents, misfit: Misfit) -> Iterator[str]:
 
 def _helping(misfit: Misfit) -> Iterator[str]:
     for name in misfit.helps:
-        nats = misfit.odds[name].guessed
+        own = misfit.support[name]
         yield (
-            f"{name}: probability of the cause {probability(misfit.cause[name])}, of a "
-            f"better prediction of a new trial {probability(misfit.better[name])}; the "
-            f"verdict gains {misfit.odds[name].gained:.0f} nats by it, and "
-            f"{100 * misfit.remains[name]:.0f} % of the excess of the fit without it "
-            "remains"
-            + (f"; guesses in its place gain {nats:.0f} nats over it" * (nats > 1))
-            + (f"; {PREDICTS}" * (name not in misfit.named))
+            f"{name}: probability of being there {probability(own.inclusion)}, of a "
+            f"better prediction of a new trial {probability(own.better)}; the "
+            f"verdict gains {own.gained:.0f} nats by it, and "
+            f"{100 * own.remains:.0f} % of the excess of the fit without it remains"
+            + f"; guesses in its place gain {own.guessed:.0f} nats over it"
+            * (own.guessed > 1)
+            + f"; {PREDICTS}" * (name not in misfit.named)
         )
     for name, others in misfit.instead.items():
         yield (

@@ -28,7 +28,7 @@ from sbi_active.display.table import Table, number
 from sbi_active.messages import Message
 
 #: Parts of the reasons of a verdict where every model misses, in :meth:`to_dict`.
-MISFIT = ("helps", "named", "cause", "better", "remains", "instead", "left_out")
+MISFIT = ("helps", "named", "open_forms", "instead", "left_out")
 MISFIT += ("sensor", "passes", "size", "time_scale", "weights")
 
 
@@ -87,7 +87,9 @@ class Report(Contents):
                 # By the fitted trials alone they would contradict the verdict.
                 "probabilities": self.probabilities if holds else None,
                 "credible_set": self.credible_set if holds else None,
-                "misfit": misfit and {name: getattr(misfit, name) for name in MISFIT},
+                "misfit": misfit
+                and {name: getattr(misfit, name) for name in MISFIT}
+                | {"support": {n: asdict(own) for n, own in misfit.support.items()}},
                 "equivalent": self.equivalent,
                 **{name: table.to_dict("records") for name, table in tables.items()},
                 "next_action": plan,

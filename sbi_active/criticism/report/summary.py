@@ -11,7 +11,13 @@ from collections.abc import Iterator, Sequence
 from sbi_active.criticism.contradictions import MissedTrial, OutlyingTrial
 from sbi_active.criticism.forces.library import COUPLING, FAMILY
 from sbi_active.criticism.report.contents import Contents, by_channel, root_mean_square
-from sbi_active.criticism.report.words import TOLD, listed, number, stated
+from sbi_active.criticism.report.words import (
+    TOLD,
+    listed,
+    number,
+    probability,
+    stated,
+)
 from sbi_active.criticism.results import (
     NONE,
     OUTLIER,
@@ -229,15 +235,29 @@ def misfit_line(verdict: str, misfit: Misfit) -> str:
             f"unexplained: {ModelKey(misfit.helps)} predicts better, and is not named "
             "as the cause"
         )
-    shares = [f"{n} ({stated(misfit.cause[n])})" for n in named]
-    line = f"{verdict}, probably the cause"
-    line += f" ({stated(misfit.cause[named[0]])})" if len(named) == 1 else ": "
-    line += "" if len(named) == 1 else ", ".join(shares)
+    told = [_supported(misfit, n) for n in named]
+    if len(named) == 1:
+        line = f"{verdict}, probably the cause ({told[0]})"
+        if family := misfit.open_forms.get(named[0]):
+            line = f"{family}, form open: nearest is {named[0]} ({told[0]})"
+    else:
+        pairs = zip(named, told, strict=True)
+        line = f"{verdict}, probably the cause: "
+        line += ", ".join(f"{n} ({each})" for n, each in pairs)
     # An effect that imitates one that was not declared leaves something of it.
     line += "" if misfit.passes else f", beside {UNDECLARED}"
     rest = [n for n in misfit.helps if n not in named]
     verb = "helps" if len(rest) == 1 else "help"
     return line + (f"; {', '.join(rest)} {verb} to predict" if rest else "")
+
+
+def _supported(misfit: Misfit, name: str) -> str:
+    """Return the two numbers by which an effect is named, and whether of a family."""
+    own, family = misfit.support[name], misfit.open_forms.get(name)
+    told = f"inclusion {probability(own.inclusion)}, "
+    told += f"leaves {100 * own.remains:.0f} % of the excess"
+    is_one = len(misfit.named) == 1
+    return told if family is None or is_one else f"{family}, form open; {told}"
 
 
 def open_form(report: Contents) -> str | None:

@@ -163,7 +163,7 @@ def withdrawn(tracing: Tracing) -> Tracing:
         chosen=(),
         beside=(),
         instead_of=str(ModelKey(tracing.chosen)),
-        misfit=None if misfit is None else replace(misfit, helps=()),
+        misfit=None if misfit is None else replace(misfit, helps=(), named=()),
     )
 
 

@@ -34,8 +34,8 @@ def named():
 def test_the_cause_is_named_beside_what_nobody_declared(named):
     tracing = named.trace()
     assert tracing.verdict == "lag"
-    assert tracing.misfit.cause["lag"] > 0.5
-    assert tracing.misfit.better["lag"] > 0.9
+    assert tracing.misfit.support["lag"].inclusion > 0.9
+    assert tracing.misfit.support["lag"].better > 0.9
     bare, own = tracing.misfit.of("none"), tracing.misfit.of(tracing.model)
     assert own.left_out[0] < 0.5 * bare.left_out[0]
     assert own.remains < 0.5
@@ -46,7 +46,7 @@ def test_the_cause_is_named_beside_what_nobody_declared(named):
 def test_the_report_says_what_remains(named):
     report = named.report()
     text = " ".join(str(report).split())
-    assert text.startswith("Verdict: lag, probably the cause (P = 0.")
+    assert text.startswith("Verdict: lag, probably the cause (inclusion ")
     line = misfit_line(report.verdict, report.tracing.misfit)
     assert "), beside something undeclared; cubic helps" in line
     passing = replace(report.tracing.misfit, passes=True)
@@ -92,8 +92,10 @@ def test_the_order_of_effects_and_trials_does_not_matter():
     turned = loop(own.select([*range(7, -1, -1)]), EFFECTS[::-1]).trace()
     same = loop(own).trace()
     assert {*turned.chosen} == {*same.chosen}
-    for name, cause in same.misfit.cause.items():
-        assert turned.misfit.cause[name] == pytest.approx(cause, abs=0.05)
+    assert {*turned.misfit.named} == {*same.misfit.named}
+    for name, own in same.misfit.support.items():
+        remains = turned.misfit.support[name].remains
+        assert remains == pytest.approx(own.remains, abs=0.05)
 
 
 def test_held_out_trials_are_scored_for_every_admitted_model():

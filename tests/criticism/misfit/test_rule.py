@@ -1,7 +1,5 @@
 """What helps and what is the cause, on errors that are given."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -26,23 +24,37 @@ def models(**errors):
     }
 
 
-def product(cause):
-    """Of the factors of odds, which are tempered by .6."""
-    return (cause / (1 - cause)) ** (1 / 0.6)
-
-
-def test_the_odds_of_a_cause_are_the_product_that_the_equation_says():
+def test_an_effect_is_named_that_halves_the_error_beyond_the_sensor():
     several = models(none=(0.0, 101.0, 91.0), a=(20.0, 11.0, 10.0), b=(1.0, 90.0))
     found = choose(several, "ab")
     assert found.key == ModelKey(("a",))
-    own = found.odds["a"]
+    own = found.support["a"]
     assert own.remains == pytest.approx(0.1)  # of the fit, not of left-out trials
-    assert own.error == pytest.approx(11.0, rel=1e-2)
-    known = 6 * 2 / (1 + (0.1 / 0.25) ** 2) ** 2 / (1 + own.error / 200)
-    assert product(found.cause["a"]) == pytest.approx(known * 20 / 70)
-    assert found.better["a"] > 0.99
-    few = choose(several, "ab", timed=False)
-    assert product(few.cause["a"]) == pytest.approx(known * (20 / 40) ** 2)
+    assert own.gained == pytest.approx(20.0)
+    assert found.named == ("a",)
+    assert own.inclusion > 0.99
+    assert own.better > 0.99
+    barely = several | models(a=(20.0, 30.0, 1 + 0.26 * 90))
+    assert choose(barely, "ab").key == ModelKey(("a",))
+    assert choose(barely, "ab").named == ()
+    faint = several | models(a=(4.5, 11.0, 10.0))  # a Bayes factor of 90
+    assert choose(faint, "ab").named == ()
+
+
+def test_what_is_named_does_not_depend_on_the_declared_sensor():
+    """Ten times finer, every error is a hundred times as many sensor variances."""
+    errors = {"none": (0.0, 1e4), "a": (30.0, 1e3), "b": (1.0, 9e3)}
+    finer = {name: (log_p, 100 * square) for name, (log_p, square) in errors.items()}
+    names = [choose(models(**own), "ab").named for own in (errors, finer)]
+    assert names == [("a",), ("a",)]
+
+
+def test_effects_that_explain_nothing_change_nothing():
+    several = models(none=(0.0, 101.0), a=(20.0, 12.0), b=(-1.0, 101.0))
+    more = several | models(c=(-1.0, 101.0), d=(-1.0, 101.0))
+    few, many = choose(several, "ab"), choose(more, "abcd")
+    assert few.named == many.named == ("a",)
+    assert few.support["a"] == many.support["a"]
 
 
 def test_formulas_in_the_place_of_an_effect_compete_with_it():
@@ -57,12 +69,8 @@ def test_formulas_in_the_place_of_an_effect_compete_with_it():
     found = choose(several, "ab", guessed=guessed)
     assert without.key == found.key == ModelKey(("a", "b"))
     assert asked == [(("a", "b"), "a"), (("a", "b"), "b")]
-    assert found.cause["a"] == without.cause["a"]
-    less = product(without.cause["b"]) / product(found.cause["b"])
-    assert less == pytest.approx(1 + np.exp(12.0) / 6, rel=1e-6)
-    with np.errstate(over="raise"):
-        far = replace(found.odds["b"], guessed=1e4)
-        assert far.probability == 0
+    assert without.named == ("a", "b")
+    assert found.named == ("a",)
 
 
 def test_one_trial_far_from_the_others_does_not_rule_a_model_out():
@@ -101,7 +109,7 @@ def test_an_effect_that_does_not_predict_better_is_dropped():
 def test_nothing_helps_where_left_out_trials_are_predicted_alike():
     found = choose(models(none=(0.0, 50.0), a=(-1.0, 50.0), b=(0.5, 50.0)), "ab")
     assert found.key == ModelKey()
-    assert found.cause == {}
+    assert found.support == {}
 
 
 def test_effects_that_nothing_separates_share_their_mass():
@@ -111,10 +119,9 @@ def test_effects_that_nothing_separates_share_their_mass():
     together = choose(several, "ab", [frozenset("ab")])
     assert len(together.key.effects) == 1
     (name,) = together.key.effects
-    sure = together.odds[name].probability
-    assert together.cause == pytest.approx({name: sure}, abs=1e-6)
-    assert apart.cause["a"] == pytest.approx(apart.odds["a"].probability / 2, abs=1e-6)
-    assert apart.cause["a"] < 0.5 < together.cause[name]
+    assert together.named == (name,)
+    assert together.support[name].inclusion == pytest.approx(1.0, abs=1e-6)
+    assert apart.support["a"].inclusion == pytest.approx(0.5, abs=1e-6)
 
 
 def test_what_left_out_trials_do_not_tell_apart_is_listed_in_its_place():
@@ -206,7 +213,8 @@ def test_a_model_that_predicts_left_out_trials_worse_is_not_admitted():
     )
     assert [*found.probabilities] == [ModelKey(("a", "b"))]
     assert found.key == ModelKey(("a", "b"))
-    assert found.cause["a"] < 0.5 < found.better["a"]  # since b alone leaves half
+    assert found.named == ()  # beside b, a leaves half of the excess
+    assert found.support["a"].better > 0.5
 
 
 def test_without_a_time_axis_a_model_within_a_fifth_is_compared_and_no_other():

@@ -57,7 +57,7 @@ def beside():
 def test_the_cause_is_named(beside):
     tracing = beside.trace()
     assert tracing.verdict == "quadratic"
-    assert tracing.misfit.cause["quadratic"] > 0.5
+    assert tracing.misfit.named == ("quadratic",)
     assert not tracing.misfit.passes
     assert 2 < tracing.misfit.size < 20
     assert math.isnan(tracing.misfit.time_scale)
@@ -83,10 +83,10 @@ def test_the_report_speaks_of_no_time(beside):
 def test_scatter_gives_way_to_effects_that_help_beside_it(beside):
     beside.trace()
     misfit = beside._misfit
-    unnamed = replace(misfit.choice, cause={"quadratic": 0.4})
+    unnamed = replace(misfit.choice, named=())
     assert replace(misfit, choice=unnamed).replaces("scatter")
     assert not replace(misfit, choice=unnamed).replaces("step + quadratic")
-    nothing = replace(unnamed, key=ModelKey(), cause={})
+    nothing = replace(unnamed, key=ModelKey(), support={})
     assert not replace(misfit, choice=nothing).replaces("scatter")
 
 
@@ -102,15 +102,15 @@ def test_a_formula_that_does_better_leaves_an_imitation_unnamed():
     report = found.report(evaluate=False, plan=False)
     misfit = report.tracing.misfit
     assert misfit.helps == ("quadratic",)
-    assert misfit.remains["quadratic"] < 0.02
-    assert misfit.odds["quadratic"].guessed > 10
-    assert misfit.cause["quadratic"] < 0.01
+    assert misfit.support["quadratic"].remains < 0.02
+    assert misfit.support["quadratic"].guessed > 10
+    assert misfit.named == ()
     assert report.guess == "|xi|^1.5"
     assert "guesses in its place gain" in " ".join(str(report).split())
 
 
 def test_a_cause_has_no_rival_among_formulas(beside):
-    guessed = beside.trace().misfit.odds["quadratic"].guessed
+    guessed = beside.trace().misfit.support["quadratic"].guessed
     # One of about twenty is the effect itself: the mean is log(20) = 3 nats below it.
     assert -4 < guessed < 0
 
@@ -120,7 +120,7 @@ def test_several_effects_are_asked_what_left_out_trials_say_of_them():
     tracing = found.trace()
     assert tracing.verdict == "quadratic + step"
     assert found.misfit() is not None
-    assert all(0.5 < tracing.misfit.cause[n] <= 0.85 for n in tracing.chosen)
+    assert {*tracing.misfit.named} == {*tracing.chosen}
     draws = tracing.evidences["quadratic"].draws  # without the step, which matters
     mean, sd = draws.mean(0), draws.std(0)
     assert (abs(mean - (*THETA, QUADRATIC)) < 2 * sd).all()

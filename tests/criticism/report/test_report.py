@@ -14,7 +14,7 @@ from sbi_active.criticism import Trials, joint_prior
 from sbi_active.criticism.contradictions import Bounds, MissedTrial, SevereTest
 from sbi_active.criticism.report.summary import sentences
 from sbi_active.criticism.report.words import with_error
-from sbi_active.criticism.under_misfit import Misfit, ModelError, Odds
+from sbi_active.criticism.under_misfit import Misfit, ModelError, Support
 from tests.criticism.report.reports import (
     DRAG,
     evaluation,
@@ -174,15 +174,7 @@ def test_residuals_stand_beside_the_sensor_s_error_in_the_units_of_x():
 
 def under_misfit(**changes):
     """Return a report where every model misses, and drag is probably the cause."""
-    odds = Odds(
-        declared=3,
-        helping=1,
-        at_bounds=0,
-        gained=90.0,
-        remains=0.1,
-        error=2.0,
-        timed=True,
-    )
+    support = Support(inclusion=0.98, better=0.99, gained=90.0, remains=0.1)
     models = tuple(
         ModelError(
             name=name,
@@ -196,9 +188,8 @@ def under_misfit(**changes):
     misfit = Misfit(
         models=models,
         helps=("drag",),
-        cause={"drag": 0.76},
-        better={"drag": 0.99},
-        odds={"drag": odds},
+        named=("drag",),
+        support={"drag": support},
         sensor=np.array([0.1]),
         passes=False,
         size=5.0,
@@ -210,7 +201,10 @@ def under_misfit(**changes):
 def test_tables_do_not_contradict_a_verdict_of_other_trials():
     made = under_misfit()
     text = flat(made)
-    assert text.startswith("Verdict: drag, probably the cause (P = 0.76), beside some")
+    assert text.startswith(
+        "Verdict: drag, probably the cause (inclusion 0.98, leaves 10 % of the "
+        "excess), beside something undeclared"
+    )
     assert "With drag the error on left-out trials goes from 0.9 to 0.2." in text
     assert "15 % of the excess over the sensor's remains" in text
     assert "a time scale of 0.25 s" in text

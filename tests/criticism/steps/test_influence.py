@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sbi_active.criticism.steps.influence import unless_refuted
-from sbi_active.criticism.under_misfit import Misfit, ModelError, Odds
+from sbi_active.criticism.under_misfit import Misfit, ModelError, Support
 from tests.criticism.report.reports import flat, report, tracing
 
 
@@ -24,19 +24,8 @@ def under_misfit(left_out, held_out=None, *, sensor=(0.005,)):
     misfit = Misfit(
         models=(model("none", 0), model("drag", 1)),
         helps=("drag",),
-        cause={"drag": 0.2},
-        better={"drag": 0.9},
-        odds={
-            "drag": Odds(
-                declared=3,
-                helping=1,
-                at_bounds=0,
-                gained=9.0,
-                remains=0.9,
-                error=100.0,
-                timed=True,
-            )
-        },
+        named=(),
+        support={"drag": Support(inclusion=0.9, better=0.9, gained=9.0, remains=0.9)},
         sensor=np.array(sensor),
         passes=False,
         size=40.0,

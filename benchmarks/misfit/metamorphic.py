@@ -1,0 +1,259 @@
+"""Whether a verdict stays the same where what changes is not data.
+
+    python -m benchmarks misfit.metamorphic --first 700 --cases 20
+    python -m benchmarks misfit.metamorphic --first 5200 --cases 40
+    python -m benchmarks misfit.metamorphic --summary --first 5200
+
+A case of :mod:`benchmarks.misfit.cases`, its kind by turns, is judged as it is and
+again after each change: "irrelevant", four more declared effects that explain nothing;
+"units", outcomes in thousandths of their unit; "finer", the sensor declared ten times
+finer than it is; "denser", four times as many samples of the same trials; "order", the
+effects declared in the opposite order. The same names are due. With a finer sensor a
+clean case misses it, which is true; its names are due nevertheless.
+
+Cases below 1,000 are for tuning, those from 1,000 on judge. Resumable: a case that
+stands in the CSV file is not run again.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from benchmarks.misfit.cases import FIRST_JUDGED, Case, Kind, Problem, draw_case
+from benchmarks.misfit.machines import GROUPS, LAYOUTS, get_machine
+from benchmarks.misfit.verdicts import Outcome, read_report
+from benchmarks.rows import append, read
+from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active.criticism import Effect, Trials, close_loop
+from sbi_active.display.table import Table
+from sbi_active.seeding import derive_seed, forked_generators
+
+__all__ = ["CHANGES", "main", "table"]
+
+RESULT = Path(__file__).parent / "results" / "metamorphic.csv"
+COLUMNS = ["group", "machine", "kind", "case", "change", "named", "helps"]
+#: Kinds by turns; E and R, whose names are hardest, as often as all others.
+KINDS: tuple[Kind, ...] = ("E", "R", "P", "E", "R", "CE", "E", "R", "M", "C")
+UNIT, FINER, DENSER = 1000.0, 10.0, 4
+IRRELEVANT = 4
+
+
+def irrelevant(case: Case) -> Problem:
+    """Return the problem with four effects that explain nothing."""
+    problem, sd = case.problem, case.truth.machine.noise_sd
+
+    def pattern(seed: int) -> Effect:
+        def apply(x: Tensor, phi: Tensor, action: Tensor, context: Any) -> Tensor:
+            with forked_generators(derive_seed(seed, "irrelevant")):
+                signs = 2.0 * torch.randint(2, (97, *x.shape[1:])).to(x) - 1
+            return (
+                x
+                + sd
+                * phi.reshape(-1, *[1] * (x.ndim - 1))
+                * signs[context.index.long() % 97]
+            )
+
+        prior = torch.distributions.Normal(torch.zeros(1), torch.ones(1))
+        return Effect(
+            f"pattern {seed}",
+            hook="observation",
+            prior=torch.distributions.Independent(prior, 1),
+            null=0.0,
+            apply=apply,
+            units="",
+            family="pattern",
+        )
+
+    more = [pattern(k) for k in range(IRRELEVANT)]
+    return replace(problem, effects=[*problem.effects, *more])
+
+
+def units(case: Case) -> Problem:
+    """Return the problem with outcomes in thousandths of their unit."""
+    problem, truth = case.problem, case.truth
+    fn, t = problem.model.fn, problem.trials
+
+    def scaled(theta: Tensor, action: Tensor, **options: Any) -> Tensor:
+        return UNIT * fn(theta, action, **options)
+
+    scaled.__signature__ = inspect.signature(fn)  # type: ignore[attr-defined]
+    model = _model(case, scaled, UNIT * truth.machine.noise_sd)
+    trials = Trials(
+        t.action, UNIT * t.x, index=t.index, sample_times=problem.model.sample_times
+    )
+    effects = [_in_units(effect) for effect in problem.effects]
+    return replace(problem, model=model, trials=trials, effects=effects)
+
+
+def finer(case: Case) -> Problem:
+    """Return the problem with a sensor declared finer than it is."""
+    sd = case.truth.machine.noise_sd / FINER
+    return replace(case.problem, model=_model(case, case.problem.model.fn, sd))
+
+
+def denser(case: Case) -> Problem | None:
+    """Return the problem with more samples of the same trials; None if it has none."""
+    truth = case.truth
+    if truth.machine.name not in GROUPS["own"]:
+        return None
+    layout = _layout(case)
+    machine = get_machine(truth.machine.name, (layout[0], DENSER * layout[1]))
+    with forked_generators(derive_seed(len(truth.action), "denser")):
+        shape = len(truth.error), DENSER * truth.error.shape[1], *truth.error.shape[2:]
+        error = machine.noise_sd * torch.randn(shape, dtype=torch.float64)
+    error[:, DENSER - 1 :: DENSER] = truth.error
+    kept = {effect.name for effect in case.problem.effects}
+    more = replace(
+        truth,
+        machine=machine,
+        error=error,
+        effects=tuple(machine.effect(name) for name in truth.names),
+    )
+    trials = Trials(
+        truth.action[truth.fitted],
+        more.measured(truth.fitted),
+        index=truth.fitted,
+        sample_times=machine.times,
+    )
+    return Problem(
+        model=machine.model(),
+        prior=machine.prior,
+        trials=trials,
+        effects=[effect for effect in machine.library if effect.name in kept],
+    )
+
+
+def order(case: Case) -> Problem:
+    """Return the problem with its effects in the opposite order."""
+    return replace(case.problem, effects=case.problem.effects[::-1])
+
+
+CHANGES: dict[str, Callable[[Case], Problem | None]] = {
+    "none": lambda case: case.problem,
+    "irrelevant": irrelevant,
+    "units": units,
+    "finer": finer,
+    "denser": denser,
+    "order": order,
+}
+
+
+def _layout(case: Case) -> tuple[int, int]:
+    num = case.truth.machine.num_trials
+    return next(layout for layout in LAYOUTS if layout[0] == num)
+
+
+def _model(case: Case, fn: Callable[..., Any], sd: float) -> SimulatorModel:
+    machine = case.truth.machine
+    return SimulatorModel(
+        fn,
+        noise=GaussianNoise(sd),
+        parameter_names=[*machine.parameter_names],
+        sample_times=machine.times if machine.declares_times else None,
+    )
+
+
+def _in_units(effect: Effect) -> Effect:
+    """Return an effect whose outcomes are in other units."""
+    if effect.hook != "observation":
+        return effect
+
+    def apply(x: Tensor, phi: Tensor, action: Tensor, context: Any) -> Tensor:
+        return UNIT * effect.apply(x / UNIT, phi, action, context)
+
+    return replace(effect, apply=apply)
+
+
+def judged(problem: Problem, seed: int) -> Outcome:
+    """Return what the loop says of a problem."""
+    report = close_loop(
+        problem.model,
+        problem.prior,
+        problem.trials,
+        effects=problem.effects,
+        seed=seed,
+        evaluate=False,
+        plan=False,
+    )
+    return read_report(report, [])
+
+
+def table(rows: Sequence[Mapping[str, str]]) -> list[str]:
+    """Return how often the names stay, by change."""
+    names, helps = (
+        {
+            (r["group"], r["kind"], r["case"], r["change"]): frozenset(
+                json.loads(r[column])
+            )
+            for r in rows
+        }
+        for column in ("named", "helps")
+    )
+    cells = []
+    for change in [name for name in CHANGES if name != "none"]:
+        keys = [key for key in names if key[3] == change]
+        bases = [(*key[:3], "none") for key in keys]
+        same, alike = (
+            sum(of[k] == of[b] for k, b in zip(keys, bases, strict=True))
+            for of in (names, helps)
+        )
+        cells.append((change, f"{same}/{len(keys)}", f"{alike}/{len(keys)}"))
+    return [
+        *Table(("change", "same names", "same helps"), cells).markdown().split("\n")
+    ]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is run.
+
+    Args:
+        first: Number of the first case.
+        cases: Number of cases.
+        out: File of the results.
+        summary: Whether to run nothing, and print the table of the rows.
+    """
+
+    first: int = 700
+    cases: int = 40
+    out: Path = RESULT
+    summary: bool = False
+
+
+def main(arguments: Settings) -> None:
+    """Run the cases that are asked for and print the table."""
+    numbers = range(arguments.first, arguments.first + arguments.cases)
+    done = {(int(r["case"]), r["change"]) for r in read(arguments.out)}
+    for number in () if arguments.summary else numbers:
+        group = [*GROUPS][number // len(KINDS) % len(GROUPS)]
+        kind = KINDS[number % len(KINDS)]
+        case = draw_case(group, kind, number)
+        for change, changed in CHANGES.items():
+            if (number, change) in done or (problem := changed(case)) is None:
+                continue
+            found = judged(problem, number)
+            row = {
+                "group": group,
+                "machine": case.truth.machine.name,
+                "kind": kind,
+                "case": number,
+                "change": change,
+                "named": json.dumps(sorted(found.named)),
+                "helps": json.dumps(sorted(found.helps)),
+            }
+            append(arguments.out, COLUMNS, [row])
+            print(group, kind, number, change, row["named"], flush=True)
+    is_judged = arguments.first >= FIRST_JUDGED
+    rows = read(arguments.out)
+    print(
+        *table([r for r in rows if (int(r["case"]) >= FIRST_JUDGED) == is_judged]),
+        sep="\n",
+    )
