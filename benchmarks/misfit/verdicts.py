@@ -22,8 +22,9 @@ class Outcome:
     Attributes:
         line: The verdict in its words.
         alarm: Whether the bare model is said to miss.
-        support: Inclusion probability, nats gained and share of the excess that
-            remains, by effect that helps; empty where a model fits to the sensor.
+        support: Inclusion probability, nats gained, share of the excess that remains
+            and nats of formulas, by effect that helps; empty where a model fits to the
+            sensor.
         named: Effects given as a cause.
         helps: Effects said to predict better, those named among them.
         instead: Effects said to be possible in the place of one that helps.
@@ -33,7 +34,7 @@ class Outcome:
 
     line: str
     alarm: bool
-    support: Mapping[str, tuple[float, float, float]]
+    support: Mapping[str, tuple[float, float, float, float]]
     named: tuple[str, ...]
     helps: tuple[str, ...]
     instead: Mapping[str, Sequence[str]] = field(default_factory=dict)
@@ -65,7 +66,7 @@ def read_report(report: Report, effects: Sequence[str]) -> Outcome:
         line=str(report).splitlines()[0],
         alarm=alarm,
         support={
-            name: (own.inclusion, own.gained, own.remains)
+            name: (own.inclusion, own.gained, own.remains, own.guessed)
             for name, own in support.items()
         },
         named=tracing.chosen if misfit is None else misfit.named,
