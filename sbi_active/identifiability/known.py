@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch.distributions import Distribution
 
-from sbi_active.combinations.formula import Combination, Term, linked
-from sbi_active.combinations.search import KNOWN, search, width
+from sbi_active.identifiability.formula import Combination, Term, linked
+from sbi_active.identifiability.search import KNOWN, search, width
 from sbi_active.seeding import forked_generators
 
 Array = NDArray[Any]

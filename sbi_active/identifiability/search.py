@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.optimize import minimize_scalar
 
-from sbi_active.combinations.formula import SIMPLE, Combination, Term
+from sbi_active.identifiability.formula import SIMPLE, Combination, Term
 
 Array = NDArray[Any]
 
@@ -141,29 +141,22 @@ def _ranked(
         c, s = moments([Term(i, log=log) for i in usable])
         at = np.array(subsets)
         rows, columns = at[:, :, None], at[:, None, :]
-        scale = np.sqrt(s.diagonal())
-        c, s = (m / np.outer(scale, scale) for m in (c, s))
-        widths = np.sqrt(_smallest(c[rows, columns], s[rows, columns]).clip(0))
+        widths = _eigenvectors(c[rows, columns], s[rows, columns])[0][:, 0]
         for subset, own in zip(subsets, widths.tolist(), strict=True):
             key = tuple(usable[k] for k in subset)
             best[key] = min(own, best.get(key, np.inf))
     return sorted((own, subset) for subset, own in best.items())
 
 
-def _smallest(covariance: Array, prior: Array) -> Array:
-    """Return the smallest generalized eigenvalue of each pair, (k, m, m) -> (k,)."""
-    ridge = 1e-9 * np.eye(prior.shape[-1])
-    inverse = np.linalg.inv(np.linalg.cholesky(prior + ridge))
-    return np.linalg.eigvalsh(inverse @ covariance @ inverse.swapaxes(1, 2))[:, 0]
-
-
 def _eigenvectors(covariance: Array, prior: Array) -> tuple[Array, Array]:
-    """Return widths, smallest first, and the weights of each as a column."""
-    scale = np.sqrt(prior.diagonal())
-    c, s = (m / np.outer(scale, scale) for m in (covariance, prior))
-    inverse = np.linalg.inv(np.linalg.cholesky(s + 1e-9 * np.eye(len(s))))
-    values, vectors = np.linalg.eigh(inverse @ c @ inverse.T)
-    return np.sqrt(values.clip(0)), (inverse.T @ vectors) / scale[:, None]
+    """Return widths, smallest first, and the weights of each as a column, (..., m)."""
+    scale = np.sqrt(np.einsum("...ii->...i", prior))
+    units = scale[..., :, None] * scale[..., None, :]
+    whole = prior / units + 1e-9 * np.eye(prior.shape[-1])
+    inverse = np.linalg.inv(np.linalg.cholesky(whole))
+    turned = inverse.swapaxes(-1, -2)
+    values, vectors = np.linalg.eigh(inverse @ (covariance / units) @ turned)
+    return np.sqrt(values.clip(0)), (turned @ vectors) / scale[..., None]
 
 
 def _best_formula(

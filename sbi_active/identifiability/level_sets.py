@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sbi_active.combinations.formula import Combination
-from sbi_active.simulation.sensitivities import Sensitivities
+from sbi_active.identifiability.formula import Combination
+from sbi_active.identifiability.sensitivities import Sensitivities
 from sbi_active.support import within_support
 
 __all__ = ["moved_along"]
