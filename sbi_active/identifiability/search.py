@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -198,26 +199,23 @@ def _shifted(
 
     One with its best exponents, and one with exponents 1 and 1, or 1 and -1.
     """
-    for k, i in enumerate(subset):
-        other = subset[1 - k]
+    for i, other in (subset, subset[::-1]):
         if low[other] <= 0:
             continue
 
-        def pair(shift: float, k: int = k, i: int = i, other: int = other) -> Any:
-            terms = [Term(other, log=True), Term(i, log=True, shift=float(shift))]
-            return terms if k else terms[::-1]
-
-        def free(shift: float, pair: Any = pair) -> Combination:
-            c, s = moments(pair(shift))
-            return rounded(pair(shift), _eigenvectors(c, s)[1][:, 0], c, s, floor)
-
-        def plain(shift: float, pair: Any = pair) -> Combination:
-            product = Combination(tuple(pair(shift)))
+        def made(is_free: bool, shift: float, i: int = i) -> Combination:
+            moved = {i: float(shift)}
+            terms = [Term(j, log=True, shift=moved.get(j, 0.0)) for j in subset]
+            if is_free:
+                c, s = moments(terms)
+                return rounded(terms, _eigenvectors(c, s)[1][:, 0], c, s, floor)
+            product = Combination(tuple(terms))
             both = (product, product.mirrored())
             return min(both, key=lambda one: _own_width(one, moments))
 
-        for made in (free, plain):
-            best = _best_shift(made, moments, low[i], span[i], floor)
+        for is_free in (True, False):
+            product = partial(made, is_free)
+            best = _best_shift(product, moments, low[i], span[i], floor)
             if best is not None:
                 yield best
 

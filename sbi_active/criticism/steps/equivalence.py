@@ -19,6 +19,7 @@ from sbi_active.criticism.rivals.coordinates import SearchCoordinates
 from sbi_active.criticism.rivals.further_trials import conditions_at, together
 from sbi_active.criticism.rivals.noise_grid import declared_noise
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
+from sbi_active.inference.sampling.least_squares import basis_of
 from sbi_active.seeding import derive_seed, forked_generators
 
 Array = NDArray[Any]
@@ -162,8 +163,7 @@ class _World:
             np.where(np.isfinite(part), part, 0.0)
             for part in self.slopes(self.coordinates, u)
         )
-        basis, size, _ = np.linalg.svd(jacobian, full_matrices=False)
-        basis = basis[:, size > 1e-9 * max(size.max(), 1e-300)]
+        basis = basis_of(jacobian)
         left = []
         for effect in effects:
             shift, scale = _small(effect, self.step)
