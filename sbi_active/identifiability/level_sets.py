@@ -15,8 +15,6 @@ from sbi_active.identifiability.formula import Combination
 from sbi_active.identifiability.sensitivities import Sensitivities
 from sbi_active.support import within_support
 
-__all__ = ["moved_along"]
-
 Array = NDArray[Any]
 
 FEWEST_MOVED = 0.25  # prior deviations that places lie apart to be compared at all

@@ -24,8 +24,6 @@ from sbi_active.mujoco.effects.insertions import Transmission, least_compliance
 from sbi_active.mujoco.models.changes import ModelChange
 from sbi_active.mujoco.models.names import element_id
 
-__all__ = ["effects_of"]
-
 TABLE = Path(__file__).with_name("table.md")
 
 
