@@ -21,7 +21,7 @@ GROUND = "ground"
 FLOORS = (
     GROUND,
     "actions",
-    "combinations",
+    "identifiability",
     "simulation",
     "inference",
     "pyro",

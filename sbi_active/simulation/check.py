@@ -15,13 +15,13 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
-from sbi_active.renamed import takes_loose
-from sbi_active.seeding import derive_seed, forked_generators, row_seeds
-from sbi_active.simulation.identifiability import (
+from sbi_active.identifiability.undetermined import (
     MAX_ACTIONS,
     Undetermined,
     find_undetermined,
 )
+from sbi_active.renamed import takes_loose
+from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.simulation.model import SimulatorModel, takes_seeds
 from sbi_active.simulation.outcomes import MissingRowsWarning, Outcome, SimulationError
 from sbi_active.simulation.report import SimulatorReport

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from sbi_active.identifiability.undetermined import Undetermined
 from sbi_active.messages import Message
-from sbi_active.simulation.identifiability import Undetermined
 
 LINES = 10  # of actions without a measurement
 

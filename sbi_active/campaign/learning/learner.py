@@ -30,10 +30,10 @@ from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.learning.rounds import Round
 from sbi_active.campaign.score import Score, score_outcome, simulate_from
 from sbi_active.campaign.state import CampaignState, Trial
+from sbi_active.identifiability.known import note_combinations
 from sbi_active.inference.beliefs.belief import information_gained, named
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.enumerated import Enumeration
-from sbi_active.inference.beliefs.identifiability import note_combinations
 from sbi_active.inference.beliefs.priors import require_support, require_width
 from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeError
 from sbi_active.inference.trainers.base import ActiveInference

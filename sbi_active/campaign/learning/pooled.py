@@ -21,7 +21,7 @@ from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.design.design import Design
 from sbi_active.design.elimination import Estimates, choose
 from sbi_active.design.limits import DesignLimits
-from sbi_active.inference.beliefs.identifiability import note_combinations
+from sbi_active.identifiability.known import note_combinations
 from sbi_active.inference.emulation.joint import candidate_gains
 from sbi_active.inference.emulation.pool import Pool
 from sbi_active.inference.emulation.processes import PooledTrial, Processes

@@ -163,9 +163,7 @@ class AugmentedSimulator(SimulatorModel):
             context: Context of the rows, as in :meth:`evaluate`.
         """
         context = self._row_context(action, index, context)
-        for effect in self._active("noise", phi):
-            sd = applied(effect, sd, phi[effect.name], action, context)
-        return sd
+        return self._through("noise", sd, phi, action, context)
 
     def split(self, parameters: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return theta and phi by effect from (theta, phi), shape (n, dim)."""
@@ -274,49 +272,51 @@ class AugmentedSimulator(SimulatorModel):
         if seeds is None and self.noise is not None:
             seeds = torch.zeros(len(theta), dtype=torch.int64)
         commanded = action
-        for effect in self._active("parameter", phi):
-            theta = applied(effect, theta, phi[effect.name], commanded, context)
-        for effect in self._active("action", phi):
-            action = applied(effect, action, phi[effect.name], commanded, context)
+        theta = self._through("parameter", theta, phi, commanded, context)
+        action = self._through("action", action, phi, commanded, context)
         if context.inputs is None and self.base.inputs is not None:
             signals = played(self.base.inputs, action, action.dtype)
             context = replace(context, **signals)
-        changed: dict[str, Any] = {
-            **self._handed_over(phi, action, commanded, context),
-            **(keywords or {}),
-        }
-        for effect in self._active("dynamics", phi):
-            changed = applied(effect, changed, phi[effect.name], commanded, context)
+        told = self._told(phi, commanded, context) | dict(keywords or {})
+        told = self._through("dynamics", told, phi, commanded, context)
         run = self._run_merged if merge else self.base._run
-        x = run(theta, action, seeds, changed)
-        for effect in self._active("observation", phi):
-            x = applied(effect, x, phi[effect.name], commanded, context)
-        return x
+        x = run(theta, action, seeds, told)
+        return self._through("observation", x, phi, commanded, context)
 
-    def _handed_over(
-        self, phi: dict[str, Tensor], action: Tensor, commanded: Tensor, given: Context
+    def _through(
+        self,
+        hook: str,
+        value: Any,
+        phi: dict[str, Tensor],
+        action: Tensor,
+        context: Context,
+    ) -> Any:
+        """Return a value as all effects of a hook change it, one after the other."""
+        for effect in self._active(hook, phi):
+            value = applied(effect, value, phi[effect.name], action, context)
+        return value
+
+    def _told(
+        self, phi: dict[str, Tensor], action: Tensor, context: Context
     ) -> dict[str, Any]:
         """Return what the simulator's function is told of how its trials are run."""
-        inputs = given.inputs
+        inputs, wanted = context.inputs, self.base.conditions
         for effect in self._active("input", phi):
-            if inputs is None or "inputs" not in self.base.conditions:
+            if inputs is None or "inputs" not in wanted:
                 raise ValueError(
                     f"expected inputs over time for effect {effect.name!r}, in the "
                     "trials and as an argument of the simulator's function; got "
                     f"{'none in the trials' if inputs is None else 'no such argument'}"
                     "; pass Trials(inputs=...), and take fn(theta, action, *, inputs)"
                 )
-            inputs = applied(effect, inputs, phi[effect.name], commanded, given)
-        # The simulator is read where the trial was, not on a grid of its own.
-        times = None if given.times is None else given.times.expand(len(action), -1)
         every = {
-            "times": times,
-            "inputs": inputs,
-            "input_times": given.input_times,
-            "start": given.start,
+            **vars(context),
+            "inputs": self._through("input", inputs, phi, action, context),
         }
-        wanted = self.base.conditions
-        return {k: v for k, v in every.items() if k in wanted and v is not None}
+        if context.times is not None:
+            # The simulator is read where the trial was, not on a grid of its own.
+            every["times"] = context.times.expand(len(action), -1)
+        return {k: every[k] for k in wanted if every[k] is not None}
 
     def _run_merged(
         self,

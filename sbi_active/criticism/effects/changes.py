@@ -1,145 +1,52 @@
-"""Changes of a value by an effect: what an actuator or a sensor makes of it.
-
-Each takes ``(value, phi, action, context)``, as ``Effect.apply`` does: phi, shape (n,
-k), acts on the last axis of the value.
-"""
+"""Changes of a value by an effect: what an actuator or a sensor makes of it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from sbi_active.criticism.effects.effect import Context
-from sbi_active.criticism.effects.series import played, rounded
-
-Change = Callable[[Tensor, Tensor, Tensor, Context], Tensor]
-#: A change of a series by phi and the step, or the times, of its samples.
-InTime = Callable[[Tensor, Tensor, Tensor], Tensor]
-
-
-@dataclass(frozen=True)
-class OnInput:
-    """Changes one input over time."""
-
-    name: str
-    change: Change
-
-    def __call__(
-        self, value: dict[str, Tensor], phi: Tensor, action: Tensor, context: Context
-    ) -> dict[str, Tensor]:
-        """Return the inputs with that one changed."""
-        own = self.change(value[self.name], phi, action, context)
-        return {**value, self.name: own}
+from sbi_active.criticism.effects.series import (
+    at_times,
+    delayed_input,
+    delayed_samples,
+    lagged_input,
+    lagged_samples,
+    played,
+    rounded,
+)
 
 
 @dataclass(frozen=True)
-class OnChannel:
-    """Changes one entry of x's last axis."""
+class Wrapped:
+    """A change of an action, of some inputs over time, or of x.
 
-    channel: int
-    change: Change
+    Attributes:
+        what: Name of the change in :data:`CHANGES`.
+        inputs: Names of the inputs that it changes alike; () changes the value itself.
+        channel: Entry of x's last axis that alone is changed; None changes all.
+    """
+
+    what: str
+    inputs: tuple[str, ...] = ()
+    channel: int | None = None
 
     def __call__(
-        self, x: Tensor, phi: Tensor, action: Tensor, context: Context
-    ) -> Tensor:
-        """Return x with that channel changed."""
-        parts = [*x.split(1, -1)]
-        parts[self.channel] = self.change(parts[self.channel], phi, action, context)
+        self, value: Any, phi: Tensor, action: Tensor, context: Context
+    ) -> Any:
+        """Return the value changed."""
+        change = CHANGES[self.what]
+        if self.inputs:
+            return {**value, **{n: change(value[n], phi, context) for n in self.inputs}}
+        if self.channel is None:
+            return change(value, phi, context)
+        parts = [*value.split(1, -1)]
+        parts[self.channel] = change(parts[self.channel], phi, context)
         return torch.cat(parts, -1)
-
-
-@dataclass(frozen=True)
-class AlongInput:
-    """Changes a series on the uniform grid of the inputs."""
-
-    change: InTime
-
-    def __call__(
-        self, u: Tensor, phi: Tensor, action: Tensor, context: Context
-    ) -> Tensor:
-        """Return the series changed."""
-        assert context.input_times is not None
-        return self.change(u, phi, context.input_times[1] - context.input_times[0])
-
-
-@dataclass(frozen=True)
-class AlongSamples:
-    """Changes x along its sample times."""
-
-    change: InTime
-
-    def __call__(
-        self, x: Tensor, phi: Tensor, action: Tensor, context: Context
-    ) -> Tensor:
-        """Return x changed."""
-        return self.change(x, phi, _sample_times(x, context))
-
-
-def add(value: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
-    """Return the value with phi added."""
-    return value + _lift(phi, value)
-
-
-def scale(value: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
-    """Return the value times 1 + phi."""
-    return value * (1 + _lift(phi, value))
-
-
-def drift(value: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
-    """Return the value with phi added from trial to trial."""
-    return value + _lift(phi * context.index[:, None], value)
-
-
-def clamp(value: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
-    """Return the value within limits of phi."""
-    limit = _lift(phi, value)
-    return torch.minimum(torch.maximum(value, -limit), limit)
-
-
-def clamp_log(value: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
-    """Return the value within limits whose logarithm is phi."""
-    return clamp(value, phi.exp(), action, context)
-
-
-def dead_zone(value: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
-    """Return the value nearer to zero by phi."""
-    return value.sign() * (value.abs() - _lift(phi, value)).clamp(min=0)
-
-
-def backlash(u: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
-    """Return a series behind a play of phi."""
-    return played(u, phi)
-
-
-def quantize(x: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
-    """Return multiples of phi."""
-    return rounded(x, _lift(phi, x))
-
-
-def creep(x: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
-    """Return x with a bias that grows along each recording."""
-    times = _sample_times(x, context)
-    since = (times - times[:, :1]).reshape(*times.shape, *[1] * (x.ndim - 2))
-    return x + _lift(phi, x) * since
-
-
-def shift_in_time(x: Tensor, phi: Tensor, action: Tensor, context: Context) -> Tensor:
-    """Return x at times + phi, linear between samples and beyond the ends."""
-    times = _sample_times(x, context).contiguous()
-    wanted = (times + phi).contiguous()
-    last = times.shape[1] - 2
-    low = (torch.searchsorted(times, wanted, right=True) - 1).clamp(0, last)
-    step = times.gather(1, low + 1) - times.gather(1, low)
-    # What pads a shorter trial has the time of its last sample.
-    step = step.where(step > 0, torch.ones_like(step))
-    weight = (wanted - times.gather(1, low)) / step
-    shape = (*low.shape, *[1] * (x.ndim - 2))
-    index = low.reshape(shape).expand_as(x)
-    weight = weight.reshape(shape)
-    return (1 - weight) * x.gather(1, index) + weight * x.gather(1, index + 1)
 
 
 def _lift(phi: Tensor, value: Tensor) -> Tensor:
@@ -147,10 +54,44 @@ def _lift(phi: Tensor, value: Tensor) -> Tensor:
     return phi.reshape(len(phi), *[1] * (value.ndim - 2), phi.shape[1])
 
 
-def _sample_times(x: Tensor, context: Context) -> Tensor:
+def _limited(value: Tensor, limit: Tensor) -> Tensor:
+    return torch.minimum(torch.maximum(value, -limit), limit)
+
+
+def _since_start(x: Tensor, context: Context) -> Tensor:
+    """Return the time since the first sample, of a shape that acts on x."""
+    times = _times(x, context)
+    return (times - times[:, :1]).reshape(*times.shape, *[1] * (x.ndim - 2))
+
+
+def _times(x: Tensor, context: Context) -> Tensor:
     if context.times is None:
         raise ValueError(
             "expected sample times for an effect along them; got none; give "
             "SimulatorModel(sample_times=...) or Trials(sample_times=...)"
         )
     return context.times.to(x.dtype).expand(len(x), -1)
+
+
+def _step(context: Context) -> Tensor:
+    assert context.input_times is not None
+    return context.input_times[1] - context.input_times[0]
+
+
+#: Changes of a value by phi, shape (n, k), which acts on its last axis.
+CHANGES: dict[str, Callable[[Tensor, Tensor, Context], Tensor]] = {
+    "offset": lambda x, phi, c: x + _lift(phi, x),
+    "gain": lambda x, phi, c: x * (1 + _lift(phi, x)),
+    "limit": lambda x, phi, c: _limited(x, _lift(phi, x)),
+    "log limit": lambda x, phi, c: _limited(x, _lift(phi.exp(), x)),
+    "dead zone": lambda x, phi, c: x.sign() * (x.abs() - _lift(phi, x)).clamp(min=0),
+    "backlash": lambda u, phi, c: played(u, phi),
+    "input delay": lambda u, phi, c: delayed_input(u, phi, _step(c)),
+    "input lag": lambda u, phi, c: lagged_input(u, phi, _step(c)),
+    "drift by trial": lambda x, phi, c: x + _lift(phi * c.index[:, None], x),
+    "drift in time": lambda x, phi, c: x + _lift(phi, x) * _since_start(x, c),
+    "clock": lambda x, phi, c: at_times(x, _times(x, c) + phi, _times(x, c)),
+    "delay": lambda x, phi, c: delayed_samples(x, phi, _times(x, c)),
+    "lag": lambda x, phi, c: lagged_samples(x, phi, _times(x, c)),
+    "quantum": lambda x, phi, c: rounded(x, _lift(phi, x)),
+}

@@ -30,7 +30,7 @@ from torch.distributions import Independent, Normal
 from sbi_active.callers import stack_level
 from sbi_active.criticism.data.arrays import repeated
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.effects.effect import Context, Effect
+from sbi_active.criticism.effects.effect import Context, Effect, Hook
 from sbi_active.messages import warn
 
 Array = NDArray[Any]
@@ -92,54 +92,27 @@ def start_from_first_samples(
         >>> nuisance.scope, nuisance.phi_dim
         ('trial', 2)
     """
-    wanted = {
-        key: (value, 0) if isinstance(value, int) else value
-        for key, value in start.items()
-    }
-    degree = max([1, *[order for _, order in wanted.values()]])
-    channels = [channel for channel, _ in wanted.values()]
-    sds = _deviations(trials, sd, channels)
-    found: dict[str, list[float]] = {key: [] for key in wanted}
-    errors: dict[str, list[float]] = {key: [] for key in wanted}
-    bent = set()
-    for i in range(len(trials)):
-        for (key, (channel, order)), own in zip(wanted.items(), sds, strict=True):
-            t, x = _first(trials, i, channel, within, degree)
-            t = t - (t[0] if at is None else at)
-            value, error = _polynomial(t, x, degree)
-            misfit = x - np.polynomial.Polynomial(value)(t)
-            p = chi2.sf(np.sum((misfit / own) ** 2), max(len(t) - degree - 1, 1))
-            if p < BENT / (len(trials) * len(wanted)):
-                bent.add(i)
-            found[key].append(factorial(order) * value[order])
-            errors[key].append(factorial(order) * own * error[order])
-    if bent:
-        warn(
-            f"SA211 the first samples of {trials.called(sorted(bent))} leave a "
-            f"polynomial of order {degree} by more than the sensor's error, so that "
-            "their start is wrong and hides what bends them, such as gravity: name a "
-            f"derivative of order {degree + 1} as well, or pass a shorter within",
-            stacklevel=stack_level(),
-        )
     if trials.start is not None and not isinstance(trials.start, dict):
         raise ValueError(
             "expected measured start states by name; got an array; pass "
             "Trials(start={name: ...}), whose names the simulator tells apart"
         )
+    wanted = [(v, 0) if isinstance(v, int) else v for v in start.values()]
+    degree = max([1, *[order for _, order in wanted]])
+    values, errors, p_value = _fitted(trials, wanted, degree, within, sd, at)
+    if bent := np.flatnonzero(p_value < BENT / (len(trials) * len(wanted))).tolist():
+        warn(
+            f"SA211 the first samples of {trials.called(bent)} leave a "
+            f"polynomial of order {degree} by more than the sensor's error, so that "
+            "their start is wrong and hides what bends them, such as gravity: name a "
+            f"derivative of order {degree + 1} as well, or pass a shorter within",
+            stacklevel=stack_level(),
+        )
     copy = trials.select(slice(None))
-    shown = {key: torch.tensor(v, dtype=torch.float64) for key, v in found.items()}
+    shown = dict(zip(start, torch.from_numpy(values.T.copy()), strict=True))
     copy.start = {**(trials.start or {}), **shown}
     copy.repeat_of = repeated(copy.settings())
-    deviations = [width * max(errors[key]) for key in wanted]
-    nuisance = Effect(
-        name,
-        hook="dynamics",
-        prior=_about_zero(deviations),
-        null=0.0,
-        apply=_Shifted((*wanted,)),
-        scope="trial",
-    )
-    return copy, nuisance
+    return copy, _nuisance(name, "dynamics", _Shifted((*start,)), width * errors)
 
 
 def zero_from_first_samples(
@@ -179,27 +152,11 @@ def zero_from_first_samples(
         >>> trials.x.tolist()
         [[0.0, 0.0, 6.0], [0.0, 0.0, 7.0]]
     """
-    copy, deviations = trials.select(slice(None)), []
-    sds = _deviations(trials, sd, channels)
-    copy.x = trials.x.clone()
-    for channel, own in zip(channels, sds, strict=True):
-        errors = []
-        for i in range(len(trials)):
-            t, x = _first(trials, i, channel, within, 0)
-            (value,), (error,) = _polynomial(t, x, 0)
-            errors.append(own * error)
-            whole = copy.x[i] if copy.x.ndim == 2 else copy.x[i, :, channel]
-            whole -= value
-        deviations.append(width * max(errors))
-    nuisance = Effect(
-        name,
-        hook="observation",
-        prior=_about_zero(deviations),
-        null=0.0,
-        apply=_Offset((*channels,)),
-        scope="trial",
-    )
-    return copy, nuisance
+    each = [(channel, 0) for channel in channels]
+    values, errors, _ = _fitted(trials, each, 0, within, sd)
+    copy = trials.select(slice(None))
+    copy.x = _Offset((*channels,))(trials.x, torch.from_numpy(-values))
+    return copy, _nuisance(name, "observation", _Offset((*channels,)), width * errors)
 
 
 @dataclass(frozen=True)
@@ -225,18 +182,58 @@ class _Offset:
     channels: tuple[int, ...]
 
     def __call__(
-        self, value: Tensor, phi: Tensor, action: Tensor, context: Context
+        self, value: Tensor, phi: Tensor, action: Any = None, context: Any = None
     ) -> Tensor:
         if value.ndim == 2:
-            return value + phi
+            return value + phi.to(value.dtype)
         offset = torch.zeros_like(value)
         offset[..., list(self.channels)] = phi.to(value.dtype)[:, None]
         return value + offset
 
 
-def _about_zero(deviations: Sequence[float]) -> Independent:
-    scale = torch.tensor(deviations, dtype=torch.float64)
-    return Independent(Normal(torch.zeros_like(scale), scale), 1)
+def _nuisance(name: str, hook: Hook, apply: Any, deviations: Array) -> Effect:
+    """Return the nuisance of a trial, as wide as in the trial that tells least."""
+    scale = torch.from_numpy(deviations.max(0))
+    prior = Independent(Normal(torch.zeros_like(scale), scale), 1)
+    return Effect(name, hook=hook, prior=prior, null=0.0, apply=apply, scope="trial")
+
+
+def _fitted(
+    trials: Trials,
+    wanted: Sequence[tuple[int, int]],
+    degree: int,
+    within: float,
+    sd: float | Sequence[float],
+    at: float | None = None,
+) -> tuple[Array, Array, Array]:
+    """Return derivatives of polynomials at the start of each trial, (n, k).
+
+    Args:
+        trials: Trials with sample times.
+        wanted: Entry of x's last axis and order of the derivative, k of them.
+        degree: Degree of the polynomials.
+        within: Time from its first sample in which a trial is fitted.
+        sd: Standard deviation of the sensor, one for all entries of x or one each.
+        at: Time of the start; None for each trial's first sample.
+
+    Returns:
+        The derivatives, their standard errors, and the tail probability of what the
+        polynomial leaves; the last by trial, the smallest of the k.
+    """
+    sds = _deviations(trials, sd, [channel for channel, _ in wanted])
+    values, errors = np.empty((2, len(trials), len(wanted)))
+    p_value = np.ones(len(trials))
+    for i in range(len(trials)):
+        for j, ((channel, order), own) in enumerate(zip(wanted, sds, strict=True)):
+            t, x = _first(trials, i, channel, within, degree)
+            t = t - (t[0] if at is None else at)
+            value, error = _polynomial(t, x, degree)
+            misfit = x - np.polynomial.Polynomial(value)(t)
+            freedom = max(len(t) - degree - 1, 1)
+            p_value[i] = min(p_value[i], chi2.sf(np.sum((misfit / own) ** 2), freedom))
+            values[i, j] = factorial(order) * value[order]
+            errors[i, j] = factorial(order) * own * error[order]
+    return values, errors, p_value
 
 
 def _deviations(

@@ -2,32 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution, Independent, Uniform
+from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace, DiscreteActions
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.effects.changes import (
-    add,
-    clamp_log,
-    drift,
-    scale,
-    shift_in_time,
-)
-from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.effects.generic_series import (
-    SCALES,
-    normal,
-    of_actuator,
-    of_inputs,
-    of_samples,
-    on_channel,
-    typical_delay,
-)
+from sbi_active.criticism.effects.changes import Wrapped
+from sbi_active.criticism.effects.effect import Effect, Hook
+from sbi_active.criticism.effects.table import rows_of
 from sbi_active.criticism.effects.trial_conditions import (
     conditions_for,
     has_own_times,
@@ -36,9 +23,14 @@ from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.noise.base import declared_sds
 
+TABLE = Path(__file__).with_name("generic.md")
 NUM_ACTIONS, NUM_PRIOR = 256, 256
 #: Sensors along a trajectory that have effects each for itself.
 MOST_SENSORS = 4
+#: Delays, lags and a clock's error, in spans of a recording.
+LATE = 0.02
+#: Samples of a recording that delays and lags are at most.
+MOST_SAMPLES = 10.0
 
 
 def generic_effects(
@@ -81,142 +73,166 @@ def generic_effects(
         )
     sd = None if model.noise is None else declared_sds(model.noise)
     draws = None if prior is None else _prior_draws(model, actions, prior)
+    times, signals, trials = model.sample_times, model.inputs, None
+    inputs, grid = None, None
     if isinstance(actions, Trials):
-        return _of_trials(model, actions, sd, draws)
-    sd, spread = _sizes(sd, draws)
-    if model.inputs is not None:
-        signals = model.inputs.inputs(actions.sample((NUM_ACTIONS,), seed=0).double())
-        grid, times = model.inputs.input_times, model.sample_times
-        found = [*_of_series(signals, grid, times), *_of_observation(sd, spread, None)]
-        return found if times is None else [*found, *of_samples(sd, times)]
-    return [*_of_action(actions), *_of_observation(sd, spread, model.sample_times)]
-
-
-def _of_trials(
-    model: SimulatorModel,
-    trials: Trials,
-    sd: Tensor | None,
-    draws: tuple[Tensor, Tensor] | None,
-) -> list[Effect]:
-    times = trials.sample_times
-    if has_own_times(model, trials):
-        times = model.sample_times
-    found, inputs, grid = [], trials.inputs, trials.input_times
-    if inputs is None and model.inputs is not None:
-        inputs = model.inputs.inputs(trials.action)
-        grid = model.inputs.input_times
-    if not trials.action_is_label and model.inputs is None:
-        labels = trials.action_labels or ()
-        units = [label.partition(" [")[2].removesuffix("]") for label in labels]
-        recorded = trials.action.unique(dim=0)
-        found += _of_action(DiscreteActions(recorded, units=units or None))
+        trials, inputs, grid = actions, actions.inputs, actions.input_times
+        times = times if has_own_times(model, actions) else actions.sample_times
+    found = []
+    if signals is not None:
+        if inputs is None:
+            inputs, grid = signals.inputs(_some(actions)), signals.input_times
+    elif trials is None or not trials.action_is_label:
+        space = _recorded(actions) if isinstance(actions, Trials) else actions
+        unit = space.units[0] if len({*space.units}) == 1 else ""
+        words = {"who": "the action", "before": "", "unit": unit}
+        found += _made("command", "action", "action", _command(_some(space)), words)
     if inputs is not None:
         assert grid is not None
-        found += _of_series(inputs, grid, times, trials.input_labels)
-    return [*found, *_of_sensors(trials, sd, draws, times, model.channel_names)]
+        delay = min(typical_delay(t) for t in (grid, times) if t is not None)
+        labels = None if trials is None else trials.input_labels
+        found += _of_inputs(inputs, labels, delay)
+    if times is None:
+        late: dict[str, Tensor] = {}
+    elif trials is None and inputs is None:
+        late = {"late": torch.tensor([LATE * float(times.max() - times.min())])}
+    else:
+        far = times.nan_to_num(-torch.inf).max() - times.nan_to_num(torch.inf).min()
+        late = {"span": far, "delay": torch.tensor([typical_delay(times)])}
+    if trials is None or times is None:
+        return [*found, *_of_sensor(sd, draws, late)]
+    names = trials.channel_labels or model.channel_names
+    return [*found, *_of_sensors(trials.x, names, sd, draws, late)]
+
+
+def typical_delay(times: Tensor) -> float:
+    """Return one prior deviation of delays and lags, s.
+
+    Args:
+        times: Sample times of one recording, or of several, shape (k,) or (t, k), NaN
+            for none.
+    """
+    rows = times.reshape(-1, times.shape[-1]).double()
+    known = [row[row.isfinite()] for row in rows]
+    span = max(float(row.max() - row.min()) for row in known)
+    gaps = torch.cat([row.diff() for row in known])
+    step = float(gaps[gaps > 0].median()) if bool((gaps > 0).any()) else span
+    return min(LATE * span, MOST_SAMPLES * step)
+
+
+def _made(
+    of: str,
+    hook: Hook,
+    label: str,
+    sizes: Mapping[str, Any],
+    words: Mapping[str, str],
+    **wrapped: Any,
+) -> list[Effect]:
+    """Return the effects of the table whose sizes are known."""
+    return [
+        row.made(
+            *(hook, Wrapped(row.changes, **wrapped), label, sizes, words),
+            needs_order=row.changes == "drift by trial",
+        )
+        for row in rows_of(TABLE)
+        if row.of == of and row.is_sized(sizes)
+    ]
+
+
+def _some(actions: ActionSpace | Trials) -> Tensor:
+    if isinstance(actions, Trials):
+        return actions.action
+    return actions.sample((NUM_ACTIONS,), seed=0).double()
+
+
+def _recorded(trials: Trials) -> ActionSpace:
+    labels = trials.action_labels or ()
+    units = [label.partition(" [")[2].removesuffix("]") for label in labels]
+    return DiscreteActions(trials.action.unique(dim=0), units=units or None)
+
+
+def _command(some: Tensor) -> dict[str, Tensor]:
+    """Return sizes of commands, shape (n, k)."""
+    low, high = some.min(0).values, some.max(0).values
+    width = torch.where(high > low, high - low, high.abs().clamp(min=1e-12))
+    sizes = {"one": torch.ones_like(width), "range": width}
+    if bool(((low < 0) & (high > 0)).any()):
+        sizes["swing"] = width
+    return sizes | {"largest": some.abs().max(0).values.clamp(min=1e-12)}
+
+
+def _of_inputs(
+    inputs: Mapping[str, Tensor], labels: Sequence[str] | None, delay: float
+) -> list[Effect]:
+    """Return effects of an actuator on each input that is not always zero."""
+    found = []
+    each = zip(inputs.items(), labels or [""] * len(inputs), strict=True)
+    for (name, value), label in each:
+        if not bool((value != 0).any()):
+            continue
+        before = name if len(inputs) > 1 else ""
+        sizes = _command(value[value.isfinite()].double()[:, None])
+        if bool((value.diff(dim=1) != 0).any()):
+            sizes |= {"play": sizes["range"], "delay": torch.tensor([delay])}
+        unit = label.partition(" [")[2].removesuffix("]")
+        words = {"who": f"the input {name}", "before": before, "unit": unit}
+        own = before or "input"
+        found += _made("command", "input", own, sizes, words, inputs=(name,))
+    return found
 
 
 def _of_sensors(
-    trials: Trials,
+    x: Tensor,
+    names: Sequence[str] | None,
     sd: Tensor | None,
     draws: tuple[Tensor, Tensor] | None,
-    times: Tensor | None,
-    names: Sequence[str] | None,
+    late: Mapping[str, Tensor],
 ) -> list[Effect]:
     """Return effects of one sensor, or of each where few have a series of their own."""
-    if times is None:
-        return _of_observation(*_sizes(sd, draws), None)
-    num = 1 if trials.x.ndim == 2 else trials.x.shape[2]
-    if num == 1 or trials.x.ndim > 3 or num > MOST_SENSORS:
+    num = 1 if x.ndim == 2 else x.shape[2]
+    if num == 1 or x.ndim > 3 or num > MOST_SENSORS:
         if num == 1 and sd is not None:
             sd = sd.mean().reshape(1)  # a sample is no channel
-        sd, spread = _sizes(sd, draws)
-        return [*_of_observation(sd, spread, None), *of_samples(sd, times)]
-    labels = trials.channel_labels or names or [f"x {j + 1}" for j in range(num)]
+        return _of_sensor(sd, draws, late)
     found = []
-    for j, label in enumerate(labels):
+    for j, label in enumerate(names or [f"x {j + 1}" for j in range(num)]):
         own = None if sd is None else sd[[j if len(sd) == num else 0]]
-        part = None
-        if draws is not None:
-            part = draws[0][..., [j]], draws[1][..., [j]]
-        own, spread = _sizes(own, part)
+        part = draws and (draws[0][..., [j]], draws[1][..., [j]])
         name = label.partition(" [")[0]
-        each = [*_of_observation(own, spread, None), *of_samples(own, times)]
-        found += [on_channel(effect, j, name) for effect in each]
+        found += _of_sensor(own, part, late, name, f"{name}: ", channel=j)
     return found
 
 
-def _of_series(
-    inputs: dict[str, Tensor],
-    grid: Tensor,
-    times: Tensor | None,
-    labels: Sequence[str] | None = None,
+def _of_sensor(
+    sd: Tensor | None,
+    draws: tuple[Tensor, Tensor] | None,
+    late: Mapping[str, Tensor],
+    label: str = "",
+    at: str = "",
+    **wrapped: Any,
 ) -> list[Effect]:
-    delay = typical_delay(grid)
-    if times is not None:
-        delay = min(delay, typical_delay(times))
-    stated = labels or [""] * len(inputs)
-    units = [label.partition(" [")[2].removesuffix("]") for label in stated]
-    return of_inputs(inputs, delay, dict(zip(inputs, units, strict=True)))
+    """Return effects on an observation.
 
-
-def _of_action(actions: ActionSpace) -> list[Effect]:
-    some = actions.sample((NUM_ACTIONS,), seed=0).double()
-    units = actions.units[0] if len({*actions.units}) == 1 else ""
-    make = partial(Effect, hook="action", units=units)
-    return of_actuator(make, some, "action ", "", "the action")
-
-
-def _of_observation(
-    sd: Tensor, spread: Tensor | None, times: Tensor | None
-) -> list[Effect]:
-    make = partial(Effect, hook="observation", null=0.0)
-    found = [
-        make(
-            "bias",
-            prior=normal(SCALES.bias * sd),
-            apply=add,
-            describe="the sensor reads a constant too much",
-        ),
-        make(
-            "sensor gain",
-            prior=normal(torch.full_like(sd, SCALES.gain)),
-            apply=scale,
-            describe="the sensor reads a multiple of the truth",
-        ),
-        make(
-            "drift",
-            prior=normal(SCALES.drift * sd),
-            apply=drift,
-            units="a trial",
-            describe="the sensor's bias grows from trial to trial",
-            needs_order=True,
-        ),
-    ]
-    if times is not None:
-        span = float(times.max() - times.min())
-        found.append(
-            make(
-                "clock offset",
-                prior=normal(torch.tensor([SCALES.late * span]).double()),
-                apply=shift_in_time,
-                units="s",
-                describe="the time stamps are late by a constant",
-            )
-        )
-    if spread is not None:
-        low, high = (torch.log(f * spread.reshape(1)) for f in SCALES.range)
-        found.append(
-            make(
-                "sensor saturation",
-                prior=Independent(Uniform(low, high), 1),
-                null=torch.inf,
-                apply=clamp_log,
-                units="log",
-                describe="readings beyond a limit are that limit",
-            )
-        )
-    return found
+    Args:
+        sd: Deviations of its noise, None if they are not declared.
+        draws: Draws of x, twice; None if no prior is known.
+        late: Sizes of what acts in time.
+        label: Name of the sensor.
+        at: Beginning of the sentences.
+        **wrapped: Entry of x's last axis that is changed.
+    """
+    sizes = dict(late)
+    if draws is not None:
+        x, again = draws
+        finite = x.flatten(1).isfinite().all(-1) & again.flatten(1).isfinite().all(-1)
+        within = (x - again)[finite].square().mean().sqrt().reshape(1) / 2**0.5
+        # A median: a spread that a few extreme actions make is not the typical one.
+        spread = (x[finite] - x[finite].median(0).values).abs().median() * 1.4826
+        sizes["spread"] = spread.clamp(min=float(within)).reshape(1)
+        sd = within if sd is None else sd
+    assert sd is not None
+    sizes |= {"noise": sd, "one": torch.ones_like(sd)}
+    return _made("sensor", "observation", label, sizes, {"at": at}, **wrapped)
 
 
 def _prior_draws(
@@ -235,18 +251,3 @@ def _prior_draws(
         x = model(theta, action, seeds=row_seeds(0, NUM_PRIOR), **run)
         again = model(theta, action, seeds=row_seeds(1, NUM_PRIOR), **run)
     return x.double(), again.double()
-
-
-def _sizes(
-    sd: Tensor | None, draws: tuple[Tensor, Tensor] | None
-) -> tuple[Tensor, Tensor | None]:
-    """Return deviations of the noise, and of x over the prior where that is known."""
-    if draws is None:
-        assert sd is not None
-        return sd, None
-    x, again = draws
-    finite = x.flatten(1).isfinite().all(-1) & again.flatten(1).isfinite().all(-1)
-    within = (x - again)[finite].square().mean().sqrt().reshape(1) / 2**0.5
-    # A median: a spread that a few extreme actions make is not the typical one.
-    spread = (x[finite] - x[finite].median(0).values).abs().median() * 1.4826
-    return within if sd is None else sd, spread.clamp(min=float(within))

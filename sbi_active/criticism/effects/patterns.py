@@ -2,30 +2,47 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 
 from sbi_active.criticism.effects.effect import Effect
 
-
-def as_patterns(given: str | Iterable[str]) -> list[str]:
-    """Return a list of patterns, of one or of several."""
-    return [given] if isinstance(given, str) else [*given]
-
-
-def unmatched(effects: Iterable[Effect], patterns: Sequence[str]) -> list[str]:
-    """Return the patterns that fit no effect."""
-    names = [e.name for e in effects]
-    return [p for p in patterns if not any(fnmatchcase(n, p) for n in names)]
+Patterns = str | Iterable[str]
 
 
 def picked(
-    effects: Iterable[Effect], include: Sequence[str], exclude: Sequence[str]
+    effects: Sequence[Effect],
+    include: Patterns,
+    exclude: Patterns = (),
+    *,
+    strict: bool = True,
 ) -> list[Effect]:
-    """Return the effects that a pattern includes and none excludes."""
-    return [
-        e
-        for e in effects
-        if any(fnmatchcase(e.name, p) for p in include)
-        and not any(fnmatchcase(e.name, p) for p in exclude)
-    ]
+    """Return the effects that a pattern includes and none excludes.
+
+    Args:
+        effects: Effects of a library.
+        include: Pattern of names that are kept, as in "sin*", or several.
+        exclude: Patterns of names that are left out.
+        strict: Whether every pattern has to fit an effect.
+
+    Raises:
+        ValueError: If a pattern fits no effect.
+    """
+    kept, left = (
+        [given] if isinstance(given, str) else [*given] for given in (include, exclude)
+    )
+    names = [effect.name for effect in effects]
+    for pattern in [*kept, *left] if strict else ():
+        if not any(fnmatchcase(name, pattern) for name in names):
+            near = difflib.get_close_matches(pattern, names, cutoff=0.5)
+            hint = f"did you mean {' or '.join(map(repr, near))}?"
+            raise ValueError(
+                f"expected patterns of names as in {names[0]!r}; got {pattern!r}, "
+                f"which matches none; {hint if near else 'correct it'}"
+            )
+
+    def fits(name: str, patterns: list[str]) -> bool:
+        return any(fnmatchcase(name, pattern) for pattern in patterns)
+
+    return [e for e in effects if fits(e.name, kept) and not fits(e.name, left)]

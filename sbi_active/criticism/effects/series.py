@@ -119,13 +119,23 @@ def delayed_samples(x: Tensor, tau: Tensor, times: Tensor) -> Tensor:
     """
     if x.shape[1] < 2:
         return x
-    times = times.contiguous()
     wanted = torch.minimum((times - tau).clamp(min=times[:, :1]), times[:, -1:])
+    return at_times(x, wanted, times)
+
+
+def at_times(x: Tensor, wanted: Tensor, times: Tensor) -> Tensor:
+    """Return samples at other times, linear between samples and beyond the ends.
+
+    Args:
+        x: Samples, as in :func:`lagged_samples`.
+        wanted: Times that are wanted, shape (n, k).
+        times: Sample times, as in :func:`lagged_samples`.
+    """
+    times, wanted = times.contiguous(), wanted.contiguous()
     last = times.shape[1] - 2
-    low = (torch.searchsorted(times, wanted.contiguous(), right=True) - 1).clamp(
-        0, last
-    )
+    low = (torch.searchsorted(times, wanted, right=True) - 1).clamp(0, last)
     gap = times.gather(1, low + 1) - times.gather(1, low)
+    # What pads a shorter trial has the time of its last sample.
     gap = gap.where(gap > 0, torch.ones_like(gap))
     weight = (wanted - times.gather(1, low)) / gap
     shape = (*low.shape, *[1] * (x.ndim - 2))

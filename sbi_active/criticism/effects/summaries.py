@@ -181,10 +181,10 @@ def _trained(
         parameters = prior.sample(torch.Size([NUM_SIMULATIONS]))
         draws = {e.name: e.sample(NUM_SIMULATIONS) for e in effects}
         fixed = {e.name: e.sample(NUM_SIMULATIONS) for e in known}
-    sizes = [e.phi_dim for e in known if e.scope == "campaign"]
-    theta, *phi = parameters.split([parameters.shape[1] - sum(sizes), *sizes], -1)
-    campaign = [e.name for e in known if e.scope == "campaign"]
-    fixed |= dict(zip(campaign, phi, strict=True))
+    theta = parameters
+    if isinstance(model, AugmentedSimulator):
+        theta, campaign = model.split(parameters)
+        fixed |= campaign
     row = torch.as_tensor(rng.integers(len(trials), size=NUM_SIMULATIONS))
     action, index = trials.action[row].to(theta.dtype), trials.index[row]
 

@@ -13,7 +13,7 @@ from torch.distributions import Distribution, Independent, Normal
 
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect, UnderKey
-from sbi_active.criticism.effects.patterns import as_patterns, picked, unmatched
+from sbi_active.criticism.effects.patterns import picked
 from sbi_active.criticism.forces.dictionary import (
     FORMS,
     FREE,
@@ -115,13 +115,7 @@ def force_effects(
             sized = _sized(force, nominal, scale)
             if sized is not None:
                 found.append(_effect(name, family, sized, order))
-    wanted, without = as_patterns(include), as_patterns(exclude)
-    for pattern in unmatched(found, [*wanted, *without]):
-        raise ValueError(
-            f"expected patterns of names as in {found[0].name!r}; got {pattern!r}, "
-            "which matches none; correct it"
-        )
-    return picked(found, wanted, without)
+    return picked(found, include, exclude)
 
 
 def is_force(effect: Effect) -> bool:

@@ -35,6 +35,7 @@ from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
+from sbi_active.inference.sampling.least_squares import basis_of
 from sbi_active.simulation import SimulatorModel
 
 Array = NDArray[Any]
@@ -308,8 +309,8 @@ def _beside(
 def _aliases(found: Linear, least: float) -> tuple[str, ...]:
     """Return the effects that a change of the parameters imitates."""
     jacobian, effect = found.model.jacobian, found.effect
-    rest = jacobian[:, effect < 0]
-    left = jacobian - rest @ np.linalg.lstsq(rest, jacobian, rcond=1e-9)[0]
+    basis = basis_of(jacobian[:, effect < 0])
+    left = jacobian - basis @ (basis.T @ jacobian)
     own, whole = (
         np.sqrt(np.bincount(effect + 1, (part**2).sum(0))[1:])
         for part in (left, jacobian)

@@ -26,7 +26,7 @@ from sbi_active.criticism.results import (
     Tracing,
 )
 from sbi_active.criticism.steps.leave_one_out import LeaveOneOut
-from sbi_active.inference.beliefs.identifiability import (
+from sbi_active.identifiability.known import (
     Combinations,
     combinations_of_draws,
 )

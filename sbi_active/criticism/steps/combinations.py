@@ -13,6 +13,7 @@ from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.results import CATCH_ALLS, NONE, ModelKey
 from sbi_active.criticism.steps.detection import THRESHOLD
+from sbi_active.inference.sampling.least_squares import basis_of
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed
 
@@ -121,8 +122,7 @@ def _promising(rivals: RivalSet, names: tuple[str, ...]) -> list[str]:
     rival, at = fit.rival, fit.likeliest
     whiten = rival.error.whitener(rival.residual(at)[0][0])
     r, jacobian = (part[0] for part in rival.jacobian(at, whiten, rivals.step))
-    basis, size, _ = np.linalg.svd(jacobian, full_matrices=False)
-    basis = basis[:, size > 1e-9 * max(size.max(), 1e-300)]
+    basis = basis_of(jacobian)
     r = r - basis @ (basis.T @ r)
     promising = []
     for extra in rivals.effects:

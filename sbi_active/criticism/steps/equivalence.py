@@ -19,6 +19,7 @@ from sbi_active.criticism.rivals.coordinates import SearchCoordinates
 from sbi_active.criticism.rivals.further_trials import conditions_at, together
 from sbi_active.criticism.rivals.noise_grid import declared_noise
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
+from sbi_active.inference.sampling.least_squares import basis_of
 from sbi_active.seeding import derive_seed, forked_generators
 
 Array = NDArray[Any]
@@ -81,34 +82,32 @@ def equivalent_effects(
         actions: The permitted ones; None compares on the trials at hand.
     """
     trials = rivals.trials if actions is None else every_action(rivals, actions)
-    simulator = TrialSimulator(
-        rivals.simulator.model, trials, seed=derive_seed(rivals.seed, "equivalence")
-    )
-    unit = noise_unit(rivals, simulator)
+    world = _World(rivals, trials)
     effects = [e for e in rivals.effects.values() if e.hook != "noise"]
     votes = np.zeros((2, len(effects) + 1, len(effects) + 1))
-    coordinates = SearchCoordinates(rivals.prior, (), (), len(trials))
     local = [bool(e.null_phi(1).isfinite().all()) for e in effects]
-    every_u = coordinates.sample(NUM_THETA, seed=derive_seed(rivals.seed, "theta"))
+    every_u = world.coordinates.sample(
+        NUM_THETA, seed=derive_seed(rivals.seed, "theta")
+    )
     for u in every_u:
-        left = _left_over(simulator, coordinates, u, effects, unit, rivals)
+        left = world.left_over(u, effects)
         vote = _alike(left, local)
         for i, effect in enumerate(effects, 1):
             lost = votes[1, 0, i] - votes[0, 0, i] > (1 - AGREEMENT) * NUM_THETA
             if lost:  # whatever the other parameters say
                 vote[0, 0, i] = vote[0, i, 0] = 0.0
-            elif local[i - 1] and vote[0, 0, i]:
-                size = left[i - 1][1]
-                near = _Neighborhood(simulator, coordinates, u, unit, rivals)
-                vote[0, 0, i] = vote[0, i, 0] = float(near.hides(effect, size))
+            # Where the simulator jumps, the direction near the null says enough.
+            near = world.is_smooth or left[i - 1][1] == 0
+            if not lost and local[i - 1] and vote[0, 0, i] and near:
+                vote[0, 0, i] = vote[0, i, 0] = float(world.imitates(None, effect, u))
         votes += vote
     same = (votes[0] >= AGREEMENT * votes[1]) & (votes[1] > NUM_THETA / 2)
     for i, j in zip(*np.nonzero(np.triu(same, 1)), strict=True):
-        one, other = effects[i - 1], effects[j - 1]
-        if i > 0 and rivals.is_smooth:  # else a search would find the jumps
+        pair = effects[i - 1], effects[j - 1]
+        if i > 0 and world.is_smooth:  # else a search would find the jumps
             same[i, j] = same[j, i] = all(
-                _imitates(a, b, simulator, rivals, coordinates.to_z(u[None]), unit)
-                for a, b in ((one, other), (other, one))
+                world.imitates(a, b, u)
+                for a, b in (pair, pair[::-1])
                 for u in every_u[:NUM_FAR]
             )
     names = [NONE, *[e.name for e in effects]]
@@ -124,158 +123,119 @@ def noise_unit(rivals: RivalSet, simulator: TrialSimulator) -> Array:
     return unit
 
 
-def _left_over(
-    simulator: TrialSimulator,
-    coordinates: SearchCoordinates,
-    u: Array,
-    effects: Sequence[Effect],
-    unit: Array,
-    rivals: RivalSet,
-) -> list[tuple[Array, float]]:
-    """Return each effect's direction that no parameter imitates, and its size."""
-    step = max(rivals.step, STEP)
-    sign = np.where(u + step > coordinates.high, -1.0, 1.0)
-    points = np.concatenate([u[None], u + step * np.diag(sign)])
-    mean = simulator.predict(*coordinates.split(points))[0] / unit
-    mean = np.where(np.isfinite(mean), mean, 0.0)
-    jacobian = ((mean[1:] - mean[0]) / step).T
-    basis, size, _ = np.linalg.svd(jacobian, full_matrices=False)
-    basis = basis[:, size > 1e-9 * max(size.max(), 1e-300)]
-    left = []
-    for effect in effects:
-        theta, phi = coordinates.split(u[None])
-        shift, scale = _small(effect, step)
-        phi[effect.name] = shift
-        moved = simulator.predict(theta, phi)[0][0] / unit
-        change = (np.where(np.isfinite(moved), moved, 0.0) - mean[0]) / scale
-        rest = change - basis @ (basis.T @ change)
-        left.append((rest, float(np.linalg.norm(change))))
-    return left
+class _World:
+    """Predictions of trials, in noise units.
 
+    Args:
+        rivals: The models.
+        trials: Trials that are predicted.
+    """
 
-class _Neighborhood:
-    """Predictions near some parameters u, in noise units."""
+    def __init__(self, rivals: RivalSet, trials: Trials) -> None:
+        self.simulator = TrialSimulator(
+            rivals.simulator.model, trials, seed=derive_seed(rivals.seed, "equivalence")
+        )
+        self.prior, self.is_smooth = rivals.prior, rivals.is_smooth
+        self.unit = noise_unit(rivals, self.simulator)
+        self.step = max(rivals.step, STEP)
+        self.coordinates = SearchCoordinates(self.prior, (), (), len(trials))
 
-    def __init__(
-        self,
-        simulator: TrialSimulator,
-        coordinates: SearchCoordinates,
-        u: Array,
-        unit: Array,
-        rivals: RivalSet,
-    ) -> None:
-        self.simulator, self.coordinates, self.u = simulator, coordinates, u
-        self.unit, self.step = unit, max(rivals.step, STEP)
-        # Where the simulator jumps, a search for parameters finds the jumps.
-        self.num_search = NUM_SEARCH if rivals.is_smooth else 1
+    def predict(
+        self, c: SearchCoordinates, u: Array, effect: Effect | None = None, phi: Any = 0
+    ) -> Array:
+        """Return predictions at u, shape (n, d), beside an effect that u has not."""
+        theta, own = c.split(u)
+        if effect is not None:
+            own[effect.name] = phi
+        return self.simulator.predict(theta, own)[0] / self.unit
 
-    def hides(self, effect: Effect, size: float) -> bool:
-        """Return whether parameters make up for an effect away from its null, too.
+    def slopes(self, c: SearchCoordinates, u: Array) -> tuple[Array, Array]:
+        """Return predictions at u, shape (N,), and their derivatives, (N, d)."""
+        sign = np.where(u + self.step > c.high, -1.0, 1.0)
+        mean = self.predict(c, np.concatenate([u[None], u + self.step * np.diag(sign)]))
+        return mean[0], ((mean[1:] - mean[0]) / self.step * sign[:, None]).T
+
+    def left_over(
+        self, u: Array, effects: Sequence[Effect]
+    ) -> list[tuple[Array, float]]:
+        """Return each effect's direction that no parameter imitates, and its size."""
+        mean, jacobian = (
+            np.where(np.isfinite(part), part, 0.0)
+            for part in self.slopes(self.coordinates, u)
+        )
+        basis = basis_of(jacobian)
+        left = []
+        for effect in effects:
+            shift, scale = _small(effect, self.step)
+            moved = self.predict(self.coordinates, u[None], effect, shift)[0]
+            change = (np.where(np.isfinite(moved), moved, 0.0) - mean) / scale
+            rest = change - basis @ (basis.T @ change)
+            left.append((rest, float(np.linalg.norm(change))))
+        return left
+
+    def imitates(self, one: Effect | None, other: Effect, u: Array) -> bool:
+        """Return whether parameters imitate an effect away from its null, too.
 
         Args:
-            effect: Effect of which nothing is left near the null.
-            size: Size of its change there, for a deviation of the prior.
+            one: Effect that may help them; None for none.
+            other: Effect that is imitated.
+            u: Parameters beside it, shape (d,).
         """
-        if self.num_search == 1 and size > 0:  # its direction says enough
-            return True
+        c, start = self.coordinates, u
+        own = () if one is None else (one,)
+        if own:
+            c = SearchCoordinates(self.prior, own, (), len(self.simulator))
         for far in FAR:
-            shift, scale = _small(effect, far)
-            if not np.isfinite(effect.log_prob(shift).numpy()).all():
+            shift, scale = _small(other, far)
+            begin = [_small(effect, far)[0] for effect in own]
+            each = zip((other, *own), (shift, *begin), strict=True)
+            if not all(bool(e.log_prob(phi).isfinite().all()) for e, phi in each):
                 continue
-            moved = self._predict(self.u[None], effect, shift)[0]
-            own = self._predict(self.u[None])[0]
-            both = np.isfinite(moved) & np.isfinite(own)
-            whole = float(np.linalg.norm((moved - own)[both])) / scale
-            rest, is_free, _ = self.rest(moved, both)
+            if own:
+                z = [self.coordinates.to_z(u[None]), *(phi.numpy() for phi in begin)]
+                start = c.from_z(np.concatenate(z, 1))[0]
+            aim = self.predict(self.coordinates, u[None], other, shift)[0]
+            bare = self.predict(self.coordinates, u[None])[0]
+            both = np.isfinite(aim) & np.isfinite(bare)
+            whole = float(np.linalg.norm((aim - bare)[both])) / scale
+            rest, is_free, has_ended = self._rest(c, start, aim, both)
             left = float(np.linalg.norm(rest)) / scale
             nothing = left**2 < SAME and left < RELATIVE * whole
-            if whole > 0 and is_free and not nothing:
+            if whole > 0 and is_free and not nothing and (has_ended or not own):
                 return False
         return True
 
-    def rest(self, aim: Array, both: NDArray[np.bool_]) -> tuple[Array, bool, bool]:
+    def _rest(
+        self, c: SearchCoordinates, u: Array, aim: Array, both: NDArray[np.bool_]
+    ) -> tuple[Array, bool, bool]:
         """Return the rest of predictions that parameters leave, by Gauss-Newton steps.
 
         It also returns whether they were free, since at an edge of the prior the edge
         may be what stands against them; and whether the search has ended, so that no
         step promises more.
         """
-        low, high = self.coordinates.low, self.coordinates.high
-        v = self.u
-        rest, has_ended = (aim - self._predict(v[None])[0])[both], False
-        for _ in range(self.num_search):
-            sign = np.where(v + self.step > high, -1.0, 1.0)
-            points = np.concatenate([v[None], v + self.step * np.diag(sign)])
-            mean = self._predict(points)
-            slope = ((mean[1:] - mean[0]) / self.step * sign[:, None]).T[both]
+        rest, has_ended = (aim - self.predict(c, u[None])[0])[both], False
+        # Where the simulator jumps, a search for parameters finds the jumps.
+        for _ in range(NUM_SEARCH):
+            slope = self.slopes(c, u)[1][both]
             slope = np.where(np.isfinite(slope), slope, 0.0)
             move = np.linalg.lstsq(slope, rest, rcond=1e-9)[0]
-            if self.num_search == 1:  # to first order
+            if not self.is_smooth:  # to first order
                 return rest - slope @ move, True, True
+            size = np.linalg.norm(rest)
             for share in (1.0, 0.5, 0.25, 0.125):
-                to = np.clip(v + share * move, low, high)
-                after = (aim - self._predict(to[None])[0])[both]
-                if np.linalg.norm(after) < np.linalg.norm(rest):
-                    has_ended = bool(
-                        np.linalg.norm(after) > ENDED * np.linalg.norm(rest)
-                    )
-                    v, rest = to, after
+                to = np.clip(u + share * move, c.low, c.high)
+                after = (aim - self.predict(c, to[None])[0])[both]
+                if np.linalg.norm(after) < size:
+                    u, rest = to, after
+                    has_ended = bool(np.linalg.norm(after) > ENDED * size)
                     break
             else:
-                promised = np.linalg.norm(rest - slope @ move)
-                has_ended = bool(promised > 0.5 * np.linalg.norm(rest))
+                has_ended = bool(np.linalg.norm(rest - slope @ move) > 0.5 * size)
                 break
             if np.linalg.norm(rest) < FOUND:
                 break
-        return rest, bool(((v > low) & (v < high)).all()), has_ended
-
-    def _predict(
-        self, u: Array, effect: Effect | None = None, shift: Any = None
-    ) -> Array:
-        theta, phi = self.coordinates.split(u)
-        if effect is not None:
-            phi[effect.name] = shift
-        return self.simulator.predict(theta, phi)[0] / self.unit
-
-
-def _imitates(
-    one: Effect,
-    other: Effect,
-    simulator: TrialSimulator,
-    rivals: RivalSet,
-    theta: Array,
-    unit: Array,
-) -> bool:
-    """Return whether an effect and parameters imitate another away from its null.
-
-    Args:
-        one: Effect that imitates.
-        other: Effect that is imitated.
-        simulator: Simulator of the permitted actions.
-        rivals: The models.
-        theta: Parameters beside the other, shape (1, theta_dim).
-        unit: Size that counts as large in each number.
-    """
-    own = SearchCoordinates(rivals.prior, (one,), (), len(simulator))
-    for far in FAR:
-        shift, scale = _small(other, far)
-        start = _small(one, far)[0]
-        inside = torch.cat([other.log_prob(shift), one.log_prob(start)])
-        if not bool(inside.isfinite().all()):
-            continue
-        u = own.from_z(np.concatenate([theta, start.numpy()], 1))[0]
-        near = _Neighborhood(simulator, own, u, unit, rivals)
-        told = torch.from_numpy(theta)
-        aim = simulator.predict(told, {other.name: shift})[0][0] / unit
-        bare = simulator.predict(told, {})[0][0] / unit
-        both = np.isfinite(aim) & np.isfinite(bare)
-        whole = float(np.linalg.norm((aim - bare)[both])) / scale
-        rest, is_free, has_ended = near.rest(aim, both)
-        left = float(np.linalg.norm(rest)) / scale
-        nothing = left**2 < SAME and left < RELATIVE * whole
-        if whole > 0 and is_free and has_ended and not nothing:
-            return False
-    return True
+        return rest, bool(((u > c.low) & (u < c.high)).all()), has_ended
 
 
 def _small(effect: Effect, step: float) -> tuple[torch.Tensor, float]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from sbi_active.display.notebook import badge, card, facts, items
 from sbi_active.display.table import number
-from sbi_active.inference.beliefs.identifiability import Combinations
+from sbi_active.identifiability.known import Combinations
 from sbi_active.messages import Message, warn
 
 VERDICTS = {

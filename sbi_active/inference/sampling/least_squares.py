@@ -175,3 +175,9 @@ def within(
             open_ = np.ix_(~held, ~held)
             move[i, ~held] = np.linalg.solve(system[i][open_], rest)
     return move
+
+
+def basis_of(jacobian: Array) -> Array:
+    """Return orthonormal columns that span those of (N, d), without flat directions."""
+    basis, size, _ = np.linalg.svd(jacobian, full_matrices=False)
+    return basis[:, size > 1e-9 * max(size.max(initial=0.0), 1e-300)]

@@ -6,19 +6,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 from typing_extensions import override
 
-from sbi_active.criticism.effects.effect import Context
-from sbi_active.criticism.effects.series import (
-    delayed_input,
-    delayed_samples,
-    lagged_input,
-    lagged_samples,
-    rounded,
-)
 from sbi_active.mujoco.models.changes import ModelChange, StateChange
 from sbi_active.mujoco.models.names import element_id, names_of
 from sbi_active.mujoco.models.quantities import (
@@ -296,56 +286,3 @@ class ContactChange(ModelChange):
                 values[0] *= factor
             else:
                 values[1] /= factor
-
-
-@dataclass(frozen=True)
-class LateInput:
-    """Delays some inputs alike, or puts them behind a lag."""
-
-    names: tuple[str, ...]
-    what: Literal["delay", "lag"]
-
-    def __call__(
-        self, value: dict[str, Tensor], phi: Tensor, action: Tensor, context: Context
-    ) -> dict[str, Tensor]:
-        """Return the inputs, those of its names changed."""
-        grid = context.input_times
-        assert grid is not None
-        late = delayed_input if self.what == "delay" else lagged_input
-        changed = {n: late(value[n], phi, grid[1] - grid[0]) for n in self.names}
-        return {**value, **changed}
-
-
-@dataclass(frozen=True)
-class ReadingChange:
-    """Changes what a sensor reads.
-
-    Attributes:
-        channel: Entry of x's last axis; None where x has no such axis.
-        what: Kind of the change.
-    """
-
-    channel: int | None
-    what: Literal["bias", "gain", "delay", "lag", "quantum"]
-
-    def __call__(
-        self, x: Tensor, phi: Tensor, action: Tensor, context: Context
-    ) -> Tensor:
-        """Return x, its channel changed."""
-        if self.channel is None:
-            return self._changed(x, phi, context)
-        parts = [*x.split(1, -1)]
-        parts[self.channel] = self._changed(parts[self.channel], phi, context)
-        return torch.cat(parts, -1)
-
-    def _changed(self, x: Tensor, phi: Tensor, context: Context) -> Tensor:
-        own = phi.reshape(len(phi), *[1] * (x.ndim - 1))
-        if self.what == "bias":
-            return x + own
-        if self.what == "gain":
-            return x * (1 + own)
-        if self.what == "quantum":
-            return rounded(x, own)
-        assert context.times is not None
-        late = delayed_samples if self.what == "delay" else lagged_samples
-        return late(x, phi, context.times.to(x.dtype).expand(len(x), -1))

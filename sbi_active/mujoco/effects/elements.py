@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from sbi_active.criticism.effects.generic_series import typical_delay
+from sbi_active.criticism.effects.generic import typical_delay
 from sbi_active.mujoco.effects.nominal import Nominal
 from sbi_active.mujoco.models.names import element_id, names_of, scalar_joints
 from sbi_active.mujoco.models.quantities import (

@@ -12,12 +12,11 @@ from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect
-from sbi_active.criticism.effects.patterns import as_patterns, picked, unmatched
+from sbi_active.criticism.effects.patterns import picked
 from sbi_active.mujoco.effects.changes import QuantityChange
 from sbi_active.mujoco.effects.elements import elements
 from sbi_active.mujoco.effects.nominal import nominal
-from sbi_active.mujoco.effects.table import rows
-from sbi_active.mujoco.models.names import require_name
+from sbi_active.mujoco.effects.table import effects_of
 from sbi_active.mujoco.robot import Robot, from_spec
 from sbi_active.mujoco.simulator import MujocoFunction
 from sbi_active.simulation import SimulatorModel
@@ -69,11 +68,7 @@ def mjcf_effects(
         ValueError: If a pattern fits no effect.
     """
     simulator, every, call = _offered(model, trials, actions)
-    wanted, without = as_patterns(include), as_patterns(exclude)
-    for pattern in unmatched(every, [*wanted, *without]):
-        names = [e.name for e in every]
-        require_name(pattern, names, "effect, or a pattern of some,")
-    return _that_matter(simulator, picked(every, wanted, without), call)
+    return _that_matter(simulator, picked(every, include, exclude), call)
 
 
 def likely_effects(robot: Robot, trials: Trials) -> list[Effect]:
@@ -86,7 +81,8 @@ def likely_effects(robot: Robot, trials: Trials) -> list[Effect]:
     simulator, every, call = _offered(robot, trials, None)
     likely = ("* friction loss", "* quadratic damping", "* stiffness", "* lag")
     fitted_by_these = ("* sensor lag", "* cubic *", "* quadratic stiffness", "all *")
-    return _that_matter(simulator, picked(every, likely, fitted_by_these), call)
+    some = picked(every, likely, fitted_by_these, strict=False)
+    return _that_matter(simulator, some, call)
 
 
 def _offered(
@@ -114,11 +110,11 @@ def _offered(
     noise = None if sd is None else torch.as_tensor(sd).reshape(-1).tolist()
     channels = simulator.fn.channels
     every = [
-        row.effect(element)
+        effect
         for element in elements(channels, sizes, driven=driven, noise=noise)
-        for row in rows()
+        for effect in effects_of(element)
     ]
-    return simulator, [effect for effect in every if effect is not None], call
+    return simulator, every, call
 
 
 def _that_matter(

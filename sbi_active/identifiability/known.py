@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.stats import entropy
 from torch.distributions import Distribution
 
-from sbi_active.combinations.formula import Combination, Term, linked
-from sbi_active.combinations.search import KNOWN, search, width
+from sbi_active.identifiability.formula import Combination, Term, linked
+from sbi_active.identifiability.search import KNOWN, search, width
 from sbi_active.seeding import forked_generators
 
 Array = NDArray[Any]
@@ -149,6 +150,7 @@ def combinations_of(
     names: Sequence[str] | None = None,
     *,
     seed: int = 0,
+    settings: CombinationSettings = CombinationSettings(),  # noqa: B008  (frozen)
 ) -> Combinations:
     r"""Return the combinations of parameters that a belief knows, and does not know.
 
@@ -167,6 +169,7 @@ def combinations_of(
         prior: Prior before any trial.
         names: Names of the parameters; None is theta_1, theta_2, ...
         seed: Seed of the draws.
+        settings: Settings of what counts as open, and as known.
 
     References:
         Gutenkunst et al., Universally sloppy parameter sensitivities in systems biology
@@ -174,15 +177,19 @@ def combinations_of(
         identifiability analysis of partially observed dynamical models by exploiting
         the profile likelihood, Bioinformatics 2009.
     """
-    before, after = _draws(prior, seed, "prior"), _draws(belief, seed, "belief")
-    return combinations_of_draws(after, before, names)
+    draws = []
+    for key, distribution in (("prior", prior), ("belief", belief)):
+        with forked_generators(seed, "combinations", key):
+            found = distribution.sample(torch.Size([settings.num_draws]))
+        draws.append(found.double().numpy())
+    return combinations_of_draws(draws[1], draws[0], names, settings)
 
 
 def combinations_of_draws(
     after: Array,
     before: Array,
     names: Sequence[str] | None = None,
-    settings: CombinationSettings = CombinationSettings(),
+    settings: CombinationSettings = CombinationSettings(),  # noqa: B008  (frozen)
 ) -> Combinations:
     """Return combinations by draws of a belief and of the prior, (m, d) and (n, d)."""
     dim = before.shape[1]
@@ -190,29 +197,28 @@ def combinations_of_draws(
         return Combinations()
     if _effective(after) < settings.enough * dim:
         return Combinations()
-    if names is None:
-        names = [f"theta_{i + 1}" for i in range(dim)]
-    kept = _without_outliers(after, settings)
+    names = names or [f"theta_{i + 1}" for i in range(dim)]
+    kept = _without_outliers(after, settings.outliers)
 
     def moments(terms: Sequence[Term]) -> tuple[Array, Array]:
-        own, old = (
+        each = (
             np.stack([t.coordinate(rows) for t in terms]) for rows in (kept, before)
         )
-        n = len(terms)
-        return np.cov(own).reshape(n, n), np.cov(old).reshape(n, n)
+        own, old = (np.cov(part).reshape(2 * [len(terms)]) for part in each)
+        return own, old
 
     everything = np.concatenate([before, after])
     low, span = everything.min(0), np.ptp(before, 0)
     own = kept.std(0) / np.maximum(before.std(0), 1e-300)
-    filled = _filled(after, before, settings)
+    filled = _filled(after, before, settings.bins)
     is_open = (own > settings.open) & (filled > settings.filled * own.clip(max=1.0))
     found = search(moments, np.flatnonzero(is_open).tolist(), low, span)
-    groups = linked([c for c, _ in found])
-    widths = {id(c): w for c, w in found}
-    known = [_known(c, widths[id(c)], after, names) for g in groups for c in g]
+    widths = dict(found)
+    groups = linked([*widths])
+    known = [_known(c, widths[c], after, names) for g in groups for c in g]
     unknown = [_left(group, moments, own, names, settings) for group in groups]
-    named = {i for c, _ in found for i in c.index}
-    best = min([*own[~is_open].tolist(), *(w for _, w in found)], default=np.inf)
+    named = {i for c in widths for i in c.index}
+    best = min([*own[~is_open].tolist(), *widths.values()], default=np.inf)
     for i in np.flatnonzero(is_open & (own > settings.wide)).tolist():
         if i not in named and best < KNOWN * own[i]:
             unknown.append(UnknownCombination(names[i], float(own[i])))
@@ -234,45 +240,26 @@ def note_combinations(belief: Any, names: Sequence[str] | None, *, seed: int) ->
     belief.diagnostics = belief.diagnostics.extended(combinations=found)
 
 
-def _draws(
-    distribution: Distribution,
-    seed: int,
-    key: str,
-    settings: CombinationSettings = CombinationSettings(),
-) -> Array:
-    with forked_generators(seed, "combinations", key):
-        return distribution.sample(torch.Size([settings.num_draws])).double().numpy()
-
-
 def _effective(draws: Array) -> float:
     """Return the number of different draws, repetitions weighed."""
     count = np.unique(draws, axis=0, return_counts=True)[1]
     return float(count.sum() ** 2 / (count**2).sum())
 
 
-def _without_outliers(
-    draws: Array, settings: CombinationSettings = CombinationSettings()
-) -> Array:
+def _without_outliers(draws: Array, share: float) -> Array:
     """Return the draws nearest to their mean, by their covariance."""
     step = draws - draws.mean(0)
     inverse = np.linalg.pinv(np.cov(step.T), hermitian=True)
     distance = np.einsum("ni,ij,nj->n", step, inverse, step)
-    return draws[distance <= np.quantile(distance, 1 - settings.outliers)]
+    return draws[distance <= np.quantile(distance, 1 - share)]
 
 
-def _filled(
-    draws: Array, prior: Array, settings: CombinationSettings = CombinationSettings()
-) -> Array:
+def _filled(draws: Array, prior: Array, bins: int) -> Array:
     """Return the share of the prior's bins that each parameter fills, shape (d,)."""
-    edges = np.quantile(prior, np.linspace(0, 1, settings.bins + 1)[1:-1], axis=0)
-    shares = []
-    for own, inner in zip(draws.T, edges.T, strict=True):
-        count = np.bincount(np.searchsorted(inner, own), minlength=settings.bins) / len(
-            own
-        )
-        entropy = -(count[count > 0] * np.log(count[count > 0])).sum()
-        shares.append(np.exp(entropy) / settings.bins)
-    return np.array(shares)
+    edges = np.quantile(prior, np.linspace(0, 1, bins + 1)[1:-1], axis=0)
+    each = zip(draws.T, edges.T, strict=True)
+    places = [np.bincount(np.searchsorted(at, own), minlength=bins) for own, at in each]
+    return np.exp(entropy(places, axis=1)) / bins
 
 
 def _known(
@@ -289,7 +276,7 @@ def _left(
     moments: Any,
     own: Array,
     names: Sequence[str],
-    settings: CombinationSettings = CombinationSettings(),
+    settings: CombinationSettings,
 ) -> UnknownCombination:
     """Return the combination that the known ones leave open."""
     if len(group) == 1 and len(group[0].terms) == 2:

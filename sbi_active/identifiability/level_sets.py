@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -10,11 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sbi_active.combinations.formula import Combination
-from sbi_active.simulation.sensitivities import Sensitivities
+from sbi_active.identifiability.formula import Combination
+from sbi_active.identifiability.sensitivities import Sensitivities
 from sbi_active.support import within_support
-
-__all__ = ["moved_along"]
 
 Array = NDArray[Any]
 
@@ -40,16 +39,15 @@ def moved_along(
         gradient = _gradient(theta, group, at) * scale
         direction -= _solved(gradient, np.einsum("kgi,ki->kg", gradient, direction))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True) + 1e-300
-        for size in MOVES:
-            for sign in (1.0, -1.0):
-                tried = theta.copy()
-                tried[:, at] += sign * size * direction * scale
-                tried = _back(tried, theta, group, at, scale)
-                rows = torch.from_numpy(np.nan_to_num(tried)).float()
-                inside = within_support(probe.prior, rows)
-                inside &= torch.from_numpy(np.isfinite(tried).all(1))
-                still = (result == probe.theta).all(dim=1)
-                result = torch.where((inside & still)[:, None], rows, result)
+        for size, sign in product(MOVES, (1.0, -1.0)):
+            tried = theta.copy()
+            tried[:, at] += sign * size * direction * scale
+            tried = _back(tried, theta, group, at, scale)
+            rows = torch.from_numpy(np.nan_to_num(tried)).float()
+            inside = within_support(probe.prior, rows)
+            inside &= torch.from_numpy(np.isfinite(tried).all(1))
+            inside &= (result == probe.theta).all(dim=1)
+            result = torch.where(inside[:, None], rows, result)
     step = (result - probe.theta).double().numpy() / probe.deviation
     far = np.sqrt((step**2).sum(1))
     return result if np.median(far) > FEWEST_MOVED else None
@@ -69,7 +67,6 @@ def _back(
         aim = np.stack([c.coordinate(theta) for c in group], 1)
         for _ in range(NEWTON_STEPS):
             gap = np.stack([c.coordinate(tried) for c in group], 1) - aim
-            gap = np.nan_to_num(gap, nan=np.nan, posinf=np.nan, neginf=np.nan)
             lost = np.asarray(~np.isfinite(gap).all(1))
             gap[lost], safe = 0.0, np.where(lost[:, None], theta, tried)
             tried = np.where(lost[:, None], np.nan, tried)

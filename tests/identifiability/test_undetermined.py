@@ -7,8 +7,8 @@ from sbi.utils import BoxUniform
 from sbi_active import BoxActions, DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.actions import ActionSpace
 from sbi_active.cli import main
+from sbi_active.identifiability.undetermined import find_undetermined
 from sbi_active.simulation import check_simulator
-from sbi_active.simulation.identifiability import find_undetermined
 
 SPEEDS = DiscreteActions([0.5, 1.0, 2.0, 3.0], names=["speed"])
 POSITIVE, CENTERED = (0.2, 1.0), (-1.0, 1.0)

@@ -8,11 +8,11 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import Distribution, MultivariateNormal
 
-from sbi_active.inference.beliefs.diagnostics import Diagnostics
-from sbi_active.inference.beliefs.identifiability import (
+from sbi_active.identifiability.known import (
     Combinations,
     combinations_of,
 )
+from sbi_active.inference.beliefs.diagnostics import Diagnostics
 
 POSITIVE, CENTERED = (0.2, 1.0), (-1.0, 1.0)
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sbi_active.combinations.formula import Combination, Term, linked
-from sbi_active.combinations.search import KNOWN, search
+from sbi_active.identifiability.formula import Combination, Term, linked
+from sbi_active.identifiability.search import KNOWN, search
 
 NAMES = [*"abcdef"]
 

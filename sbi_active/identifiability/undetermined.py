@@ -12,18 +12,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.combinations.formula import Combination, Term, linked
-from sbi_active.combinations.search import search
-from sbi_active.simulation.level_sets import moved_along
-from sbi_active.simulation.sensitivities import (
+from sbi_active.identifiability.formula import Combination, Term, linked
+from sbi_active.identifiability.level_sets import moved_along
+from sbi_active.identifiability.search import search
+from sbi_active.identifiability.sensitivities import (
     EQUAL,
     SAME,
     STEP,
     Sensitivities,
     Simulate,
 )
-
-__all__ = ["Undetermined", "find_undetermined"]
 
 Array = NDArray[Any]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.optimize import minimize_scalar
 
-from sbi_active.combinations.formula import SIMPLE, Combination, Term
+from sbi_active.identifiability.formula import SIMPLE, Combination, Term
 
 Array = NDArray[Any]
 
@@ -141,29 +142,22 @@ def _ranked(
         c, s = moments([Term(i, log=log) for i in usable])
         at = np.array(subsets)
         rows, columns = at[:, :, None], at[:, None, :]
-        scale = np.sqrt(s.diagonal())
-        c, s = (m / np.outer(scale, scale) for m in (c, s))
-        widths = np.sqrt(_smallest(c[rows, columns], s[rows, columns]).clip(0))
+        widths = _eigenvectors(c[rows, columns], s[rows, columns])[0][:, 0]
         for subset, own in zip(subsets, widths.tolist(), strict=True):
             key = tuple(usable[k] for k in subset)
             best[key] = min(own, best.get(key, np.inf))
     return sorted((own, subset) for subset, own in best.items())
 
 
-def _smallest(covariance: Array, prior: Array) -> Array:
-    """Return the smallest generalized eigenvalue of each pair, (k, m, m) -> (k,)."""
-    ridge = 1e-9 * np.eye(prior.shape[-1])
-    inverse = np.linalg.inv(np.linalg.cholesky(prior + ridge))
-    return np.linalg.eigvalsh(inverse @ covariance @ inverse.swapaxes(1, 2))[:, 0]
-
-
 def _eigenvectors(covariance: Array, prior: Array) -> tuple[Array, Array]:
-    """Return widths, smallest first, and the weights of each as a column."""
-    scale = np.sqrt(prior.diagonal())
-    c, s = (m / np.outer(scale, scale) for m in (covariance, prior))
-    inverse = np.linalg.inv(np.linalg.cholesky(s + 1e-9 * np.eye(len(s))))
-    values, vectors = np.linalg.eigh(inverse @ c @ inverse.T)
-    return np.sqrt(values.clip(0)), (inverse.T @ vectors) / scale[:, None]
+    """Return widths, smallest first, and the weights of each as a column, (..., m)."""
+    scale = np.sqrt(np.einsum("...ii->...i", prior))
+    units = scale[..., :, None] * scale[..., None, :]
+    whole = prior / units + 1e-9 * np.eye(prior.shape[-1])
+    inverse = np.linalg.inv(np.linalg.cholesky(whole))
+    turned = inverse.swapaxes(-1, -2)
+    values, vectors = np.linalg.eigh(inverse @ (covariance / units) @ turned)
+    return np.sqrt(values.clip(0)), (turned @ vectors) / scale[..., None]
 
 
 def _best_formula(
@@ -205,26 +199,23 @@ def _shifted(
 
     One with its best exponents, and one with exponents 1 and 1, or 1 and -1.
     """
-    for k, i in enumerate(subset):
-        other = subset[1 - k]
+    for i, other in (subset, subset[::-1]):
         if low[other] <= 0:
             continue
 
-        def pair(shift: float, k: int = k, i: int = i, other: int = other) -> Any:
-            terms = [Term(other, log=True), Term(i, log=True, shift=float(shift))]
-            return terms if k else terms[::-1]
-
-        def free(shift: float, pair: Any = pair) -> Combination:
-            c, s = moments(pair(shift))
-            return rounded(pair(shift), _eigenvectors(c, s)[1][:, 0], c, s, floor)
-
-        def plain(shift: float, pair: Any = pair) -> Combination:
-            product = Combination(tuple(pair(shift)))
+        def made(is_free: bool, shift: float, i: int = i) -> Combination:
+            moved = {i: float(shift)}
+            terms = [Term(j, log=True, shift=moved.get(j, 0.0)) for j in subset]
+            if is_free:
+                c, s = moments(terms)
+                return rounded(terms, _eigenvectors(c, s)[1][:, 0], c, s, floor)
+            product = Combination(tuple(terms))
             both = (product, product.mirrored())
             return min(both, key=lambda one: _own_width(one, moments))
 
-        for made in (free, plain):
-            best = _best_shift(made, moments, low[i], span[i], floor)
+        for is_free in (True, False):
+            product = partial(made, is_free)
+            best = _best_shift(product, moments, low[i], span[i], floor)
             if best is not None:
                 yield best
 

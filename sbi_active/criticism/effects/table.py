@@ -1,0 +1,127 @@
+"""Effects by tables in Markdown: a row each, with the sizes that scale its prior."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution, HalfNormal, Independent, Normal, Uniform
+
+from sbi_active.criticism.effects.effect import Effect
+
+#: A factor of a formula such as "0.1 position / load^2".
+FACTOR = re.compile(r"(/?) *([\w.-]+)\^?(\d?)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """An effect that elements of a kind may have; its columns are text.
+
+    Attributes:
+        of: Kind of element.
+        effect: Name of the effect, with that of the element in braces.
+        changes: What it changes.
+        prior: Prior of phi.
+        unit: Unit of phi.
+        sentence: Sentence for reports.
+        family: Family of the effect; "" takes the hook.
+    """
+
+    of: str
+    effect: str
+    changes: str
+    prior: str
+    unit: str
+    sentence: str
+    family: str = ""
+
+    def made(
+        self,
+        hook: Any,
+        apply: Callable[..., Any],
+        label: str,
+        sizes: Mapping[str, Any],
+        words: Mapping[str, str],
+        **options: Any,
+    ) -> Effect:
+        """Return the effect of an element.
+
+        Args:
+            hook: Part of the simulator that it changes.
+            apply: Change of that part.
+            label: Name of the element.
+            sizes: Sizes that the prior is scaled by, by name.
+            words: Words in braces, by name.
+            **options: Options of :class:`.Effect`.
+        """
+        has_unit = words or "{" not in self.unit
+        return Effect(
+            self.effect.format(label, **words).strip(),
+            hook=hook,
+            prior=prior_of(self.prior, sizes),
+            null=torch.inf if "limit" in self.prior else 0.0,
+            apply=apply,
+            units=self.unit.format(**words) if has_unit else "",
+            family=self.family or None,
+            describe=self.sentence.format(label, **words),
+            **options,
+        )
+
+    def is_sized(self, sizes: Mapping[str, Any]) -> bool:
+        """Return whether all sizes of the prior are known."""
+        _, formulas = _parts(self.prior)
+        names = [name for _, name, _ in FACTOR.findall(formulas)]
+        return all(name in sizes or name[0].isdigit() for name in names)
+
+
+@cache
+def rows_of(table: Path) -> tuple[Row, ...]:
+    """Return the rows of a table."""
+    lines = table.read_text(encoding="utf-8").splitlines()
+    cells = [
+        [cell.strip() for cell in line.split("|")[1:-1]]
+        for line in lines
+        if line.startswith("|")
+    ]
+    return tuple(Row(**dict(zip(cells[0], each, strict=True))) for each in cells[2:])
+
+
+def prior_of(text: str, sizes: Mapping[str, Any]) -> Distribution:
+    """Return a prior, of as many numbers as its formulas have.
+
+    Args:
+        text: Kind of the prior, and a formula or several apart by commas.
+        sizes: Sizes in the formulas, numbers or shape (k,), by name.
+    """
+    kind, formulas = _parts(text)
+    numbers = [_number(formula, sizes) for formula in formulas.split(",")]
+    if "limit" in kind:
+        low, high = (n.log() for n in numbers) if "log" in kind else numbers
+        return Independent(Uniform(low, high), 1)
+    size = torch.cat(numbers)
+    if kind == "half":
+        return Independent(HalfNormal(size), 1)
+    # Zero where nothing is known of the noise yet; Pyro turns the check of it on.
+    one = Normal(torch.zeros_like(size), size, validate_args=False)
+    return Independent(one, 1, validate_args=False)
+
+
+def _parts(text: str) -> tuple[str, str]:
+    match = re.match(r"(log limit|limit|half|normal) +(.*)", text)
+    assert match is not None
+    return match[1], match[2]
+
+
+def _number(formula: str, sizes: Mapping[str, Any]) -> Tensor:
+    """Return the value of a product, as in "0.1 position / load^2", shape (k,)."""
+    value = 1.0
+    for slash, name, power in FACTOR.findall(formula):
+        factor = (sizes[name] if name in sizes else float(name)) ** int(power or 1)
+        value = value / factor if slash else value * factor
+    return torch.as_tensor(value, dtype=torch.float64).reshape(-1)
