@@ -252,7 +252,7 @@ class Processes(Stages):
         """Add rows at the trials that know least."""
         if size == 0:
             return
-        stage = self.course.stages[-1]
+        stage = self.stages[-1]
         own, potential = CHEAP, stage.fit.potential
         c, draws = potential.coordinates, stage.draws[:NUM_REFERENCE]
         weight = np.full(len(draws), 1 / len(draws))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.beliefs.enumerated import (
     EnumeratedBelief,
     Enumeration,
@@ -30,92 +29,11 @@ from sbi_active.inference.refinement.course import StageSettings
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.refinement.regional import Regions, Task
 from sbi_active.inference.regression.histories import HistoryRecord
-from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.seeding import derive_seed
 from sbi_active.support import parameter_dim
 from sbi_active.threads import single_thread
 
 Array = NDArray[Any]
-
-
-@dataclass(frozen=True)
-class Confirmation:
-    """How far a learned belief is from what fresh simulations give.
-
-    Attributes:
-        shift: Largest error of a mean, in standard deviations of the belief.
-        num_simulations: Rows simulated.
-        limit: Largest shift of a belief that is to be trusted.
-    """
-
-    shift: float
-    num_simulations: int
-    limit: float
-
-    @property
-    def holds(self) -> bool:
-        """Whether the shift lies within its limit."""
-        return self.shift <= self.limit
-
-    def noted(self, diagnostics: Diagnostics) -> Diagnostics:
-        """Return diagnostics with the figures, and a warning where they are large."""
-        known = diagnostics.extended(
-            num_simulations=diagnostics.num_simulations + self.num_simulations,
-            assumptions={
-                **diagnostics.assumptions,
-                "confirmed": Assumption(self.holds, self.shift),
-            },
-            mean_shift=self.shift,
-        )
-        if self.holds:
-            return known
-        return known.warned(
-            "SA101 fresh simulations do not confirm the belief: its mean is off by "
-            f"{self.shift:.2g} standard deviations; raise num_histories"
-        )
-
-
-def by_replicates(
-    regions: Regions, belief: LearnedBelief, rng: np.random.Generator
-) -> Confirmation:
-    """Compare with fresh simulations at draws of the belief.
-
-    Args:
-        regions: Simulations that led to the belief.
-        belief: Learned belief.
-        rng: Source of the draws.
-    """
-    own, coordinates = regions.own, regions.coordinates
-    num = max(own.least_checked, int(own.checked_share * regions.budget))
-    with forked_generators(int(rng.integers(2**62))):
-        theta = belief.sample(torch.Size([num])).float()
-    histories = regions.histories
-    before = histories.num_simulations
-    x, lost = histories.fresh(theta)
-    z = coordinates.to_z(theta)
-    sds, d = z.std(0) + 1e-300, z.shape[1]
-    last = regions.course.stages[-1].surrogate
-    label, moves = last.assign(z), np.full(z.shape, np.nan)
-    for k, fit in enumerate(last.regressions):
-        rows = np.flatnonzero((label == k) & ~lost)
-        if not len(rows):
-            continue
-        predicted = fit.whitened(z[rows])[0]
-        error = fit.whitened_outcomes(x[rows]) - predicted
-        axes = own.step * np.diag(sds)
-        moved = [(fit.whitened(z[rows] + axis)[0] - predicted) for axis in axes]
-        slope = np.stack(moved, 2) / (own.step * sds)
-        system = np.einsum("nqj,nqk->njk", slope, slope) + own.flat * np.eye(d)
-        score = np.einsum("nqj,nq->nj", slope, error)
-        moves[rows] = np.linalg.solve(system, score[..., None])[..., 0]
-    moves = moves[np.isfinite(moves).all(1)] / sds
-    shift, error = np.inf, np.inf
-    if len(moves) > 1:
-        worst = int(np.abs(moves.mean(0)).argmax())
-        shift = float(np.abs(moves.mean(0))[worst])
-        error = float(moves[:, worst].std() / np.sqrt(len(moves)))
-    used = histories.num_simulations - before
-    limit = max(own.largest_shift, own.chance * error)
-    return Confirmation(shift, used, limit)
 
 
 def refine(
@@ -231,9 +149,6 @@ def _learned(task: Task, past: object, seed: int) -> LearnedBelief:
     belief, contradiction = regions.run(), regions.contradiction()
     if contradiction is not None:
         return _inflated(regions, belief, contradiction, seed)
-    rng = np.random.default_rng(derive_seed(seed, "confirm"))
-    found = by_replicates(regions, belief, rng)
-    belief.diagnostics = found.noted(belief.diagnostics)
     return belief
 
 

@@ -16,9 +16,8 @@ from sbi_active.inference.declared.contradiction import Contradiction, compared
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.refinement.checks import (
     check_outcomes,
-    has_hard_edges,
-    noise_shape,
-    tail_probability,
+    compared_with_fresh,
+    noise_tails,
     trial_correlation,
 )
 from sbi_active.inference.refinement.course import (
@@ -107,21 +106,17 @@ class Regions(Stages):
         return self.histories.num_drawn, self.histories.num_simulations
 
     def run(self) -> LearnedBelief:
-        """Return the belief with its histories, and what they say of lost outcomes.
-
-        Measurements are judged by what was fitted before simulations from further off.
-        """
-        belief, histories, stage = super().run(), self.histories, self.course.stages[-1]
-        fits = stage.surrogate.regressions
-        live = [f.ratio for f, m in zip(fits, stage.mass, strict=True) if m > LIVE]
+        """Return the belief with its histories, and what they say of lost outcomes."""
+        belief, histories, stage = super().run(), self.histories, self.stages[-1]
         known = belief.diagnostics.extended(
             error_nats_if_explained=expected_error(
                 stage.surrogate, stage.draws, self.rng, explained=True
             ),
-            residual_to_noise=float(max(live, default=np.inf)),
             share_invalid=histories.share_invalid,
         )
-        belief.diagnostics = check_outcomes(known, stage.fitted, stage.draws, histories)
+        belief.diagnostics = check_outcomes(
+            known, stage.surrogate, stage.draws, histories
+        )
         belief.histories = histories.record()
         if histories.num_missing:
             warn(
@@ -137,7 +132,7 @@ class Regions(Stages):
         """Put the next stage's regions around what is still plausible."""
         many = 2 * max(self.num_forced, len(self.regions))
         fewer = max(1, self.num_forced // 2)
-        is_stuck = self.course.is_stuck
+        is_stuck = self.stages[-1].is_stuck
         self.num_forced = min(many, self.own.max_forced) if is_stuck else fewer
         limit = max(1, int(size / (1.2 * fewest_rows(self.coordinates.dim))))
         self.regions = cover(
@@ -150,8 +145,8 @@ class Regions(Stages):
 
     def simulate(self, size: int) -> None:
         """Bring the stage's regions to their numbers, past histories first."""
-        if self.course.stages:
-            self._propose(self.course.stages[-1], size)
+        if self.stages:
+            self._propose(self.stages[-1], size)
         histories, regions = self.histories, self.regions
         is_first = histories.num_drawn == 0
         num_places = size - max(int(self.own.replicate_share * size), 12)
@@ -202,11 +197,15 @@ class Regions(Stages):
         error = expected_error(surrogate, draws, self.rng)
         return max(live, default=np.inf), mass, error
 
-    def with_more(self, stage: Stage) -> tuple[Surrogate, float]:
-        """Return regressions of simulations from further off that agree."""
-        return widened(
+    def with_more(self, stage: Stage) -> Stage:
+        """Return the stage with simulations from further off that agree."""
+        wider, bias = widened(
             self.histories, stage.surrogate, stage.error, stage.draws, self.rng
         )
+        if wider is stage.surrogate:
+            return stage
+        wide = self.sample(wider, stage.draws)
+        return replace(wide, error=wide.error + bias)
 
     def last(self, stage: Stage) -> Stage:
         """Return the stage with noise that is not Gaussian, where it is not."""
@@ -218,35 +217,49 @@ class Regions(Stages):
         if all(fit.shape is None for fit in shaped):
             return stage
         other = self.sample(Surrogate(c, shaped), stage.draws)
-        change = other.log_prob(other.draws) - stage.log_prob(other.draws)
-        self.is_shaped, self.change = True, float(change.mean())
-        return replace(other, fitted=stage.fitted, error=max(stage.error, other.error))
+        self.is_shaped, self.change = True, other.after(stage).change
+        error = max(stage.error, other.error)
+        return replace(
+            other, error=error, change=stage.change, shrinkage=stage.shrinkage
+        )
 
     def tails(self, stage: Stage) -> tuple[list[float], float]:
-        """Return tail probabilities of the trials and of all together."""
-        num_trials = len(self.task.action)
-        return tail_probability(stage.surrogate, stage.draws, num_trials)
+        """Return tail probabilities, by fresh simulations at draws of the belief."""
+        c, own = self.coordinates, self.own
+        num = max(own.least_checked, int(own.checked_share * self.budget))
+        theta = c.to_theta(stage.fit.fresh(num, self.rng))
+        x, lost = self.histories.fresh(theta)
+        z, num_trials = c.to_z(theta), len(self.task.action)
+        self.fresh = compared_with_fresh(
+            stage.surrogate, z[~lost], x[~lost], num_trials, own
+        )
+        return self.fresh.tails
 
     def doubts(self) -> dict[str, Doubt]:
         """Return what the regressions take for granted."""
-        course, last = self.course, self.course.stages[-1]
+        last, fresh = self.stages[-1], self.fresh
         fits = last.surrogate.regressions
         live = [fit for fit, mass in zip(fits, last.mass, strict=True) if mass > LIVE]
-        roughness = course.stages[0].surrogate.regressions[0].roughness
-        negentropy, is_gaussian = noise_shape(live, self.own.shapes.left, self.rng)
-        is_gaussian &= not has_hard_edges(course.stages)
+        roughness = self.stages[0].surrogate.regressions[0].roughness
+        tails, has_edges = noise_tails(self.stages)
         dim = self.coordinates.dim
         # Of d parameters known to e nats, a mean is off by (2 e / d)^(1/2) deviations.
         allowed = 0.5 * dim * self.own.known**2
         known = last.error / allowed, self.change / (self.own.unsettled * dim)
         correlation, is_independent = trial_correlation(live, len(self.task.action))
         return {
+            "confirmed": (
+                fresh.shift <= fresh.limit,
+                fresh.shift,
+                "SA101 fresh simulations do not confirm the belief: its mean is off by "
+                "{:.2g} standard deviations; raise num_histories",
+            ),
             "gaussian_noise": (
-                is_gaussian,
-                negentropy,
-                "SA110 the noise is not Gaussian (it differs by {:.2g} nats a number), "
-                "and the belief, which takes it for Gaussian, may be too wide or too "
-                "narrow; check against a belief of a trained network",
+                not has_edges,
+                tails,
+                "SA110 the noise has hard edges (its excess kurtosis is {:.2g}), which "
+                "the belief does not follow, so that it may be too wide or too narrow; "
+                "check against a belief of a trained network",
             ),
             "noise_known": (
                 not self.is_shaped or max(known) <= 1,
@@ -280,7 +293,7 @@ class Regions(Stages):
 
     def contradiction(self) -> Contradiction | None:
         """Return what contradicts at the draw that the last stage explains best."""
-        task, stage = self.task, self.course.stages[-1]
+        task, stage = self.task, self.stages[-1]
         t, label = len(task.action), stage.surrogate.assign(stage.draws)
         best: Array | None = None
         for k, fit in enumerate(stage.surrogate.regressions):
