@@ -9,14 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import kurtosis
 
-from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.refinement.course import LIVE, Stage, StageSettings
 from sbi_active.inference.regression.histories import Histories
-from sbi_active.inference.regression.surrogate import LocalRegression, Surrogate
+from sbi_active.inference.regression.surrogate import Surrogate
 
 Array = NDArray[Any]
 
-BLURRED = 0.05  # share of repeated simulations that would differ, beyond those that do
 LEAST = 2e-5  # tail probability that so few simulations may tell
 
 
@@ -42,31 +40,6 @@ def noise_tails(stages: list[Stage], *, light: float = -0.3) -> tuple[float, boo
     return float(kurtosis(values)), bool(kurtosis(values) < light - margin)
 
 
-def trial_correlation(
-    fits: list[LocalRegression], num_trials: int, *, correlated: float = 0.25
-) -> tuple[float, bool]:
-    """Return the correlation of residuals across trials, and whether it is low.
-
-    Misfit below its limit reaches half of what counts as ``correlated``.
-    """
-    if num_trials == 1 or not fits:
-        return 0.0, True
-    excess, count = 0.0, 0
-    for fit in fits:
-        n, q = fit.standardized.shape
-        freedom = n - len(fit.root)
-        correlation = fit.standardized.T @ fit.standardized / freedom
-        apart = np.kron(np.eye(num_trials), np.ones((q // num_trials,) * 2)) == 0
-        apart &= np.outer(fit.used, fit.used)
-        excess += (correlation[apart] ** 2 - 1 / freedom).sum()
-        count += int(apart.sum())
-    if count == 0:
-        return 0.0, True
-    correlation = max(excess / count, 0.0) ** 0.5
-    has_misfit = any(fit.has_misfit for fit in fits)  # which correlates as well
-    return float(correlation), correlation < correlated or has_misfit
-
-
 @dataclass(frozen=True)
 class Fresh:
     """What simulations that no regression was fitted to say of it.
@@ -75,11 +48,15 @@ class Fresh:
         tails: Tail probability of each trial, and of all.
         shift: Largest error of a mean, in standard deviations of the belief.
         limit: Largest shift of a belief that is to be trusted.
+        correlation: Correlation of their errors across trials.
+        least: Squares of the observed trials at the draw that explains them best, (t,).
     """
 
     tails: tuple[list[float], float]
     shift: float
     limit: float
+    correlation: float
+    least: Array
 
 
 def compared_with_fresh(
@@ -107,7 +84,7 @@ def compared_with_fresh(
     """
     d, sds = z.shape[1], z.std(0) + 1e-300
     label = surrogate.assign(z)
-    observed, simulated, moves = [], [], []
+    real, known, errors, moves = [], [], [], []
     for k, fit in enumerate(surrogate.regressions):
         here = z[label == k]
         predicted, widening = fit.whitened(here)
@@ -115,23 +92,42 @@ def compared_with_fresh(
         # A little leverage is the price of few rows; much of it is extrapolation, which
         # must not excuse a misfit.
         most = np.minimum(widening, 2.0)[:, None]
-        observed.append(_squares(predicted, num_trials) / most)
-        simulated.append(_squares(error, num_trials) / widening[:, None])
+        real.append(_squares(predicted, num_trials) / most)
+        known.append(_squares(error, num_trials) / widening[:, None])
         axes = own.step * np.diag(sds)
         moved = [fit.whitened(here + axis)[0] - predicted for axis in axes]
         slope = np.stack(moved, 2) / (own.step * sds)
         system = np.einsum("nqj,nqk->njk", slope, slope) + own.flat * np.eye(d)
         score = np.einsum("nqj,nq->nj", slope, error)
         moves.append(np.linalg.solve(system, score[..., None])[..., 0] / sds)
-    known, real, move = (np.concatenate(p) for p in (simulated, observed, moves))
-    if len(known) <= 10:
-        return Fresh(([1.0] * num_trials, 1.0), np.inf, own.largest_shift)
-    pairs = zip(known.T, real.T, strict=True)
+        errors.append(error / np.sqrt(widening)[:, None])
+    observed, simulated, error, move = map(np.concatenate, (real, known, errors, moves))
+    if len(move) <= 10:
+        least = np.zeros(num_trials)
+        return Fresh(([1.0] * num_trials, 1.0), np.inf, own.largest_shift, 0.0, least)
+    pairs = zip(simulated.T, observed.T, strict=True)
     tail = [float(_exceedance(*pair).mean().clip(LEAST, 1.0)) for pair in pairs]
     worst = int(np.abs(move.mean(0)).argmax())
-    error = float(move[:, worst].std() / np.sqrt(len(move)))
-    limit = max(own.largest_shift, own.chance * error)
-    return Fresh((tail[:-1], tail[-1]), float(np.abs(move.mean(0))[worst]), limit)
+    deviation = float(move[:, worst].std() / np.sqrt(len(move)))
+    return Fresh(
+        (tail[:-1], tail[-1]),
+        float(np.abs(move.mean(0))[worst]),
+        max(own.largest_shift, own.chance * deviation),
+        _across(error, num_trials),
+        observed[observed[:, -1].argmin(), :-1],
+    )
+
+
+def _across(error: Array, num_trials: int) -> float:
+    """Return the root mean square correlation of numbers (n, q) of unlike trials."""
+    n, q = error.shape
+    varies = error.std(0) > 0
+    if num_trials == 1 or not varies.any():
+        return 0.0
+    trial = np.repeat(np.arange(num_trials), q // num_trials)[varies]
+    correlation = np.corrcoef(error[:, varies].T).reshape(len(trial), len(trial))
+    apart = correlation[trial[:, None] != trial]
+    return float(max((apart**2).mean() - 1 / n, 0.0) ** 0.5) if apart.size else 0.0
 
 
 def _exceedance(known: Array, value: Array) -> Array:
@@ -169,24 +165,18 @@ def _squares(whitened: Array, num_trials: int) -> Array:
     return np.concatenate([parts, parts.sum(1, keepdims=True)], 1)
 
 
-def check_outcomes(
-    diagnostics: Diagnostics,
-    surrogate: Surrogate,
-    draws: Array,
-    pool: Histories,
-    *,
-    rare: float = 0.01,
-) -> Diagnostics:
-    r"""Return a belief's diagnostics with figures on trials without a measurement.
+def outcomes_at(
+    surrogate: Surrogate, draws: Array, pool: Histories
+) -> tuple[list[float], float]:
+    r"""Return the probability of each trial's outcome, and how blurred that is.
 
-    ``probability_of_outcome`` is :math:`E_b[P(\text{as observed} | \theta)]` of each
-    trial, over draws of the belief (n, d). Near zero, the trial did what simulations
-    near the belief seldom do (less often than ``rare``): the simulator lacks a way of
-    failing, or a fault was told as "invalid". The assumption "outcomes_followed"
-    compares repeated simulations: where those agree and the regression expects them to
-    differ, it misses an edge.
+    :math:`E_b[P(\text{as observed} | \theta)]` over draws of the belief (n, d). Near
+    zero, the trial did what simulations near the belief seldom do: the simulator lacks
+    a way of failing, or a fault was told as "invalid". The other compares repeated
+    simulations: where those agree and the regression expects them to differ, it misses
+    an edge.
     """
-    share = pool.agrees.mean(0) if len(pool) else np.ones(0)
+    share = pool.agrees.mean(0)
     # A trial in which simulations all agree, or none does, was not regressed.
     total = np.where((share > 0) & (share < 1), 0.0, share * len(draws))
     label = surrogate.assign(draws)
@@ -197,26 +187,4 @@ def check_outcomes(
             total[outcome.trial] += np.exp(outcome.log_prob(z)).sum()
             if len(z) > LIVE * len(draws):
                 blur = max(blur, outcome.blur)
-    probability = [float(p) for p in total / len(draws)]
-    followed = blur <= BLURRED
-    texts = []
-    if not followed:
-        texts.append(
-            "SA120 where simulations have a measurement and where they have none is "
-            f"followed coarsely ({blur:.0%} of repeated simulations would differ that "
-            "do not), so that the belief is too wide; raise num_histories"
-        )
-    unheard = [k for k, p in enumerate(probability) if p < rare]
-    if unheard:
-        texts.append(
-            f"SA121 trials {', '.join(map(str, unheard))} had a measurement, or none, "
-            f"where less than {rare:.0%} of the simulations near the belief do the "
-            "same: the simulator lacks a way to fail, or the status of the trial is "
-            "wrong"
-        )
-    assumption = Assumption(followed, float(blur))
-    return diagnostics.extended(
-        probability_of_outcome=probability,
-        num_missing=pool.num_missing,
-        assumptions={**diagnostics.assumptions, "outcomes_followed": assumption},
-    ).warned(*texts)
+    return [float(p) for p in total / len(draws)], float(blur)

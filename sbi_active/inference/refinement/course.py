@@ -66,6 +66,11 @@ class StageSettings:
             belief is doubted.
         unsettled: Nats a dimension that the last stage may have changed in a
             belief to be trusted.
+        correlated: Correlation of errors across trials beyond which they are taken to
+            depend on each other; misfit below its limit reaches half of this.
+        blurred: Share of repeated simulations that would differ, beyond those that do.
+        rare: Probability of a trial's outcome, a measurement or none, below which the
+            simulator is doubted.
         effective: Share of the particles that must count at each stage, or a
             mode may be lost.
     """
@@ -91,6 +96,9 @@ class StageSettings:
     rough: float = 0.5
     misfit: float = 1.5
     unsettled: float = 0.1
+    correlated: float = 0.25
+    blurred: float = 0.05
+    rare: float = 0.01
     effective: float = 0.05
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from sbi_active.inference.beliefs.enumerated import (
     enumerated,
 )
 from sbi_active.inference.beliefs.priors import require_support
-from sbi_active.inference.declared.contradiction import MAX_INFLATIONS, Contradiction
+from sbi_active.inference.declared.contradiction import MAX_INFLATIONS
 from sbi_active.inference.declared.refining import refine_declared
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.declared.simulated_belief import (
@@ -27,7 +28,7 @@ from sbi_active.inference.declared.simulated_belief import (
 )
 from sbi_active.inference.refinement.course import StageSettings
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
-from sbi_active.inference.refinement.regional import Regions, Task
+from sbi_active.inference.refinement.regional import Regions
 from sbi_active.inference.regression.histories import HistoryRecord
 from sbi_active.seeding import derive_seed
 from sbi_active.support import parameter_dim
@@ -114,62 +115,62 @@ def refine(
         )
     hints = [] if start is None else start
     hints = [hints] if isinstance(hints, Distribution) else [*hints]
-    own = StageSettings() if stages is None else stages
-    task = Task(simulator, prior, action, outcome, [*hints], settings, own)
     with single_thread():
         belief = refine_declared(
             *(simulator, prior, action, outcome),
-            hints=task.hints,
+            hints=hints,
             past=past,
             settings=settings,
             seed=seed,
         )
         if belief is None:
-            belief = _within_memory(task, past, seed)
+            known = past if isinstance(past, HistoryRecord) else None
+            learned = partial(
+                Regions,
+                *(simulator, prior, action, outcome),
+                hints=hints,
+                settings=settings,
+                own=StageSettings() if stages is None else stages,
+            )
+            belief = _within_memory(learned, known, seed)
     return belief
 
 
-def _within_memory(task: Task, past: object, seed: int) -> LearnedBelief:
+def _within_memory(
+    learned: partial[Regions], past: HistoryRecord | None, seed: int
+) -> LearnedBelief:
     try:
-        return _learned(task, past, seed)
+        return _learned(learned, past, seed)
     except RuntimeError as error:
         if "allocate memory" not in str(error):
             raise
+        dim = parameter_dim(learned.args[1])
         raise MemoryError(
-            f"expected memory for a belief of {parameter_dim(task.prior)} parameters; "
-            "got none left; fix the parameters that no trial informs, or lower "
-            "num_histories"
+            f"expected memory for a belief of {dim} parameters; got none left; fix the "
+            "parameters that no trial informs, or lower num_histories"
         ) from error
 
 
-def _learned(task: Task, past: object, seed: int) -> LearnedBelief:
-    """Return the belief of a regression, of a wider noise where trials contradict."""
-    known = past if isinstance(past, HistoryRecord) else None
-    regions = Regions(task, known, seed)
-    belief, contradiction = regions.run(), regions.contradiction()
-    if contradiction is not None:
-        return _inflated(regions, belief, contradiction, seed)
-    return belief
-
-
-def _inflated(
-    regions: Regions, belief: LearnedBelief, first: Contradiction, seed: int
+def _learned(
+    learned: partial[Regions], past: HistoryRecord | None, seed: int
 ) -> LearnedBelief:
-    """Return a belief by simulations with noise as large as the trials scatter."""
-    contradiction, inflation = first, 1.0
+    """Return the belief of a regression, of as wide a noise as the trials scatter."""
+    regions = learned(past=past, seed=seed)
+    belief, first = regions.run(), regions.contradiction()
+    if first is None:
+        return belief
     histories, sds = belief.histories, regions.histories.noise_sds
+    now, inflation = first, 1.0
     for number in range(MAX_INFLATIONS):
-        inflation *= contradiction.inflation
-        wider = Regions(
-            regions.task,
-            None,
-            derive_seed(seed, "inflated", number),
+        inflation *= now.inflation
+        wider = learned(
+            seed=derive_seed(seed, "inflated", number),
             further_noise=np.sqrt(max(inflation**2 - 1, 0.0)) * sds,
         )
-        belief, now = wider.run(), wider.contradiction()
-        if now is None:
+        belief, further = wider.run(), wider.contradiction()
+        if further is None:
             break
-        contradiction = now
+        now = further
     belief.diagnostics = replace(first, inflation=inflation).noted(belief.diagnostics)
     belief.histories = histories  # those without the further noise
     return belief

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,10 +15,10 @@ from torch.distributions import Distribution
 from sbi_active.inference.declared.contradiction import Contradiction, compared
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.refinement.checks import (
-    check_outcomes,
+    Fresh,
     compared_with_fresh,
     noise_tails,
-    trial_correlation,
+    outcomes_at,
 )
 from sbi_active.inference.refinement.course import (
     LIVE,
@@ -31,7 +31,7 @@ from sbi_active.inference.refinement.regression_error import expected_error, wid
 from sbi_active.inference.refinement.stages import Stages
 from sbi_active.inference.regression.histories import Histories, HistoryRecord
 from sbi_active.inference.regression.regions import around, cover, whole_space
-from sbi_active.inference.regression.surrogate import Surrogate, fewest_rows
+from sbi_active.inference.regression.surrogate import MISFIT, Surrogate, fewest_rows
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.messages import warn
@@ -41,65 +41,62 @@ from sbi_active.simulation.outcomes import MissingRowsWarning
 Array = NDArray[Any]
 
 
-@dataclass(frozen=True)
-class Task:
-    """What is to be refined, as in :func:`.refine`.
-
-    Attributes:
-        stages: Settings of the stages.
-    """
-
-    simulator: Callable[..., Any]
-    prior: Distribution
-    action: Tensor
-    outcome: Tensor
-    hints: list[Distribution]
-    settings: RefinementOptions
-    stages: StageSettings = StageSettings()
-
-
 class Regions(Stages):
     """Histories in regions, and a polynomial in each.
 
     Args:
-        task: Task that is refined.
-        past: Histories of the first of its trials.
+        simulator: ``simulator(theta, action)``.
+        prior: The original prior.
+        action: Executed actions, shape (t, action_dim).
+        outcome: Their outcomes, shape (t, *x_shape).
+        hints: Distributions to look at first.
+        past: Histories of the first of these trials.
+        settings: Settings of the belief.
+        own: Settings of the stages.
         seed: Seed of everything random here.
         further_noise: Standard deviations of noise to add, shape (t, q).
+
+    Attributes:
+        fresh: What fresh simulations say of the last stage.
     """
+
+    fresh: Fresh
 
     def __init__(
         self,
-        task: Task,
-        past: HistoryRecord | None,
-        seed: int,
+        simulator: Callable[..., Any],
+        prior: Distribution,
+        action: Tensor,
+        outcome: Tensor,
         *,
+        hints: Sequence[Distribution] = (),
+        past: HistoryRecord | None = None,
+        settings: RefinementOptions,
+        own: StageSettings = StageSettings(),  # noqa: B008  (frozen)
+        seed: int,
         further_noise: Array | None = None,
     ) -> None:
         rng = np.random.default_rng(derive_seed(seed, "refine"))
-        coordinates = PriorCoordinates(task.prior, rng)
-        budget = task.settings.num_histories
+        coordinates = PriorCoordinates(prior, rng)
         super().__init__(
-            *(task.prior, task.settings, task.stages, budget, rng, coordinates)
+            *(prior, settings, own, settings.num_histories, rng, coordinates)
         )
-        self.task = task
-        observed = task.outcome.numpy().reshape(len(task.outcome), -1)
+        self.action, self.outcome = action, outcome
         self.histories = Histories(
-            *(task.simulator, task.action, observed, coordinates),
-            *(seed, past, task.settings.workers),
+            *(simulator, action, outcome.numpy().reshape(len(action), -1)),
+            *(coordinates, seed, past, settings.workers),
             further_noise=further_noise,
         )
-        self.regions = [whole_space(self.coordinates.dim)]
+        self.regions = [whole_space(coordinates.dim)]
         near: list[Array] = []
-        for hint in task.hints:
+        for hint in hints:
             with forked_generators(derive_seed(seed, "start")):
-                draws = hint.sample(torch.Size([1_000])).float()
-            z = self.coordinates.to_z(draws)
-            near.append(z[self.coordinates.inside(z)])
+                z = coordinates.to_z(hint.sample(torch.Size([1_000])).float())
+            near.append(z[coordinates.inside(z)])
             self.regions.append(around(near[-1]))
         self.near = np.concatenate(near) if near else None
-        self.num_forced, self.is_shaped, self.change = 1, False, 0.0
-        self.least = max(self.own.fewest, 2 * fewest_rows(self.coordinates.dim))
+        self.num_forced, self.shape_change = 1, 0.0
+        self.least = max(own.fewest, 2 * fewest_rows(coordinates.dim))
 
     def spent(self) -> tuple[int, int]:
         """Return the histories simulated or taken over, and the rows."""
@@ -108,14 +105,13 @@ class Regions(Stages):
     def run(self) -> LearnedBelief:
         """Return the belief with its histories, and what they say of lost outcomes."""
         belief, histories, stage = super().run(), self.histories, self.stages[-1]
-        known = belief.diagnostics.extended(
+        belief.diagnostics = belief.diagnostics.extended(
             error_nats_if_explained=expected_error(
                 stage.surrogate, stage.draws, self.rng, explained=True
             ),
             share_invalid=histories.share_invalid,
-        )
-        belief.diagnostics = check_outcomes(
-            known, stage.surrogate, stage.draws, histories
+            probability_of_outcome=self.probability_of_outcome,
+            num_missing=histories.num_missing,
         )
         belief.histories = histories.record()
         if histories.num_missing:
@@ -147,27 +143,25 @@ class Regions(Stages):
         """Bring the stage's regions to their numbers, past histories first."""
         if self.stages:
             self._propose(self.stages[-1], size)
-        histories, regions = self.histories, self.regions
-        is_first = histories.num_drawn == 0
-        num_places = size - max(int(self.own.replicate_share * size), 12)
-        shares = np.full(len(regions), 1 / len(regions))
-        if is_first and len(regions) > 2:  # the overview keeps half of the stage
-            shares = np.array([0.5, *[0.5 / (len(regions) - 1)] * (len(regions) - 1)])
-        bounds = num_places * np.concatenate([[0.0], shares.cumsum()])
-        counts = np.diff(np.round(bounds, 6).astype(int))
-        for k, (region, count) in enumerate(zip(regions, counts, strict=True)):
+        histories, regions, own = self.histories, self.regions, self.own
+        is_first, num = histories.num_drawn == 0, len(regions)
+        weights = np.ones(num)
+        if is_first and num > 2:  # the overview keeps half of the stage
+            weights[0] = num - 1
+        ends = np.round(size * weights.cumsum() / weights.sum(), 6).astype(int)
+        for k, count in enumerate(np.diff(ends, prepend=0)):
             # The first stage's first region is the whole space, seen from the prior.
             is_overview = is_first and k == 0
-            missing = int(count)
-            missing -= histories.reuse(region, missing, is_overview=is_overview)
-            if missing <= 0:
+            count -= histories.reuse(regions[k], int(count), is_overview=is_overview)
+            if count <= 0:
                 continue
-            z = region.sample_inside(missing, self.coordinates, self.rng)
-            z = self.rng.permutation(z)
+            num_repeated = int(max(own.replicate_share, 12 / size) * count)
+            missing = int(count) - num_repeated
+            z = regions[k].sample_inside(missing, self.coordinates, self.rng)
             if len(z) == 0:  # it lies beside the support, as of an outcome far away
                 z = self.coordinates.sample_prior(missing, self.rng)
-            num_replicates = missing * (size - num_places) // num_places
-            histories.add(z, min(num_replicates, len(z)), is_overview=is_overview)
+            z = self.rng.permutation(z)
+            histories.add(z, min(num_repeated, len(z)), is_overview=is_overview)
 
     def fit(self, near: Array | None, *, is_last: bool) -> Surrogate:
         """Return the regressions of the regions that have simulations enough."""
@@ -217,7 +211,7 @@ class Regions(Stages):
         if all(fit.shape is None for fit in shaped):
             return stage
         other = self.sample(Surrogate(c, shaped), stage.draws)
-        self.is_shaped, self.change = True, other.after(stage).change
+        self.shape_change = other.after(stage).change
         error = max(stage.error, other.error)
         return replace(
             other, error=error, change=stage.change, shrinkage=stage.shrinkage
@@ -229,7 +223,7 @@ class Regions(Stages):
         num = max(own.least_checked, int(own.checked_share * self.budget))
         theta = c.to_theta(stage.fit.fresh(num, self.rng))
         x, lost = self.histories.fresh(theta)
-        z, num_trials = c.to_z(theta), len(self.task.action)
+        z, num_trials = c.to_z(theta), len(self.action)
         self.fresh = compared_with_fresh(
             stage.surrogate, z[~lost], x[~lost], num_trials, own
         )
@@ -237,16 +231,21 @@ class Regions(Stages):
 
     def doubts(self) -> dict[str, Doubt]:
         """Return what the regressions take for granted."""
-        last, fresh = self.stages[-1], self.fresh
-        fits = last.surrogate.regressions
-        live = [fit for fit, mass in zip(fits, last.mass, strict=True) if mass > LIVE]
+        last, fresh, own = self.stages[-1], self.fresh, self.own
+        fits, dim = last.surrogate.regressions, self.coordinates.dim
+        live = [f.ratio for f, mass in zip(fits, last.mass, strict=True) if mass > LIVE]
         roughness = self.stages[0].surrogate.regressions[0].roughness
         tails, has_edges = noise_tails(self.stages)
-        dim = self.coordinates.dim
-        # Of d parameters known to e nats, a mean is off by (2 e / d)^(1/2) deviations.
-        allowed = 0.5 * dim * self.own.known**2
-        known = last.error / allowed, self.change / (self.own.unsettled * dim)
-        correlation, is_independent = trial_correlation(live, len(self.task.action))
+        known = 0.0
+        if any(fit.shape is not None for fit in fits):
+            # Of d parameters known to e nats, a mean is off by (2 e / d)^(1/2)
+            # deviations.
+            allowed = 0.5 * dim * own.known**2
+            known = self.shape_change / (own.unsettled * dim)
+            known = max(last.error / allowed, known)
+        share, blur = outcomes_at(last.surrogate, last.draws, self.histories)
+        self.probability_of_outcome = share
+        rare = ", ".join(str(k) for k, p in enumerate(share) if p < own.rare)
         return {
             "confirmed": (
                 fresh.shift <= fresh.limit,
@@ -262,14 +261,14 @@ class Regions(Stages):
                 "check against a belief of a trained network",
             ),
             "noise_known": (
-                not self.is_shaped or max(known) <= 1,
-                max(known) if self.is_shaped else 0.0,
+                known <= 1,
+                known,
                 "SA110 the noise is not Gaussian, and the simulations are too few to "
                 "tell what it is ({:.2g} times the error that is allowed for); raise "
                 "num_histories",
             ),
             "smooth_response": (
-                roughness <= self.own.rough,
+                roughness <= own.rough,
                 roughness,
                 "SA111 over the prior the outcomes have more turns than a cubic, which "
                 "misses {:.0%} of their variance, so that four or more narrow modes "
@@ -277,41 +276,42 @@ class Regions(Stages):
                 "narrower prior",
             ),
             "no_misfit": (
-                last.excess <= self.own.misfit,
-                max((fit.ratio for fit in live), default=np.inf),
+                last.excess <= own.misfit,
+                max(live, default=np.inf),
                 "SA112 the residuals of the surrogate have {:.2g} times the variance "
                 "of the noise, so that the belief is too wide; raise num_histories",
             ),
             "independent_trials": (
-                is_independent,
-                correlation,
+                fresh.correlation < own.correlated or last.excess > MISFIT,
+                fresh.correlation,
                 "SA104 simulated trials correlate at the same parameters ({:.2f}), yet "
                 "the likelihood is a product over trials; check how the simulator "
                 "seeds its noise",
+            ),
+            "outcomes_followed": (
+                blur <= own.blurred,
+                blur,
+                "SA120 where simulations have a measurement and where they have none "
+                "is followed coarsely ({:.0%} of repeated simulations would differ "
+                "that do not), so that the belief is too wide; raise num_histories",
+            ),
+            "outcomes_usual": (
+                not rare,
+                min(share),
+                f"SA121 trials {rare} had a measurement, or none, where only {{:.1%}} "
+                "of the simulations near the belief do the same: the simulator lacks a "
+                "way to fail, or the status of the trial is wrong",
             ),
         }
 
     def contradiction(self) -> Contradiction | None:
         """Return what contradicts at the draw that the last stage explains best."""
-        task, stage = self.task, self.stages[-1]
-        t, label = len(task.action), stage.surrogate.assign(stage.draws)
-        best: Array | None = None
-        for k, fit in enumerate(stage.surrogate.regressions):
-            if not (label == k).any():
-                continue
-            error, widening = fit.whitened(stage.draws[label == k])
-            squares = (error.reshape(len(error), t, -1) ** 2).sum(2)
-            squares = squares / np.minimum(widening, 2.0)[:, None]
-            least = squares[squares.sum(1).argmin()]
-            best = least if best is None or least.sum() < best.sum() else best
-        if best is None:
-            return None
         sds = torch.from_numpy(self.histories.noise_sds).mean(0)
         sds = torch.where(sds > 0, sds, torch.inf)
         return compared(
-            task.action,
-            task.outcome,
+            self.action,
+            self.outcome,
             lambda gap: gap.flatten(1) / sds,
-            best,
+            self.fresh.least,
             num_fitted=self.coordinates.dim,
         )

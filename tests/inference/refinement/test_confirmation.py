@@ -6,7 +6,7 @@ from torch.distributions import Independent, Normal
 
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.refinement.checks import compared_with_fresh
-from sbi_active.inference.refinement.regional import Regions, Task
+from sbi_active.inference.refinement.regional import Regions
 
 PRIOR = Independent(Normal(torch.zeros(2), torch.ones(2)), 1)
 ACTION = torch.tensor([[1.0], [2.0]])
@@ -21,9 +21,8 @@ def compared(by=0.0, off=0.0):
     """Compare at draws that lie beside the belief, of outcomes that lie beside."""
     x = torch.tensor([[0.5, 0.9], [1.0, 0.9]])
     settings = RefinementOptions(num_histories=1_000)
-    task = Task(simulator, PRIOR, ACTION, x.double(), [], settings)
     torch.manual_seed(0)
-    stages = Regions(task, None, 0)
+    stages = Regions(simulator, PRIOR, ACTION, x.double(), settings=settings, seed=0)
     belief = stages.run()
     theta = belief.sample((100,)) + by * belief.variance.sqrt()
     outcomes, lost = stages.histories.fresh(theta)
