@@ -19,7 +19,6 @@ from sbi_active.inference.emulation.likelihood import (
     correlation_root,
     declared_process,
     learned_processes,
-    mixture_gain,
 )
 from sbi_active.inference.emulation.pool import Pool
 from sbi_active.inference.emulation.summaries import Summary
@@ -155,33 +154,12 @@ class Processes(Stages):
         """Return the summary by which a trial is expected to tell most."""
         if trial.label is not None or len(self.summaries) == 1:
             return trial.label or self.summaries[0].label
-        gains = [
-            self.gain(self.fit_trial(trial, summary.label, self.near))
-            for summary in self.summaries
-        ]
+        gains = []
+        for summary in self.summaries:
+            rng = np.random.default_rng(derive_seed(self.seed, "gain"))
+            fitted = self.fit_trial(trial, summary.label, self.near)
+            gains.append(fitted.gain(self.near, rng))
         return self.summaries[int(np.argmax(gains))].label
-
-    def gain(
-        self, fitted: TrialLikelihood, *, num: int = 728, outer: int = 128
-    ) -> float:
-        """Return the information of an outcome at a trial's action, nats.
-
-        Args:
-            fitted: Likelihood of the trial.
-            num: Number of parameters.
-            outer: Number of those that outcomes are drawn at.
-        """
-        if not fitted.processes:
-            return 0.0
-        z = np.resize(self.near, (num, self.near.shape[1]))
-        mean, variance = fitted.predict(z)
-        if self.noise is None:
-            root = fitted.learned_sd[:, None] * fitted.root
-        else:
-            root = np.diag(fitted.declared_sd)
-        rng = np.random.default_rng(derive_seed(self.seed, "gain"))
-        normal = rng.standard_normal((outer, mean.shape[1]))
-        return float(mixture_gain(mean, variance, root, normal, outer).mean())
 
     def fit_trial(
         self, trial: PooledTrial, label: str, reference: Array
@@ -200,7 +178,7 @@ class Processes(Stages):
         outcome = self._outcome(z, numbers, used)
         region = Region(np.zeros(z.shape[1]), np.eye(z.shape[1]), 1.0)
         processes: tuple[GaussianProcess, ...] = ()
-        root, freedom, seen = np.eye(1), 1.0, observed[used]
+        root, freedom, seen = np.eye(used.sum()), np.inf, observed[used]
         needed = z.shape[1] + 4
         if used.any() and valid.sum() < needed:
             raise UnexplainedOutcomeError(

@@ -107,7 +107,7 @@ class FreshDraws:
         rng: np.random.Generator,
         *,
         plenty: int = 4,
-        spare: int = 15_000,
+        enough: int = 20_000,
         block: int = 50_000,
     ) -> Array:
         """Return the prior's coordinates of equally weighted draws, (num, d).
@@ -117,10 +117,10 @@ class FreshDraws:
             rng: Source of the draws.
             plenty: Effective draws that each is chosen from. Half leaves the worst of
                 30 samples of a curved ridge .04 nats off, this .02 and twice .03.
-            spare: Effective draws beyond ``num`` at most.
+            enough: Effective draws beyond which no more than ``num`` are taken.
             block: Draws of the proposal that are weighed at once.
         """
-        wanted = min(plenty * num, num + spare) / max(self.efficiency, 1e-3)
+        wanted = min(plenty * num, max(num, enough)) / max(self.efficiency, 1e-3)
         parts: list[Array] = []
         for count in np.diff(np.linspace(0, num, int(wanted // block) + 2).astype(int)):
             size = int(np.ceil(wanted * count / max(num, 1)))

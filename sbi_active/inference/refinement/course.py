@@ -161,22 +161,3 @@ class Stage:
     def is_stuck(self) -> bool:
         """Whether misfit remains though the stage learned nothing."""
         return self.excess > MISFIT and self.change < 0.3 and self.shrinkage < 0.3
-
-
-def ended_at_best(stages: list[Stage], own: StageSettings) -> list[Stage]:
-    """Return stages without last ones that err more than one without misfit before.
-
-    Unless the stage after that one differs from it by more than its own error: what is
-    missed far off has no part in the expected error. It is settled if the stage after
-    it, or it, changed nothing.
-    """
-    errors = [s.error if s.excess <= MISFIT else np.inf for s in stages]
-    best = min(range(1, len(stages) - 1), key=errors.__getitem__, default=-1)
-    last = stages[-1]
-    if best < 0 or last.error <= own.small or errors[best] >= errors[-1]:
-        return stages
-    after = stages[best + 1]
-    if after.change > own.unsettled * last.draws.shape[1] + after.error:
-        return stages
-    change = min(stages[best].change, after.change)
-    return [*stages[:best], replace(stages[best], change=change)]

@@ -22,7 +22,6 @@ from sbi_active.inference.refinement.course import (
     Doubt,
     Stage,
     StageSettings,
-    ended_at_best,
 )
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
@@ -97,7 +96,7 @@ class Stages(ABC):
         return stage
 
     def run(self) -> LearnedBelief:
-        """Return the belief of the last stage, or of one before that errs less.
+        """Return the belief of the last stage that explains the trials.
 
         Raises:
             UnexplainedOutcomeError: If nothing has a likelihood.
@@ -122,7 +121,6 @@ class Stages(ABC):
             if is_last or stage.is_settled(own):
                 break
             near = stage.draws
-        stages = self.stages = ended_at_best(stages, own)
         stages[-1] = self.last(stages[-1])
         belief = LearnedBelief(
             self.prior, stages[-1].fit, defensive=self.settings.defensive
