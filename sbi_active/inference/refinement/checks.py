@@ -84,9 +84,12 @@ def compared_with_fresh(
     """
     d, sds = z.shape[1], z.std(0) + 1e-300
     label = surrogate.assign(z)
+    if (label >= 0).sum() <= 10:
+        tails = [1.0] * num_trials, 1.0
+        return Fresh(tails, np.inf, own.largest_shift, 0.0, np.zeros(num_trials))
     real, known, errors, moves = [], [], [], []
-    for k, fit in enumerate(surrogate.regressions):
-        here = z[label == k]
+    for k in np.unique(label[label >= 0]):
+        fit, here = surrogate.regressions[k], z[label == k]
         predicted, widening = fit.whitened(here)
         error = fit.whitened_outcomes(x[label == k]) - predicted
         # A little leverage is the price of few rows; much of it is extrapolation, which
@@ -102,9 +105,6 @@ def compared_with_fresh(
         moves.append(np.linalg.solve(system, score[..., None])[..., 0] / sds)
         errors.append(error / np.sqrt(widening)[:, None])
     observed, simulated, error, move = map(np.concatenate, (real, known, errors, moves))
-    if len(move) <= 10:
-        least = np.zeros(num_trials)
-        return Fresh(([1.0] * num_trials, 1.0), np.inf, own.largest_shift, 0.0, least)
     pairs = zip(simulated.T, observed.T, strict=True)
     tail = [float(_exceedance(*pair).mean().clip(LEAST, 1.0)) for pair in pairs]
     worst = int(np.abs(move.mean(0)).argmax())

@@ -35,8 +35,7 @@ class StageSettings:
         oversampling: Number of effective draws of a learned likelihood for each that
             is asked of a simulated one. Half raises the error of a log density from
             .018 to .025 nats at 200.
-        max_regions: Number of ellipsoids at most, but for splits against misfit.
-        max_forced: Number of ellipsoids that split misfit, at most.
+        max_regions: Number of ellipsoids at most.
         small: Nats by which the belief is off for want of simulations that need no
             further stage.
         settled: Nats a dimension that the last stage may have changed for there to be
@@ -81,7 +80,6 @@ class StageSettings:
     fewest: int = 60
     oversampling: float = 16.0
     max_regions: int = 8
-    max_forced: int = 32
     small: float = 0.01
     settled: float = 0.03
     untrusted: float = 0.1
@@ -156,8 +154,3 @@ class Stage:
         return not np.isfinite(own.settled) or bool(
             self.change < most[0] and self.shrinkage < most[1]
         )
-
-    @property
-    def is_stuck(self) -> bool:
-        """Whether misfit remains though the stage learned nothing."""
-        return self.excess > MISFIT and self.change < 0.3 and self.shrinkage < 0.3

@@ -95,7 +95,7 @@ class Regions(Stages):
             near.append(z[coordinates.inside(z)])
             self.regions.append(around(near[-1]))
         self.near = np.concatenate(near) if near else None
-        self.num_forced, self.shape_change = 1, 0.0
+        self.shape_change = 0.0
         self.least = max(own.fewest, 2 * fewest_rows(coordinates.dim))
 
     def spent(self) -> tuple[int, int]:
@@ -126,16 +126,11 @@ class Regions(Stages):
 
     def _propose(self, stage: Stage, size: int) -> None:
         """Put the next stage's regions around what is still plausible."""
-        many = 2 * max(self.num_forced, len(self.regions))
-        fewer = max(1, self.num_forced // 2)
-        is_stuck = self.stages[-1].is_stuck
-        self.num_forced = min(many, self.own.max_forced) if is_stuck else fewer
         limit = max(1, int(size / (1.2 * fewest_rows(self.coordinates.dim))))
         self.regions = cover(
             stage.draws,
             self.rng,
-            min_regions=min(self.num_forced, limit),
-            max_regions=min(max(self.own.max_regions, self.num_forced), limit),
+            max_regions=min(self.own.max_regions, limit),
             generous=stage.excess < 3,
         )
 
