@@ -29,13 +29,13 @@ from torch import Tensor
 
 from sbi_active.inference.emulation.summaries import Statistic, learned_statistic
 from sbi_active.inference.regression.outcomes import TrialOutcome
-from sbi_active.inference.regression.process import (
+from sbi_active.inference.regression.regions import Region
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.inference.sampling.gaussian_process import (
     GaussianProcess,
     Kind,
     ProcessSettings,
 )
-from sbi_active.inference.regression.regions import Region
-from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.student_mixture import log_student
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation.noise.base import NoiseModel

@@ -107,7 +107,7 @@ def fitted_summaries(
         rows = raw.detach().float().flatten(1)
         rows = rows[rows.isfinite().any(1)]
         rows = rows[:: -(-len(rows) // most_fitted)].double().numpy()
-        fill = np.nan_to_num(_mean(rows))
+        fill = np.ma.masked_invalid(rows).mean(0).filled(0.0)
         filled = np.where(np.isfinite(rows), rows, fill)
         own = copy.deepcopy(summary)
         try:
@@ -119,14 +119,6 @@ def fitted_summaries(
             ) from error
         found.append(Summary(label, own, fill))
     return found
-
-
-def _mean(rows: Array) -> Array:
-    """Return the mean of what was measured, NaN where nothing was."""
-    present = np.isfinite(rows)
-    total = np.where(present, rows, 0.0).sum(0)
-    with np.errstate(invalid="ignore"):
-        return total / present.sum(0)
 
 
 @dataclass(frozen=True)

@@ -137,9 +137,6 @@ class ShapeSettings:
         floor: Size of the prediction, in its root mean square, below which the noise
             does not shrink: half lets the noise vanish where a mean crosses zero.
         powers: Least and largest power of the prediction.
-        left: Nats a number that the mixture may lose, which serves all numbers: of
-            skewed noise a Gaussian loses .1 to .25, and this .01 to .04. Half doubts
-            one in five of the beliefs that are right, twice the same as this.
     """
 
     gain: float = 0.01
@@ -147,7 +144,6 @@ class ShapeSettings:
     most_fitted: int = 3_000
     floor: float = 0.2
     powers: tuple[float, float] = (-0.5, 2.0)
-    left: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -161,7 +157,6 @@ class NoiseShape:
         mixture: F.
         covariance: Covariance of the normal scores y.
         shift: Mean of the scores, shape (q,).
-        score: Normal scores of the simulations over their deviations, shape (n, q).
         coefficient: Coefficients of outcomes less the observed ones, shape (p, q).
         observed: Observed outcomes, shape (q,).
     """
@@ -172,7 +167,6 @@ class NoiseShape:
     mixture: GaussianMixture
     covariance: ResidualCovariance
     shift: Array
-    score: Array
     coefficient: Array
     observed: Array
 
@@ -237,7 +231,7 @@ class NoiseShape:
         score = (score - shift) / deviation
         covariance = ResidualCovariance.of(score, deviation, freedom, trial)
         return NoiseShape(
-            *(power, floor, scale, mixture, covariance, shift, score),
+            *(power, floor, scale, mixture, covariance, shift),
             *(coefficient, observed),
         )
 

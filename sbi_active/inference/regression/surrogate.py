@@ -20,7 +20,7 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -108,8 +108,7 @@ class LocalRegression:
     def __getstate__(self) -> dict[str, Any]:
         # Residuals have served the diagnostics and would only weigh on a pickle.
         empty = np.zeros((0, len(self.used)))
-        shape = self.shape and replace(self.shape, score=empty[:, self.used])
-        return {**vars(self), "residual": empty, "standardized": empty, "shape": shape}
+        return {**vars(self), "residual": empty, "standardized": empty}
 
     @property
     def has_misfit(self) -> bool:
