@@ -170,9 +170,10 @@ class Processes(Stages):
         z = self.coordinates.to_z(rows.theta)
         observed = summary(trial.x[None].float())[0]
         numbers = summary(rows.x)
-        if numbers.shape[1] != len(observed):  # nothing measured on one side
-            width = max(numbers.shape[1], len(observed))
-            numbers, observed = _wide(numbers, width), _wide(observed[None], width)[0]
+        # Where nothing was measured on one side, that is one NaN.
+        width = max(numbers.shape[1], len(observed))
+        numbers = np.broadcast_to(numbers, (len(numbers), width))
+        observed = np.broadcast_to(observed, width)
         used = np.isfinite(observed)
         valid = np.isfinite(numbers[:, used]).all(1) & used.any()
         outcome = self._outcome(z, numbers, used)
@@ -285,10 +286,3 @@ def nearest(
     near = near[distance[near] <= reach]
     size = np.sqrt((distance[near] ** 2).mean() / dim)
     return near, Region(center, region.factor, max(1.0, float(size)))
-
-
-def _wide(numbers: Array, width: int) -> Array:
-    """Return numbers (n, d) with NaN up to a width."""
-    full = np.full((len(numbers), width), np.nan)
-    full[:, : numbers.shape[1]] = numbers
-    return full
