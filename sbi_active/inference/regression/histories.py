@@ -162,7 +162,8 @@ class Histories:
         Args:
             theta: Parameters, shape (n, d).
         """
-        x = self._simulate(theta, 0)[0].reshape(len(theta), -1) - self.observed
+        x = self._simulate(theta, 0, enough=0.9)[0]  # few are judged by
+        x = x.reshape(len(theta), -1) - self.observed
         return x, ~np.isfinite(x[:, self.used]).all(1) | (x == LOST).any(1)
 
     def record(self) -> HistoryRecord:
