@@ -15,9 +15,6 @@ from sbi_active.inference.regression.surrogate import MISFIT
 
 Array = NDArray[Any]
 
-#: Whether something that is taken for granted holds, its figure, and what to say with
-#: that where it does not.
-Doubt = tuple[bool, float, str]
 LIVE = 0.01  # mass below which a region is left out of the checks
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.inference.declared.contradiction import Contradiction, compared
+from sbi_active.inference.declared.diagnosing import Doubt
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.refinement.checks import (
     Fresh,
@@ -20,12 +21,7 @@ from sbi_active.inference.refinement.checks import (
     noise_tails,
     outcomes_at,
 )
-from sbi_active.inference.refinement.course import (
-    LIVE,
-    Doubt,
-    Stage,
-    StageSettings,
-)
+from sbi_active.inference.refinement.course import LIVE, Stage, StageSettings
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.refinement.regression_error import expected_error, widened
 from sbi_active.inference.refinement.stages import Stages

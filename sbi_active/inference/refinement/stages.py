@@ -14,15 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from torch.distributions import Distribution
 
-from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
-from sbi_active.inference.declared.diagnosing import misplaced
+from sbi_active.inference.beliefs.diagnostics import Diagnostics
+from sbi_active.inference.declared.diagnosing import Doubt, judged
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.engine.learned import LearnedLikelihood, learned_fit
-from sbi_active.inference.refinement.course import (
-    Doubt,
-    Stage,
-    StageSettings,
-)
+from sbi_active.inference.refinement.course import Stage, StageSettings
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
@@ -180,21 +176,14 @@ class Stages(ABC):
             ),
             **self.doubts(),
         }
-        warnings = [text.format(f) for holds, f, text in doubts.values() if not holds]
-        warnings += misplaced(*tails, edge_mass)
-        return Diagnostics(
-            trustworthy=not warnings,
-            warnings=(*warnings,),
-            assumptions={
-                name: Assumption(bool(holds), float(figure))
-                for name, (holds, figure, _) in doubts.items()
-            },
+        return judged(
+            doubts,
+            tails,
+            edge_mass,
             num_simulations=self.spent()[1],
             effective_sample_size=float(last.fit.fit.effective_sample_size),
             error_nats=last.error,
             error_nats_if_explained=last.error,
-            tail_probability=tails[1],
-            tail_probability_of_trial=(*tails[0],),
             figures={
                 "num_stages": num,
                 "num_regions": len(last.mass),
