@@ -128,18 +128,21 @@ class Statistic:
     Attributes:
         center: Mean of the summaries, shape (q,).
         scale: Deviation of the summaries, shape (q,); infinite if one never varies.
-        weight: Shape (q, s).
+        weight: Shape (q, s); None keeps the numbers as they are.
         offset: Shape (s,).
     """
 
     center: Array
     scale: Array
-    weight: Array
+    weight: Array | None
     offset: Array
 
     def __call__(self, summary: Array) -> Array:
         """Return statistics, shape (n, s)."""
-        return self.offset + (summary - self.center) / self.scale @ self.weight
+        features = (summary - self.center) / self.scale
+        if self.weight is None:
+            return features
+        return self.offset + features @ self.weight
 
 
 def learned_statistic(
@@ -163,7 +166,7 @@ def learned_statistic(
     scale = np.where(scale > floor, scale, np.inf)
     if q <= FEW * z.shape[1] or not np.isfinite(scale).any():
         varies = np.where(np.isfinite(scale), scale, np.maximum(np.abs(center), 1e-30))
-        plain = Statistic(center, varies, np.eye(q), np.zeros(q))
+        plain = Statistic(center, varies, None, np.zeros(q))
         return plain, plain(summary)
     features = (summary - center) / scale
     size = z.std(0) + 1e-12
