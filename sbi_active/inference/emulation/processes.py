@@ -175,7 +175,9 @@ class Processes(Stages):
         numbers = np.broadcast_to(numbers, (len(numbers), width))
         observed = np.broadcast_to(observed, width)
         used = np.isfinite(observed)
-        valid = np.isfinite(numbers[:, used]).all(1) & used.any()
+        valid: NDArray[np.bool_] = np.asarray(
+            np.isfinite(numbers[:, used]).all(1) & used.any()
+        )
         outcome = self._outcome(z, numbers, used)
         region = Region(np.zeros(z.shape[1]), np.eye(z.shape[1]), 1.0)
         processes: tuple[GaussianProcess, ...] = ()
