@@ -6,7 +6,7 @@ With declared noise the noise-free outcome f is interpolated,
     p(x | \theta) = \mathcal N\big(x; m(\theta), \Sigma + V(\theta)\big),
 
 m and V the mean and the variance of a Gaussian process on simulations of f. A simulator
-that is itself the noise gives statistics s (:mod:`.statistics`) with a noise that is
+that is itself the noise gives statistics s (:mod:`.summaries`) with a noise that is
 learned with them, at this action and near the belief, and the density is that of
 Student's t, as a variance from n simulations is uncertain.
 
