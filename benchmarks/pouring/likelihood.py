@@ -42,8 +42,11 @@ from scipy.special import gammaln, logsumexp
 from sbi_active.inference.emulation.likelihood import correlation_root
 from sbi_active.inference.emulation.summaries import Statistic, learned_statistic
 from sbi_active.inference.regression.outcomes import TrialOutcome
-from sbi_active.inference.regression.process import GaussianProcess, ProcessSettings
 from sbi_active.inference.regression.regions import whole_space
+from sbi_active.inference.sampling.gaussian_process import (
+    GaussianProcess,
+    ProcessSettings,
+)
 
 __all__ = ["ImageLikelihood", "components", "doubted", "observed", "thumbnails"]
 

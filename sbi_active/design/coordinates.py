@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, BoxActions
-from sbi_active.inference.regression.process import IN_CUBE, GaussianProcess
+from sbi_active.inference.sampling.gaussian_process import IN_CUBE, GaussianProcess
 from sbi_active.seeding import derive_seed
 
 

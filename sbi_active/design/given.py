@@ -16,7 +16,7 @@ from sbi_active.design.estimators.base import (
 )
 from sbi_active.design.problem import DesignProblem
 from sbi_active.design.search import Evaluations, Objective
-from sbi_active.inference.regression.process import GaussianProcess
+from sbi_active.inference.sampling.gaussian_process import GaussianProcess
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import Outcome, Simulations
 from sbi_active.threads import single_thread

@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from sbi_active.actions import ActionSpace
 from sbi_active.design.coordinates import Coordinates
-from sbi_active.inference.regression.process import GaussianProcess
+from sbi_active.inference.sampling.gaussian_process import GaussianProcess
 from sbi_active.seeding import derive_seed
 
 Score = Callable[[Tensor], Tensor]

@@ -31,7 +31,7 @@ QUICK = {
         *("compartments_3", "compartments_6", "decay", "eight_modes", "banana", "jump"),
         *("edge", "student", "missing", "invalid"),
     ),
-    "refine, noise drawn": ("linear_3_10", "edge", "hard_edged"),
+    "refine, noise drawn": ("linear_3_10", "banana", "edge", "hard_edged"),
     "close_loop, bare model": tuple(
         name for name in PROBLEMS if name not in ("hard_edged", "payload")
     ),

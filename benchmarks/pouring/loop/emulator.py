@@ -33,7 +33,10 @@ from benchmarks.pouring.loop.worlds import World, poured_effects
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect
 from sbi_active.inference.emulation.likelihood import correlation_root
-from sbi_active.inference.regression.process import GaussianProcess, ProcessSettings
+from sbi_active.inference.sampling.gaussian_process import (
+    GaussianProcess,
+    ProcessSettings,
+)
 from sbi_active.tasks.pouring.raster import NUM_PIXELS, PIXEL
 
 __all__ = ["SHIFTS", "Emulator", "pictures_numbers"]

@@ -30,7 +30,10 @@ from benchmarks.pouring.learned import (
 )
 from benchmarks.pouring.likelihood import ImageLikelihood, observed
 from benchmarks.pouring.power import best_power
-from sbi_active.inference.regression.process import GaussianProcess, ProcessSettings
+from sbi_active.inference.sampling.gaussian_process import (
+    GaussianProcess,
+    ProcessSettings,
+)
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import images_of, intersection_volume

@@ -24,13 +24,9 @@ class WeightedBelief(Belief):
         b(\theta) = (1 - \epsilon)\, \frac{p(\theta)\, L(\theta)}{Z}
         + \epsilon\, p(\theta)
 
-    Draws are resampled from the weighted ones of a fit, whose density costs nothing.
-
     Args:
         prior: Original prior p.
         coordinates: Coordinates of the prior.
-        z: Draws in these coordinates, shape (n, d).
-        weight: Weights of the draws, which sum to 1, shape (n,).
         log_evidence: Log of Z, nats.
         defensive: Share :math:`\epsilon` of the prior.
 
@@ -46,15 +42,17 @@ class WeightedBelief(Belief):
         self,
         prior: Distribution,
         coordinates: PriorCoordinates,
-        z: Array,
-        weight: Array,
         log_evidence: float,
         *,
         defensive: float,
     ) -> None:
         super().__init__(prior)
-        self._coordinates, self._z, self._weight = coordinates, z, weight
+        self._coordinates = coordinates
         self.log_evidence, self._defensive = log_evidence, defensive
+
+    @abstractmethod
+    def _drawn(self, num: int, rng: np.random.Generator) -> Array:
+        """Return coordinates of draws but for the share of the prior, (num, d)."""
 
     @abstractmethod
     def _log_likelihood(self, theta: Tensor, z: Array) -> Array:
@@ -79,7 +77,7 @@ class WeightedBelief(Belief):
     def _sample(self, num_samples: int) -> Tensor:
         rng = np.random.default_rng(int(torch.randint(2**62, ())))
         num_prior = rng.binomial(num_samples, self._defensive)
-        row = rng.choice(len(self._z), size=num_samples - num_prior, p=self._weight)
+        drawn = self._drawn(num_samples - num_prior, rng)
         prior = self._coordinates.sample_prior(num_prior, rng)
-        z = rng.permutation(np.concatenate([self._z[row], prior]))
+        z = rng.permutation(np.concatenate([drawn, prior]))
         return self._coordinates.to_theta(z)

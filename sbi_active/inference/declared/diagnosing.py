@@ -1,7 +1,8 @@
-"""Diagnostics of a belief by a simulated likelihood."""
+"""Diagnostics of a belief: what it takes for granted, and how far that holds."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,10 @@ from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.noise.whitening import is_known_gaussian
 
 Array = NDArray[Any]
+
+#: Whether something that is taken for granted holds, its figure, and what to say with
+#: that where it does not.
+Doubt = tuple[bool, float, str]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,24 +67,21 @@ def diagnose_fit(
         seed: Seed of the draws behind tail probabilities.
         own: Settings.
     """
-    assumptions, doubts = _assumptions(fit, own)
     base = potential.coordinates.base
     z = potential.coordinates.to_z(fit.u)
     near_edge = np.abs(z[:, base.bounded]) > 0.98
     edge_mass = float((fit.weight @ near_edge).max(initial=0.0))
     rng = np.random.default_rng(derive_seed(seed, "tail"))
     rows = rng.choice(len(z), size=own.num_checked, p=fit.weight)
-    tail = _tail_probability(declared, base.to_theta(z[rows]), seed, own)
-    warnings = [*doubts, *misplaced(tail[:-1], tail[-1], edge_mass, own)]
+    *tails, joint = _tail_probability(declared, base.to_theta(z[rows]), seed, own)
     found = fit.found
-    return Diagnostics(
-        trustworthy=not warnings,
-        warnings=(*warnings,),
-        assumptions=assumptions,
+    return judged(
+        _doubts(fit, own),
+        (tails, joint),
+        edge_mass,
+        own,
         effective_sample_size=fit.effective_sample_size,
         error_nats=float(max(fit.effective_sample_size, 1e-9) ** -0.5),
-        tail_probability=tail[-1],
-        tail_probability_of_trial=(*tail[:-1],),
         figures={
             "likelihood": "simulated",
             "method": fit.method,
@@ -93,45 +95,74 @@ def diagnose_fit(
     )
 
 
-def _assumptions(
-    fit: Fit, own: FitChecks = FitChecks()
-) -> tuple[dict[str, Assumption], list[str]]:
-    """Return the assumptions, and a sentence for each that fails."""
+def _doubts(fit: Fit, own: FitChecks) -> dict[str, Doubt]:
+    """Return what a fit takes for granted, by name."""
     effective, dim = fit.effective_sample_size, int((~fit.free).sum())
     needed = max(own.coarse, dim * (dim + 3) / (4 * own.tolerated))
-    found = {"enough_draws": Assumption(effective >= needed, effective)}
-    words = {
+    doubts: dict[str, Doubt] = {
         "enough_draws": (
-            f"SA114 the belief rests on {effective:.0f} effective draws, fewer than "
-            f"the {needed:.0f} that {dim} parameters ask for, so that its log density "
-            f"is off by about {max(effective, 1e-9) ** -0.5:.2g} nats; raise "
-            "num_histories"
+            effective >= needed,
+            effective,
+            "SA114 the belief rests on {:.0f} effective draws, fewer than the "
+            f"{needed:.0f} that {dim} parameters ask for, so that its log density is "
+            f"off by about {max(effective, 1e-9) ** -0.5:.2g} nats; raise "
+            "num_histories",
         )
     }
     if fit.particles is None:
-        shape = fit.tail_shape
-        found["light_tails"] = Assumption(shape <= Settings().largest_shape, shape)
-        words["light_tails"] = (
-            f"SA116 few draws outweigh all others (tail shape {shape:.2g}), so that "
-            "the belief may miss where they are from; raise num_histories"
+        doubts["light_tails"] = (
+            fit.tail_shape <= Settings().largest_shape,
+            fit.tail_shape,
+            "SA116 few draws outweigh all others (tail shape {:.2g}), so that the "
+            "belief may miss where they are from; raise num_histories",
         )
     else:
         moved = fit.particles
-        moves = moved.acceptance >= own.moving
-        moves = moves and moved.memory <= own.remembered
-        found["particles_move"] = Assumption(moves, moved.acceptance)
-        words["particles_move"] = (
-            f"SA117 {moved.acceptance:.1%} of the moves of the particles were "
-            "accepted, too few for them to reach the posterior; raise num_histories"
+        doubts["particles_move"] = (
+            moved.acceptance >= own.moving and moved.memory <= own.remembered,
+            moved.acceptance,
+            "SA117 {:.1%} of the moves of the particles were accepted, too few for "
+            "them to reach the posterior; raise num_histories",
         )
     if fit.found is not None and not fit.is_rough:
-        twice = fit.found.num_found >= 2
-        found["mode_found_twice"] = Assumption(twice, float(fit.found.num_found))
-        words["mode_found_twice"] = (
-            f"SA118 the best mode was found by one of {fit.found.num_starts} "
-            "searches, so that a better one may be missed; check against another seed"
+        doubts["mode_found_twice"] = (
+            fit.found.num_found >= 2,
+            fit.found.num_found,
+            f"SA118 the best mode was found by one of {fit.found.num_starts} searches, "
+            "so that a better one may be missed; check against another seed",
         )
-    return found, [words[name] for name, a in found.items() if not a.holds]
+    return doubts
+
+
+def judged(
+    doubts: Mapping[str, Doubt],
+    tails: tuple[list[float], float],
+    edge_mass: float,
+    own: FitChecks = FitChecks(),
+    **known: Any,
+) -> Diagnostics:
+    """Return diagnostics of a belief: what it takes for granted, and warnings.
+
+    Args:
+        doubts: Things that are taken for granted, by name.
+        tails: Tail probability of each trial, and of all.
+        edge_mass: Mass of the belief near the edge of one parameter.
+        own: Limits.
+        known: Further diagnostics.
+    """
+    warnings = [text.format(f) for holds, f, text in doubts.values() if not holds]
+    warnings += misplaced(*tails, edge_mass, own)
+    return Diagnostics(
+        trustworthy=not warnings,
+        warnings=(*warnings,),
+        assumptions={
+            name: Assumption(bool(holds), float(figure))
+            for name, (holds, figure, _) in doubts.items()
+        },
+        tail_probability=tails[1],
+        tail_probability_of_trial=(*tails[0],),
+        **known,
+    )
 
 
 def misplaced(

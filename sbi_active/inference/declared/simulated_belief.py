@@ -86,11 +86,8 @@ class SimulatedBelief(WeightedBelief):
         num_fitted: int = 1_000,
     ) -> None:
         coordinates = potential.coordinates
-        super().__init__(
-            *(prior, coordinates.base, coordinates.to_z(fit.u), fit.weight),
-            fit.log_evidence,
-            defensive=defensive,
-        )
+        super().__init__(prior, coordinates.base, fit.log_evidence, defensive=defensive)
+        self._z, self._weight = coordinates.to_z(fit.u), fit.weight
         self._likelihood, rng = potential.likelihood, np.random.default_rng(0)
         self._normal = NormalCoordinates(coordinates.base, rng, keeps_edges=False)
         self.free = fit.free
@@ -99,6 +96,10 @@ class SimulatedBelief(WeightedBelief):
         self._fitted = NormalMixture(
             np.exp(mixture.log_weight), mixture.mean, mixture.factor
         )
+
+    def _drawn(self, num: int, rng: np.random.Generator) -> Array:
+        # Resampled: a further likelihood would cost a simulation a trial.
+        return self._z[rng.choice(len(self._z), size=num, p=self._weight)]
 
     def _smooth_log_prob(self, theta: Tensor) -> Tensor:
         z = self._coordinates.to_z(theta)

@@ -6,7 +6,7 @@ With declared noise the noise-free outcome f is interpolated,
     p(x | \theta) = \mathcal N\big(x; m(\theta), \Sigma + V(\theta)\big),
 
 m and V the mean and the variance of a Gaussian process on simulations of f. A simulator
-that is itself the noise gives statistics s (:mod:`.statistics`) with a noise that is
+that is itself the noise gives statistics s (:mod:`.summaries`) with a noise that is
 learned with them, at this action and near the belief, and the density is that of
 Student's t, as a variance from n simulations is uncertain.
 
@@ -25,16 +25,17 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 from scipy.stats import chi2
+from torch import Tensor
 
 from sbi_active.inference.emulation.summaries import Statistic, learned_statistic
 from sbi_active.inference.regression.outcomes import TrialOutcome
-from sbi_active.inference.regression.process import (
+from sbi_active.inference.regression.regions import Region
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.inference.sampling.gaussian_process import (
     GaussianProcess,
     Kind,
     ProcessSettings,
 )
-from sbi_active.inference.regression.regions import Region
-from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.student_mixture import log_student
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation.noise.base import NoiseModel
@@ -55,7 +56,7 @@ class TrialLikelihood:
         noise: Declared noise; None if it was learned.
         x_shape: Shape of the outcome that noise is declared for.
         used: Which of its numbers were observed, shape (k,).
-        root: Cholesky factor of the correlation of learned noise, shape (q, q).
+        root: Cholesky factor of the correlation of the noise, shape (q, q).
         freedom: Degrees of freedom of learned noise.
         outcome: Probability of a measurement, or of none; None where simulations agree.
         label: Label of the summary.
@@ -81,15 +82,16 @@ class TrialLikelihood:
             total = total + self.outcome.log_prob(z)
         if not self.processes:
             return total
-        mean, variance = self.predict(z)
-        residual = self.observed - mean
-        if self.noise is None:
-            return total + self._student(residual, variance)
-        if type(self.noise) is GaussianNoise and self.noise.posterior is None:
-            spread = self.declared_sd**2 + variance
-            density = residual**2 / spread + np.log(2 * np.pi * spread)
-            return total - 0.5 * density.sum(1)
-        return total + self._declared(mean)
+        noise = self.noise
+        is_white = type(noise) is GaussianNoise and noise.posterior is None
+        if noise is not None and not is_white:
+            return total + self._declared(self.predict(z)[0])
+        white, spread = self._whitened(z)
+        log_volume = np.log(spread).sum(1) + np.log(np.diag(self.root)).sum()
+        square, size = (white**2).sum(1), white.shape[1]
+        if noise is None:
+            return total + log_student(square, log_volume, size, self.freedom)
+        return total - 0.5 * (square + size * np.log(2 * np.pi)) - log_volume
 
     def predict(self, z: Array) -> tuple[Array, Array]:
         """Return mean and variance without noise, both (n, q)."""
@@ -105,67 +107,68 @@ class TrialLikelihood:
         if self.noise is None:
             normal = rng.standard_normal(mean.shape) @ self.root.T
             scale = np.sqrt(self.freedom / rng.chisquare(self.freedom, (len(z), 1)))
-            return drawn + self.learned_sd * normal * scale
-        full = np.zeros((len(z), len(self.used)))
-        full[:, self.used] = drawn
+            return drawn + self.noise_sd * normal * scale
         seeds = torch.from_numpy(rng.integers(2**62, size=len(z)))
-        x = torch.from_numpy(full).reshape(len(z), *self.x_shape)
-        noisy = self.noise.sample(x, seeds).reshape(len(z), -1).numpy()
-        return noisy[:, self.used]
+        noisy = self.noise.sample(self._full(drawn, 0.0), seeds)
+        return noisy.reshape(len(z), -1).numpy()[:, self.used]
 
     def error(self, z: Array) -> float:
         """Return the nats that simulations are too few by, about, at draws (n, d)."""
         if not self.processes:
             return 0.0
-        _, variance = self.predict(z)
-        if self.noise is None:
-            ratio = variance / self.learned_sd**2
-            return float(0.5 * (ratio.mean(0) + 1 / self.freedom).sum())
-        return float(0.5 * (variance / self.declared_sd**2).mean(0).sum())
+        ratio = (self.predict(z)[1] / self.noise_sd**2).mean(0)
+        return float(0.5 * (ratio + (self.noise is None) / self.freedom).sum())
 
     def tail(self, z: Array) -> float:
         """Return how often simulations at draws (n, d) lie as far out as the trial."""
         if not self.processes:
             return 1.0
-        mean, variance = self.predict(z)
-        is_learned = self.noise is None
-        sd = np.sqrt(
-            (self.learned_sd if is_learned else self.declared_sd) ** 2 + variance
-        )
-        white = (self.observed - mean) / sd
-        if is_learned:
-            white = np.linalg.solve(self.root, white.T).T
-        return float(chi2.sf((white**2).sum(1), mean.shape[1]).mean())
+        white = self._whitened(z)[0]
+        return float(chi2.sf((white**2).sum(1), white.shape[1]).mean())
+
+    def gain(
+        self, z: Array, rng: np.random.Generator, *, num: int = 728, outer: int = 128
+    ) -> float:
+        """Return the information of an outcome at this action, nats.
+
+        Args:
+            z: Draws of the parameters, shape (n, d).
+            rng: Source of the noise.
+            num: Number of parameters.
+            outer: Number of those that outcomes are drawn at.
+        """
+        if not self.processes:
+            return 0.0
+        mean, variance = self.predict(np.resize(z, (num, z.shape[1])))
+        normal = rng.standard_normal((outer, mean.shape[1]))
+        root = self.noise_sd[:, None] * self.root
+        return float(mixture_gain(mean, variance, root, normal, outer).mean())
 
     @property
-    def learned_sd(self) -> Array:
-        """Deviation of the learned noise, shape (q,)."""
-        return np.concatenate([process.noise_sd for process in self.processes])
-
-    @property
-    def declared_sd(self) -> Array:
-        """Deviation of the declared noise of the numbers observed, shape (q,)."""
-        assert self.noise is not None
+    def noise_sd(self) -> Array:
+        """Deviation of the noise, learned or declared, of what was observed, (q,)."""
+        if self.noise is None:
+            return np.concatenate([process.noise_sd for process in self.processes])
         sd = np.asarray(getattr(self.noise, "sd", 1.0), dtype=np.float64)
         return np.broadcast_to(sd, self.x_shape).reshape(-1)[self.used]
 
-    def _student(self, residual: Array, variance: Array) -> Array:
-        spread = np.sqrt(self.learned_sd**2 + variance)
-        white = np.linalg.solve(self.root, (residual / spread).T).T
-        log_volume = np.log(spread).sum(1) + np.log(np.diag(self.root)).sum()
-        square = (white**2).sum(1)
-        return log_student(square, log_volume, residual.shape[1], self.freedom)
+    def _whitened(self, z: Array) -> tuple[Array, Array]:
+        """Return residuals in units of noise and interpolation, and their size."""
+        mean, variance = self.predict(z)
+        spread = np.sqrt(self.noise_sd**2 + variance)
+        residual = (self.observed - mean) / spread
+        return np.linalg.solve(self.root, residual.T).T, spread
+
+    def _full(self, numbers: Array, fill: float) -> Tensor:
+        """Return outcomes (n, *x_shape) of what is used, (n, q)."""
+        full = np.full((len(numbers), len(self.used)), fill)
+        full[:, self.used] = numbers
+        return torch.from_numpy(full).reshape(len(numbers), *self.x_shape)
 
     def _declared(self, mean: Array) -> Array:
         assert self.noise is not None
-        full = np.full((len(mean), len(self.used)), np.nan)
-        full[:, self.used] = mean
-        seen = np.full(len(self.used), np.nan)
-        seen[self.used] = self.observed
-        shape = (len(mean), *self.x_shape)
-        x = torch.from_numpy(np.broadcast_to(seen, full.shape).copy()).reshape(shape)
-        at = torch.from_numpy(np.nan_to_num(full)).reshape(shape)
-        return self.noise.log_prob(x, at).double().numpy()
+        seen = self._full(np.broadcast_to(self.observed, mean.shape), np.nan)
+        return self.noise.log_prob(seen, self._full(mean, 0.0)).double().numpy()
 
 
 def declared_process(

@@ -19,7 +19,6 @@ from sbi_active.inference.emulation.likelihood import (
     correlation_root,
     declared_process,
     learned_processes,
-    mixture_gain,
 )
 from sbi_active.inference.emulation.pool import Pool
 from sbi_active.inference.emulation.summaries import Summary
@@ -29,13 +28,13 @@ from sbi_active.inference.engine.pool import PriorDraws
 from sbi_active.inference.refinement.course import Stage, StageSettings
 from sbi_active.inference.refinement.stages import Stages
 from sbi_active.inference.regression.outcomes import TrialOutcome
-from sbi_active.inference.regression.process import (
-    GaussianProcess,
-    num_features,
-)
 from sbi_active.inference.regression.regions import Region, whole_space
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.inference.sampling.gaussian_process import (
+    GaussianProcess,
+    num_features,
+)
 from sbi_active.inference.sampling.student_mixture import Defended
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.noise.base import NoiseModel
@@ -155,33 +154,12 @@ class Processes(Stages):
         """Return the summary by which a trial is expected to tell most."""
         if trial.label is not None or len(self.summaries) == 1:
             return trial.label or self.summaries[0].label
-        gains = [
-            self.gain(self.fit_trial(trial, summary.label, self.near))
-            for summary in self.summaries
-        ]
+        gains = []
+        for summary in self.summaries:
+            rng = np.random.default_rng(derive_seed(self.seed, "gain"))
+            fitted = self.fit_trial(trial, summary.label, self.near)
+            gains.append(fitted.gain(self.near, rng))
         return self.summaries[int(np.argmax(gains))].label
-
-    def gain(
-        self, fitted: TrialLikelihood, *, num: int = 728, outer: int = 128
-    ) -> float:
-        """Return the information of an outcome at a trial's action, nats.
-
-        Args:
-            fitted: Likelihood of the trial.
-            num: Number of parameters.
-            outer: Number of those that outcomes are drawn at.
-        """
-        if not fitted.processes:
-            return 0.0
-        z = np.resize(self.near, (num, self.near.shape[1]))
-        mean, variance = fitted.predict(z)
-        if self.noise is None:
-            root = fitted.learned_sd[:, None] * fitted.root
-        else:
-            root = np.diag(fitted.declared_sd)
-        rng = np.random.default_rng(derive_seed(self.seed, "gain"))
-        normal = rng.standard_normal((outer, mean.shape[1]))
-        return float(mixture_gain(mean, variance, root, normal, outer).mean())
 
     def fit_trial(
         self, trial: PooledTrial, label: str, reference: Array
@@ -192,15 +170,18 @@ class Processes(Stages):
         z = self.coordinates.to_z(rows.theta)
         observed = summary(trial.x[None].float())[0]
         numbers = summary(rows.x)
-        if numbers.shape[1] != len(observed):  # nothing measured on one side
-            width = max(numbers.shape[1], len(observed))
-            numbers, observed = _wide(numbers, width), _wide(observed[None], width)[0]
+        # Where nothing was measured on one side, that is one NaN.
+        width = max(numbers.shape[1], len(observed))
+        numbers = np.broadcast_to(numbers, (len(numbers), width))
+        observed = np.broadcast_to(observed, width)
         used = np.isfinite(observed)
-        valid = np.isfinite(numbers[:, used]).all(1) & used.any()
+        valid: NDArray[np.bool_] = np.asarray(
+            np.isfinite(numbers[:, used]).all(1) & used.any()
+        )
         outcome = self._outcome(z, numbers, used)
         region = Region(np.zeros(z.shape[1]), np.eye(z.shape[1]), 1.0)
         processes: tuple[GaussianProcess, ...] = ()
-        root, freedom, seen = np.eye(1), 1.0, observed[used]
+        root, freedom, seen = np.eye(used.sum()), np.inf, observed[used]
         needed = z.shape[1] + 4
         if used.any() and valid.sum() < needed:
             raise UnexplainedOutcomeError(
@@ -252,7 +233,7 @@ class Processes(Stages):
         """Add rows at the trials that know least."""
         if size == 0:
             return
-        stage = self.course.stages[-1]
+        stage = self.stages[-1]
         own, potential = CHEAP, stage.fit.potential
         c, draws = potential.coordinates, stage.draws[:NUM_REFERENCE]
         weight = np.full(len(draws), 1 / len(draws))
@@ -307,10 +288,3 @@ def nearest(
     near = near[distance[near] <= reach]
     size = np.sqrt((distance[near] ** 2).mean() / dim)
     return near, Region(center, region.factor, max(1.0, float(size)))
-
-
-def _wide(numbers: Array, width: int) -> Array:
-    """Return numbers (n, d) with NaN up to a width."""
-    full = np.full((len(numbers), width), np.nan)
-    full[:, : numbers.shape[1]] = numbers
-    return full

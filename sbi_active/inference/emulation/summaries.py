@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from sklearn.linear_model import Ridge, RidgeCV
 from torch import Tensor
 
 from sbi_active.actions.summaries import SummaryAction, is_fitted
@@ -106,7 +107,7 @@ def fitted_summaries(
         rows = raw.detach().float().flatten(1)
         rows = rows[rows.isfinite().any(1)]
         rows = rows[:: -(-len(rows) // most_fitted)].double().numpy()
-        fill = np.nan_to_num(_mean(rows))
+        fill = np.ma.masked_invalid(rows).mean(0).filled(0.0)
         filled = np.where(np.isfinite(rows), rows, fill)
         own = copy.deepcopy(summary)
         try:
@@ -118,14 +119,6 @@ def fitted_summaries(
             ) from error
         found.append(Summary(label, own, fill))
     return found
-
-
-def _mean(rows: Array) -> Array:
-    """Return the mean of what was measured, NaN where nothing was."""
-    present = np.isfinite(rows)
-    total = np.where(present, rows, 0.0).sum(0)
-    with np.errstate(invalid="ignore"):
-        return total / present.sum(0)
 
 
 @dataclass(frozen=True)
@@ -176,39 +169,16 @@ def learned_statistic(
         plain = Statistic(center, varies, None, np.zeros(q))
         return plain, plain(summary)
     features = (summary - center) / scale
-    penalty = _best_penalty(features, z)
+    size = z.std(0) + 1e-12
+    best: Any = RidgeCV(alphas=n * PENALTIES).fit(features, z / size)
+    penalty = best.alpha_ / n
     fold = np.random.default_rng(seed).permutation(n) % min(num_folds, n)
     own = np.zeros_like(z)
     for k in range(fold.max() + 1):
-        _, weight, _ = _ridge(features[fold != k], z[fold != k], penalty)
+        kept = fold != k
+        ridge = Ridge(alpha=kept.sum() * penalty).fit(features[kept], z[kept])
         # One center for all: the means of the others would tell who was left out.
-        own[fold == k] = z.mean(0) + features[fold == k] @ weight
-    offset, weight, mean = _ridge(features, z, penalty)
-    return Statistic(center, scale, weight, offset - mean @ weight), own
-
-
-def _ridge(features: Array, z: Array, penalty: float) -> tuple[Array, Array, Array]:
-    """Return offset (d,), weight (q, d) and mean of the features (q,)."""
-    mean, offset = features.mean(0), z.mean(0)
-    f, target = features - mean, z - offset
-    n, q = f.shape
-    if n < q:
-        weight = f.T @ np.linalg.solve(f @ f.T + n * penalty * np.eye(n), target)
-    else:
-        weight = np.linalg.solve(f.T @ f + n * penalty * np.eye(q), f.T @ target)
-    return offset, weight, mean
-
-
-def _best_penalty(features: Array, z: Array) -> float:
-    """Return the penalty of the smallest error of left-out rows."""
-    f, target = features - features.mean(0), z - z.mean(0)
-    left, size, _ = np.linalg.svd(f, full_matrices=False)
-    projected, scale, n = left.T @ target, z.std(0) + 1e-12, len(z)
-    errors = []
-    for penalty in PENALTIES:
-        shrink = size**2 / (size**2 + n * penalty)
-        residual = target - left @ (shrink[:, None] * projected)
-        leverage = (left**2) @ shrink + 1 / n
-        left_out = residual / np.maximum(1 - leverage, 1e-3)[:, None] / scale
-        errors.append(float((left_out**2).mean()))
-    return float(PENALTIES[int(np.argmin(errors))])
+        own[~kept] = z.mean(0) + features[~kept] @ ridge.coef_.reshape(len(size), q).T
+    ridge = Ridge(alpha=n * penalty).fit(features, z)
+    weight = ridge.coef_.reshape(len(size), q).T
+    return Statistic(center, scale, weight, np.atleast_1d(ridge.intercept_)), own

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
@@ -17,6 +18,8 @@ Array = NDArray[Any]
 class LearnedBelief(WeightedBelief):
     r"""The posterior of all trials, by a learned likelihood.
 
+    A likelihood costs nothing, so that draws are fresh ones.
+
     Args:
         prior: Original prior.
         fit: Posterior of the learned likelihood.
@@ -26,13 +29,16 @@ class LearnedBelief(WeightedBelief):
     def __init__(
         self, prior: Distribution, fit: LearnedFit, *, defensive: float
     ) -> None:
-        potential, own = fit.potential, fit.fit
+        self._learned, self._fresh = fit.potential.learned, fit.fresh
         super().__init__(
-            *(prior, potential.learned.coordinates, potential.coordinates.to_z(own.u)),
-            *(own.weight, own.log_evidence),
+            prior,
+            self._learned.coordinates,
+            fit.fit.log_evidence,
             defensive=defensive,
         )
-        self._learned = potential.learned
+
+    def _drawn(self, num: int, rng: np.random.Generator) -> Array:
+        return self._fresh(num, rng)
 
     def log_likelihood(self, z: Array) -> Array:
         """Return the learned log likelihood at the prior's coordinates (n, d), (n,)."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,14 +13,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.beliefs.enumerated import (
     EnumeratedBelief,
     Enumeration,
     enumerated,
 )
 from sbi_active.inference.beliefs.priors import require_support
-from sbi_active.inference.declared.contradiction import MAX_INFLATIONS, Contradiction
+from sbi_active.inference.declared.contradiction import MAX_INFLATIONS
 from sbi_active.inference.declared.refining import refine_declared
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.declared.simulated_belief import (
@@ -28,94 +28,13 @@ from sbi_active.inference.declared.simulated_belief import (
 )
 from sbi_active.inference.refinement.course import StageSettings
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
-from sbi_active.inference.refinement.regional import Regions, Task
+from sbi_active.inference.refinement.regional import Regions
 from sbi_active.inference.regression.histories import HistoryRecord
-from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.seeding import derive_seed
 from sbi_active.support import parameter_dim
 from sbi_active.threads import single_thread
 
 Array = NDArray[Any]
-
-
-@dataclass(frozen=True)
-class Confirmation:
-    """How far a learned belief is from what fresh simulations give.
-
-    Attributes:
-        shift: Largest error of a mean, in standard deviations of the belief.
-        num_simulations: Rows simulated.
-        limit: Largest shift of a belief that is to be trusted.
-    """
-
-    shift: float
-    num_simulations: int
-    limit: float
-
-    @property
-    def holds(self) -> bool:
-        """Whether the shift lies within its limit."""
-        return self.shift <= self.limit
-
-    def noted(self, diagnostics: Diagnostics) -> Diagnostics:
-        """Return diagnostics with the figures, and a warning where they are large."""
-        known = diagnostics.extended(
-            num_simulations=diagnostics.num_simulations + self.num_simulations,
-            assumptions={
-                **diagnostics.assumptions,
-                "confirmed": Assumption(self.holds, self.shift),
-            },
-            mean_shift=self.shift,
-        )
-        if self.holds:
-            return known
-        return known.warned(
-            "SA101 fresh simulations do not confirm the belief: its mean is off by "
-            f"{self.shift:.2g} standard deviations; raise num_histories"
-        )
-
-
-def by_replicates(
-    regions: Regions, belief: LearnedBelief, rng: np.random.Generator
-) -> Confirmation:
-    """Compare with fresh simulations at draws of the belief.
-
-    Args:
-        regions: Simulations that led to the belief.
-        belief: Learned belief.
-        rng: Source of the draws.
-    """
-    own, coordinates = regions.own, regions.coordinates
-    num = max(own.least_checked, int(own.checked_share * regions.budget))
-    with forked_generators(int(rng.integers(2**62))):
-        theta = belief.sample(torch.Size([num])).float()
-    histories = regions.histories
-    before = histories.num_simulations
-    x, lost = histories.fresh(theta)
-    z = coordinates.to_z(theta)
-    sds, d = z.std(0) + 1e-300, z.shape[1]
-    last = regions.course.stages[-1].surrogate
-    label, moves = last.assign(z), np.full(z.shape, np.nan)
-    for k, fit in enumerate(last.regressions):
-        rows = np.flatnonzero((label == k) & ~lost)
-        if not len(rows):
-            continue
-        predicted = fit.whitened(z[rows])[0]
-        error = fit.whitened_outcomes(x[rows]) - predicted
-        axes = own.step * np.diag(sds)
-        moved = [(fit.whitened(z[rows] + axis)[0] - predicted) for axis in axes]
-        slope = np.stack(moved, 2) / (own.step * sds)
-        system = np.einsum("nqj,nqk->njk", slope, slope) + own.flat * np.eye(d)
-        score = np.einsum("nqj,nq->nj", slope, error)
-        moves[rows] = np.linalg.solve(system, score[..., None])[..., 0]
-    moves = moves[np.isfinite(moves).all(1)] / sds
-    shift, error = np.inf, np.inf
-    if len(moves) > 1:
-        worst = int(np.abs(moves.mean(0)).argmax())
-        shift = float(np.abs(moves.mean(0))[worst])
-        error = float(moves[:, worst].std() / np.sqrt(len(moves)))
-    used = histories.num_simulations - before
-    limit = max(own.largest_shift, own.chance * error)
-    return Confirmation(shift, used, limit)
 
 
 def refine(
@@ -196,65 +115,62 @@ def refine(
         )
     hints = [] if start is None else start
     hints = [hints] if isinstance(hints, Distribution) else [*hints]
-    own = StageSettings() if stages is None else stages
-    task = Task(simulator, prior, action, outcome, [*hints], settings, own)
     with single_thread():
         belief = refine_declared(
             *(simulator, prior, action, outcome),
-            hints=task.hints,
+            hints=hints,
             past=past,
             settings=settings,
             seed=seed,
         )
         if belief is None:
-            belief = _within_memory(task, past, seed)
+            known = past if isinstance(past, HistoryRecord) else None
+            learned = partial(
+                Regions,
+                *(simulator, prior, action, outcome),
+                hints=hints,
+                settings=settings,
+                own=StageSettings() if stages is None else stages,
+            )
+            belief = _within_memory(learned, known, seed)
     return belief
 
 
-def _within_memory(task: Task, past: object, seed: int) -> LearnedBelief:
+def _within_memory(
+    learned: partial[Regions], past: HistoryRecord | None, seed: int
+) -> LearnedBelief:
     try:
-        return _learned(task, past, seed)
+        return _learned(learned, past, seed)
     except RuntimeError as error:
         if "allocate memory" not in str(error):
             raise
+        dim = parameter_dim(learned.args[1])
         raise MemoryError(
-            f"expected memory for a belief of {parameter_dim(task.prior)} parameters; "
-            "got none left; fix the parameters that no trial informs, or lower "
-            "num_histories"
+            f"expected memory for a belief of {dim} parameters; got none left; fix the "
+            "parameters that no trial informs, or lower num_histories"
         ) from error
 
 
-def _learned(task: Task, past: object, seed: int) -> LearnedBelief:
-    """Return the belief of a regression, of a wider noise where trials contradict."""
-    known = past if isinstance(past, HistoryRecord) else None
-    regions = Regions(task, known, seed)
-    belief, contradiction = regions.run(), regions.contradiction()
-    if contradiction is not None:
-        return _inflated(regions, belief, contradiction, seed)
-    rng = np.random.default_rng(derive_seed(seed, "confirm"))
-    found = by_replicates(regions, belief, rng)
-    belief.diagnostics = found.noted(belief.diagnostics)
-    return belief
-
-
-def _inflated(
-    regions: Regions, belief: LearnedBelief, first: Contradiction, seed: int
+def _learned(
+    learned: partial[Regions], past: HistoryRecord | None, seed: int
 ) -> LearnedBelief:
-    """Return a belief by simulations with noise as large as the trials scatter."""
-    contradiction, inflation = first, 1.0
+    """Return the belief of a regression, of as wide a noise as the trials scatter."""
+    regions = learned(past=past, seed=seed)
+    belief, first = regions.run(), regions.contradiction()
+    if first is None:
+        return belief
     histories, sds = belief.histories, regions.histories.noise_sds
+    now, inflation = first, 1.0
     for number in range(MAX_INFLATIONS):
-        inflation *= contradiction.inflation
-        wider = Regions(
-            regions.task,
-            None,
-            derive_seed(seed, "inflated", number),
+        inflation *= now.inflation
+        wider = learned(
+            seed=derive_seed(seed, "inflated", number),
             further_noise=np.sqrt(max(inflation**2 - 1, 0.0)) * sds,
         )
-        belief, now = wider.run(), wider.contradiction()
-        if now is None:
+        belief, further = wider.run(), wider.contradiction()
+        if further is None:
             break
-        contradiction = now
+        now = further
     belief.diagnostics = replace(first, inflation=inflation).noted(belief.diagnostics)
     belief.histories = histories  # those without the further noise
     return belief

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,26 +13,21 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.inference.declared.contradiction import Contradiction, compared
+from sbi_active.inference.declared.diagnosing import Doubt
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.refinement.checks import (
-    check_outcomes,
-    has_hard_edges,
-    noise_shape,
-    tail_probability,
-    trial_correlation,
+    Fresh,
+    compared_with_fresh,
+    noise_tails,
+    outcomes_at,
 )
-from sbi_active.inference.refinement.course import (
-    LIVE,
-    Doubt,
-    Stage,
-    StageSettings,
-)
+from sbi_active.inference.refinement.course import LIVE, Stage, StageSettings
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.refinement.regression_error import expected_error, widened
 from sbi_active.inference.refinement.stages import Stages
 from sbi_active.inference.regression.histories import Histories, HistoryRecord
 from sbi_active.inference.regression.regions import around, cover, whole_space
-from sbi_active.inference.regression.surrogate import Surrogate, fewest_rows
+from sbi_active.inference.regression.surrogate import MISFIT, Surrogate, fewest_rows
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.messages import warn
@@ -42,86 +37,78 @@ from sbi_active.simulation.outcomes import MissingRowsWarning
 Array = NDArray[Any]
 
 
-@dataclass(frozen=True)
-class Task:
-    """What is to be refined, as in :func:`.refine`.
-
-    Attributes:
-        stages: Settings of the stages.
-    """
-
-    simulator: Callable[..., Any]
-    prior: Distribution
-    action: Tensor
-    outcome: Tensor
-    hints: list[Distribution]
-    settings: RefinementOptions
-    stages: StageSettings = StageSettings()
-
-
 class Regions(Stages):
     """Histories in regions, and a polynomial in each.
 
     Args:
-        task: Task that is refined.
-        past: Histories of the first of its trials.
+        simulator: ``simulator(theta, action)``.
+        prior: The original prior.
+        action: Executed actions, shape (t, action_dim).
+        outcome: Their outcomes, shape (t, *x_shape).
+        hints: Distributions to look at first.
+        past: Histories of the first of these trials.
+        settings: Settings of the belief.
+        own: Settings of the stages.
         seed: Seed of everything random here.
         further_noise: Standard deviations of noise to add, shape (t, q).
+
+    Attributes:
+        fresh: What fresh simulations say of the last stage.
     """
+
+    fresh: Fresh
 
     def __init__(
         self,
-        task: Task,
-        past: HistoryRecord | None,
-        seed: int,
+        simulator: Callable[..., Any],
+        prior: Distribution,
+        action: Tensor,
+        outcome: Tensor,
         *,
+        hints: Sequence[Distribution] = (),
+        past: HistoryRecord | None = None,
+        settings: RefinementOptions,
+        own: StageSettings = StageSettings(),  # noqa: B008  (frozen)
+        seed: int,
         further_noise: Array | None = None,
     ) -> None:
         rng = np.random.default_rng(derive_seed(seed, "refine"))
-        coordinates = PriorCoordinates(task.prior, rng)
-        budget = task.settings.num_histories
+        coordinates = PriorCoordinates(prior, rng)
         super().__init__(
-            *(task.prior, task.settings, task.stages, budget, rng, coordinates)
+            *(prior, settings, own, settings.num_histories, rng, coordinates)
         )
-        self.task = task
-        observed = task.outcome.numpy().reshape(len(task.outcome), -1)
+        self.action, self.outcome = action, outcome
         self.histories = Histories(
-            *(task.simulator, task.action, observed, coordinates),
-            *(seed, past, task.settings.workers),
+            *(simulator, action, outcome.numpy().reshape(len(action), -1)),
+            *(coordinates, seed, past, settings.workers),
             further_noise=further_noise,
         )
-        self.regions = [whole_space(self.coordinates.dim)]
+        self.regions = [whole_space(coordinates.dim)]
         near: list[Array] = []
-        for hint in task.hints:
+        for hint in hints:
             with forked_generators(derive_seed(seed, "start")):
-                draws = hint.sample(torch.Size([1_000])).float()
-            z = self.coordinates.to_z(draws)
-            near.append(z[self.coordinates.inside(z)])
+                z = coordinates.to_z(hint.sample(torch.Size([1_000])).float())
+            near.append(z[coordinates.inside(z)])
             self.regions.append(around(near[-1]))
         self.near = np.concatenate(near) if near else None
-        self.num_forced, self.is_shaped, self.change = 1, False, 0.0
-        self.least = max(self.own.fewest, 2 * fewest_rows(self.coordinates.dim))
+        self.shape_change = 0.0
+        self.least = max(own.fewest, 2 * fewest_rows(coordinates.dim))
 
     def spent(self) -> tuple[int, int]:
         """Return the histories simulated or taken over, and the rows."""
         return self.histories.num_drawn, self.histories.num_simulations
 
     def run(self) -> LearnedBelief:
-        """Return the belief with its histories, and what they say of lost outcomes.
-
-        Measurements are judged by what was fitted before simulations from further off.
-        """
-        belief, histories, stage = super().run(), self.histories, self.course.stages[-1]
-        fits = stage.surrogate.regressions
-        live = [f.ratio for f, m in zip(fits, stage.mass, strict=True) if m > LIVE]
-        known = belief.diagnostics.extended(
+        """Return the belief with its histories, and what they say of lost outcomes."""
+        belief, histories, stage = super().run(), self.histories, self.stages[-1]
+        belief.diagnostics = belief.diagnostics.extended(
             error_nats_if_explained=expected_error(
                 stage.surrogate, stage.draws, self.rng, explained=True
             ),
-            residual_to_noise=float(max(live, default=np.inf)),
             share_invalid=histories.share_invalid,
+            probability_of_outcome=self.probability_of_outcome,
+            num_missing=histories.num_missing,
         )
-        belief.diagnostics = check_outcomes(known, stage.fitted, stage.draws, histories)
         belief.histories = histories.record()
         if histories.num_missing:
             warn(
@@ -135,44 +122,37 @@ class Regions(Stages):
 
     def _propose(self, stage: Stage, size: int) -> None:
         """Put the next stage's regions around what is still plausible."""
-        many = 2 * max(self.num_forced, len(self.regions))
-        fewer = max(1, self.num_forced // 2)
-        is_stuck = self.course.is_stuck
-        self.num_forced = min(many, self.own.max_forced) if is_stuck else fewer
         limit = max(1, int(size / (1.2 * fewest_rows(self.coordinates.dim))))
         self.regions = cover(
             stage.draws,
             self.rng,
-            min_regions=min(self.num_forced, limit),
-            max_regions=min(max(self.own.max_regions, self.num_forced), limit),
+            max_regions=min(self.own.max_regions, limit),
             generous=stage.excess < 3,
         )
 
     def simulate(self, size: int) -> None:
         """Bring the stage's regions to their numbers, past histories first."""
-        if self.course.stages:
-            self._propose(self.course.stages[-1], size)
-        histories, regions = self.histories, self.regions
-        is_first = histories.num_drawn == 0
-        num_places = size - max(int(self.own.replicate_share * size), 12)
-        shares = np.full(len(regions), 1 / len(regions))
-        if is_first and len(regions) > 2:  # the overview keeps half of the stage
-            shares = np.array([0.5, *[0.5 / (len(regions) - 1)] * (len(regions) - 1)])
-        bounds = num_places * np.concatenate([[0.0], shares.cumsum()])
-        counts = np.diff(np.round(bounds, 6).astype(int))
-        for k, (region, count) in enumerate(zip(regions, counts, strict=True)):
+        if self.stages:
+            self._propose(self.stages[-1], size)
+        histories, regions, own = self.histories, self.regions, self.own
+        is_first, num = histories.num_drawn == 0, len(regions)
+        weights = np.ones(num)
+        if is_first and num > 2:  # the overview keeps half of the stage
+            weights[0] = num - 1
+        ends = np.round(size * weights.cumsum() / weights.sum(), 6).astype(int)
+        for k, count in enumerate(np.diff(ends, prepend=0)):
             # The first stage's first region is the whole space, seen from the prior.
             is_overview = is_first and k == 0
-            missing = int(count)
-            missing -= histories.reuse(region, missing, is_overview=is_overview)
-            if missing <= 0:
+            count -= histories.reuse(regions[k], int(count), is_overview=is_overview)
+            if count <= 0:
                 continue
-            z = region.sample_inside(missing, self.coordinates, self.rng)
-            z = self.rng.permutation(z)
+            num_repeated = int(max(own.replicate_share, 12 / size) * count)
+            missing = int(count) - num_repeated
+            z = regions[k].sample_inside(missing, self.coordinates, self.rng)
             if len(z) == 0:  # it lies beside the support, as of an outcome far away
                 z = self.coordinates.sample_prior(missing, self.rng)
-            num_replicates = missing * (size - num_places) // num_places
-            histories.add(z, min(num_replicates, len(z)), is_overview=is_overview)
+            z = self.rng.permutation(z)
+            histories.add(z, min(num_repeated, len(z)), is_overview=is_overview)
 
     def fit(self, near: Array | None, *, is_last: bool) -> Surrogate:
         """Return the regressions of the regions that have simulations enough."""
@@ -202,11 +182,15 @@ class Regions(Stages):
         error = expected_error(surrogate, draws, self.rng)
         return max(live, default=np.inf), mass, error
 
-    def with_more(self, stage: Stage) -> tuple[Surrogate, float]:
-        """Return regressions of simulations from further off that agree."""
-        return widened(
+    def with_more(self, stage: Stage) -> Stage:
+        """Return the stage with simulations from further off that agree."""
+        wider, bias = widened(
             self.histories, stage.surrogate, stage.error, stage.draws, self.rng
         )
+        if wider is stage.surrogate:
+            return stage
+        wide = self.sample(wider, stage.draws)
+        return replace(wide, error=wide.error + bias)
 
     def last(self, stage: Stage) -> Stage:
         """Return the stage with noise that is not Gaussian, where it is not."""
@@ -218,45 +202,64 @@ class Regions(Stages):
         if all(fit.shape is None for fit in shaped):
             return stage
         other = self.sample(Surrogate(c, shaped), stage.draws)
-        change = other.log_prob(other.draws) - stage.log_prob(other.draws)
-        self.is_shaped, self.change = True, float(change.mean())
-        return replace(other, fitted=stage.fitted, error=max(stage.error, other.error))
+        self.shape_change = other.after(stage).change
+        error = max(stage.error, other.error)
+        return replace(
+            other, error=error, change=stage.change, shrinkage=stage.shrinkage
+        )
 
     def tails(self, stage: Stage) -> tuple[list[float], float]:
-        """Return tail probabilities of the trials and of all together."""
-        num_trials = len(self.task.action)
-        return tail_probability(stage.surrogate, stage.draws, num_trials)
+        """Return tail probabilities, by fresh simulations at draws of the belief."""
+        c, own = self.coordinates, self.own
+        num = max(own.least_checked, int(own.checked_share * self.budget))
+        theta = c.to_theta(stage.fit.fresh(num, self.rng))
+        x, lost = self.histories.fresh(theta)
+        z, num_trials = c.to_z(theta), len(self.action)
+        self.fresh = compared_with_fresh(
+            stage.surrogate, z[~lost], x[~lost], num_trials, own
+        )
+        return self.fresh.tails
 
     def doubts(self) -> dict[str, Doubt]:
         """Return what the regressions take for granted."""
-        course, last = self.course, self.course.stages[-1]
-        fits = last.surrogate.regressions
-        live = [fit for fit, mass in zip(fits, last.mass, strict=True) if mass > LIVE]
-        roughness = course.stages[0].surrogate.regressions[0].roughness
-        negentropy, is_gaussian = noise_shape(live, self.own.shapes.left, self.rng)
-        is_gaussian &= not has_hard_edges(course.stages)
-        dim = self.coordinates.dim
-        # Of d parameters known to e nats, a mean is off by (2 e / d)^(1/2) deviations.
-        allowed = 0.5 * dim * self.own.known**2
-        known = last.error / allowed, self.change / (self.own.unsettled * dim)
-        correlation, is_independent = trial_correlation(live, len(self.task.action))
+        last, fresh, own = self.stages[-1], self.fresh, self.own
+        fits, dim = last.surrogate.regressions, self.coordinates.dim
+        live = [f.ratio for f, mass in zip(fits, last.mass, strict=True) if mass > LIVE]
+        roughness = self.stages[0].surrogate.regressions[0].roughness
+        tails, has_edges = noise_tails(self.stages)
+        known = 0.0
+        if any(fit.shape is not None for fit in fits):
+            # Of d parameters known to e nats, a mean is off by (2 e / d)^(1/2)
+            # deviations.
+            allowed = 0.5 * dim * own.known**2
+            known = self.shape_change / (own.unsettled * dim)
+            known = max(last.error / allowed, known)
+        share, blur = outcomes_at(last.surrogate, last.draws, self.histories)
+        self.probability_of_outcome = share
+        rare = ", ".join(str(k) for k, p in enumerate(share) if p < own.rare)
         return {
+            "confirmed": (
+                fresh.shift <= fresh.limit,
+                fresh.shift,
+                "SA101 fresh simulations do not confirm the belief: its mean is off by "
+                "{:.2g} standard deviations; raise num_histories",
+            ),
             "gaussian_noise": (
-                is_gaussian,
-                negentropy,
-                "SA110 the noise is not Gaussian (it differs by {:.2g} nats a number), "
-                "and the belief, which takes it for Gaussian, may be too wide or too "
-                "narrow; check against a belief of a trained network",
+                not has_edges,
+                tails,
+                "SA110 the noise has hard edges (its excess kurtosis is {:.2g}), which "
+                "the belief does not follow, so that it may be too wide or too narrow; "
+                "check against a belief of a trained network",
             ),
             "noise_known": (
-                not self.is_shaped or max(known) <= 1,
-                max(known) if self.is_shaped else 0.0,
+                known <= 1,
+                known,
                 "SA110 the noise is not Gaussian, and the simulations are too few to "
                 "tell what it is ({:.2g} times the error that is allowed for); raise "
                 "num_histories",
             ),
             "smooth_response": (
-                roughness <= self.own.rough,
+                roughness <= own.rough,
                 roughness,
                 "SA111 over the prior the outcomes have more turns than a cubic, which "
                 "misses {:.0%} of their variance, so that four or more narrow modes "
@@ -264,41 +267,42 @@ class Regions(Stages):
                 "narrower prior",
             ),
             "no_misfit": (
-                last.excess <= self.own.misfit,
-                max((fit.ratio for fit in live), default=np.inf),
+                last.excess <= own.misfit,
+                max(live, default=np.inf),
                 "SA112 the residuals of the surrogate have {:.2g} times the variance "
                 "of the noise, so that the belief is too wide; raise num_histories",
             ),
             "independent_trials": (
-                is_independent,
-                correlation,
+                fresh.correlation < own.correlated or last.excess > MISFIT,
+                fresh.correlation,
                 "SA104 simulated trials correlate at the same parameters ({:.2f}), yet "
                 "the likelihood is a product over trials; check how the simulator "
                 "seeds its noise",
+            ),
+            "outcomes_followed": (
+                blur <= own.blurred,
+                blur,
+                "SA120 where simulations have a measurement and where they have none "
+                "is followed coarsely ({:.0%} of repeated simulations would differ "
+                "that do not), so that the belief is too wide; raise num_histories",
+            ),
+            "outcomes_usual": (
+                not rare,
+                min(share),
+                f"SA121 trials {rare} had a measurement, or none, where only {{:.1%}} "
+                "of the simulations near the belief do the same: the simulator lacks a "
+                "way to fail, or the status of the trial is wrong",
             ),
         }
 
     def contradiction(self) -> Contradiction | None:
         """Return what contradicts at the draw that the last stage explains best."""
-        task, stage = self.task, self.course.stages[-1]
-        t, label = len(task.action), stage.surrogate.assign(stage.draws)
-        best: Array | None = None
-        for k, fit in enumerate(stage.surrogate.regressions):
-            if not (label == k).any():
-                continue
-            error, widening = fit.whitened(stage.draws[label == k])
-            squares = (error.reshape(len(error), t, -1) ** 2).sum(2)
-            squares = squares / np.minimum(widening, 2.0)[:, None]
-            least = squares[squares.sum(1).argmin()]
-            best = least if best is None or least.sum() < best.sum() else best
-        if best is None:
-            return None
         sds = torch.from_numpy(self.histories.noise_sds).mean(0)
         sds = torch.where(sds > 0, sds, torch.inf)
         return compared(
-            task.action,
-            task.outcome,
+            self.action,
+            self.outcome,
             lambda gap: gap.flatten(1) / sds,
-            best,
+            self.fresh.least,
             num_fitted=self.coordinates.dim,
         )

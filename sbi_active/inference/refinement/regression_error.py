@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from sbi_active.inference.regression.histories import Histories
-from sbi_active.inference.regression.regions import Region, around
+from sbi_active.inference.regression.regions import around
 from sbi_active.inference.regression.surrogate import MISFIT, LocalRegression, Surrogate
 
 Array = NDArray[Any]
@@ -94,16 +94,15 @@ def widened(
     allowed = error * chi2.ppf(chance, dim) / dim
     near = surrogate.log_likelihood(draws)
     num_rows = int(histories.valid.sum())
-    wider: list[tuple[list[Region], tuple[float, ...]]]
-    wider = [([fit.region for fit in surrogate.regressions], reaches)]
+    wider = [([fit.region for fit in surrogate.regressions], np.array(reaches))]
     if len(surrogate.regressions) > 1 and error > pieces:
         one = around(draws)
         reach = 1.01 * max(1.0, float(one.distance(draws).max()))
-        wider.insert(0, ([one], (reach, *(reach * further for further in reaches))))
-    for regions, reaches in wider:
-        for reach in reaches if best is surrogate else ():
+        wider.insert(0, ([one], reach * np.array([1.0, *reaches])))
+    for regions, factors in wider:
+        for factor in factors if best is surrogate else ():
             fits = [
-                histories.regress(replace(region, radius=reach * region.radius))
+                histories.regress(replace(region, radius=factor * region.radius))
                 for region in regions
             ]
             wide = [fit for fit in fits if fit is not None and fit.excess <= MISFIT]

@@ -8,22 +8,17 @@ The budget and where the loop ends are settings.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from torch.distributions import Distribution
 
+from sbi_active.inference.beliefs.diagnostics import Diagnostics
+from sbi_active.inference.declared.diagnosing import Doubt, judged
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.engine.learned import LearnedLikelihood, learned_fit
-from sbi_active.inference.refinement.course import (
-    Course,
-    Doubt,
-    Stage,
-    StageSettings,
-    diagnose,
-)
+from sbi_active.inference.refinement.course import Stage, StageSettings
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
@@ -43,7 +38,7 @@ class Stages(ABC):
         coordinates: Coordinates of the prior.
 
     Attributes:
-        course: The stages so far.
+        stages: The stages so far.
         near: Coordinates of draws of a guess, shape (n, d), or None.
         least: Simulations below which another stage adds nothing.
     """
@@ -61,7 +56,8 @@ class Stages(ABC):
     ) -> None:
         self.prior, self.settings, self.own = prior, settings, own
         self.budget, self.rng, self.coordinates = budget, rng, coordinates
-        self.course, self.least = Course(own), own.fewest
+        self.stages: list[Stage] = []
+        self.least = own.fewest
 
     @abstractmethod
     def spent(self) -> tuple[int, int]:
@@ -87,52 +83,45 @@ class Stages(ABC):
         """Return what else is taken for granted, by name."""
         return {}
 
-    def with_more(self, stage: Stage) -> tuple[Any, float]:
-        """Return a likelihood of more simulations, and what it may err beyond."""
-        return stage.surrogate, 0.0
+    def with_more(self, stage: Stage) -> Stage:
+        """Return the stage with more of the simulations, where these are of use."""
+        return stage
 
     def last(self, stage: Stage) -> Stage:
         """Return the last stage, with what is worth its cost there alone."""
         return stage
 
     def run(self) -> LearnedBelief:
-        """Return the belief of the last stage, or of one before that errs less.
+        """Return the belief of the last stage that explains the trials.
 
         Raises:
             UnexplainedOutcomeError: If nothing has a likelihood.
         """
-        course, near = self.course, self.near
-        size = self._size(self.own.first_share)
+        stages, near, own = self.stages, self.near, self.own
+        size = self._size(own.first_share)
         while True:
             self.simulate(size)
-            size = self._size(self.own.stage_share)
+            size = self._size(own.stage_share)
             is_last = size < self.least
-            surrogate = self.fit(near, is_last=is_last)
             try:
-                stage = self.sample(surrogate, near)
+                stage = self.sample(self.fit(near, is_last=is_last), near)
             except UnexplainedOutcomeError:
-                if not course.stages:
+                if not stages:
                     raise
                 break  # beyond what any parameters explain, closer is no better
-            if stage.error > self.own.small and course.stages:
-                wider, bias = self.with_more(stage)
-                if wider is not surrogate:
-                    wide = self.sample(wider, stage.draws)
-                    stage = replace(wide, fitted=surrogate, error=wide.error + bias)
-            course.append(stage)
-            if is_last or course.is_settled:
+            if stages:
+                if stage.error > own.small:
+                    stage = self.with_more(stage)
+                stage = stage.after(stages[-1])
+            stages.append(stage)
+            if is_last or stage.is_settled(own):
                 break
             near = stage.draws
-        course.end_at_best()
-        stage = course.stages[-1] = self.last(course.stages[-1])
-        belief = LearnedBelief(self.prior, stage.fit, defensive=self.settings.defensive)
-        belief.diagnostics = diagnose(
-            course,
-            self.doubts(),
-            tails=self.tails(stage),
-            num_simulations=self.spent()[1],
-            bounded=self.coordinates.bounded,
+        stages[-1] = self.last(stages[-1])
+        belief = LearnedBelief(
+            self.prior, stages[-1].fit, defensive=self.settings.defensive
         )
+        belief.diagnostics = self._diagnosed()
         return belief
 
     def _size(self, share: float) -> int:
@@ -154,9 +143,52 @@ class Stages(ABC):
                 "likelihood; correct the outcome, or leave the trial out"
             )
         draws = fit.draws(1_000, self.rng)
-        excess, mass, error = self.judged(surrogate, draws)
-        stage = Stage(
-            *(surrogate, surrogate, fit, self.settings.defensive, draws),
-            *(excess, mass, 0.0, error),
+        judged = self.judged(surrogate, draws)
+        return Stage(surrogate, fit, self.settings.defensive, draws, *judged)
+
+    def _diagnosed(self) -> Diagnostics:
+        """Return figures about the last stage, what it assumes, and warnings."""
+        last, own, num = self.stages[-1], self.own, len(self.stages)
+        edge = np.abs(last.draws[:, self.coordinates.bounded]) > 0.98
+        edge_mass = float(edge.mean(0).max(initial=0.0))
+        effective = min(stage.fit.efficiency for stage in self.stages)
+        change = last.change if num > 1 else -1.0
+        allowed = own.unsettled * last.draws.shape[1]
+        tails = self.tails(last)
+        doubts: dict[str, Doubt] = {
+            "few_modes": (
+                effective >= own.effective,
+                effective,
+                "SA111 at some stage only {:.1%} of the particles counted, as with "
+                "many narrow modes, and a mode may be lost; raise num_histories",
+            ),
+            "settled": (
+                not np.isfinite(own.settled) or (num > 1 and change <= allowed),
+                change,
+                "SA109 the last stage still changed the belief, by {:.2g} nats; raise "
+                "num_histories",
+            ),
+            "small_error": (
+                last.error <= own.untrusted,
+                last.error,
+                "SA105 the belief is off by about {:.2g} nats, since it rests on few "
+                "simulations for so many parameters and numbers; raise num_histories",
+            ),
+            **self.doubts(),
+        }
+        return judged(
+            doubts,
+            tails,
+            edge_mass,
+            num_simulations=self.spent()[1],
+            effective_sample_size=float(last.fit.fit.effective_sample_size),
+            error_nats=last.error,
+            error_nats_if_explained=last.error,
+            figures={
+                "num_stages": num,
+                "num_regions": len(last.mass),
+                "region_mass": [float(mass) for mass in last.mass],
+                "prior_edge_mass": edge_mass,
+                "surrogate_kl_last_stage": change,
+            },
         )
-        return replace(stage, entropy=-float(stage.log_prob(draws).mean()))

@@ -37,12 +37,13 @@ LOST = np.inf  # marks the rows of a history that a fault hit
 class HistoryRecord:
     """Simulated histories to go on from when a further trial is known.
 
+    Rows of equal parameters repeat each other.
+
     Attributes:
         action: The executed actions, shape (t, action_dim).
         theta: Parameters, shape (n, d), float32.
         x: Outcomes, shape (n, t, q); NaN where there was no measurement.
         present: Which of them were there at the first attempt, shape (n, t, q).
-        twin: Number of the row that a row repeats, -1 where it repeats none, (n,).
         is_overview: Which rows were drawn from the whole prior, shape (n,).
     """
 
@@ -50,7 +51,6 @@ class HistoryRecord:
     theta: Tensor
     x: Array
     present: NDArray[np.bool_]
-    twin: NDArray[np.intp]
     is_overview: NDArray[np.bool_]
 
     def precedes(self, action: Tensor) -> bool:
@@ -77,8 +77,7 @@ class Histories:
         z: Coordinates of the parameters, shape (n, d).
         x: Outcomes less the observed ones, or themselves where nothing was observed,
             shape (n, t * q).
-        present: Which outcomes were there at the first attempt, shape (n, t * q).
-        twin: Number of the row that a row repeats, -1 where it repeats none, (n,).
+        present: Which outcomes were there at the first attempt, shape (n, t, q).
         observed: Observed numbers, zero where nothing was, shape (t * q,).
         used: Which numbers were observed, shape (t * q,).
         num_drawn: Histories simulated here or taken over, those lost to faults of the
@@ -107,8 +106,7 @@ class Histories:
         self.coordinates, self.seed = coordinates, seed
         self.z = np.zeros((0, coordinates.dim))
         self.x = np.zeros((0, x.size))
-        self.present = np.zeros((0, x.size), dtype=bool)
-        self.twin = np.zeros(0, dtype=np.intp)
+        self.present = np.zeros((0, *x.shape), dtype=bool)
         self.num_simulations = self.num_drawn = self.num_missing = 0
         self._theta = torch.zeros(0, coordinates.dim)
         self._is_overview = np.zeros(0, dtype=bool)
@@ -129,8 +127,7 @@ class Histories:
         if self.num_drawn == 0:
             again = torch.from_numpy(x[len(z) :])
             require_noise(torch.from_numpy(x[:num_replicates]), again)
-        twice = np.arange(num_replicates)
-        self._append(theta, x, present, twice, is_overview=is_overview)
+        self._append(theta, x, present, is_overview=is_overview)
 
     def reuse(self, region: Region, count: int, *, is_overview: bool = False) -> int:
         """Take past histories in a region, simulated at the further actions only.
@@ -144,24 +141,18 @@ class Histories:
         eligible = past.is_overview
         if not is_overview:
             eligible = region.distance(self.coordinates.to_z(past.theta)) <= 1
-        eligible = eligible & (past.twin < 0) & self._unused
-        rows = np.flatnonzero(eligible)[:count]
+        rows = np.flatnonzero(eligible & self._unused)[:count]
         if len(rows) == 0:
             return 0
         self._unused[rows] = False
-        again = np.flatnonzero(np.isin(past.twin, rows))
-        again = again[np.argsort(past.twin[again])]
-        twice = np.searchsorted(rows, past.twin[again])
-        both = np.concatenate([rows, again])
-        theta = past.theta[torch.from_numpy(both)]
-        x, present = (
-            part[both].reshape(len(both), -1) for part in (past.x, past.present)
-        )
-        if len(past.action) < len(self.action):
-            further = self._simulate(theta, len(past.action))
+        theta, known = past.theta[torch.from_numpy(rows)], len(past.action)
+        x, present = past.x[rows], past.present[rows]
+        if known < len(self.action):
+            further = self._simulate(theta, known)
             x = np.concatenate([x, further[0]], 1)
             present = np.concatenate([present, further[1]], 1)
-        return self._append(theta, x, present, twice, is_overview=is_overview)
+        self._append(theta, x, present, is_overview=is_overview)
+        return len(rows)
 
     def fresh(self, theta: Tensor) -> tuple[Array, NDArray[np.bool_]]:
         """Return outcomes less the observed ones (n, t * q), and which rows lack some.
@@ -171,20 +162,15 @@ class Histories:
         Args:
             theta: Parameters, shape (n, d).
         """
-        x, _ = self._simulate(theta, 0)
-        lacks = ~np.isfinite(x[:, self.used]).all(1) | (x == LOST).any(1)
-        return x - self.observed, lacks
+        x = self._simulate(theta, 0, enough=0.9)[0]  # few are judged by
+        x = x.reshape(len(theta), -1) - self.observed
+        return x, ~np.isfinite(x[:, self.used]).all(1) | (x == LOST).any(1)
 
     def record(self) -> HistoryRecord:
         """Return the histories for a later call with further trials."""
-        shape = len(self), *self._seen.shape
+        x = (self.x + self.observed).reshape(self.present.shape)
         return HistoryRecord(
-            action=self.action,
-            theta=self._theta,
-            x=(self.x + self.observed).reshape(shape),
-            present=self.present.reshape(shape),
-            twin=self.twin,
-            is_overview=self._is_overview,
+            self.action, self._theta, x, self.present, self._is_overview
         )
 
     def _simulate(
@@ -199,110 +185,87 @@ class Histories:
     ) -> tuple[Array, NDArray[np.bool_]]:
         """Return outcomes at each theta of the trials from ``first`` on.
 
-        And which of them were there at the first attempt, both of shape (n, t * q).
-        Up to ``most`` more attempts are made until a share is ``enough``, if a few
-        probes show that they are ``worthwhile``.
+        And which of them were there at the first attempt, both of shape (n, t, q).
+        Where chance decides who gives a measurement, histories of many trials would
+        seldom be complete; given one, x has the same law at any attempt. So up to
+        ``most`` more are made until a share is ``enough``, if a few probes show that
+        they are ``worthwhile``.
         """
         n, t = len(theta), len(self.action) - first
         seed = derive_seed(self.seed, "histories", self.num_simulations)
         trial = torch.arange(first, len(self.action)).repeat(n)
-        x = self._rows(theta.repeat_interleave(t, 0), trial, seed)
-        present = np.isfinite(x)
         place = torch.arange(n).repeat_interleave(t)
+        x = self._rows(theta[place], trial, seed)
+        present = np.isfinite(x)
         for attempt in range(most):
-            # Where chance decides who gives a measurement, histories of many trials
-            # would seldom be complete; given one, x has the same law at any attempt.
             lacks = (self._seen[trial] & np.isnan(x)).any(1)
-            incomplete = np.flatnonzero(lacks)
-            complete = ~lacks.reshape(n, t).any(1)
-            if complete.mean() >= enough or len(incomplete) == 0:
+            rows = np.flatnonzero(lacks)
+            if (~lacks.reshape(n, t).any(1)).mean() >= enough or not len(rows):
                 break
             if attempt == 0:  # a few show whether it is chance at all
-                incomplete = incomplete[:: max(len(incomplete) // num_probes, 1)]
+                rows = rows[:: max(len(rows) // num_probes, 1)]
             again = self._rows(
-                theta[place[incomplete]], trial[incomplete], derive_seed(seed, attempt)
+                theta[place[rows]], trial[rows], derive_seed(seed, attempt)
             )
-            filled = ~(self._seen[trial[incomplete]] & np.isnan(again)).any(1)
-            filled &= ~np.isinf(again).any(1)  # not lost
-            x[incomplete[filled]] = again[filled]
+            filled = (np.isfinite(again) | ~self._seen[trial[rows]]).all(1)
+            x[rows[filled]] = again[filled]
             if filled.mean() < worthwhile:
                 break
-        x, present = x.reshape(n, -1), present.reshape(n, -1)
-        x[np.isinf(x).any(1)] = LOST
-        return x, present
+        return x.reshape(n, t, -1), present.reshape(n, t, -1)
 
     def _rows(self, theta: Tensor, trial: Tensor, seed: int) -> Array:
         """Return outcomes (n, q) of theta (n, d) at the actions of trials (n,).
 
         NaN stands for no number, LOST for faults.
         """
+        is_first, size = self.num_simulations == 0, self._seen.shape[1]
+        self.num_simulations += len(theta)
         rows = rows_of(
             *(self.simulator, theta, self.action[trial], seed, self.workers),
-            is_first=self.num_simulations == 0,
+            is_first=is_first,
         )
         if rows is None:
-            self.num_simulations += len(theta)
             self.num_missing += len(theta)
-            return np.full((len(theta), self._seen.shape[1]), LOST)
-        self.num_simulations += len(rows)
+            return np.full((len(theta), size), LOST)
         x = rows.x.double().flatten(1).numpy()
-        if x.shape[1] != self._seen.shape[1]:
+        if x.shape[1] != size:
             raise ValueError(
                 f"expected simulated x of shape {tuple(rows.x.shape[1:])} a row, as "
-                f"observed; got {self._seen.shape[1]} observed numbers a trial; "
+                f"observed; got {size} observed numbers a trial; "
                 "pass x (t, *x_shape) of the simulator's shape"
             )
         x = np.where(np.isfinite(x), x, np.nan)
         if self.further_noise is not None:
             rng = np.random.default_rng(derive_seed(seed, "further noise"))
-            sds = self.further_noise[trial.numpy()]
-            x = x + sds * rng.standard_normal(x.shape)
+            x = x + self.further_noise[trial.numpy()] * rng.standard_normal(x.shape)
         lost = (rows.status == Outcome.MISSING).numpy()
         self.num_missing += int(lost.sum())
         x[lost] = LOST
         return x
 
     def _append(
-        self,
-        theta: Tensor,
-        x: Array,
-        present: NDArray[np.bool_],
-        twice: NDArray[np.intp],
-        *,
-        is_overview: bool,
-    ) -> int:
-        """Append rows of which the last are replicates of ``twice``.
-
-        A history that a fault hit is left out, and its replicate with it. Returns the
-        number of those that are no replicates.
-        """
-        num_places = len(theta) - len(twice)
+        self, theta: Tensor, x: Array, present: Array, *, is_overview: bool
+    ) -> None:
+        """Append histories; one that a fault hit is left out."""
         self.num_drawn += len(theta)
-        lost = (x == LOST).any(1)
-        if lost.any():
-            lost[num_places:] |= lost[twice]
-            place = np.cumsum(~lost[:num_places]) - 1
-            twice = place[twice[~lost[num_places:]]]
-            theta = theta[torch.from_numpy(~lost)]
-            x, present = x[~lost], present[~lost]
-            num_places = len(theta) - len(twice)
-        start = len(self)
+        kept = ~(x == LOST).any((1, 2))
+        theta = theta[torch.from_numpy(kept)]
         # What was simulated is the float32 parameter.
         self.z = np.concatenate([self.z, self.coordinates.to_z(theta)])
-        self.x = np.concatenate([self.x, x - self.observed])
-        self.present = np.concatenate([self.present, present])
+        flat = x[kept].reshape(len(theta), -1)
+        self.x = np.concatenate([self.x, flat - self.observed])
+        self.present = np.concatenate([self.present, present[kept]])
         self._theta = torch.cat([self._theta, theta])
         overview = np.full(len(theta), is_overview)
         self._is_overview = np.concatenate([self._is_overview, overview])
-        twin = np.concatenate([np.full(num_places, -1), start + twice])
-        self.twin = np.concatenate([self.twin, twin])
-        return num_places
 
     @property
     def pairs(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Rows that were simulated twice, and their repetitions, both (r,)."""
-        second = np.flatnonzero(self.twin >= 0)
-        return self.twin[second], second
+        """Rows of the same parameters, one after the other, both (r,)."""
+        label = np.unique(self._theta.numpy(), axis=0, return_inverse=True)[1]
+        order = np.argsort(label.reshape(-1), kind="stable")
+        same = np.diff(label.reshape(-1)[order]) == 0
+        return order[:-1][same], order[1:][same]
 
     @property
     def noise_sds(self) -> Array:
@@ -319,9 +282,9 @@ class Histories:
 
         That is without a measurement, as observed, or with the numbers observed.
         """
-        present = self.present.reshape(len(self), *self._seen.shape)
         without = ~self._seen.any(1)
-        return np.where(without, ~present.any(2), (present | ~self._seen).all(2))
+        agrees = (self.present | ~self._seen).all(2)
+        return np.where(without, ~self.present.any(2), agrees)
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -331,8 +294,7 @@ class Histories:
     @property
     def share_invalid(self) -> float:
         """Share of outcomes without a measurement."""
-        present = self.present.reshape(len(self), *self._seen.shape)
-        return float((~present.any(2)).mean()) if len(self) else 0.0
+        return float((~self.present.any(2)).mean()) if len(self) else 0.0
 
     def regress(
         self,

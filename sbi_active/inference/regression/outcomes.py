@@ -30,7 +30,7 @@ References:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -148,10 +148,7 @@ def outcomes_of(
         key = agrees[:, k].tobytes() + pairs.tobytes()
         if key not in known:
             known[key] = TrialOutcome.fit(region, k, z, agrees[:, k], pairs)
-        same = known[key]
-        outcomes.append(
-            TrialOutcome(region, k, same.basis, same.coefficient, same.slip, same.blur)
-        )
+        outcomes.append(replace(known[key], trial=k))
     return tuple(outcomes)
 
 

@@ -104,7 +104,6 @@ def cover(
     points: Array,
     rng: np.random.Generator,
     *,
-    min_regions: int,
     max_regions: int,
     generous: bool,
     worth: float = 0.1,
@@ -117,9 +116,7 @@ def cover(
     has spread already.
     """
     d = points.shape[1]
-    counts = sorted(
-        {min(max(k, min_regions), max_regions) for k in (1, 2, 3, 4, 6, 8, min_regions)}
-    )
+    counts = [k for k in (1, 2, 3, 4, 6, 8) if k <= max_regions]
     best = GaussianMixture.fit(points, counts[0], rng)
     for count in counts[1:]:
         other = GaussianMixture.fit(points, count, rng)

@@ -49,37 +49,27 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class ResidualCovariance:
-    r"""Covariance S = L L^T with shrunk correlations.
+    r"""Covariance S = L L^T with shrunk correlations within each trial.
 
-    Correlations shrink by :math:`\lambda = \sum \mathrm{Var}(r_{ij}) / \sum r_{ij}^2`,
-    apart within a trial and across trials. Noise does not correlate across trials,
-    which are independent given theta; misfit does.
+    Correlations shrink by :math:`\lambda = \sum \mathrm{Var}(r_{ij}) / \sum r_{ij}^2`.
+    There are none across trials, which are independent given theta.
 
     Attributes:
         deviation: Deviation of the residuals, shape (q,).
-        blocks: Outcomes that correlate, and the inverse Cholesky factor of their
-            correlation; all at once, or trial by trial where S has nothing between
-            them, which takes a ninth of the time for three.
-        shrinkage: Shrinkage of the correlations within a trial and across trials, 1
-            where S has none.
+        blocks: Outcomes of each trial, and the inverse Cholesky factor of their
+            correlation.
         precision: Factor that makes the inverse of the sample covariance unbiased.
         log_volume: log det L.
     """
 
     deviation: Array
     blocks: tuple[tuple[NDArray[np.intp], Array], ...]
-    shrinkage: tuple[float, float]
     precision: float
     log_volume: float
 
     @staticmethod
     def of(
-        standardized: Array,
-        deviation: Array,
-        freedom: int,
-        trial: NDArray[np.intp],
-        *,
-        independent: bool,
+        standardized: Array, deviation: Array, freedom: int, trial: NDArray[np.intp]
     ) -> ResidualCovariance:
         """Return the covariance of residuals over their deviations, shape (n, q).
 
@@ -88,38 +78,28 @@ class ResidualCovariance:
             deviation: Shape (q,).
             freedom: Rows less coefficients.
             trial: Trial of each outcome, shape (q,).
-            independent: Whether there is no misfit, and so nothing across trials.
         """
         q = len(deviation)
-        groups = trial if independent else np.zeros_like(trial)
-        rows = [np.flatnonzero(groups == k) for k in np.unique(groups)]
+        rows = [np.flatnonzero(trial == k) for k in np.unique(trial)]
         correlations = [
             standardized[:, r].T @ standardized[:, r] / freedom for r in rows
         ]
-        across = 1.0
-        if not independent and q:
-            within = trial[:, None] == trial
-            across = _shrinkage(correlations[0][~within], freedom)
-            apart = np.where(within, 1.0, 1 - across)
-            own = correlations[0][within]
-        else:
-            apart = 1.0
-            own = np.concatenate([np.zeros(0), *(c.ravel() for c in correlations)])
-        shrunk = _shrinkage(own, freedom, num_ones=q)
+        square = np.concatenate([np.zeros(0), *(c.ravel() ** 2 for c in correlations)])
+        variance = ((1 - square) ** 2).sum() / freedom
+        # The diagonal is one by definition.
+        shrunk = float(min(1.0, variance / max(square.sum() - q, 1e-300)))
         blocks, log_volume = [], float(np.log(deviation).sum())
         for members, correlation in zip(rows, correlations, strict=True):
-            correlation *= (1 - shrunk) * apart
+            correlation *= 1 - shrunk
             np.fill_diagonal(correlation, 1.0)
             factor = np.linalg.cholesky(correlation)
             (invert,) = get_lapack_funcs(("trtri",), (factor,))
             log_volume += float(np.log(np.diag(factor)).sum())
             blocks.append((members, invert(factor, lower=1)[0]))
-        size = q if across < 1 else int(np.bincount(trial, minlength=1).max())
+        size = int(np.bincount(trial, minlength=1).max())
         free = 1 + (size - 1) * (1 - shrunk) ** 2
         precision = max((freedom - free - 1) / freedom, 0.2) if q else 1.0
-        return ResidualCovariance(
-            deviation, tuple(blocks), (shrunk, across), precision, log_volume
-        )
+        return ResidualCovariance(deviation, tuple(blocks), precision, log_volume)
 
     def whiten(self, rows: Array) -> Array:
         r"""Return :math:`L^{-1}` times each row, shape (n, q)."""
@@ -142,16 +122,6 @@ def alike(standardized: Array, freedom: int) -> float:
     return float(max(square / max(q, 1), 1.0))
 
 
-def _shrinkage(correlation: Array, freedom: int, num_ones: int = 0) -> float:
-    """Return the shrinkage of correlations, of which some are one by definition."""
-    if len(correlation) <= num_ones:
-        return 1.0
-    square = correlation**2
-    total = square.sum() - num_ones
-    variance = ((1 - square) ** 2).sum() / freedom
-    return float(min(1.0, variance / max(total, 1e-300)))
-
-
 @dataclass(frozen=True, kw_only=True)
 class ShapeSettings:
     """When and how residuals are taken for a mixture.
@@ -167,9 +137,6 @@ class ShapeSettings:
         floor: Size of the prediction, in its root mean square, below which the noise
             does not shrink: half lets the noise vanish where a mean crosses zero.
         powers: Least and largest power of the prediction.
-        left: Nats a number that the mixture may lose, which serves all numbers: of
-            skewed noise a Gaussian loses .1 to .25, and this .01 to .04. Half doubts
-            one in five of the beliefs that are right, twice the same as this.
     """
 
     gain: float = 0.01
@@ -177,7 +144,6 @@ class ShapeSettings:
     most_fitted: int = 3_000
     floor: float = 0.2
     powers: tuple[float, float] = (-0.5, 2.0)
-    left: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -191,7 +157,6 @@ class NoiseShape:
         mixture: F.
         covariance: Covariance of the normal scores y.
         shift: Mean of the scores, shape (q,).
-        score: Normal scores of the simulations over their deviations, shape (n, q).
         coefficient: Coefficients of outcomes less the observed ones, shape (p, q).
         observed: Observed outcomes, shape (q,).
     """
@@ -202,7 +167,6 @@ class NoiseShape:
     mixture: GaussianMixture
     covariance: ResidualCovariance
     shift: Array
-    score: Array
     coefficient: Array
     observed: Array
 
@@ -265,11 +229,9 @@ class NoiseShape:
         score = _normal_scores(mixture, e)
         shift, deviation = score.mean(0), score.std(0)
         score = (score - shift) / deviation
-        covariance = ResidualCovariance.of(
-            score, deviation, freedom, trial, independent=True
-        )
+        covariance = ResidualCovariance.of(score, deviation, freedom, trial)
         return NoiseShape(
-            *(power, floor, scale, mixture, covariance, shift, score),
+            *(power, floor, scale, mixture, covariance, shift),
             *(coefficient, observed),
         )
 

@@ -20,7 +20,7 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -88,7 +88,6 @@ class LocalRegression:
         residual: Whitened residuals, shape (n, q).
         standardized: Residuals over their deviations, not rotated, shape (n, q).
         covariance: S, of the outcomes in use.
-        leverage: h of the simulations, as part of the fit, shape (n,).
         shape: Another density of the noise, not Gaussian; None where that is none.
     """
 
@@ -104,14 +103,12 @@ class LocalRegression:
     residual: Array
     standardized: Array
     covariance: ResidualCovariance
-    leverage: Array
     shape: NoiseShape | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         # Residuals have served the diagnostics and would only weigh on a pickle.
         empty = np.zeros((0, len(self.used)))
-        shape = self.shape and replace(self.shape, score=empty[:, self.used])
-        return {**vars(self), "residual": empty, "standardized": empty, "shape": shape}
+        return {**vars(self), "residual": empty, "standardized": empty}
 
     @property
     def has_misfit(self) -> bool:
@@ -185,9 +182,7 @@ class LocalRegression:
         deviation = np.sqrt((residual**2).sum(0) / freedom + 1e-9 * noise.variance)
         standardized = residual / deviation
         excess = _excess(ratio, alike(standardized, freedom), freedom, noise.num_pairs)
-        covariance = ResidualCovariance.of(
-            standardized, deviation, freedom, trial, independent=excess <= MISFIT
-        )
+        covariance = ResidualCovariance.of(standardized, deviation, freedom, trial)
         shape = None
         if shapes is not None and observed is not None:
             shape = NoiseShape.fit(
@@ -207,7 +202,6 @@ class LocalRegression:
             residual=_spread(covariance.whiten(residual), used),
             standardized=_spread(standardized, used),
             covariance=covariance,
-            leverage=((basis(u) @ root) ** 2).sum(1),
         )
 
     def whitened(self, z: Array) -> tuple[Array, Array]:

@@ -74,7 +74,7 @@ def test_cover_holds_each_mode(num_modes: int):
     label = rng.integers(num_modes, size=5_000)
     z = 0.01 * rng.standard_normal((5_000, 2))
     z[:, 0] += centers[label]
-    regions = cover(z[:1_000], rng, min_regions=1, max_regions=8, generous=True)
+    regions = cover(z[:1_000], rng, max_regions=8, generous=True)
     assert len(regions) >= num_modes
     assert (nearest_region(regions, z) >= 0).mean() > 0.999
     # Between the modes lies nothing: the ellipsoids are much smaller than the box.

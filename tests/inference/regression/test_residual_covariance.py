@@ -18,7 +18,6 @@ WITHIN = np.array(
         [0.0, 0.0, -0.5, 1.0],
     ]
 )
-ACROSS = WITHIN + 0.3 * (1 - np.kron(np.eye(2), np.ones((2, 2))))
 
 
 def standardized(correlation, num, seed=0):
@@ -26,22 +25,19 @@ def standardized(correlation, num, seed=0):
     return np.random.default_rng(seed).normal(size=(num, len(factor))) @ factor.T
 
 
-@pytest.mark.parametrize("independent", [True, False])
-def test_many_rows_leave_the_correlations_as_they_are(independent):
-    correlation = WITHIN if independent else ACROSS
-    z = standardized(correlation, 40_000)
-    found = ResidualCovariance.of(z, DEVIATION, 40_000, TRIAL, independent=independent)
-    exact = DEVIATION[:, None] * correlation * DEVIATION
-    assert len(found.blocks) == (2 if independent else 1)
+def test_many_rows_leave_the_correlations_as_they_are():
+    z = standardized(WITHIN, 40_000)
+    found = ResidualCovariance.of(z, DEVIATION, 40_000, TRIAL)
+    exact = DEVIATION[:, None] * WITHIN * DEVIATION
+    assert len(found.blocks) == 2
     inverse_root = found.whiten(np.eye(4))
     inverse = DEVIATION[:, None] * (inverse_root @ inverse_root.T) * DEVIATION
-    np.testing.assert_allclose(inverse @ correlation, np.eye(4), atol=0.05)
+    np.testing.assert_allclose(inverse @ WITHIN, np.eye(4), atol=0.05)
     white = found.whiten(z * DEVIATION)
     np.testing.assert_allclose(white.T @ white / 40_000, np.eye(4), atol=0.03)
     assert found.log_volume == pytest.approx(
         0.5 * np.linalg.slogdet(exact)[1], abs=0.05
     )
-    assert max(found.shrinkage[: 1 + (not independent)]) < 0.01
     assert found.precision == pytest.approx(1, abs=1e-3)
 
 
@@ -53,7 +49,7 @@ def test_the_inverse_is_unbiased_where_nothing_shrinks():
         z = standardized(correlation, 24, seed)
         deviation = np.sqrt((z**2).sum(0) / 24)
         own = z / deviation
-        found = ResidualCovariance.of(own, deviation, 24, trial, independent=True)
+        found = ResidualCovariance.of(own, deviation, 24, trial)
         root = found.whiten(np.eye(8))
         plain.append(np.trace(root @ root.T @ correlation) / 8)
         total.append(found.precision * plain[-1])

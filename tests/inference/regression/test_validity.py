@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from sbi_active.inference.refinement.checks import BLURRED
+from sbi_active.inference.refinement.course import StageSettings
 from sbi_active.inference.regression.outcomes import TrialOutcome
 from sbi_active.inference.regression.regions import whole_space
 
@@ -57,7 +57,7 @@ def test_a_hard_edge_becomes_steep(distance):
     assert (right == (distance(z) > 0))[clear].all()
     wrong = 1 - np.exp(outcome.log_prob(z[clear & (distance(z) > 0)]))
     assert wrong.mean() < 0.02
-    assert outcome.blur < 0.2 * BLURRED
+    assert outcome.blur < 0.2 * StageSettings().blurred
 
 
 def test_an_edge_it_cannot_follow_is_seen_in_its_pairs():

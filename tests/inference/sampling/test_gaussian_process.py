@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
-from sbi_active.inference.regression.process import GaussianProcess, ProcessSettings
+from sbi_active.inference.sampling.gaussian_process import (
+    GaussianProcess,
+    ProcessSettings,
+)
 
 
 def test_a_trend_of_ten_thousand_deviations_is_known_to_one():
