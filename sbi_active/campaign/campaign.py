@@ -22,8 +22,9 @@ from sbi_active.campaign.learning.pooled import make_learner
 from sbi_active.campaign.learning.revision import recompute, revise
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.state import CampaignState, Trial
-from sbi_active.campaign.storage.directory import CampaignDirectory, make_campaign
+from sbi_active.campaign.storage.directory import CampaignDirectory
 from sbi_active.campaign.storage.loading import load
+from sbi_active.campaign.storage.manifest import make_campaign
 from sbi_active.campaign.storage.simulations import Storage, num_rows, stored
 from sbi_active.campaign.trials import CampaignTrials
 from sbi_active.renamed import set_later

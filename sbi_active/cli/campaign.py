@@ -8,7 +8,7 @@ from typing import Any
 
 from sbi_active.campaign import Campaign, CampaignOptions
 from sbi_active.campaign.options import GROUPS
-from sbi_active.campaign.storage.directory import read_manifest
+from sbi_active.campaign.storage.manifest import read_manifest
 from sbi_active.cli.declared import (
     Declared,
     declare,

@@ -15,7 +15,7 @@ from click.core import ParameterSource
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, DiscreteActions
-from sbi_active.campaign.storage.directory import has_manifest
+from sbi_active.campaign.storage.manifest import has_manifest
 from sbi_active.cli.given import (
     effects_of,
     load_object,

@@ -264,6 +264,7 @@ def _blank(name: str) -> Any:
 
 def _places(known: Mapping[str, Any]) -> Iterator[tuple[tuple[Any, ...], Any]]:
     """Yield where each object below what is known hangs, the nearest last."""
+    levels: list[list[tuple[tuple[Any, ...], Any]]]
     levels = [[((name,), value) for name, value in known.items()]]
     seen = {id(value) for value in known.values()}
     for _ in range(DEPTH):

@@ -9,12 +9,8 @@ simulator's. ``campaign.toml`` says what the campaign is, for people alone.
 from __future__ import annotations
 
 import hashlib
-import json
-import platform
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from datetime import datetime, timezone
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -24,26 +20,16 @@ import torch
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.state import CampaignState, ModelVersion, Trial
 from sbi_active.campaign.storage.codec import NotStorableError, decode, encode
-from sbi_active.campaign.storage.drawn import drawn
+from sbi_active.campaign.storage.manifest import now, read_manifest
 from sbi_active.campaign.telling import LOST, recorded
 from sbi_active.messages import Explained
-from sbi_active.simulation.bank.fingerprint import fingerprint
-from sbi_active.simulation.bank.sqlite import (
-    NAME,
-    CorruptSegmentError,
-    require,
-    sensible,
-)
+from sbi_active.simulation.bank.sqlite import CorruptSegmentError, require, sensible
 from sbi_active.simulation.bank.store import Store
 
 LOG, STATE, BELIEF = "log", "state", "belief"
-MANIFEST, COPY, FOR_PEOPLE = "campaign", "campaign copy", "campaign.toml"
-FORMAT, SCHEMA = "sbi-active campaign", 3  # schema 1 was a folder of files
-GIVEN = ("prior", "actions", "options")  # objects that are stored where they can be
-PLAIN = (
-    *("created", "method", "seed", "parameter_names", "channel_names", "x_shape"),
-    *("effects", "has_cost", "has_constraint"),
-)
+#: What a state holds beside the settings of the campaign.
+SAVED = ("trials", "processed", "draws", "versions", "is_stale", "batches")
+FACTS = ("index", "action", "x", "status", "target", "reason")
 
 
 class LogChangedError(Explained, ValueError):
@@ -62,115 +48,6 @@ class LogChangedError(Explained, ValueError):
             "another process told since; load it again, and tell this once more: "
             "nothing was written"
         )
-
-
-def make_campaign(
-    folder: Path,
-    state: CampaignState,
-    given: Mapping[str, Any],
-    simulator: Callable[..., Any],
-    **facts: Any,
-) -> None:
-    """Write what a new campaign is.
-
-    Args:
-        folder: Folder, which is made where there is none.
-        state: State of the campaign.
-        given: Prior, actions and options.
-        simulator: Simulator of the campaign.
-        **facts: Facts to note, as JSON data.
-
-    Raises:
-        ValueError: If the folder holds anything.
-        OSError: If it cannot be written.
-    """
-    objects: dict[str, bytes] = {}
-    for what, thing in given.items():
-        with suppress(NotStorableError):
-            objects[what] = encode(thing, known={})
-    own = [what for what in given if what not in objects]
-    for what in {*own} - {"options"}:
-        objects[what] = encode(drawn(given[what], seed=state.seed), known={})
-    packages = {name: version(name) for name in ("sbi-active", "sbi", "torch", "numpy")}
-    names = {
-        n: getattr(simulator, n, None) for n in ("parameter_names", "channel_names")
-    }
-    manifest = {
-        "created": _now(),
-        "packages": {"python": platform.python_version(), **packages},
-        "method": state.method,
-        "seed": state.seed,
-        "num_earlier": state.num_earlier,
-        **{name: found if found is None else [*found] for name, found in names.items()},
-        **facts,
-        **{f"{what}_text": repr(thing) for what, thing in given.items()},
-        "own": own,
-        "simulator": fingerprint(simulator),
-    }
-    write_campaign(folder, manifest, objects)
-
-
-def write_campaign(
-    folder: Path, manifest: Mapping[str, Any], objects: Mapping[str, bytes]
-) -> None:
-    """Write a manifest, with a copy, the objects beside it, and a text for people.
-
-    Raises:
-        ValueError: If the folder holds anything.
-        OSError: If it cannot be written.
-    """
-    store = Store(folder, "campaign", make=True)
-    if {*store.catalog} - {"writer"}:
-        raise ValueError(
-            f"expected an empty folder for a new campaign; got {folder} with a "
-            "campaign; go on with it by Campaign.load(directory, simulator=...), or "
-            "choose another folder"
-        )
-    records = {MANIFEST: {**manifest, "format": FORMAT, "schema": SCHEMA}, **objects}
-    with store.writing():
-        for kind, content in {**records, COPY: records[MANIFEST]}.items():
-            store.put(kind, 0, content)
-    store.close()
-    texts = {what: manifest[f"{what}_text"] for what in GIVEN}
-    plain = {name: manifest[name] for name in PLAIN if manifest[name] is not None}
-    heading = f"# What this campaign is, for people. All is kept in {NAME}; this is not"
-    # A text of JSON is one of TOML.
-    lines = [f"{k} = {json.dumps(v)}" for k, v in {**plain, **texts}.items()]
-    text = "\n".join([f"{heading} read.", *lines, ""])
-    (folder / FOR_PEOPLE).write_text(text, encoding="utf-8")
-
-
-def has_manifest(folder: Path) -> bool:
-    """Return whether a folder holds a campaign, damaged or of before or not."""
-    if not (folder / NAME).exists():
-        return (folder / "campaign.json").exists()
-    try:
-        return MANIFEST in Store(folder, "campaign").catalog
-    except OSError:
-        return True
-
-
-def read_manifest(store: Store) -> dict[str, Any]:
-    """Return what a campaign is; from the copy where a repair gave up the first.
-
-    Raises:
-        ValueError: If there is none, or one of another schema.
-        CorruptSegmentError: If it does not hold what was written.
-    """
-    manifest = store.json(MANIFEST) or store.json(COPY)
-    if manifest is None:
-        raise ValueError(
-            f"expected a folder with a campaign; got {store.folder} without one; make "
-            "it by Campaign(..., directory=...)"
-        )
-    if (manifest.get("format"), manifest.get("schema")) != (FORMAT, SCHEMA):
-        with sensible(store.path):
-            release = manifest["packages"]["sbi-active"]
-        raise ValueError(
-            f"expected a campaign of schema {SCHEMA}; got {manifest.get('schema')} in "
-            f"{store.path}; use the release of sbi-active that wrote it: {release}"
-        )
-    return manifest
 
 
 class CampaignDirectory:
@@ -219,7 +96,7 @@ class CampaignDirectory:
             trial: The trial as it is afterwards.
             **entries: JSON data.
         """
-        line = {"line": len(self._entries) + 1, "time": _now(), "event": event}
+        line = {"line": len(self._entries) + 1, "time": now(), "event": event}
         if trial is not None:
             line["trial"] = _facts(trial)
         with self._writing():
@@ -302,7 +179,7 @@ class CampaignDirectory:
                 state.meter.spent = saved["num_simulated"]
             for entry in self._entries[saved["lines"] if saved else 0 :]:
                 apply(state, entry)
-        name = saved and saved["belief"]
+        name = saved["belief"] if saved else None
         if name == "" and state.processed or saved is None and len(state.versions) > 1:
             state.is_stale = True
         return name or None
@@ -413,31 +290,31 @@ class CampaignDirectory:
         self.close()
 
 
-#: What a state holds beside the settings of the campaign.
-SAVED = ("trials", "processed", "draws", "versions", "is_stale", "batches")
-
-
 def apply(state: CampaignState, entry: Mapping[str, Any]) -> None:
     """Change a state by a line of the log, as the campaign did when it was written."""
     event = entry["event"]
     if "trial" in entry:
         facts = entry["trial"]
-        x, action = (
-            None if facts[n] is None else torch.from_numpy(np.array(facts[n], float))
-            for n in ("x", "action")
-        )
-        told = {"action": action.float(), "x": None if x is None else x.float()}
+        told = {name: _numbers(facts[name]) for name in ("action", "x")}
         state.record(recorded(state, {**facts, **told}))
     elif event == "simulator changed":
         state.is_stale = bool(state.processed)  # until an update is saved
     elif event == "examined":
         state.examined(entry["digest"])
     elif event == "adopted":
-        version = entry["version"].items()
-        version = {k: tuple(v) if isinstance(v, list) else v for k, v in version}
+        version: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value
+            for name, value in entry["version"].items()
+        }
         state.versions.append(ModelVersion(**version))
         state.processed[:] = version["trials"]
         state.is_stale = True
+
+
+def _numbers(listed: Any) -> torch.Tensor | None:
+    if listed is None:
+        return None
+    return torch.from_numpy(np.array(listed, np.float64)).float()  # null is NaN
 
 
 def _facts(trial: Trial) -> dict[str, Any]:
@@ -445,13 +322,7 @@ def _facts(trial: Trial) -> dict[str, Any]:
     facts = {name: getattr(trial, name) for name in FACTS}
     facts["action"] = trial.action.tolist()
     if trial.x is not None:
-        x = trial.x.numpy().astype(object)
-        facts["x"] = np.where(trial.x.isnan().numpy(), None, x).tolist()
+        x: Any = trial.x.numpy().astype(object)
+        x[trial.x.isnan().numpy()] = None
+        facts["x"] = x.tolist()
     return facts
-
-
-FACTS = ("index", "action", "x", "status", "target", "reason")
-
-
-def _now() -> str:
-    return datetime.now(timezone.utc).isoformat(timespec="seconds")

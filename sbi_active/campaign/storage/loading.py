@@ -136,7 +136,8 @@ def load(
     """Return the parts of a campaign, see :meth:`.Campaign.load`."""
     disk = CampaignDirectory(Path(directory), repair=repair)
     manifest, reads = disk.manifest, simulator is None
-    if options not in (None, disk.given("options", reads=True)):
+    kept = disk.given("options", reads=True)
+    if options is not None and kept not in (None, options):
         warn(
             f"SA604 options= hold for this process: the campaign in {directory} keeps "
             f"{manifest['options_text']}; pass them at each load",

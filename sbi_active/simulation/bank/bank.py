@@ -12,8 +12,6 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.arrays import own_tensor
-from sbi_active.messages import warn
 from sbi_active.simulation.bank.fingerprint import (
     differences,
     fingerprint,
@@ -22,6 +20,7 @@ from sbi_active.simulation.bank.fingerprint import (
 from sbi_active.simulation.bank.rows import (
     COLUMNS,
     Rows,
+    columns_of,
     grown,
     positions,
     row_type,
@@ -30,7 +29,6 @@ from sbi_active.simulation.bank.sqlite import CorruptSegmentError, sensible
 from sbi_active.simulation.bank.store import Store
 from sbi_active.simulation.outcomes import Outcome, Simulations
 from sbi_active.simulation.workers.store import StoredRows, run_digest
-from sbi_active.support import log_density
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -98,12 +96,11 @@ class Bank:
         if simulator is None:
             _ = self.header
             return
-        if parameter_names is None:
-            parameter_names = getattr(simulator, "parameter_names", None)
+        names = parameter_names or getattr(simulator, "parameter_names", None)
         mine = {
             "created": created,
             **fingerprint(simulator, version=version),
-            "parameter_names": None if parameter_names is None else [*parameter_names],
+            "parameter_names": None if names is None else [*names],
             "shapes": None,
         }
         key = self._rows.key
@@ -254,8 +251,9 @@ class Bank:
             rows: Positions, in any order and repeated where wanted; a slice; or a mask
                 over all rows. None reads everything into memory.
         """
-        names = ["theta", "action", "x", "status"]
-        return Simulations(*self._rows.gather(names, positions(rows, len(self))))
+        names, places = ["theta", "action", "x", "status"], positions(rows, len(self))
+        theta, action, x, status = self._rows.gather(names, places)
+        return Simulations(theta, action, x, status)
 
     def chunks(self, size: int = 10_000) -> Iterator[Simulations]:
         """Yield all rows in order, at most ``size`` at a time.
@@ -364,9 +362,8 @@ class Bank:
     def _require_lock(self) -> None:
         if not self._writable:
             raise ValueError(
-                f"expected a bank opened with its simulator, to write to; got "
-                f"Bank({str(self.path)!r}), which reads; open it by "
-                f"Bank({str(self.path)!r}, simulator=...)"
+                "expected a bank opened with its simulator, to write to; got "
+                f"{self!r}, which reads; open it with simulator="
             )
         if not self._store.held:
             self._store.acquire()
@@ -374,12 +371,13 @@ class Bank:
 
     def _require_shapes(self, shapes: dict[str, list[int]]) -> None:
         header = self.header
-        if header["shapes"] == shapes:
+        known = header["shapes"]
+        if known == shapes:
             return
-        if header["shapes"] is not None and len(self):
+        if known is not None and len(self):
             raise ValueError(
-                f"expected rows of shapes {header['shapes']}, as in the bank "
-                f"{self.path}; got {shapes}; make a bank of its own for them"
+                f"expected rows of shapes {known}, as in the bank {self.path}; got "
+                f"{shapes}; make a bank of its own for them"
             )
         with self._store.writing():
             self._store.put(self._rows.key, 0, {**header, "shapes": shapes})
@@ -399,25 +397,5 @@ class LabeledStore:
 
     def save(self, run: str, **rows: Unpack[StoredRows]) -> None:
         """Store rows of a run, as :meth:`.Bank.save` does."""
-        index, seed = rows["index"], rows["seed"]
-        columns = {name: rows[name] for name in COLUMNS[:4]}
-        lengths = {name: len(column) for name, column in columns.items()}
-        if {*lengths.values()} - {len(index)}:
-            raise ValueError(
-                f"expected {len(index)} rows, one an index; got {lengths}; give "
-                "columns of one length"
-            )
-        log_proposal = torch.full((len(index),), torch.nan, dtype=torch.float64)
-        if self.proposal is not None:
-            log_proposal = log_density(self.proposal, rows["theta"])
-            if bool((log_proposal == -torch.inf).any()):
-                warn(
-                    f"SA305 {int((log_proposal == -torch.inf).sum())} of {len(index)} "
-                    f"rows have density 0 under the proposal {self.label!r}: they "
-                    "were not drawn from it",
-                    stacklevel=2,
-                )
-        for name in ("theta", "action", "x"):
-            columns[name] = own_tensor(columns[name], torch.float32, name=name)
-        columns |= {"index": index, "log_proposal": log_proposal}
-        self.bank._write({"run": run, "seed": int(seed), "label": self.label}, columns)
+        known = {"run": run, "seed": int(rows["seed"]), "label": self.label}
+        self.bank._write(known, columns_of(rows, self.proposal, self.label))

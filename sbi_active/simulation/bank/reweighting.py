@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -31,16 +30,11 @@ class ReusedRows:
         bank: Bank that has the rows.
         rows: Positions of the rows, shape (k,), int64.
         weights: Weights that sum to one, shape (k,), float64.
-        denominator: Denominator of the weights: "mixture" of all proposals, or each
-            row's "own".
-        share: Share of the weight, by label of the proposal.
     """
 
     bank: Bank
     rows: Tensor
     weights: Tensor
-    denominator: Literal["mixture", "own"]
-    share: dict[str, float]
 
     @property
     def effective_sample_size(self) -> float:
@@ -157,14 +151,7 @@ def reuse(
             " of density 0; simulate from the target"
         )
     weights = log_weight.softmax(0)
-    totals = {
-        name: float(weights[label == code].sum())
-        for code, name in enumerate(bank.labels)
-        if name
-    }
-    result = ReusedRows(
-        bank, rows, weights, "own" if proposals is None else "mixture", totals
-    )
+    result = ReusedRows(bank, rows, weights)
     if result.effective_sample_size < FEW:
         warn(
             f"SA304 {len(rows)} rows of the bank are worth "

@@ -11,9 +11,14 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.distributions import Distribution
 
+from sbi_active.arrays import own_tensor
+from sbi_active.messages import warn
 from sbi_active.simulation.bank.sqlite import require, sensible
 from sbi_active.simulation.bank.store import Store
+from sbi_active.simulation.workers.store import StoredRows
+from sbi_active.support import log_density
 
 #: Bytes of a segment: what reading one row may cost in memory. With 16 MiB, ten rows of
 #: 1 MB one by one take four times the CPU, and nothing else takes less
@@ -164,6 +169,43 @@ def row_type(shapes: Mapping[str, Sequence[int]]) -> np.dtype:
     tables = ("theta", "<f4", theta), ("action", "<f4", action)
     own = ("log_proposal", "<f8"), ("index", "<i8"), *tables, ("status", "i1")
     return np.dtype([*own])
+
+
+def columns_of(
+    rows: StoredRows, proposal: Distribution | None, label: str
+) -> dict[str, Tensor]:
+    """Return the columns of rows that are to be written.
+
+    Args:
+        rows: The rows.
+        proposal: Proposal that theta was drawn from; None if it is not known.
+        label: Label of the proposal.
+
+    Raises:
+        ValueError: If they differ in length, or are no numbers that float32 holds.
+    """
+    index = rows["index"]
+    columns: dict[str, Tensor] = {
+        **{n: own_tensor(rows[n], torch.float32, name=n) for n in COLUMNS[:3]},
+        **{"status": rows["status"], "index": index},
+    }
+    lengths = {name: len(column) for name, column in columns.items()}
+    if len({*lengths.values()}) > 1:
+        raise ValueError(
+            f"expected {len(index)} rows, one an index; got {lengths}; give columns of "
+            "one length"
+        )
+    log_proposal = torch.full((len(index),), torch.nan, dtype=torch.float64)
+    if proposal is not None:
+        log_proposal = log_density(proposal, rows["theta"])
+        num_outside = int((log_proposal == -torch.inf).sum())
+        if num_outside:
+            warn(
+                f"SA305 {num_outside} of {len(index)} rows have density 0 under the "
+                f"proposal {label!r}: they were not drawn from it",
+                stacklevel=3,
+            )
+    return {**columns, "log_proposal": log_proposal}
 
 
 def positions(rows: Any, total: int) -> np.ndarray:

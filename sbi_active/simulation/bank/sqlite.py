@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import itertools
 import json
 import os
 import platform
@@ -16,7 +17,7 @@ import shutil
 import sqlite3
 import stat
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -47,6 +48,7 @@ OF_THE_DISK = {
     "readonly": errno.EROFS,
     "disk I/O": errno.EIO,
     "unable to open": errno.EACCES,
+    "too big": errno.EFBIG,  # 1 GB
 }
 
 
@@ -122,13 +124,11 @@ def is_locked(folder: Path) -> bool:
     """
     if not (folder / LOCK).exists():
         return False
-    lock = connected(folder / LOCK, "ro", timeout=0.0)
     try:
-        lock.execute("SELECT name FROM sqlite_master")
+        with closing(connected(folder / LOCK, "ro", timeout=0.0)) as lock:
+            lock.execute("SELECT name FROM sqlite_master")
     except sqlite3.OperationalError as error:
         return "locked" in str(error)
-    finally:
-        lock.close()
     return False
 
 
@@ -184,13 +184,11 @@ def opened(path: Path, what: str) -> tuple[sqlite3.Connection, bool]:
         connection = connected(path, mode, timeout=PATIENCE)
         try:
             _check(connection, path, what, (setting, *SETTINGS))
-        except sqlite3.OperationalError:
+        except Exception as error:
             connection.close()
-            if (mode, setting) == last:
+            is_last = (mode, setting) == last
+            if is_last or not isinstance(error, sqlite3.OperationalError):
                 raise
-        except BaseException:
-            connection.close()
-            raise
         else:
             return connection, (mode, setting) == last
     raise AssertionError
@@ -269,9 +267,10 @@ def sealed(
     return (kind, number, head, *digests, body)
 
 
-def digest_of(name: int, part: str, kind: str, number: int, content: Any) -> bytes:
-    if isinstance(content, str):  # as anybody can have SQLite return
-        return b""
+def digest_of(name: int, part: str, kind: str, number: int, content: Any) -> Any:
+    """Return the checksum of a part of a record, in a store of a name."""
+    if not isinstance(content, bytes | memoryview):  # as anybody can write there
+        return None
     digest = hashlib.sha256(f"{name} {part} {kind} {number} ".encode())
     digest.update(content)
     return digest.digest()
@@ -280,11 +279,6 @@ def digest_of(name: int, part: str, kind: str, number: int, content: Any) -> byt
 def explained(error: Exception, path: Path, what: str) -> Exception:
     """Return an error of SQLite as one of this library."""
     text = str(error)
-    if isinstance(error, sqlite3.DataError) or "too big" in text:
-        return ValueError(
-            "expected rows of at most 1 GB, which SQLite keeps; got a larger one; keep "
-            "what is needed of it"
-        )
     for words, number in OF_THE_DISK.items():
         if words in text:
             return OSError(
@@ -305,15 +299,10 @@ def _advice(folder: Path, otherwise: str) -> str:
 
 
 def keep_aside(path: Path) -> None:
-    """Keep a file under a name ending in ".damaged" too, beside those of before."""
-    number, copy = 1, path.with_name(f"{path.name}.damaged")
-    while copy.exists():
-        number += 1
-        copy = path.with_name(f"{path.name}.damaged-{number}")
-    try:
-        os.link(path, copy)
-    except OSError:  # a file system without
-        shutil.copy2(path, copy)
+    """Keep a copy under a name ending in ".damaged", beside those of before."""
+    names = (f"{path.name}.damaged" + f"-{n}" * (n > 1) for n in itertools.count(1))
+    copies = (path.with_name(name) for name in names)
+    shutil.copy2(path, next(copy for copy in copies if not os.path.lexists(copy)))
 
 
 def synchronize(folder: Path) -> None:

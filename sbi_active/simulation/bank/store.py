@@ -41,6 +41,8 @@ from sbi_active.simulation.bank.sqlite import (
     written,
 )
 
+MOST_LISTED = 1_000  # problems; a catalog may be made up
+
 _OPEN: weakref.WeakSet[Store] = weakref.WeakSet()
 
 
@@ -165,7 +167,10 @@ class Store:
     @property
     def catalog(self) -> dict[str, int]:
         """The last number of each kind."""
-        return self.json(CATALOG) or {}
+        found = self.json(CATALOG) or {}
+        own = all(type(number) is int for number in found.values())
+        require(self.path, own, "a catalog that none writes")
+        return found
 
     def length(self, series: str) -> int:
         """Return the number of records of a series."""
@@ -281,6 +286,8 @@ class Store:
                     self.body(kind, number)
                 except CorruptSegmentError as error:
                     wrong.append(error.reason)
+                    if len(wrong) > MOST_LISTED:
+                        return wrong
         return wrong
 
     def salvage(self) -> None:
@@ -297,7 +304,7 @@ class Store:
                         "SELECT rowid, kind, number, head, head_digest, body_digest, "
                         f"body FROM records NOT INDEXED ORDER BY rowid{order}"
                     ):
-                        if row[1:] == sealed(self._id, *row[1:4], row[6]):
+                        if row[1:] == sealed(self._id, row[1], row[2], row[3], row[6]):
                             whole[row[0]] = row[1:3]
             catalog: dict[str, int] = {}
 
@@ -308,7 +315,7 @@ class Store:
                     number = number and catalog.get(kind, 0) + 1
                     if kind != CATALOG:
                         catalog[kind] = number
-                        yield sealed(self._id, kind, number, *content)
+                        yield sealed(self._id, kind, number, content[0], content[1])
                 yield sealed(self._id, CATALOG, 0, catalog)
 
             fresh = written(self.folder, self._id, renumbered())

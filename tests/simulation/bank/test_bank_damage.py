@@ -14,6 +14,7 @@ from sbi_active.cli import main
 from sbi_active.simulation import Simulations
 from sbi_active.simulation.bank import CorruptSegmentError
 from sbi_active.simulation.bank.rows import row_type
+from sbi_active.simulation.bank.store import Store
 from tests.simulation.bank.filled import FILE, crafted, execute, filled, simulator
 
 
@@ -118,6 +119,7 @@ def test_crafted_segments(folder, change):
 LARGE = "x'" + "00" * 1000 + "'"
 STATEMENTS = {
     "a text": "UPDATE records SET body = 'abc' WHERE kind = 'rows'",
+    "a number": "UPDATE records SET body = 7 WHERE kind = 'rows'",
     "a head of text": "UPDATE records SET head = 'abc' WHERE kind = 'rows'",
     "another content": f"UPDATE records SET body = {LARGE} WHERE kind = 'rows'",
     "a checksum of text": "UPDATE records SET body_digest = 'abc' WHERE kind = 'rows'",
@@ -136,6 +138,15 @@ def test_what_anybody_can_do_with_sqlite(folder, statement):
     execute(folder, statement)
     with pytest.raises(CorruptSegmentError, match=str(folder)):
         Bank(folder).columns("x")
+
+
+@pytest.mark.parametrize("catalog", [{"rows": "4"}, {"rows": 10**18}, [], None])
+def test_crafted_catalogs(folder, catalog):
+    content = json.dumps({"bank rows": 0, **catalog} if catalog else catalog).encode()
+    crafted(folder, "catalog", 0, content)
+    with pytest.raises((CorruptSegmentError, ValueError), match=str(folder)):
+        Bank(folder).columns("x")
+    assert Store(folder).problems()
 
 
 def test_a_view_in_place_of_a_table_is_not_read(folder):
