@@ -93,8 +93,7 @@ class Bank:
         self.path, self._writable = self._store.folder, makes
         self._rows = Rows(self._store, name)
         self._stored: tuple[str, np.ndarray] = ("", np.zeros(0, bool))  # of a run
-        if simulator is None:
-            _ = self.header
+        if simulator is None and self.header:
             return
         names = parameter_names or getattr(simulator, "parameter_names", None)
         mine = {
