@@ -93,7 +93,8 @@ class Bank:
         self.path, self._writable = self._store.folder, makes
         self._rows = Rows(self._store, name)
         self._stored: tuple[str, np.ndarray] = ("", np.zeros(0, bool))  # of a run
-        if simulator is None and self.header:
+        if simulator is None:
+            _ = self.header
             return
         names = parameter_names or getattr(simulator, "parameter_names", None)
         mine = {
@@ -173,8 +174,7 @@ class Bank:
             label: Label of the proposal, "prior" or "round 3"; given with it.
 
         Returns:
-            Number of rows stored, less than n where rows of the same theta, action and
-            seed are there already, as those of ``simulate(..., store=bank)`` are.
+            Number of rows stored: those of a seed, theta and action are stored once.
         """
         before = len(self)
         self.drawn_from(proposal, label=label).save(
