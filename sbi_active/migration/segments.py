@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
-from sbi_active.simulation.bank.rows import COLUMNS, Rows, row_type
+from sbi_active.simulation.bank.rows import COLUMNS, Rows
 from sbi_active.simulation.bank.sqlite import CorruptSegmentError, require, sensible
 from sbi_active.simulation.bank.store import Store
 
@@ -52,11 +53,8 @@ def copy_bank(folder: Path, store: Store, name: str) -> int:
         for start, stop in pairwise([*starts, len(run)]):
             own = runs[run[start]]
             own = {"run": own["digest"], "seed": own["seed"], "label": own["label"]}
-            rows = np.empty(stop - start, row_type(header["shapes"]))
-            for key in {*COLUMNS} - {"x"}:
-                rows[key] = columns[key][start:stop]
-            with store.writing():
-                into.append(own, rows, columns["x"][start:stop])
+            part = {key: columns[key][start:stop] for key in COLUMNS}
+            into.append(own, {k: torch.from_numpy(v.copy()) for k, v in part.items()})
     return total
 
 

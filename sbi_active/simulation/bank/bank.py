@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+import copy
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,9 +21,7 @@ from sbi_active.simulation.bank.rows import (
     COLUMNS,
     Rows,
     columns_of,
-    grown,
     positions,
-    row_type,
 )
 from sbi_active.simulation.bank.sqlite import CorruptSegmentError, sensible
 from sbi_active.simulation.bank.store import Store
@@ -92,7 +90,7 @@ class Bank:
         self._store = path if isinstance(path, Store) else Store(Path(path), make=makes)
         self.path, self._writable = self._store.folder, makes
         self._rows = Rows(self._store, name)
-        self._stored: tuple[str, np.ndarray] = ("", np.zeros(0, bool))  # of a run
+        self._proposal: tuple[Distribution | None, str] = (None, "")
         if simulator is None:
             _ = self.header
             return
@@ -193,7 +191,7 @@ class Bank:
         proposal: Distribution | None,
         *,
         label: str | None,
-    ) -> LabeledStore:
+    ) -> Bank:
         """Return this bank as a store of simulations whose theta has one proposal.
 
         Args:
@@ -208,7 +206,9 @@ class Bank:
                 f"expected a proposal and its label together; got {proposal!r} and "
                 f"{label!r}; name the proposal, as in label='round 3'"
             )
-        return LabeledStore(self, proposal, label or "")
+        labeled = copy.copy(self)
+        labeled._proposal = proposal, label or ""
+        return labeled
 
     def load(self, run: str) -> tuple[Tensor, Tensor, Tensor] | None:
         """Return the stored rows of a run: index (k,), x (k, *x_shape), status (k,).
@@ -241,7 +241,10 @@ class Bank:
             LockedError: If somebody else is writing.
             OSError: If the disk is full or cannot be written.
         """
-        self.drawn_from(None, label=None).save(run, **rows)
+        self._require_lock()
+        proposal, label = self._proposal
+        known = {"run": run, "seed": int(rows["seed"]), "label": label}
+        self._rows.append(known, columns_of(rows, proposal, label))
 
     def read(self, rows: Tensor | Sequence[int] | slice | None = None) -> Simulations:
         """Return rows.
@@ -318,31 +321,6 @@ class Bank:
         """Let others write. Reading goes on to work."""
         self._store.close()
 
-    def _write(self, run: Mapping[str, Any], columns: Mapping[str, Tensor]) -> None:
-        """Write those rows of a run that are not there; see :meth:`save`."""
-        self._require_lock()
-        arrays = {name: c.detach().cpu().numpy() for name, c in columns.items()}
-        shapes = {name: [*arrays[name].shape[1:]] for name in ("theta", "action", "x")}
-        self._require_shapes(shapes)
-        x, index, name = arrays.pop("x"), arrays["index"], run["run"]
-        if self._stored[0] != name:
-            mask = np.zeros(0, bool)
-            for segment in self._rows.segments():
-                if segment.run == name:
-                    mask = grown(mask, segment.rows["index"])
-                    mask[segment.rows["index"]] = True
-            self._stored = name, mask
-        mask = grown(self._stored[1], index)
-        first = np.unique(index, return_index=True)[1]  # of those that are given twice
-        fresh = np.sort(first[~mask[index[first]]])
-        rows = np.empty(len(index), row_type(shapes))
-        for key, array in arrays.items():
-            rows[key] = array
-        with self._store.writing():
-            self._rows.append(run, rows[fresh], x[fresh])
-        mask[index] = True
-        self._stored = name, mask
-
     def _require_same_simulator(self, mine: dict[str, Any]) -> None:
         header = self.header
         with sensible(self._store.path):
@@ -364,37 +342,4 @@ class Bank:
                 "expected a bank opened with its simulator, to write to; got "
                 f"{self!r}, which reads; open it with simulator="
             )
-        if not self._store.held:
-            self._store.acquire()
-            self._stored = ("", np.zeros(0, bool))  # others may have written meanwhile
-
-    def _require_shapes(self, shapes: dict[str, list[int]]) -> None:
-        header = self.header
-        known = header["shapes"]
-        if known == shapes:
-            return
-        if known is not None and len(self):
-            raise ValueError(
-                f"expected rows of shapes {known}, as in the bank {self.path}; got "
-                f"{shapes}; make a bank of its own for them"
-            )
-        with self._store.writing():
-            self._store.put(self._rows.key, 0, {**header, "shapes": shapes})
-
-
-@dataclass(frozen=True)
-class LabeledStore:
-    """A bank that notes which proposal theta was drawn from; see ``drawn_from``."""
-
-    bank: Bank
-    proposal: Distribution | None
-    label: str
-
-    def load(self, run: str) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Return the stored rows of a run, as :meth:`.Bank.load` does."""
-        return self.bank.load(run)
-
-    def save(self, run: str, **rows: Unpack[StoredRows]) -> None:
-        """Store rows of a run, as :meth:`.Bank.save` does."""
-        known = {"run": run, "seed": int(rows["seed"]), "label": self.label}
-        self.bank._write(known, columns_of(rows, self.proposal, self.label))
+        self._store.acquire()

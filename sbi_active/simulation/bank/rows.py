@@ -69,8 +69,8 @@ class Rows:
 
     def __init__(self, store: Store, name: str) -> None:
         self.store, self._name, self.key = store, name, f"bank {name}"
-        self._found: list[Segment] = []
-        self._generation, self._last = -1, (0, np.zeros(0))
+        self._generation = -1
+        self._forget()
 
     @property
     def header(self) -> dict[str, Any]:
@@ -95,14 +95,19 @@ class Rows:
         with self.store.reading():
             total = self.store.length(self._name)
             if self._generation != self.store.generation or total < len(self._found):
-                self._found, self._generation = [], self.store.generation
-                self._last = 0, np.zeros(0)
+                self._forget()
+                self._generation = self.store.generation
             if total > len(self._found):
                 with sensible(self.store.path):
                     kind = row_type(self.header["shapes"])
                     for number in range(len(self._found) + 1, total + 1):
                         self._found.append(self._segment(number, kind))
             return self._found[:]
+
+    def _forget(self) -> None:
+        self._found: list[Segment] = []
+        self._last = 0, np.zeros(0)  # the segment whose x was read last
+        self._stored = "", 0, np.zeros(0, bool)  # rows of the run that was written last
 
     def _segment(self, number: int, kind: np.dtype) -> Segment:
         head = self.store.get(self._name, number) or b""
@@ -125,14 +130,49 @@ class Rows:
             self._last = segment.number, x
         return self._last[1]
 
-    def append(self, run: Mapping[str, Any], rows: np.ndarray, x: np.ndarray) -> None:
-        """Write rows of a run; for use in the store's ``writing``."""
+    def append(self, run: Mapping[str, Any], columns: Mapping[str, Tensor]) -> None:
+        """Write those rows of a run that are not there, on the disk at the end.
+
+        Raises:
+            ValueError: If the rows have other shapes than those in the bank.
+        """
+        arrays = {name: c.detach().cpu().numpy() for name, c in columns.items()}
+        shapes = {name: [*arrays[name].shape[1:]] for name in COLUMNS[:3]}
+        header, x, index = self.header, arrays.pop("x"), arrays["index"]
+        known = header["shapes"]
+        if known not in (None, shapes) and self.segments():
+            raise ValueError(
+                f"expected rows of shapes {known}, as in the bank {self.store.folder}; "
+                f"got {shapes}; make a bank of its own for them"
+            )
+        mask = _grown(self._mask(run["run"]), index)
+        first = np.unique(index, return_index=True)[1]  # of those that are given twice
+        fresh = np.sort(first[~mask[index[first]]])
+        rows = np.empty(len(index), row_type(shapes))
+        for name, array in arrays.items():
+            rows[name] = array
         size = max(1, SEGMENT_BYTES // max(rows.itemsize + x[:1].nbytes, 1))
-        for start in range(0, len(rows), size):
-            part = slice(start, start + size)
-            head = json.dumps(run).encode() + b"\n" + rows[part].tobytes()
-            body = np.ascontiguousarray(x[part], "<f4").reshape(-1).view(np.uint8).data
-            self.store.append(self._name, head, body)
+        with self.store.writing():
+            if known != shapes:
+                self.store.put(self.key, 0, {**header, "shapes": shapes})
+            for start in range(0, len(fresh), size):
+                part = fresh[start : start + size]
+                head = json.dumps(run).encode() + b"\n" + rows[part].tobytes()
+                body = np.ascontiguousarray(x[part], "<f4").reshape(-1).view(np.uint8)
+                self.store.append(self._name, head, body.data)
+
+    def _mask(self, run: str) -> np.ndarray:
+        """Return a mask over the rows of a run that are stored."""
+        segments = self.segments()
+        name, seen, mask = self._stored
+        if name != run:
+            seen, mask = 0, np.zeros(0, bool)
+        for segment in segments[seen:]:
+            if segment.run == run:
+                mask = _grown(mask, segment.rows["index"])
+                mask[segment.rows["index"]] = True
+        self._stored = run, len(segments), mask
+        return mask
 
     def gather(self, names: Sequence[str], rows: np.ndarray) -> list[Tensor]:
         """Return columns at positions."""
@@ -242,6 +282,6 @@ def _whole_number(value: int) -> np.int64:
         ) from error
 
 
-def grown(mask: np.ndarray, index: np.ndarray) -> np.ndarray:
+def _grown(mask: np.ndarray, index: np.ndarray) -> np.ndarray:
     """Return a mask over the rows of a run with room for more of them."""
     return np.pad(mask, (0, max(0, int(index.max(initial=-1)) + 1 - len(mask))))

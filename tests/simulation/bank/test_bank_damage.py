@@ -140,7 +140,7 @@ def test_what_anybody_can_do_with_sqlite(folder, statement):
         Bank(folder).columns("x")
 
 
-@pytest.mark.parametrize("catalog", [{"rows": "4"}, {"rows": 10**18}, [], None])
+@pytest.mark.parametrize("catalog", [{"rows": "4"}, {"rows": 10**18}, None])
 def test_crafted_catalogs(folder, catalog):
     content = json.dumps({"bank rows": 0, **catalog} if catalog else catalog).encode()
     crafted(folder, "catalog", 0, content)
