@@ -147,3 +147,31 @@ def parameter_dim(prior: Distribution) -> int:
     """Return the number of parameters, without drawing from the prior."""
     shape = prior.event_shape or prior.batch_shape
     return shape[-1] if shape else 1
+
+
+def log_density(distribution: Any, theta: Tensor) -> Tensor:
+    """Return the log density of rows, -inf outside the support.
+
+    Otherwise a torch distribution that validates its arguments would raise there.
+
+    Args:
+        distribution: Anything with ``log_prob``.
+        theta: Parameters, shape (n, theta_dim).
+
+    Returns:
+        Shape (n,), float64.
+    """
+    result = torch.full((len(theta),), -torch.inf, dtype=torch.float64)
+    with torch.no_grad():
+        inside = within_support(distribution, theta).reshape(len(theta), -1).all(-1)
+        if bool(inside.any()):
+            value = distribution.log_prob(theta[inside])
+            if value.shape != (int(inside.sum()),):
+                raise ValueError(
+                    "expected one log density a row from a distribution over "
+                    f"parameters; got shape {tuple(value.shape)} for "
+                    f"{int(inside.sum())} rows; wrap it, as in "
+                    "torch.distributions.Independent(distribution, 1)"
+                )
+            result[inside] = value.double()
+    return result

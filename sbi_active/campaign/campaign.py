@@ -24,9 +24,8 @@ from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.campaign.storage.directory import CampaignDirectory
 from sbi_active.campaign.storage.loading import load
-from sbi_active.campaign.storage.manifest import new_manifest, write_manifest
-from sbi_active.campaign.storage.simulations import num_rows
-from sbi_active.campaign.storage.storage import Storage, stored
+from sbi_active.campaign.storage.manifest import make_campaign
+from sbi_active.campaign.storage.simulations import Storage, num_rows, stored
 from sbi_active.campaign.trials import CampaignTrials
 from sbi_active.renamed import set_later
 from sbi_active.simulation.workers.meter import SimulationBudgetError, metering
@@ -118,17 +117,16 @@ class Campaign(CampaignTrials):
         self._begin(state, actions, learner, planner)
         disk = None
         if directory is not None:
-            manifest = new_manifest(
+            make_campaign(
+                Path(directory),
                 state,
-                simulator=simulator,
-                prior=prior,
-                actions=actions,
-                x_shape=learner.x_shape,
+                {"prior": prior, "actions": actions, "options": options},
+                simulator,
+                x_shape=[*learner.x_shape],
                 effects=[effect.name for effect in effects],
                 has_cost=cost is not None,
                 has_constraint=constraint is not None,
             )
-            write_manifest(Path(directory), manifest)
             disk = CampaignDirectory(Path(directory))
         self._storage = Storage(disk, options.bank, prior)
 
@@ -185,7 +183,7 @@ class Campaign(CampaignTrials):
 
         Raises:
             ValueError: If there is no campaign, or one of another simulator or schema.
-            DamagedCampaignError: If a file does not hold what was written.
+            CorruptSegmentError: If a file does not hold what was written.
         """
         found = load(
             directory,

@@ -19,7 +19,7 @@ from torch.distributions import Distribution
 from sbi_active.campaign.state import FAR, CampaignState, Trial
 from sbi_active.diagnostics.beliefs import check_belief
 from sbi_active.diagnostics.check import check_calibration
-from sbi_active.inference.beliefs.belief import Belief, UnchangedBelief
+from sbi_active.inference.beliefs.belief import UnchangedBelief
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.refinement.regression_error import LARGE
 from sbi_active.seeding import derive_seed
@@ -225,8 +225,8 @@ def in_doubt(
     """
     if not texts:
         return belief
-    if isinstance(belief, Belief):
-        marked = copy.copy(belief)
+    if hasattr(belief, "diagnostics"):
+        marked: Any = copy.copy(belief)
     else:
         marked = UnchangedBelief(prior, belief)
     known = marked.diagnostics

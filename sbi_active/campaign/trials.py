@@ -18,7 +18,7 @@ from sbi_active.campaign.display.page import campaign_html, to_dataframe
 from sbi_active.campaign.health import Health, assess, calibration_lost
 from sbi_active.campaign.isolation import guarded, isolated
 from sbi_active.campaign.state import UNSCORED, CampaignState, Status, Trial
-from sbi_active.campaign.storage.storage import Storage
+from sbi_active.campaign.storage.simulations import Storage
 from sbi_active.campaign.telling import find_trial, told_trial
 from sbi_active.display.figures import legible
 from sbi_active.inference.beliefs.belief import names_of, parameter_dim

@@ -16,8 +16,7 @@ from sbi_active.cli.given import problem_of
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 from sbi_active.simulation.bank import Bank
-from sbi_active.simulation.bank.labeled import LabeledStore
-from sbi_active.simulation.workers.store import run_digest
+from sbi_active.simulation.workers.store import RowStore, run_digest
 
 #: Rows that are drawn and simulated at once. Part of the definition of a bank's theta
 #: and action given a seed, so it is never a setting.
@@ -69,7 +68,7 @@ def build(
 class _Block:
     """Stores the first rows of a block as rows of the whole, so that it can grow."""
 
-    store: LabeledStore
+    store: RowStore
     run: str
     num_rows: int
 

@@ -8,7 +8,6 @@ from typing import Any
 
 from sbi_active.campaign import Campaign, CampaignOptions
 from sbi_active.campaign.options import GROUPS
-from sbi_active.campaign.storage.damage import naming
 from sbi_active.campaign.storage.manifest import read_manifest
 from sbi_active.cli.declared import (
     Declared,
@@ -177,9 +176,8 @@ def open_campaign(
     declared = Declared(folder, trusts=trust)
     given = {}
     if simulates or trust:
-        with naming():
-            manifest = read_manifest(Store(folder, "campaign"))
-        lacking = [what for what in ("prior", "actions") if manifest[what] is None]
+        own = read_manifest(Store(folder, "campaign"))["own"]
+        lacking = [what for what in ("prior", "actions") if what in own]
         given = {what: _object_of(declared, what) for what in lacking}
     reader = Campaign.load(folder, repair=repair, **given)
     if not simulates:

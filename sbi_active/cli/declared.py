@@ -98,9 +98,9 @@ def _is_texts(value: Any) -> bool:
 
 def write_declared(folder: Path, declared: Mapping[str, Any]) -> None:
     """Write where everything is, and remember that it was written here."""
-    from sbi_active.simulation.bank.files import write_file
-
-    write_file(folder / DECLARED, (json.dumps(declared, indent=2) + "\n").encode())
+    temporary = folder / f".writing-{os.getpid()}-{DECLARED}"
+    temporary.write_text(json.dumps(declared, indent=2) + "\n", encoding="utf-8")
+    os.replace(temporary, folder / DECLARED)
     _remember(folder)
 
 

@@ -20,10 +20,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from sbi_active.campaign.storage.damage import naming
 from sbi_active.cli.declared import read_declared
 from sbi_active.cli.options import flat
-from sbi_active.simulation.bank.sqlite import EVENTS, NAME, OBJECTS
+from sbi_active.simulation.bank.sqlite import NAME
 from sbi_active.simulation.bank.store import Store
 
 SUMMARY = "status.json"
@@ -43,7 +42,7 @@ def sum_up(folder: Path, known: Mapping[str, Any]) -> None:
         known: Facts that :class:`Record` needs.
     """
     with _stored(folder) as store:
-        content = {**known, "of": _mark(store, store.length(EVENTS, LOG))}
+        content = {**known, "of": _mark(store, store.length(LOG))}
     temporary = folder / f".{os.getpid()}-{SUMMARY}"
     with contextlib.suppress(OSError):  # as in a folder that is read only
         with open(temporary, "x", encoding="utf-8") as file:  # follows no link
@@ -58,14 +57,14 @@ def digest(folder: Path) -> str:
         folder: Folder of the campaign.
     """
     with contextlib.suppress(OSError, ValueError, Unsure), _stored(folder) as store:
-        return str(_mark(store, store.length(EVENTS, LOG)))
+        return str(_mark(store, store.length(LOG)))
     return ""
 
 
 def _mark(store: Store, num: int) -> list[Any]:
     """Return the length of the log, and a checksum of its end and of the state."""
-    last = store.get(EVENTS, LOG, num) if num else None
-    content = (last or b"") + (store.get(OBJECTS, STATE) or b"")
+    last = store.get(LOG, num) if num else None
+    content = (last or b"") + (store.get(STATE) or b"")
     return [num, hashlib.sha256(content).hexdigest()]
 
 
@@ -73,7 +72,7 @@ def _mark(store: Store, num: int) -> list[Any]:
 def _stored(folder: Path) -> Iterator[Store]:
     if not (folder / NAME).exists():
         raise Unsure
-    with naming(), contextlib.closing(Store(folder, "campaign")) as store:
+    with contextlib.closing(Store(folder, "campaign")) as store:
         yield store
 
 
@@ -105,11 +104,11 @@ class Record:
             self.state = SimpleNamespace(trials=self._status["trials"])
             num = self._summary["of"][0]
             with _stored(folder) as store:
-                self._num = store.length(EVENTS, LOG)
+                self._num = store.length(LOG)
                 if self._summary["of"] != _mark(store, num):
                     raise Unsure
                 numbers = range(1, self._num + 1)
-                lines = [store.get(EVENTS, LOG, k) or b"{}" for k in numbers]
+                lines = [store.get(LOG, k) or b"{}" for k in numbers]
             for number, entry in enumerate(map(json.loads, lines), start=1):
                 self._take(entry, is_new=number > num)
             if len(self._facts) != len(self.state.trials):
@@ -184,11 +183,10 @@ class Record:
 
     def _write(self, event: str, facts: dict[str, Any]) -> dict[str, Any]:
         time = datetime.now(timezone.utc).isoformat(timespec="seconds")
-        with _stored(self.directory) as store, store.writing((EVENTS, LOG)) as number:
-            if number != self._num + 1:  # another process was faster
+        line = {"time": time, "event": event, "trial": facts}
+        with _stored(self.directory) as store, store.writing():
+            if store.append(LOG, line) != self._num + 1:  # another process was faster
                 raise Unsure
-            line = {"line": number, "time": time, "event": event, "trial": facts}
-            store.put(EVENTS, LOG, number, line)
         self._take(line, is_new=True)
         return self.state.trials[facts["index"]]
 

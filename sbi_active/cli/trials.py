@@ -96,18 +96,29 @@ def status(campaign: Any) -> Answer:
 
 def sum_up_campaign(campaign: Any) -> None:
     """Leave a summary in the folder of a campaign that holds the right to write."""
-    from sbi_active.campaign.storage.described import describe_actions
-
     with contextlib.suppress(Exception):  # a belief without moments has no summary
         known = {
             "status": found_in(campaign),
             "x_shape": [*campaign.x_shape],
-            "actions": describe_actions(campaign.actions),
+            "actions": _limits(campaign.actions),
             "names": [*campaign.actions.names],
             "units": [*campaign.actions.units],
             "processed": [*campaign.state.processed],
         }
         sum_up(campaign.directory, known)
+
+
+def _limits(actions: Any) -> dict[str, Any] | None:
+    """Return which actions are permitted as JSON; None where only the space can say."""
+    kind = type(actions).__name__
+    if kind == "BoxActions":
+        return {
+            "kind": "box",
+            "low": actions.low.tolist(),
+            "high": actions.high.tolist(),
+        }
+    listed = kind == "DiscreteActions"
+    return {"kind": "list", "values": actions.values.tolist()} if listed else None
 
 
 def found_in(campaign: Any) -> dict[str, Any]:

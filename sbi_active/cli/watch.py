@@ -159,7 +159,7 @@ def _news(campaign: Campaign, folder: Path) -> str:
         doing += f" ({stage} of trial {index}: {in_words(seconds)})"
     if not is_locked(folder):
         return f"No process writes to {folder}; {doing}."
-    writer = Store(folder, "campaign").text("writer") or {}
+    writer = Store(folder, "campaign").json("writer") or {}
     return f"Process {writer.get('pid')} on {writer.get('host')} writes; {doing}."
 
 

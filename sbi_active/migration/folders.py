@@ -13,12 +13,16 @@ from pathlib import Path
 from typing import Any
 
 from sbi_active.campaign.storage.codec import decode, encode
-from sbi_active.campaign.storage.damage import DamagedCampaignError
 from sbi_active.campaign.storage.directory import BELIEF, LOG, STATE
-from sbi_active.campaign.storage.manifest import FOR_PEOPLE, SCHEMA, write_manifest
+from sbi_active.campaign.storage.manifest import FOR_PEOPLE, write_campaign
+from sbi_active.migration.described import actions_from, options_from, prior_from
 from sbi_active.migration.segments import copy_bank
-from sbi_active.simulation.bank.files import TEMPORARY, synchronize
-from sbi_active.simulation.bank.sqlite import EVENTS, NAME, OBJECTS
+from sbi_active.simulation.bank.sqlite import (
+    NAME,
+    TEMPORARY,
+    CorruptSegmentError,
+    synchronize,
+)
 from sbi_active.simulation.bank.store import Store
 
 BEFORE = "version-1"  # gets the files of before
@@ -45,8 +49,7 @@ def migrate(folder: Path) -> dict[str, int]:
 
     Raises:
         ValueError: If there is nothing of release 0.1 in it.
-        DamagedCampaignError: If the log or the manifest is not what was written.
-        CorruptSegmentError: If a bank is not.
+        CorruptSegmentError: If a bank, the log or the manifest is not what was written.
         ImportError: If there are rows, and no h5py to read them.
     """
     banks = _banks(folder)
@@ -94,12 +97,20 @@ def _banks(folder: Path) -> dict[str, Path]:
 
 def _copy_campaign(folder: Path, made: Path) -> int:
     manifest = _manifest(folder)
-    write_manifest(made, {"drawn": {}, **manifest, "schema": SCHEMA})
+    readers = {"prior": prior_from, "actions": actions_from, "options": options_from}
+    objects = {
+        what: encode(read(manifest[what]), known={})
+        for what, read in readers.items()
+        if manifest[what] is not None
+    }
+    own = [what for what in readers if what not in objects]
+    kept = {name: value for name, value in manifest.items() if name not in readers}
+    write_campaign(made, {**kept, "own": own}, objects)
     store = Store(made, "campaign")
     entries = _entries(folder / "trials.jsonl")
     for entry in entries:
-        with store.writing((EVENTS, LOG)) as number:
-            store.put(EVENTS, LOG, number, entry)
+        with store.writing():
+            store.append(LOG, entry)
     saved = _content(folder / "state.bin")
     if saved is not None:
         state = {**ADDED, **decode(saved, known={})}
@@ -108,8 +119,8 @@ def _copy_campaign(folder: Path, made: Path) -> int:
             if state["belief"]:
                 belief = _content(folder / state["belief"]) or b""
                 state["belief"] = hashlib.sha256(belief).hexdigest()
-                store.put(OBJECTS, BELIEF, 0, belief)
-            store.put(OBJECTS, STATE, 0, encode(state, known={}))
+                store.put(BELIEF, 0, belief)
+            store.put(STATE, 0, encode(state, known={}))
     store.close()
     return len(entries)
 
@@ -130,7 +141,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
                 )
         except (OSError, KeyError, AttributeError, TypeError, json.JSONDecodeError):
             continue
-    raise DamagedCampaignError(path, "a manifest with another checksum")
+    raise CorruptSegmentError(path, "a manifest with another checksum")
 
 
 def _entries(path: Path) -> list[Mapping[str, Any]]:
@@ -141,7 +152,7 @@ def _entries(path: Path) -> list[Mapping[str, Any]]:
         head, _, tail = line.rpartition(b', "crc": "')
         text = head + b"}"
         if tail != f'{zlib.crc32(text):08x}"}}'.encode():
-            raise DamagedCampaignError(
+            raise CorruptSegmentError(
                 path, f"line {number} with another checksum: repair it by release 0.1"
             )
         entries.append(json.loads(text))

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
-from sbi_active.simulation.bank.damage import CorruptSegmentError, parsed, require
-from sbi_active.simulation.bank.segments import COLUMNS, write_segment
-from sbi_active.simulation.bank.sqlite import OBJECTS
+from sbi_active.simulation.bank.rows import COLUMNS, Rows
+from sbi_active.simulation.bank.sqlite import CorruptSegmentError, require, sensible
 from sbi_active.simulation.bank.store import Store
 
 NAME = re.compile(r"(\d{8})-(\d{8})\.h5")
@@ -36,14 +36,14 @@ def copy_bank(folder: Path, store: Store, name: str) -> int:
         ImportError: If there are rows, and no h5py.
     """
     path = folder / "bank.json"
-    header = parsed(path, path.read_bytes())
+    with sensible(path):
+        header = dict(json.loads(path.read_bytes()))
     kept = ("created", "version", "simulator", "parameter_names", "shapes")
     lacking = [key for key in kept if key not in header]
     require(path, not lacking and header.get("format") == 1, "no header of release 0.1")
+    into, total = Rows(store, name), 0
     with store.writing():
-        known = {key: header[key] for key in kept}
-        store.put(OBJECTS, f"bank {name}", 0, {**known, "lost": []})
-    total = 0
+        store.put(into.key, 0, {key: header[key] for key in kept})
     for file in _files(folder, header):
         columns, runs = _read(file)
         run = columns.pop("run")
@@ -53,8 +53,8 @@ def copy_bank(folder: Path, store: Store, name: str) -> int:
         for start, stop in pairwise([*starts, len(run)]):
             own = runs[run[start]]
             own = {"run": own["digest"], "seed": own["seed"], "label": own["label"]}
-            part = {key: column[start:stop] for key, column in columns.items()}
-            write_segment(store, name, own, part)
+            part = {key: columns[key][start:stop] for key in COLUMNS}
+            into.append(own, {k: torch.from_numpy(v.copy()) for k, v in part.items()})
     return total
 
 
@@ -91,7 +91,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
             same = hashlib.sha256(text).hexdigest() == str(file.attrs["sha256"])
             require(path, same, "meta data with another checksum")
             meta = json.loads(text)
-            names = [*COLUMNS, "run"]
+            names = [*COLUMNS, "log_action", "run"]
             columns = {name: _plain(h5py, file, name, path) for name in names}
         for name, column in columns.items():
             same = _checksum(column) == meta["checksums"][name]

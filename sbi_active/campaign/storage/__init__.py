@@ -1,9 +1,14 @@
 """A campaign on disk: what it is, what happened, and what was computed from it.
 
-This package contains the files, their checks, and the way to read them. It does not
+This package contains the records, their checks, and the way to read them. It does not
 infer or design.
 """
 
-from sbi_active.campaign.storage.damage import DamagedCampaignError
+from sbi_active.renamed import former_names
 
-__all__ = ["DamagedCampaignError"]
+__all__: list[str] = []
+
+__getattr__ = former_names(
+    __name__,
+    {"DamagedCampaignError": "sbi_active.simulation.bank:CorruptSegmentError"},
+)

@@ -8,13 +8,14 @@ from where he gives it again.
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import io
 import json
 import math
 import zlib
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -28,28 +29,21 @@ from sbi_active.messages import Explained, Message
 
 #: Packages whose classes are stored by their attributes.
 TRUSTED = (
-    "sbi_active.",
-    "sbi.utils.",
-    "sbi.neural_nets.",
-    "torch.distributions.",
-    "torch.nn.modules.",
+    *("sbi_active.", "sbi.utils.", "sbi.neural_nets."),
+    *("torch.distributions.", "torch.nn.modules."),
 )
 #: Levels of attributes below what is given again in which to look for references.
 DEPTH = 5
 #: Bytes that any file may hold, and times its size that it may hold beyond.
 LEAST_LIMIT, MOST_SHRUNK = 16 * 2**20, 100
 TAG = "!"  # of whatever JSON does not hold by itself
-
-_SEQUENCES: dict[str, Callable[[list[Any]], Any]] = {
-    "list": list,
-    "tuple": tuple,
-    "set": set,
-    "frozenset": frozenset,
+SCALARS = (type(None), bool, int, float, str, Message)
+SEQUENCES: dict[str, Any] = {
+    **{kind.__name__: kind for kind in (list, tuple, set, frozenset)},
     "size": torch.Size,
 }
-_KINDS = {list: "list", tuple: "tuple", set: "set", frozenset: "frozenset"}
-_KINDS[torch.Size] = "size"
-_MAPPINGS: dict[str, type] = {"dict": dict, "ordered": OrderedDict}
+MAPPINGS = {"dict": dict, "ordered": OrderedDict}
+NAMES = {kind: name for name, kind in (SEQUENCES | MAPPINGS).items()}
 
 
 class Absent:
@@ -118,46 +112,40 @@ class _Writer:
         self.arrays: list[Tensor] = []
         self._roots = {id(value): [name] for name, value in known.items()}
         self._places = {id(value): [*path] for path, value in _places(known)}
-        self._numbers: dict[int, int] = {}
-        self._kept: list[Any] = []
+        self._seen: dict[int, tuple[int, Any]] = {}  # kept, as identities are of these
 
     def node(self, value: Any) -> Any:
         """Return a value as JSON."""
-        if _is_scalar(value):
-            return _scalar(value)
+        if type(value) in SCALARS:
+            is_plain = not isinstance(value, float) or math.isfinite(value)
+            return value if is_plain else {TAG: "float", "value": str(value)}
         if id(value) in self._roots:
             return {TAG: "known", "path": self._roots[id(value)]}
-        if id(value) in self._numbers:
-            return {TAG: "seen", "number": self._numbers[id(value)]}
-        self._numbers[id(value)] = len(self._numbers)
-        self._kept.append(value)  # so that no other object gets its identity
-        return self._new(value)
-
-    def _new(self, value: Any) -> Any:
-        if isinstance(value, Tensor):
-            return self._tensor(value)
-        if isinstance(value, np.ndarray | np.generic):
-            return self._array(value)
-        if isinstance(value, torch.dtype):
-            return {TAG: "dtype", "name": str(value).removeprefix("torch.")}
-        if isinstance(value, torch.device):
-            return {TAG: "device", "name": str(value)}
-        kind = _KINDS.get(type(value))
-        if kind is not None:
+        if id(value) in self._seen:
+            return {TAG: "seen", "number": self._seen[id(value)][0]}
+        self._seen[id(value)] = len(self._seen), value
+        kind = NAMES.get(type(value))
+        if kind in SEQUENCES:
             return {TAG: kind, "items": [self.node(item) for item in value]}
+        if kind in MAPPINGS:
+            pairs = [[self.node(k), self.node(v)] for k, v in value.items()]
+            return {TAG: kind, "items": pairs}
         if isinstance(value, MappingProxyType):
             return {TAG: "proxy", "of": self.node({**value})}
-        for name, mapping in _MAPPINGS.items():
-            if type(value) is mapping:
-                pairs = [[self.node(k), self.node(v)] for k, v in value.items()]
-                return {TAG: name, "items": pairs}
+        if isinstance(value, torch.dtype | torch.device):
+            name = str(value).removeprefix("torch.")
+            return {TAG: type(value).__name__, "name": name}
+        if isinstance(value, Tensor):
+            kind = "parameter" if isinstance(value, torch.nn.Parameter) else "tensor"
+            number = self._kept(value.detach().cpu().clone())
+            return {TAG: kind, "array": number, "gradient": value.requires_grad}
+        if isinstance(value, np.ndarray | np.generic):
+            return self._array(value)
         return self._object(value)
 
-    def _tensor(self, value: Tensor) -> Any:
-        self.arrays.append(value.detach().cpu().clone())
-        what = "parameter" if isinstance(value, torch.nn.Parameter) else "tensor"
-        number = len(self.arrays) - 1
-        return {TAG: what, "array": number, "gradient": value.requires_grad}
+    def _kept(self, tensor: Tensor) -> int:
+        self.arrays.append(tensor)
+        return len(self.arrays) - 1
 
     def _array(self, value: Any) -> Any:
         array = np.ascontiguousarray(value)
@@ -166,29 +154,25 @@ class _Writer:
         single = array.astype(np.float32) if array.dtype == np.float64 else array
         # Simulations are float32 in most places; the other half need not be stored.
         lossless = np.array_equal(single, array, equal_nan=array.dtype.kind == "f")
-        self.arrays.append(torch.from_numpy((single if lossless else array).copy()))
+        stored = torch.from_numpy((single if lossless else array).copy())
         return {
             TAG: "array" if isinstance(value, np.ndarray) else "number",
-            "array": len(self.arrays) - 1,
+            "array": self._kept(stored),
             "shape": [*np.shape(value)],
             "dtype": array.dtype.str,
         }
 
     def _object(self, value: Any) -> Any:
         kind = type(value)
-        if not _is_trusted(kind.__module__) or _class(_name(kind)) is not kind:
+        name = f"{kind.__module__}:{kind.__qualname__}"
+        if _class(name) is not kind or not hasattr(value, "__dict__"):
             if id(value) in self._places:
                 return {TAG: "known", "path": self._places[id(value)]}
             raise NotStorableError(f"{kind.__module__}.{kind.__qualname__}")
-        state = {**getattr(value, "__dict__", {})}
         if isinstance(value, RowCache):  # what it lacks is simulated again
-            state = vars(RowCache(value.most))
-        for base in kind.__mro__:
-            for slot in _slots(base):
-                if hasattr(value, slot):
-                    state[slot] = getattr(value, slot)
-        items = [[name, self.node(part)] for name, part in state.items()]
-        return {TAG: "object", "class": _name(kind), "state": items}
+            value = RowCache(value.most)
+        state = [[name, self.node(part)] for name, part in vars(value).items()]
+        return {TAG: "object", "class": name, "state": state}
 
 
 class _Reader:
@@ -206,15 +190,17 @@ class _Reader:
         if kind == "float":
             return float(node["value"])
         if kind == "known":
+            found = _at(self._known, node["path"])
             if len(node["path"]) > 1:  # counted by the writer
-                self._seen.append(_at(self._known, node["path"]))
-            return _at(self._known, node["path"])
+                self._seen.append(found)
+            return found
         if kind == "seen":
             return self._seen[node["number"]]
         number = len(self._seen)
         self._seen.append(None)
-        if kind in _MAPPINGS:
-            made = self._seen[number] = _MAPPINGS[kind]()
+        made: Any
+        if kind in MAPPINGS:
+            made = self._seen[number] = MAPPINGS[kind]()
             made.update((self.value(k), self.value(v)) for k, v in node["items"])
         elif kind == "list":
             made = self._seen[number] = []
@@ -232,8 +218,8 @@ class _Reader:
 
     def _whole(self, kind: str, node: dict[str, Any]) -> Any:
         """Return what cannot contain itself."""
-        if kind in _SEQUENCES:
-            return _SEQUENCES[kind]([self.value(item) for item in node["items"]])
+        if kind in SEQUENCES:
+            return SEQUENCES[kind]([self.value(item) for item in node["items"]])
         if kind == "proxy":
             return MappingProxyType(self.value(node["of"]))
         if kind == "dtype":
@@ -248,33 +234,14 @@ class _Reader:
             return torch.nn.Parameter(tensor, requires_grad=node["gradient"])
         if kind == "tensor":
             return tensor.requires_grad_(node["gradient"])
-        dtype = np.dtype(node["dtype"])
-        array = tensor.numpy().astype(dtype).reshape(node["shape"])
+        array = tensor.numpy().astype(np.dtype(node["dtype"])).reshape(node["shape"])
         return array if kind == "array" else array[()]
-
-
-def _is_scalar(value: Any) -> bool:
-    return value is None or type(value) in (bool, int, float, str, Message)
-
-
-def _scalar(value: Any) -> Any:
-    if isinstance(value, float) and not math.isfinite(value):
-        return {TAG: "float", "value": str(value)}
-    return value
-
-
-def _is_trusted(module: str) -> bool:
-    return module.startswith(TRUSTED) and not module.endswith("__main__")
-
-
-def _name(kind: type) -> str:
-    return f"{kind.__module__}:{kind.__qualname__}"
 
 
 def _class(name: str) -> Any:
     """Return the class of a name, of a trusted module that defines it; else None."""
     module, _, path = name.partition(":")
-    if not _is_trusted(module):
+    if not module.startswith(TRUSTED) or module.endswith("__main__"):
         return None
     found: Any = importlib.import_module(module)
     for part in path.split("."):
@@ -284,31 +251,29 @@ def _class(name: str) -> Any:
 
 
 def _blank(name: str) -> Any:
+    """Return an object of a class with the defaults of fields that came later."""
     kind = _class(name)
     if kind is None:
         raise TypeError(f"no class {name!r} that is stored")
-    return object.__new__(kind)
-
-
-def _slots(kind: type) -> tuple[str, ...]:
-    slots = kind.__dict__.get("__slots__", ())
-    names = (slots,) if isinstance(slots, str) else tuple(slots)
-    return tuple(name for name in names if name not in ("__dict__", "__weakref__"))
+    made = object.__new__(kind)
+    for entry in dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ():
+        if entry.default_factory is not dataclasses.MISSING:
+            object.__setattr__(made, entry.name, entry.default_factory())
+    return made
 
 
 def _places(known: Mapping[str, Any]) -> Iterator[tuple[tuple[Any, ...], Any]]:
     """Yield where each object below what is known hangs, the nearest last."""
-    level: list[tuple[tuple[Any, ...], Any]] = [((n,), v) for n, v in known.items()]
-    levels, seen = [level], {id(value) for value in known.values()}
+    levels: list[list[tuple[tuple[Any, ...], Any]]]
+    levels = [[((name,), value) for name, value in known.items()]]
+    seen = {id(value) for value in known.values()}
     for _ in range(DEPTH):
-        below = []
-        for path, value in level:
+        levels.append([])
+        for path, value in levels[-2]:
             for name, part in _parts(value):
-                if not _is_scalar(part) and id(part) not in seen:
+                if type(part) not in SCALARS and id(part) not in seen:
                     seen.add(id(part))
-                    below.append(((*path, name), part))
-        levels.append(below)
-        level = below
+                    levels[-1].append(((*path, name), part))
     for level in reversed(levels):
         yield from level
 

@@ -19,18 +19,11 @@ from sbi_active.campaign.learning.revision import rebuilt
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.state import CampaignState
 from sbi_active.campaign.storage.codec import Absent
-from sbi_active.campaign.storage.damage import reading
-from sbi_active.campaign.storage.described import (
-    actions_from,
-    describe_options,
-    options_from,
-    prior_from,
-)
 from sbi_active.campaign.storage.directory import CampaignDirectory, apply
-from sbi_active.campaign.storage.drawn import drawn_from, stood_for
-from sbi_active.campaign.storage.manifest import require_same_simulator
+from sbi_active.campaign.storage.drawn import DrawnPrior
 from sbi_active.messages import warn
-from sbi_active.simulation.bank.fingerprint import fingerprint
+from sbi_active.simulation.bank.fingerprint import differences, fingerprint
+from sbi_active.simulation.bank.sqlite import sensible
 
 if TYPE_CHECKING:
     from sbi_active.criticism import Effect
@@ -88,7 +81,7 @@ class StoredLearner:
         saved, self._saved = self._saved, None
         if saved is not None:
             try:
-                self._belief = stood_for(saved(), self.first_prior, self._state)
+                self._belief = self._shown(saved())
             except ValueError as error:
                 warn(
                     f"SA601 the belief has to be computed again: {error}",
@@ -96,6 +89,17 @@ class StoredLearner:
                 )
                 self._state.is_stale = True
         return self._belief
+
+    def _shown(self, belief: Any) -> Distribution:
+        """Return a belief as read; its draws where there is no density of the prior."""
+        kept, processed = self._state.draws, self._state.processed
+        known = [index for index in processed if index in kept]
+        if not isinstance(self.first_prior, DrawnPrior) or not known:
+            return belief
+        shown: Any = DrawnPrior(kept[known[-1]])
+        for name in ("prior", "label", "parameter_names", "diagnostics"):
+            setattr(shown, name, getattr(belief, name))
+        return shown
 
     @property
     def stated_belief(self) -> Distribution:
@@ -131,20 +135,18 @@ def load(
 ) -> Loaded:
     """Return the parts of a campaign, see :meth:`.Campaign.load`."""
     disk = CampaignDirectory(Path(directory), repair=repair)
-    manifest = disk.manifest
-    settings: CampaignOptions = _given("options", options, disk, options_from)
-    kept = manifest.get("options")
-    known = None if kept is None else describe_options(options_from(kept))
-    if options is not None and describe_options(options) != known:
+    manifest, reads = disk.manifest, simulator is None
+    kept = disk.given("options", reads=True)
+    if options is not None and kept not in (None, options):
         warn(
             f"SA604 options= hold for this process: the campaign in {directory} keeps "
-            f"{manifest.get('options_text')}; pass them at each load",
+            f"{manifest['options_text']}; pass them at each load",
             stacklevel=4,
         )
-    reads = simulator is None
-    space: ActionSpace = _given("actions", actions, disk, actions_from, reads=reads)
-    first_prior: Distribution = _given("prior", prior, disk, prior_from, reads=reads)
-    with reading(disk.store.path):
+    settings: CampaignOptions = _given("options", options, disk)
+    space: ActionSpace = _given("actions", actions, disk, reads=reads)
+    first_prior: Distribution = _given("prior", prior, disk, reads=reads)
+    with sensible(disk.store.path):
         state = CampaignState(
             manifest["method"],
             manifest["seed"],
@@ -178,7 +180,13 @@ def load(
         disk.write("simulator changed", simulator=fingerprint(simulator))
         apply(state, disk.events[-1])
     else:
-        require_same_simulator(manifest, simulator)
+        lines = differences(manifest["simulator"], fingerprint(simulator))
+        if lines:
+            raise ValueError(
+                "expected the simulator of the campaign; got another: "
+                f"{'; '.join(lines)}; pass the one it was made with, or "
+                "simulator_changed=True to compute everything again with this one"
+            )
     model, joint = rebuilt(state, simulator, first_prior, space, effects)
     learner = make_learner(model, joint, space, state, x_shape=shape)
     if name is not None and not state.is_stale:
@@ -200,28 +208,18 @@ def _belief(
 
 
 def _given(
-    what: str,
-    given: Any,
-    disk: CampaignDirectory,
-    made: Callable[[Any], Any],
-    *,
-    reads: bool = False,
+    what: str, given: Any, disk: CampaignDirectory, *, reads: bool = False
 ) -> Any:
-    """Return what was passed, or else what the manifest describes.
+    """Return what was passed, or else what the folder has.
 
     Readers get what stands for it where it is a class of its author's own.
     """
     if given is not None:
         return given
-    with reading(disk.store.path):
-        described, text = disk.manifest[what], disk.manifest[f"{what}_text"]
-        drawn = disk.manifest["drawn"].get(what)
-        if reads and drawn is not None:
-            return drawn_from(drawn)
-    if described is None:
+    found = disk.given(what, reads=reads)
+    if found is None:
         raise ValueError(
             f"expected {what}=, which only its author can make again; got None; pass "
-            f"what the campaign was made with: {text:.200}"
+            f"what the campaign was made with: {disk.manifest[f'{what}_text']:.200}"
         )
-    with reading(disk.store.path):
-        return made(described)
+    return found

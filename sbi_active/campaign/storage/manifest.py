@@ -1,96 +1,100 @@
-"""The description of a campaign: written once, with a copy, and in words for people."""
+"""What a campaign is: written once, with a copy, and in words for people."""
 
 from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from datetime import datetime, timezone
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from torch.distributions import Distribution
-
-from sbi_active.actions import ActionSpace
 from sbi_active.campaign.state import CampaignState
-from sbi_active.campaign.storage.damage import DamagedCampaignError
-from sbi_active.campaign.storage.described import (
-    describe_actions,
-    describe_options,
-    describe_prior,
-)
-from sbi_active.campaign.storage.drawn import draws_of
-from sbi_active.simulation.bank.damage import CorruptSegmentError
-from sbi_active.simulation.bank.files import write_file
-from sbi_active.simulation.bank.fingerprint import differences, fingerprint
-from sbi_active.simulation.bank.sqlite import EVENTS, NAME, OBJECTS
+from sbi_active.campaign.storage.codec import NotStorableError, encode
+from sbi_active.campaign.storage.drawn import drawn
+from sbi_active.simulation.bank.fingerprint import fingerprint
+from sbi_active.simulation.bank.sqlite import NAME, sensible
 from sbi_active.simulation.bank.store import Store
 
-MANIFEST, FOR_PEOPLE = "campaign", "campaign.toml"
-FORMAT, SCHEMA = "sbi-active campaign", 2  # schema 1 was a folder of files
-PLAIN = (
-    *("created", "method", "seed", "parameter_names", "channel_names", "x_shape"),
-    *("effects", "has_cost", "has_constraint"),
-)
-DESCRIBED = ("prior", "actions", "options")
-PACKAGES = ("sbi-active", "sbi", "torch", "numpy")
+MANIFEST, COPY, FOR_PEOPLE = "campaign", "campaign copy", "campaign.toml"
+FORMAT, SCHEMA = "sbi-active campaign", 3  # schema 1 was a folder of files
+UNTOLD = ("packages", "simulator")  # what people are not told
 
 
-def new_manifest(
+def make_campaign(
+    folder: Path,
     state: CampaignState,
-    *,
+    given: Mapping[str, Any],
     simulator: Callable[..., Any],
-    prior: Distribution,
-    actions: ActionSpace,
-    x_shape: Sequence[int],
-    effects: Sequence[str],
-    has_cost: bool,
-    has_constraint: bool,
-) -> dict[str, Any]:
-    """Return the description of a new campaign.
+    **facts: Any,
+) -> None:
+    """Write what a new campaign is.
 
     Args:
+        folder: Folder, which is made where there is none.
         state: State of the campaign.
+        given: Prior, actions and options.
         simulator: Simulator of the campaign.
-        prior: Prior of the campaign.
-        actions: Action space of the campaign.
-        x_shape: Shape of an outcome.
-        effects: Names of those that the simulator may lack.
-        has_cost: Whether actions have a cost, which the reader must give again.
-        has_constraint: Whether actions have a constraint, which the reader must give
-            again.
+        **facts: Facts to note, as JSON data.
+
+    Raises:
+        ValueError: If the folder holds anything.
+        OSError: If it cannot be written.
     """
-    names = getattr(simulator, "parameter_names", None)
-    channels = getattr(simulator, "channel_names", None)
-    described = {"prior": describe_prior(prior), "actions": describe_actions(actions)}
-    return {
-        "format": FORMAT,
-        "schema": SCHEMA,
-        "created": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "packages": _packages(),
+    objects: dict[str, bytes] = {}
+    for what, thing in given.items():
+        with suppress(NotStorableError):
+            objects[what] = encode(thing, known={})
+    own = [what for what in given if what not in objects]
+    for what in {*own} - {"options"}:
+        objects[what] = encode(drawn(given[what], seed=state.seed), known={})
+    packages = {name: version(name) for name in ("sbi-active", "sbi", "torch", "numpy")}
+    declared = ("parameter_names", "channel_names")
+    names = {name: getattr(simulator, name, None) for name in declared}
+    manifest = {
+        "created": now(),
+        "packages": {"python": platform.python_version(), **packages},
         "method": state.method,
         "seed": state.seed,
         "num_earlier": state.num_earlier,
-        "parameter_names": None if names is None else [*names],
-        "channel_names": None if channels is None else [*channels],
-        "x_shape": [*x_shape],
-        "prior": described["prior"],
-        "prior_text": repr(prior),
-        "actions": described["actions"],
-        "actions_text": repr(actions),
-        "options": describe_options(state.options),
-        "options_text": repr(state.options),
-        "drawn": {
-            what: draws_of(thing, seed=state.seed)
-            for what, thing in (("prior", prior), ("actions", actions))
-            if described[what] is None
-        },
-        "effects": [*effects],
-        "has_cost": has_cost,
-        "has_constraint": has_constraint,
+        **{name: found if found is None else [*found] for name, found in names.items()},
+        **facts,
+        **{f"{what}_text": repr(thing) for what, thing in given.items()},
+        "own": own,
         "simulator": fingerprint(simulator),
     }
+    write_campaign(folder, manifest, objects)
+
+
+def write_campaign(
+    folder: Path, manifest: Mapping[str, Any], objects: Mapping[str, bytes]
+) -> None:
+    """Write a manifest, with a copy, the objects beside it, and a text for people.
+
+    Raises:
+        ValueError: If the folder holds anything.
+        OSError: If it cannot be written.
+    """
+    store = Store(folder, "campaign", make=True)
+    if {*store.catalog} - {"writer"}:
+        raise ValueError(
+            f"expected an empty folder for a new campaign; got {folder} with a "
+            "campaign; go on with it by Campaign.load(directory, simulator=...), or "
+            "choose another folder"
+        )
+    records = {MANIFEST: {**manifest, "format": FORMAT, "schema": SCHEMA}, **objects}
+    with store.writing():
+        for kind, content in {**records, COPY: records[MANIFEST]}.items():
+            store.put(kind, 0, content)
+    store.close()
+    heading = f"# What this campaign is, for people. All is kept in {NAME}; this is not"
+    # A text of JSON is one of TOML.
+    plain = {k: v for k, v in manifest.items() if v is not None and k not in UNTOLD}
+    lines = [f"{k.removesuffix('_text')} = {json.dumps(v)}" for k, v in plain.items()]
+    text = "\n".join([f"{heading} read.", *lines, ""])
+    (folder / FOR_PEOPLE).write_text(text, encoding="utf-8")
 
 
 def has_manifest(folder: Path) -> bool:
@@ -98,111 +102,34 @@ def has_manifest(folder: Path) -> bool:
     if not (folder / NAME).exists():
         return (folder / "campaign.json").exists()
     try:
-        return Store(folder, "campaign").size(OBJECTS, MANIFEST) is not None
+        return MANIFEST in Store(folder, "campaign").catalog
     except OSError:
         return True
 
 
-def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Write a manifest, its copy, and ``campaign.toml`` for people.
-
-    Raises:
-        ValueError: If the folder holds anything.
-        OSError: If it cannot be written.
-    """
-    store = Store(folder, "campaign", make=True)
-    if {*store.kinds()} - {"writer"}:
-        raise ValueError(
-            f"expected an empty folder for a new campaign; got {folder} with a "
-            "campaign; go on with it by Campaign.load(directory, simulator=...), or "
-            "choose another folder"
-        )
-    content = json.dumps(manifest).encode()
-    with store.writing():
-        for table in (OBJECTS, EVENTS):  # a copy, on other pages of the file
-            store.put(table, MANIFEST, 0, content)
-    write_file(folder / FOR_PEOPLE, _in_words(manifest).encode())
-    store.close()
-
-
-def read_manifest(store: Store, *, repair: bool = False) -> dict[str, Any]:
-    """Return a manifest.
-
-    Args:
-        store: Store of the campaign.
-        repair: Whether to take the copy where the manifest is damaged, and write it
-            again.
+def read_manifest(store: Store) -> dict[str, Any]:
+    """Return what a campaign is; from the copy where a repair gave up the first.
 
     Raises:
         ValueError: If there is none, or one of another schema.
-        DamagedCampaignError: If it does not hold what was written.
+        CorruptSegmentError: If it does not hold what was written.
     """
-    found = {table: _read(store, table) for table in (OBJECTS, EVENTS)}
-    manifest = found[OBJECTS]
-    if repair and not manifest and (manifest := found[EVENTS]):
-        with store.writing():
-            store.put(OBJECTS, MANIFEST, 0, json.dumps(manifest).encode())
-        store.close()
-    if manifest is None and found[EVENTS] is None:
+    manifest = store.json(MANIFEST) or store.json(COPY)
+    if manifest is None:
         raise ValueError(
             f"expected a folder with a campaign; got {store.folder} without one; make "
             "it by Campaign(..., directory=...)"
         )
-    if not manifest:
-        raise DamagedCampaignError(
-            store.path, "a manifest with another checksum, the log of the trials apart"
-        )
-    if manifest.get("format") != FORMAT or manifest.get("schema") != SCHEMA:
+    if (manifest.get("format"), manifest.get("schema")) != (FORMAT, SCHEMA):
+        with sensible(store.path):
+            release = manifest["packages"]["sbi-active"]
         raise ValueError(
-            f"expected a campaign of schema {SCHEMA}; got "
-            f"{manifest.get('format')!r} of schema {manifest.get('schema')} in "
-            f"{store.path}; use the release of sbi-active that wrote it: "
-            f"{manifest.get('packages', {}).get('sbi-active', 'unknown')}"
+            f"expected a campaign of schema {SCHEMA}; got {manifest.get('schema')} in "
+            f"{store.path}; use the release of sbi-active that wrote it: {release}"
         )
     return manifest
 
 
-def require_same_simulator(
-    manifest: Mapping[str, Any], simulator: Callable[..., Any]
-) -> None:
-    """Raise if a simulator is not the one that the campaign was made with.
-
-    Raises:
-        ValueError: If they differ; it says where.
-    """
-    lines = differences(manifest["simulator"], fingerprint(simulator))
-    if lines:
-        raise ValueError(
-            "expected the simulator of the campaign; got another: "
-            f"{'; '.join(lines)}; pass the one it was made with, or "
-            "simulator_changed=True to compute everything again with this one"
-        )
-
-
-def _read(store: Store, table: str) -> dict[str, Any] | None:
-    """Return what is there; None for nothing, and nothing in it for damage."""
-    try:
-        content = store.get(table, MANIFEST)
-        found = None if content is None else json.loads(content)
-    except (CorruptSegmentError, ValueError, RecursionError):
-        return {}
-    return found if isinstance(found, dict | None) else {}
-
-
-def _in_words(manifest: Mapping[str, Any]) -> str:
-    """Return a manifest as TOML; a text of JSON is one of TOML."""
-    texts = {name: manifest[f"{name}_text"] for name in DESCRIBED}
-    plain = {name: manifest[name] for name in PLAIN if manifest[name] is not None}
-    lines = [f"{k} = {json.dumps(v)}" for k, v in {**plain, **texts}.items()]
-    heading = f"# What this campaign is, for people. All is kept in {NAME}; this is not"
-    return "\n".join([f"{heading} read.", *lines, ""])
-
-
-def _packages() -> dict[str, str]:
-    found = {"python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "unknown"
-    return found
+def now() -> str:
+    """Return the time, to the second."""
+    return datetime.now(timezone.utc).isoformat(timespec="seconds")

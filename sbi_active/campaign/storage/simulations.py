@@ -1,20 +1,50 @@
-"""The simulations of a campaign in banks, one for each form of its simulator."""
+"""The storage of a campaign: nothing, its simulations in banks, or all in a folder."""
 
 from __future__ import annotations
 
+import functools
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+from torch.distributions import Distribution
+
+from sbi_active.campaign.isolation import guarded, isolated
 from sbi_active.campaign.learning.indexed import IndexedSimulator
+from sbi_active.campaign.learning.learner import Learner
+from sbi_active.campaign.state import CampaignState, Trial
+from sbi_active.campaign.storage.directory import CampaignDirectory
 from sbi_active.simulation.bank.bank import Bank
 from sbi_active.simulation.bank.sqlite import NAME
 from sbi_active.simulation.bank.store import Store
 from sbi_active.simulation.model import SimulatorModel
-from sbi_active.simulation.workers.store import RowStore
+from sbi_active.simulation.workers.meter import metering
+from sbi_active.simulation.workers.store import storing
 
 OWN = "drawn"  # rows of the simulator itself
+Method = TypeVar("Method", bound=Callable[..., Any])
+
+
+def stored(method: Method) -> Method:
+    """Return a method whose simulations are kept, apart from torch's global state.
+
+    See :func:`.isolated`.
+    """
+    apart = isolated(method)
+
+    @guarded
+    @functools.wraps(method)
+    def kept(campaign: Any, *arguments: Any, **options: Any) -> Any:
+        learner, version = campaign._learner, campaign.state.version.number
+        with (
+            metering(campaign.state.meter),
+            campaign._storage.working(learner.simulator, version),
+        ):
+            return apart(campaign, *arguments, **options)
+
+    return kept  # type: ignore[return-value]
 
 
 def num_rows(folder: str | None) -> int:
@@ -26,76 +56,107 @@ def num_rows(folder: str | None) -> int:
     if folder is None or not Path(folder, NAME).exists():
         return 0
     store = Store(Path(folder))
-    return len(Bank(store, name=OWN)) if f"bank {OWN}" in store.kinds() else 0
+    return len(Bank(store, name=OWN)) if f"bank {OWN}" in store.catalog else 0
 
 
-class CampaignBanks:
-    """Stores rows of the current simulator and of its noise-free form.
+class Storage:
+    """Keeps a campaign in a folder, its simulations in banks, or neither.
 
     A row is never simulated twice: what is asked for again, by the same seed, theta and
     action, is read. Rows of rivals, simulators with effects that are compared and not
     used, are not stored.
 
     Args:
-        place: The file that they are in, or its folder, made when it is needed.
-        suffix: Suffix of the banks' names, after another simulator took the place of
-            the first.
+        disk: The folder; None keeps the campaign in memory alone.
+        bank: Folder of the simulations; None keeps them in the campaign's file.
+        prior: Prior that the campaign began with.
     """
 
-    def __init__(self, place: Store | Path, suffix: str = "") -> None:
-        self._place, self._suffix = place, suffix
-        self._own: Callable[..., Any] | None = None
-        self._model = 0
+    def __init__(
+        self,
+        disk: CampaignDirectory | None = None,
+        bank: str | None = None,
+        prior: Distribution | None = None,
+    ) -> None:
+        self.disk, self.prior = disk, prior
+        # The file of the rows, or its folder, where it is made when it is needed.
+        self._place = Path(bank) if bank is not None else disk and disk.store
+        changes = disk.num_changes if disk is not None and bank is None else 0
+        self._suffix = f"-changed-{changes}" if changes else ""
         self._banks: dict[str, Bank] = {}
 
-    def use(self, simulator: Callable[..., Any], model: int) -> None:
-        """Store rows of a simulator from now on.
+    @property
+    def path(self) -> Path | None:
+        """The folder of the campaign."""
+        return None if self.disk is None else self.disk.path
+
+    @contextmanager
+    def working(
+        self, simulator: Callable[..., Any] | None, version: int
+    ) -> Iterator[None]:
+        """Hold the right to write, and keep simulations of the current simulator.
 
         Args:
             simulator: The current one.
-            model: Number of the model in the campaign.
+            version: Number of the version.
         """
-        self._own, self._model = simulator, model
+        if self.disk is not None:
+            self.disk.acquire()
 
-    def find(self, simulator: Callable[..., Any]) -> RowStore | None:
-        """Return the store of a simulator's rows; None if they are not stored."""
-        form = self._form(simulator)
-        return None if form is None else self.bank(simulator, form)
+        def find(other: Callable[..., Any]) -> Bank | None:
+            form = _form(other, simulator)
+            return form and self._bank(
+                other, form + f"-model-{version}" * (version > 0)
+            )
 
-    def bank(self, simulator: Callable[..., Any], form: str) -> Bank:
-        """Return the bank of a form of the current simulator, open for writing."""
-        name = form if self._model == 0 else f"{form}-model-{self._model}"
+        keeps = self._place is not None and simulator is not None
+        with storing(find) if keeps else nullcontext():
+            yield
+
+    def _bank(self, simulator: Callable[..., Any], name: str) -> Bank:
+        """Return a bank of a form of the current simulator, open for writing."""
         name += self._suffix
         if name not in self._banks:
             if isinstance(self._place, Path):
                 self._place = Store(self._place, make=True)
+            assert self._place is not None
             self._banks[name] = Bank(self._place, simulator=simulator, name=name)
         return self._banks[name]
+
+    def write(self, event: str, trial: Trial | None = None, **entries: Any) -> None:
+        """Write down what happened; it is on the disk when this returns."""
+        if self.disk is not None:
+            self.disk.write(event, trial, **entries)
+
+    def save(self, state: CampaignState, learner: Learner) -> None:
+        """Save what was computed."""
+        if self.disk is not None:
+            belief = None if learner.belief is learner.prior else learner.belief
+            known = {"simulator": learner.simulator, "prior": self.prior}
+            self.disk.save(state, belief, known)
 
     def close(self) -> None:
         """Let others write."""
         for bank in self._banks.values():
             bank.close()
         self._banks.clear()
-
-    def _form(self, simulator: Callable[..., Any]) -> str | None:
-        own = self._own
-        if own is None or simulator is own:
-            return None if own is None else OWN
-        if isinstance(simulator, IndexedSimulator):
-            return "by-index" if simulator.simulator is own else None
-        if not isinstance(own, SimulatorModel):
-            return None
-        if not isinstance(simulator, SimulatorModel):
-            return None
-        if simulator.fn is not own.fn or not _same_effects(simulator, own):
-            return None
-        if simulator.noise is None and own.noise is not None:
-            return "noise-free"
-        index = getattr(simulator, "next_index", None)
-        return None if index is None else f"drawn-trial-{index}"
+        if self.disk is not None:
+            self.disk.close()
 
 
-def _same_effects(a: Any, b: Any) -> bool:
-    mine, yours = (getattr(model, "effects", ()) for model in (a, b))
-    return len(mine) == len(yours) and all(map(operator.is_, mine, yours))
+def _form(simulator: Any, own: Any) -> Any:
+    """Return the name of a form of the current simulator; None for another one."""
+    if simulator is own:
+        return OWN
+    if isinstance(simulator, IndexedSimulator):
+        return "by-index" if simulator.simulator is own else None
+    if not (isinstance(simulator, SimulatorModel) and isinstance(own, SimulatorModel)):
+        return None
+    mine, yours = (getattr(model, "effects", ()) for model in (simulator, own))
+    same = len(mine) == len(yours) and all(map(operator.is_, mine, yours))
+    if simulator.fn is not own.fn or not same:
+        return None
+    if simulator.noise is None and own.noise is not None:
+        return "noise-free"
+    index = getattr(simulator, "next_index", None)
+    return None if index is None else f"drawn-trial-{index}"

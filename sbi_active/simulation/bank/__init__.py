@@ -12,8 +12,8 @@ from sbi_active.renamed import former_names, lazy_names
 
 if TYPE_CHECKING:
     from sbi_active.simulation.bank.bank import Bank
-    from sbi_active.simulation.bank.damage import CorruptSegmentError, LockedError
     from sbi_active.simulation.bank.reweighting import ReusedRows, reuse
+    from sbi_active.simulation.bank.sqlite import CorruptSegmentError, LockedError
 
 __all__ = [
     "Bank",
@@ -27,8 +27,8 @@ __getattr__ = lazy_names(
     __name__,
     {
         "bank": "Bank",
-        "damage": "CorruptSegmentError LockedError",
         "reweighting": "ReusedRows reuse",
+        "sqlite": "CorruptSegmentError LockedError",
     },
     former_names(__name__, {}, stacklevel=3),
 )

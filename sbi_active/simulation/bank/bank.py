@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,16 +12,18 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.simulation.bank.damage import CorruptSegmentError
 from sbi_active.simulation.bank.fingerprint import (
     differences,
     fingerprint,
     simulator_name,
 )
-from sbi_active.simulation.bank.labeled import LabeledStore
-from sbi_active.simulation.bank.rows import Rows, positions
-from sbi_active.simulation.bank.segments import COLUMNS, SEGMENT_BYTES, write_segment
-from sbi_active.simulation.bank.sqlite import OBJECTS
+from sbi_active.simulation.bank.rows import (
+    COLUMNS,
+    Rows,
+    columns_of,
+    positions,
+)
+from sbi_active.simulation.bank.sqlite import CorruptSegmentError, sensible
 from sbi_active.simulation.bank.store import Store
 from sbi_active.simulation.outcomes import Outcome, Simulations
 from sbi_active.simulation.workers.store import StoredRows, run_digest
@@ -34,7 +37,8 @@ class Bank:
 
     A row is theta, action, x, its outcome, the seed of its run, its index there, and
     the log density of the proposal that theta was drawn from. The position of a row
-    never changes. One bank holds the rows of one simulator.
+    never changes. One bank holds the rows of one simulator. What is read is in memory,
+    but for x.
 
     Without ``simulator`` a bank is read, by any number of processes; with it, rows may
     be added, by one process at a time, from the first row added until :meth:`close`.
@@ -86,31 +90,29 @@ class Bank:
         self._store = path if isinstance(path, Store) else Store(Path(path), make=makes)
         self.path, self._writable = self._store.folder, makes
         self._rows = Rows(self._store, name)
-        self._stored: tuple[str, np.ndarray] = ("", np.zeros(0, bool))  # of a run
+        self._proposal: tuple[Distribution | None, str] = (None, "")
         if simulator is None:
             _ = self.header
             return
-        if parameter_names is None:
-            parameter_names = getattr(simulator, "parameter_names", None)
+        names = parameter_names or getattr(simulator, "parameter_names", None)
         mine = {
             "created": created,
             **fingerprint(simulator, version=version),
-            "parameter_names": None if parameter_names is None else [*parameter_names],
+            "parameter_names": None if names is None else [*names],
             "shapes": None,
-            "lost": [],  # segments that were given up
         }
         key = self._rows.key
-        if self._store.text(key) is None:
+        if self._store.get(key) is None:
             is_held = self._store.held
             with self._store.writing():
-                if self._store.text(key) is None:  # nobody was faster
-                    self._store.put(OBJECTS, key, 0, mine)
+                if self._store.get(key) is None:  # nobody was faster
+                    self._store.put(key, 0, mine)
             if not is_held:
                 self._store.close()
         self._require_same_simulator(mine)
 
     def __len__(self) -> int:
-        return sum(segment.num_rows for segment in self._rows.segments())
+        return sum(len(segment.rows) for segment in self._rows.segments())
 
     def __enter__(self) -> Bank:
         return self
@@ -137,9 +139,10 @@ class Bank:
     @property
     def counts(self) -> dict[str, int]:
         """Number of rows by outcome."""
-        counts = zip(*(s.counts for s in self._rows.segments()), strict=True)
-        sums = [*map(sum, counts)] or [0] * len(Outcome)
-        return {o.name.lower(): n for o, n in zip(Outcome, sums, strict=True)}
+        status = [segment.rows["status"] for segment in self._rows.segments()]
+        return {
+            o.name.lower(): sum(int((s == o).sum()) for s in status) for o in Outcome
+        }
 
     @property
     def labels(self) -> list[str]:
@@ -158,7 +161,6 @@ class Bank:
         seed: int,
         proposal: Distribution | None = None,
         label: str | None = None,
-        log_action: float | Tensor = float("nan"),
     ) -> int:
         """Store simulations; they are on the disk when this returns.
 
@@ -168,14 +170,12 @@ class Bank:
             proposal: Proposal that theta was drawn from; None if it is not known,
                 and then the rows cannot be reweighted.
             label: Label of the proposal, "prior" or "round 3"; given with it.
-            log_action: Log density, or log mass, of the actions, a number or (n,).
 
         Returns:
-            Number of rows stored, less than n where rows of the same theta, action and
-            seed are there already, as those of ``simulate(..., store=bank)`` are.
+            Number of rows stored: those of a seed, theta and action are stored once.
         """
         before = len(self)
-        self.drawn_from(proposal, label=label, log_action=log_action).save(
+        self.drawn_from(proposal, label=label).save(
             run_digest(seed, simulations.theta, simulations.action),
             index=torch.arange(len(simulations)),
             theta=simulations.theta,
@@ -191,15 +191,12 @@ class Bank:
         proposal: Distribution | None,
         *,
         label: str | None,
-        log_action: float | Tensor = float("nan"),
-    ) -> LabeledStore:
+    ) -> Bank:
         """Return this bank as a store of simulations whose theta has one proposal.
 
         Args:
             proposal: Proposal that theta was drawn from, as in :meth:`append`.
             label: Label of the proposal, as in :meth:`append`.
-            log_action: Log density of the actions, as in :meth:`append`; a tensor is
-                indexed as the run's rows are.
 
         Example:
             ``simulate(..., store=bank.drawn_from(prior, label="prior"))``
@@ -209,7 +206,9 @@ class Bank:
                 f"expected a proposal and its label together; got {proposal!r} and "
                 f"{label!r}; name the proposal, as in label='round 3'"
             )
-        return LabeledStore(self, proposal, label or "", torch.as_tensor(log_action))
+        labeled = copy.copy(self)
+        labeled._proposal = proposal, label or ""
+        return labeled
 
     def load(self, run: str) -> tuple[Tensor, Tensor, Tensor] | None:
         """Return the stored rows of a run: index (k,), x (k, *x_shape), status (k,).
@@ -220,16 +219,12 @@ class Bank:
         Returns:
             None if there is nothing.
         """
-        parts = []
-        for segment in self._rows.segments():
-            if segment.run == run:
-                columns = self._rows.columns(segment, ("index", "x", "status"))
-                parts.append([columns[n] for n in ("index", "x", "status")])
-        if not parts:
+        own = [segment for segment in self._rows.segments() if segment.run == run]
+        if not own:
             return None
-        index, x, status = (
-            np.concatenate(arrays) for arrays in zip(*parts, strict=True)
-        )
+        rows = np.concatenate([segment.rows[["index", "status"]] for segment in own])
+        index, status = (np.ascontiguousarray(rows[n]) for n in ("index", "status"))
+        x = np.concatenate([self._rows.x(segment) for segment in own])
         return torch.from_numpy(index), torch.from_numpy(x), torch.from_numpy(status)
 
     def save(self, run: str, **rows: Unpack[StoredRows]) -> None:
@@ -246,7 +241,10 @@ class Bank:
             LockedError: If somebody else is writing.
             OSError: If the disk is full or cannot be written.
         """
-        self.drawn_from(None, label=None).save(run, **rows)
+        self._require_lock()
+        proposal, label = self._proposal
+        known = {"run": run, "seed": int(rows["seed"]), "label": label}
+        self._rows.append(known, columns_of(rows, proposal, label))
 
     def read(self, rows: Tensor | Sequence[int] | slice | None = None) -> Simulations:
         """Return rows.
@@ -255,16 +253,15 @@ class Bank:
             rows: Positions, in any order and repeated where wanted; a slice; or a mask
                 over all rows. None reads everything into memory.
         """
-        names = ["theta", "action", "x", "status"]
-        found = self._rows.gather(names, positions(rows, len(self)))
-        theta, action, x, status = found
+        names, places = ["theta", "action", "x", "status"], positions(rows, len(self))
+        theta, action, x, status = self._rows.gather(names, places)
         return Simulations(theta, action, x, status)
 
     def chunks(self, size: int = 10_000) -> Iterator[Simulations]:
         """Yield all rows in order, at most ``size`` at a time.
 
-        Memory holds one segment, 4 MiB, and what is yielded. Rows added meanwhile are
-        not seen.
+        Of x, memory holds one segment, 4 MiB, and what is yielded. Rows added meanwhile
+        are not seen.
         """
         if size < 1:
             raise ValueError(f"expected size >= 1; got {size}; pass 10_000")
@@ -278,23 +275,29 @@ class Bank:
         Args:
             names: Names of columns among ``theta``, ``action``, ``x``, ``status``,
                 ``index`` (of the row in its run), ``seed`` (of the run; a row's own one
-                is ``row_seeds(seed, 1, first=index)``), ``log_proposal``,
-                ``log_action`` and ``label`` (an index into :attr:`labels`).
+                is ``row_seeds(seed, 1, first=index)``), ``log_proposal``
+                and ``label`` (an index into :attr:`labels`).
         """
-        readable = {*COLUMNS} | {"seed", "label"}
+        readable = {*COLUMNS, "seed", "label"}
         if unknown := {*names} - readable:
             raise ValueError(
                 f"expected columns among {sorted(readable)}; got "
                 f"{sorted(unknown)}; name those"
             )
-        return dict(zip(names, self._rows.gather([*names], None), strict=True))
+        found = self._rows.gather([*names], positions(None, len(self)))
+        return dict(zip(names, found, strict=True))
 
     def verify(self) -> list[str]:
         """Return the problems of the file, one line each; none where all is well.
 
         Every byte of every column is compared with its checksum.
         """
-        wrong = [*self._store.problems(), *self._rows.damaged().values()]
+        wrong = self._store.problems()
+        try:
+            for segment in [] if wrong else self._rows.segments():
+                self._rows.x(segment)
+        except CorruptSegmentError as error:
+            wrong = [error.reason]
         return [f"{self._store.path}: {reason}" for reason in wrong]
 
     def repair(self) -> list[str]:
@@ -312,38 +315,16 @@ class Bank:
         self._require_lock()
         problems = self.verify()
         self._store.salvage()
-        lost = sorted({*self.header["lost"], *self._rows.damaged()})
-        self._rows.note(lost=lost)
         return problems
 
     def close(self) -> None:
         """Let others write. Reading goes on to work."""
         self._store.close()
 
-    def store(self, run: dict[str, Any], columns: dict[str, np.ndarray]) -> None:
-        """Write those rows of a run that are not there; see :meth:`save`."""
-        self._require_lock()
-        index, name = columns["index"], run["run"]
-        self._require_shapes(columns)
-        if self._stored[0] != name:
-            before = self.load(name)
-            self._stored = name, _mask(np.zeros(0, bool), before and before[0].numpy())
-        mask = np.pad(self._stored[1], (0, _room(self._stored[1], index)))
-        fresh = np.zeros(len(index), bool)
-        fresh[np.unique(index, return_index=True)[1]] = True
-        rows = np.flatnonzero(fresh & ~mask[index])
-        row_bytes = sum(column[:1].nbytes for column in columns.values())
-        size = max(1, SEGMENT_BYTES // max(row_bytes, 1))
-        with self._store.writing():
-            for start in range(0, len(rows), size):
-                some = rows[start : start + size]
-                part = {key: column[some] for key, column in columns.items()}
-                write_segment(self._store, self._rows.name, run, part)
-        self._stored = name, _mask(mask, index)
-
     def _require_same_simulator(self, mine: dict[str, Any]) -> None:
         header = self.header
-        lines = differences(header, mine)
+        with sensible(self._store.path):
+            lines = differences(header, mine)
         names = header["parameter_names"], mine["parameter_names"]
         if None not in names and names[0] != names[1]:
             lines.append(f"parameter names {names[0]} there, {names[1]} here")
@@ -358,34 +339,7 @@ class Bank:
     def _require_lock(self) -> None:
         if not self._writable:
             raise ValueError(
-                f"expected a bank opened with its simulator, to write to; got "
-                f"Bank({str(self.path)!r}), which reads; open it by "
-                f"Bank({str(self.path)!r}, simulator=...)"
+                "expected a bank opened with its simulator, to write to; got "
+                f"{self!r}, which reads; open it with simulator="
             )
-        if not self._store.held:
-            self._store.acquire()
-            self._stored = ("", np.zeros(0, bool))  # others may have written meanwhile
-
-    def _require_shapes(self, columns: dict[str, np.ndarray]) -> None:
-        header = self.header
-        shapes = {k: [*columns[k].shape[1:]] for k in ("theta", "action", "x")}
-        if header["shapes"] == shapes:
-            return
-        if header["shapes"] is not None and len(self):
-            raise ValueError(
-                f"expected rows of shapes {header['shapes']}, as in the bank "
-                f"{self.path}; got {shapes}; make a bank of its own for them"
-            )
-        self._rows.note(shapes=shapes)
-
-
-def _room(mask: np.ndarray, index: np.ndarray) -> int:
-    return max(0, int(index.max(initial=-1)) + 1 - len(mask))
-
-
-def _mask(mask: np.ndarray, index: np.ndarray | None) -> np.ndarray:
-    """Return a mask over the rows of a run that are stored, with more of them."""
-    if index is not None:
-        mask = np.pad(mask, (0, _room(mask, index)))
-        mask[index] = True
-    return mask
+        self._store.acquire()

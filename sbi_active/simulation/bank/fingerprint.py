@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import functools
 import hashlib
 import inspect
@@ -117,20 +118,15 @@ def _describe(value: Any, depth: int) -> Any:
         }
     if isinstance(value, torch.nn.Module):
         return {"name": _name(type(value)), "state": below(dict(value.state_dict()))}
-    settings = {k: v for k, v in _attributes(value).items() if not k.startswith("_")}
+    settings = getattr(value, "__dict__", {}).items()  # else it has slots, or is of C
     own = {"name": _name(type(value)), "source": _source(type(value))}
     if callable(value):
-        kinds = [
-            k for k in type(value).__mro__ if k.__module__ == type(value).__module__
-        ]
+        module = type(value).__module__
+        kinds = [kind for kind in type(value).__mro__ if kind.__module__ == module]
         methods = [m for k in kinds for m in vars(k).values() if inspect.isfunction(m)]
         own["globals"] = _globals(methods)
-    return {**{key: below(item) for key, item in settings.items()}, **own}
-
-
-def _attributes(value: Any) -> dict[str, Any]:
-    """Return attributes; those without a dictionary have slots or are written in C."""
-    return getattr(value, "__dict__", {})
+    public = {name: below(item) for name, item in settings if name[0] != "_"}
+    return {**public, **own}
 
 
 def _array(array: np.ndarray) -> Any:
@@ -160,8 +156,9 @@ def _globals(functions: list[types.FunctionType]) -> dict[str, Any]:
                     waiting.append(value)
                     defaults = _describe([*(value.__defaults__ or ())], DEPTH)
                     found[name] = {"source": _source(value), "defaults": defaults}
-            elif name not in changed and not name.startswith("__") and _is_plain(value):
-                found[name] = _describe(_unboxed(value), DEPTH)
+            elif name not in changed and not name.startswith("__"):
+                with contextlib.suppress(TypeError):
+                    found[name] = _describe(_plain(value), DEPTH)
     return found
 
 
@@ -195,46 +192,39 @@ def _changed_by(function: types.FunctionType) -> set[str]:
     return names
 
 
-def _is_plain(value: Any) -> bool:
-    """Return whether a global variable is a setting: numbers and texts, or many."""
-    if isinstance(value, dict):
-        return all(map(_is_plain, (*value.keys(), *value.values())))
-    if isinstance(value, list | tuple | set | frozenset):
-        return all(map(_is_plain, value))
-    if isinstance(value, torch.Tensor):
-        return value.layout == torch.strided and value.device.type != "meta"
-    if isinstance(value, np.ndarray):
-        return value.dtype.kind in "biufcSU"
-    return value is None or isinstance(
-        value, bool | int | float | complex | str | bytes | np.generic
-    )
+def _plain(value: Any) -> Any:
+    """Return a global variable that is a setting in the types of JSON, and arrays.
 
-
-def _unboxed(value: Any) -> Any:
-    """Return a plain value in the types of JSON, and arrays."""
+    Raises:
+        TypeError: If it is none: no numbers or texts, nor many of them.
+    """
     if isinstance(value, dict):
-        return {repr(key): _unboxed(item) for key, item in value.items()}
+        _ = [*map(_plain, value)]
+        return {repr(key): _plain(item) for key, item in value.items()}
     if isinstance(value, set | frozenset):
+        _ = [*map(_plain, value)]
         return sorted(map(repr, value))
     if isinstance(value, list | tuple):
-        return [_unboxed(item) for item in value]
-    if isinstance(value, torch.Tensor):
-        return value.detach().cpu().double() if value.is_floating_point() else value
+        return [*map(_plain, value)]
+    if isinstance(value, torch.Tensor) and value.device.type != "meta":
+        if value.layout == torch.strided:
+            return value.detach().cpu().double() if value.is_floating_point() else value
+    elif isinstance(value, np.ndarray) and value.dtype.kind in "biufcSU":
+        return value
     if isinstance(value, np.generic):
         value = value.item()
-    is_text = isinstance(value, complex | bytes)
-    return repr(value) if is_text else value
+    if isinstance(value, complex | bytes):
+        return repr(value)
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise TypeError(type(value).__name__)
 
 
 def _captured(function: types.FunctionType) -> dict[str, Any]:
-    captured = {}
-    for name, cell in zip(
-        function.__code__.co_freevars, function.__closure__ or (), strict=True
-    ):
-        try:
+    captured: dict[str, Any] = dict.fromkeys(function.__code__.co_freevars)
+    for name, cell in zip(captured, function.__closure__ or (), strict=True):
+        with contextlib.suppress(ValueError):  # not assigned yet
             captured[name] = cell.cell_contents
-        except ValueError:  # not assigned yet
-            captured[name] = None
     return captured
 
 

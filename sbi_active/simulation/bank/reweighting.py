@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -13,8 +12,8 @@ from torch.distributions import Distribution
 from sbi_active.messages import warn
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.bank.bank import Bank
-from sbi_active.simulation.bank.log_density import log_density
 from sbi_active.simulation.outcomes import Outcome, Simulations
+from sbi_active.support import log_density
 
 #: Below it an average over the rows has a standard error above a tenth of an sd.
 FEW = 100
@@ -31,16 +30,11 @@ class ReusedRows:
         bank: Bank that has the rows.
         rows: Positions of the rows, shape (k,), int64.
         weights: Weights that sum to one, shape (k,), float64.
-        denominator: Denominator of the weights: "mixture" of all proposals, or each
-            row's "own".
-        share: Share of the weight, by label of the proposal.
     """
 
     bank: Bank
     rows: Tensor
     weights: Tensor
-    denominator: Literal["mixture", "own"]
-    share: dict[str, float]
 
     @property
     def effective_sample_size(self) -> float:
@@ -146,11 +140,10 @@ def reuse(
     if proposals is None:
         log_denominator = log_own
     else:
-        log_densities = _log_densities(bank, proposals, theta, label, log_own)
         strata = torch.zeros(len(rows), dtype=torch.int64)
         if action is None and not same_actions:
             strata = torch.unique(column["action"][rows], dim=0, return_inverse=True)[1]
-        log_denominator = _log_mixture(log_densities, label, strata)
+        log_denominator = _log_mixture(bank, proposals, theta, label, log_own, strata)
     log_weight = log_target - log_denominator
     if not bool((log_weight > -torch.inf).any()):
         raise ValueError(
@@ -158,14 +151,7 @@ def reuse(
             " of density 0; simulate from the target"
         )
     weights = log_weight.softmax(0)
-    totals = {
-        name: float(weights[label == code].sum())
-        for code, name in enumerate(bank.labels)
-        if name
-    }
-    result = ReusedRows(
-        bank, rows, weights, "own" if proposals is None else "mixture", totals
-    )
+    result = ReusedRows(bank, rows, weights)
     if result.effective_sample_size < FEW:
         warn(
             f"SA304 {len(rows)} rows of the bank are worth "
@@ -177,41 +163,35 @@ def reuse(
     return result
 
 
-def _log_densities(
+def _log_mixture(
     bank: Bank,
     proposals: Mapping[str, Distribution],
     theta: Tensor,
     label: Tensor,
     log_own: Tensor,
+    strata: Tensor,
 ) -> Tensor:
-    """Return the log density of every row under every label, shape (n, k)."""
-    present = {code: bank.labels[code] for code in label.unique().tolist()}
-    lacking = [name for name in present.values() if name not in proposals]
+    """Return log sum_k n_k / n q_k, counted within each stratum, shape (n,)."""
+    names = bank.labels
+    lacking = [n for k in label.unique() if (n := names[k]) not in proposals]
     if lacking:
         raise ValueError(
-            f"expected proposals for all labels in the bank, {[*present.values()]}; got"
-            f" none for {lacking}; give them, or none at all for weights by each "
-            "row's own proposal"
+            f"expected proposals for all labels in the bank, {names}; got none for "
+            f"{lacking}; give them, or none at all for weights by each row's own "
+            "proposal"
         )
-    result = torch.full((len(theta), len(bank.labels)), -torch.inf).double()
-    for code, name in present.items():
-        result[:, code] = log_density(proposals[name], theta)
-        own = label == code
-        gap = (result[own, code] - log_own[own]).abs().median()
+    sizes = torch.bincount(strata).double()
+    terms = []
+    for code in label.unique():
+        own, name = label == code, names[code]
+        log_prob = log_density(proposals[name], theta)
+        gap = (log_prob[own] - log_own[own]).abs().median()
         if not gap <= TOLERANCE:
             raise ValueError(
                 f"expected proposals[{name!r}] to be what its rows were drawn from; got"
                 f" log densities that differ by {gap:.3g} nats (median) from those in "
                 "the bank; give the distribution that was passed to drawn_from"
             )
-    return result
-
-
-def _log_mixture(log_densities: Tensor, label: Tensor, strata: Tensor) -> Tensor:
-    """Return log sum_k n_k / n q_k, counted within each stratum, shape (n,)."""
-    num_labels = log_densities.shape[1]
-    cell = strata * num_labels + label
-    size = (int(strata.max()) + 1) * num_labels
-    counts = torch.bincount(cell, minlength=size).reshape(-1, num_labels).double()
-    log_share = (counts / counts.sum(1, keepdim=True)).log()
-    return torch.logsumexp(log_densities + log_share[strata], dim=1)
+        share = torch.bincount(strata[own], minlength=len(sizes)) / sizes
+        terms.append(log_prob + share.log()[strata])
+    return torch.stack(terms).logsumexp(0)

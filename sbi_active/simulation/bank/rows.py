@@ -1,118 +1,187 @@
-"""The rows of a bank in order: found, read by position, and looked at for damage."""
+"""The rows of a bank: written in segments, found again, and read by position."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import NoneType
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.distributions import Distribution
 
-from sbi_active.simulation.bank.damage import CorruptSegmentError, require
-from sbi_active.simulation.bank.segments import (
-    COLUMNS,
-    Segment,
-    find_segment,
-    read_columns,
-    require_header,
-)
-from sbi_active.simulation.bank.sqlite import OBJECTS, SEGMENTS
+from sbi_active.arrays import own_tensor
+from sbi_active.messages import warn
+from sbi_active.simulation.bank.sqlite import require, sensible
 from sbi_active.simulation.bank.store import Store
+from sbi_active.simulation.workers.store import StoredRows
+from sbi_active.support import log_density
+
+#: Bytes of a segment: what reading one row may cost in memory. With 16 MiB, ten rows of
+#: 1 MB one by one take four times the CPU, and nothing else takes less
+#: (``python -m benchmarks cost.store``).
+SEGMENT_BYTES = 4 * 2**20
+COLUMNS = ("theta", "action", "x", "status", "index", "log_proposal")
+#: Entries of a header, and what they may be.
+HEADER: dict[str, tuple[type, ...]] = {
+    "created": (str, NoneType),
+    "version": (str,),
+    "simulator": (dict, str),
+    "parameter_names": (list, NoneType),
+    "shapes": (dict, NoneType),
+}
+KNOWN = {"run": str, "seed": int, "label": str}  # of all rows of a segment
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Rows of one run that were written at once.
+
+    Attributes:
+        number: Place of the segment among those of the bank, from 1.
+        rows: All of the rows but x, which stays on the disk.
+        run: Name of the run that the rows belong to.
+        seed: Seed of the run.
+        label: Label of the run's proposal; "" if it is not known.
+    """
+
+    number: int
+    rows: np.ndarray
+    run: str
+    seed: int
+    label: str
 
 
 class Rows:
     """The segments of one bank in a store.
 
     Args:
-        store: The file.
+        store: File with the segments.
         name: Name of the bank.
 
     Attributes:
         store: File with the segments.
-        name: Name of the bank.
-        key: Key of the bank's header.
+        key: Kind of the record of the bank's header.
     """
 
     def __init__(self, store: Store, name: str) -> None:
-        self.store, self.name, self.key = store, name, f"bank {name}"
-        self._found: list[Segment] = []
+        self.store, self._name, self.key = store, name, f"bank {name}"
         self._generation = -1
-        self._last: tuple[int, dict[str, np.ndarray]] = (0, {})
+        self._forget()
 
     @property
     def header(self) -> dict[str, Any]:
         """Simulator, shapes and names, as they are on the disk."""
-        found = self.store.text(self.key)
+        found, path = self.store.json(self.key), self.store.path
         if found is None:
-            kinds = [kind for kind in self.store.kinds() if kind.startswith("bank ")]
+            kinds = [kind for kind in self.store.catalog if kind.startswith("bank ")]
             raise ValueError(
-                f"expected the {self.key} in {self.store.path}; got "
-                f"{', '.join(kinds) or 'none'}; give name= of one there, or simulator= "
-                "to make one"
+                f"expected the {self.key} in {path}; got {', '.join(kinds) or 'none'}; "
+                "give name= of one there, or simulator= to make one"
             )
-        require_header(self.store.path, found)
+        with sensible(path):
+            own = all(isinstance(found[name], kinds) for name, kinds in HEADER.items())
+            names = found["parameter_names"] or []
+            own &= all(isinstance(name, str) for name in names)
+            require(path, own, "a header that none writes")
+            _ = found["shapes"] is None or row_type(found["shapes"])
         return found
-
-    def note(self, **entries: Any) -> None:
-        """Change entries of the header."""
-        with self.store.writing():
-            self.store.put(OBJECTS, self.key, 0, {**self.header, **entries})
-        self._generation = -1
 
     def segments(self) -> list[Segment]:
         """Return the segments as they are on the disk now."""
         with self.store.reading():
-            total = self.store.length(SEGMENTS, self.name)
+            total = self.store.length(self._name)
             if self._generation != self.store.generation or total < len(self._found):
-                self._found, self._last = [], (0, {})
+                self._forget()
                 self._generation = self.store.generation
-                self._lost = {*self.header["lost"]}
-            first = self._found[-1].number if self._found else 0
-            for number in range(first + 1, total + 1):
-                if number not in self._lost:
-                    found = find_segment(self.store, self.name, number)
-                    self._found.append(found)
+            if total > len(self._found):
+                with sensible(self.store.path):
+                    kind = row_type(self.header["shapes"])
+                    for number in range(len(self._found) + 1, total + 1):
+                        self._found.append(self._segment(number, kind))
             return self._found[:]
 
-    def damaged(self) -> dict[int, str]:
-        """Return the segments that are not whole, and why."""
-        wrong: dict[int, str] = {}
-        try:
-            numbers = range(1, self.store.length(SEGMENTS, self.name) + 1)
-            lost = self.header["lost"]
-        except CorruptSegmentError:  # which is a problem of the store
-            return {}
-        for number in numbers:
-            try:
-                if number not in lost:
-                    found = find_segment(self.store, self.name, number)
-                    self.columns(found, (*COLUMNS,))
-            except CorruptSegmentError as error:
-                wrong[number] = error.reason
-        return wrong
+    def _forget(self) -> None:
+        self._found: list[Segment] = []
+        self._last = 0, np.zeros(0)  # the segment whose x was read last
+        self._stored = "", 0, np.zeros(0, bool)  # rows of the run that was written last
 
-    def columns(self, segment: Segment, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """Return columns of a segment, which cannot be written to."""
+    def _segment(self, number: int, kind: np.dtype) -> Segment:
+        head = self.store.get(self._name, number) or b""
+        text, _, content = head.partition(b"\n")
+        known = json.loads(text)
+        rows = np.frombuffer(content, kind)
+        own = {name: type(value) for name, value in known.items()} == KNOWN
+        own &= bool((rows["index"] >= 0).all())
+        own &= bool((np.abs(rows["status"] - 1) <= 1).all())  # those of an outcome
+        require(self.store.path, own, f"a segment {number} that no bank writes")
+        return Segment(number, rows, **known)
+
+    def x(self, segment: Segment) -> np.ndarray:
+        """Return what the rows of a segment measured; it cannot be written to."""
         if self._last[0] != segment.number:
-            self._last = segment.number, {}
-        kept = self._last[1]
-        if lacking := [name for name in names if name not in kept]:
-            shapes = self.header["shapes"]
-            path = self.store.path
-            require(path, shapes is not None, "segments and no shapes of their rows")
-            kept |= read_columns(self.store, self.name, segment, lacking, shapes)
-        return kept
+            content = self.store.body(self._name, segment.number)
+            with sensible(self.store.path):
+                shape = len(segment.rows), *self.header["shapes"]["x"]
+                x = np.frombuffer(content, "<f4").reshape(shape)
+            self._last = segment.number, x
+        return self._last[1]
 
-    def gather(self, names: list[str], rows: np.ndarray | None) -> list[Tensor]:
-        """Return columns at positions; None takes all rows."""
+    def append(self, run: Mapping[str, Any], columns: Mapping[str, Tensor]) -> None:
+        """Write those rows of a run that are not there, on the disk at the end.
+
+        Raises:
+            ValueError: If the rows have other shapes than those in the bank.
+        """
+        arrays = {name: c.detach().cpu().numpy() for name, c in columns.items()}
+        shapes = {name: [*arrays[name].shape[1:]] for name in COLUMNS[:3]}
+        header, x, index = self.header, arrays.pop("x"), arrays["index"]
+        known = header["shapes"]
+        if known not in (None, shapes) and self.segments():
+            raise ValueError(
+                f"expected rows of shapes {known}, as in the bank {self.store.folder}; "
+                f"got {shapes}; make a bank of its own for them"
+            )
+        mask = _grown(self._mask(run["run"]), index)
+        first = np.unique(index, return_index=True)[1]  # of those that are given twice
+        fresh = np.sort(first[~mask[index[first]]])
+        rows = np.empty(len(index), row_type(shapes))
+        for name, array in arrays.items():
+            rows[name] = array
+        size = max(1, SEGMENT_BYTES // max(rows.itemsize + x[:1].nbytes, 1))
+        with self.store.writing():
+            if known != shapes:
+                self.store.put(self.key, 0, {**header, "shapes": shapes})
+            for start in range(0, len(fresh), size):
+                part = fresh[start : start + size]
+                head = json.dumps(run).encode() + b"\n" + rows[part].tobytes()
+                body = np.ascontiguousarray(x[part], "<f4").reshape(-1).view(np.uint8)
+                self.store.append(self._name, head, body.data)
+
+    def _mask(self, run: str) -> np.ndarray:
+        """Return a mask over the rows of a run that are stored."""
         segments = self.segments()
-        ends = np.cumsum([0, *(segment.num_rows for segment in segments)])
-        rows = np.arange(ends[-1]) if rows is None else rows
+        name, seen, mask = self._stored
+        if name != run:
+            seen, mask = 0, np.zeros(0, bool)
+        for segment in segments[seen:]:
+            if segment.run == run:
+                mask = _grown(mask, segment.rows["index"])
+                mask[segment.rows["index"]] = True
+        self._stored = run, len(segments), mask
+        return mask
+
+    def gather(self, names: Sequence[str], rows: np.ndarray) -> list[Tensor]:
+        """Return columns at positions."""
+        segments = self.segments()
         if not segments:
             raise ValueError(
                 f"expected rows in {self.store.folder}; got none; simulate into it"
             )
+        ends = np.cumsum([0, *(len(segment.rows) for segment in segments)])
         order = np.argsort(rows, kind="stable")
         bounds = np.searchsorted(rows[order], ends)
         labels = [*dict.fromkeys(segment.label for segment in segments)]
@@ -122,33 +191,75 @@ class Rows:
             if not len(here) and (result or k < len(segments) - 1):
                 continue
             own = {"seed": segment.seed, "label": labels.index(segment.label)}
-            stored = self.columns(segment, [n for n in names if n not in own])
             for name in names:
                 if name in own:
                     value: Any = _whole_number(own[name])
                 else:
-                    value = stored[name][rows[here] - ends[k]]
+                    column = self.x(segment) if name == "x" else segment.rows[name]
+                    value = column[rows[here] - ends[k]]
                 if name not in result:
-                    shape, dtype = np.shape(value)[1:], np.asarray(value).dtype
-                    result[name] = np.empty((len(rows), *shape), dtype)
+                    result[name] = np.empty((len(rows), *value.shape[1:]), value.dtype)
                 result[name][here] = value
         return [torch.from_numpy(result[name]) for name in names]
 
 
-def positions(rows: Any, total: int) -> np.ndarray | None:
-    """Return the positions of rows, int64; None if all are meant.
+def row_type(shapes: Mapping[str, Sequence[int]]) -> np.dtype:
+    """Return the type of a row but for x, whose shape is looked at as well."""
+    theta, action, _ = (np.empty((0, *shapes[n])).shape[1:] for n in COLUMNS[:3])
+    tables = ("theta", "<f4", theta), ("action", "<f4", action)
+    own = ("log_proposal", "<f8"), ("index", "<i8"), *tables, ("status", "i1")
+    return np.dtype([*own])
+
+
+def columns_of(
+    rows: StoredRows, proposal: Distribution | None, label: str
+) -> dict[str, Tensor]:
+    """Return the columns of rows that are to be written.
 
     Args:
-        rows: Positions, a slice, a mask over all rows, or None.
+        rows: The rows.
+        proposal: Proposal that theta was drawn from; None if it is not known.
+        label: Label of the proposal.
+
+    Raises:
+        ValueError: If they differ in length, or are no numbers that float32 holds.
+    """
+    index = rows["index"]
+    columns: dict[str, Tensor] = {
+        **{n: own_tensor(rows[n], torch.float32, name=n) for n in COLUMNS[:3]},
+        **{"status": rows["status"], "index": index},
+    }
+    lengths = {name: len(column) for name, column in columns.items()}
+    if len({*lengths.values()}) > 1:
+        raise ValueError(
+            f"expected {len(index)} rows, one an index; got {lengths}; give columns of "
+            "one length"
+        )
+    log_proposal = torch.full((len(index),), torch.nan, dtype=torch.float64)
+    if proposal is not None:
+        log_proposal = log_density(proposal, rows["theta"])
+        num_outside = int((log_proposal == -torch.inf).sum())
+        if num_outside:
+            warn(
+                f"SA305 {num_outside} of {len(index)} rows have density 0 under the "
+                f"proposal {label!r}: they were not drawn from it",
+                stacklevel=3,
+            )
+    return {**columns, "log_proposal": log_proposal}
+
+
+def positions(rows: Any, total: int) -> np.ndarray:
+    """Return the positions of rows, int64.
+
+    Args:
+        rows: Positions, a slice, a mask over all rows, or None for all.
         total: Number of all rows.
 
     Raises:
         ValueError: If they are anything else.
     """
-    if rows is None:
-        return None
-    if isinstance(rows, slice):
-        return np.arange(*rows.indices(total))
+    if rows is None or isinstance(rows, slice):
+        return np.arange(*(rows or slice(None)).indices(total))
     found = np.asarray(rows)
     if found.dtype == bool and found.shape == (total,):
         return np.flatnonzero(found)
@@ -169,3 +280,8 @@ def _whole_number(value: int) -> np.int64:
             "expected seeds below 2**63 for a column of them; got one of "
             f"{value.bit_length()} bits; read the other columns"
         ) from error
+
+
+def _grown(mask: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """Return a mask over the rows of a run with room for more of them."""
+    return np.pad(mask, (0, max(0, int(index.max(initial=-1)) + 1 - len(mask))))

@@ -1,45 +1,45 @@
-"""Connections to a store's file, which may come from anybody: it is never executed.
+"""The file of a store, which may come from anybody: nothing in it is executed.
 
-SQLite is configured to refuse commands that a file may contain: tables are compared
-with those of a store before anything is read from them, no journal is played back that
-none leaves, and no link is followed.
+Its table is compared with that of a store before anything is read from it, no journal
+is played back that none leaves, and no link is followed.
 """
 
 from __future__ import annotations
 
 import errno
+import hashlib
+import itertools
+import json
 import os
+import platform
 import secrets
+import shutil
 import sqlite3
-from collections.abc import Sequence
+import stat
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
-from sbi_active.simulation.bank.damage import (
-    CorruptSegmentError,
-    regular_size,
-    require,
-    require_no_link,
-)
-from sbi_active.simulation.bank.files import TEMPORARY, synchronize
+from sbi_active.messages import Explained
 
-NAME, FORMAT = "store.db", 2  # format 1 was folders of HDF5
+NAME, FORMAT = "store.db", 3  # format 1 was folders of HDF5, 2 had three tables
 LOCK = "store.lock"  # empty: who writes holds SQLite's lock on it
-#: Rows of simulations; what was asked, told and decided; all that is kept once.
-SEGMENTS, EVENTS, OBJECTS = TABLES = ("segments", "events", "objects")
-SCHEMA = {
-    table: f"CREATE TABLE {table} (kind TEXT NOT NULL, number INTEGER NOT NULL, "
-    "content BLOB NOT NULL, digest BLOB NOT NULL, PRIMARY KEY (kind, number))"
-    for table in TABLES
-}
+TEMPORARY = ".writing-"
+CATALOG = "catalog"  # the last number of each kind
+#: Digests stand before the body, whose pages are then read only for the body.
+SCHEMA = (
+    "CREATE TABLE records (kind TEXT NOT NULL, number INTEGER NOT NULL, head BLOB NOT "
+    "NULL, head_digest BLOB NOT NULL, body_digest BLOB NOT NULL, body BLOB NOT NULL, "
+    "PRIMARY KEY (kind, number))"
+)
+INSERT = "INSERT OR {} INTO records VALUES (?, ?, ?, ?, ?, ?)"
 #: Seconds to wait for a moment in which another process tidies up. A choice.
 PATIENCE = 10.0
 SETTINGS = (
-    "trusted_schema = OFF",
-    "cell_size_check = ON",
-    "journal_mode = WAL",
-    "synchronous = FULL",
-    "secure_delete = OFF",
+    *("trusted_schema = OFF", "cell_size_check = ON", "journal_mode = WAL"),
+    *("synchronous = FULL", "secure_delete = OFF"),
     f"journal_size_limit = {64 * 2**20}",
 )
 #: Words of SQLite's errors that say nothing against the file.
@@ -48,7 +48,88 @@ OF_THE_DISK = {
     "readonly": errno.EROFS,
     "disk I/O": errno.EIO,
     "unable to open": errno.EACCES,
+    "too big": errno.EFBIG,  # 1 GB
 }
+
+
+class CorruptSegmentError(Explained, OSError):
+    """A file of a bank or campaign that does not hold what was written to it.
+
+    Attributes:
+        path: The file.
+        reason: Text that says what is wrong with it.
+    """
+
+    code = "SA605"
+
+    def __init__(self, path: Path, reason: str) -> None:
+        self.path, self.reason = path, reason
+        super().__init__(
+            f"expected {path} as it was written; got {reason}; restore it from a copy, "
+            "or give up what is damaged, which keeps a copy: by repair() of a bank "
+            "that is opened with its simulator, or Campaign.load(..., repair=True)"
+        )
+
+
+class LockedError(Explained, OSError):
+    """Somebody else is writing.
+
+    Attributes:
+        pid: Process that holds the lock, None if it did not say.
+    """
+
+    code = "SA608"
+
+    def __init__(self, folder: Path, pid: int | None, host: str) -> None:
+        self.pid = pid
+        here = " (this one)" if pid == os.getpid() and host == platform.node() else ""
+        super().__init__(
+            f"expected no other writer of {folder}; got process {pid}{here} on "
+            f"{host}; wait for it, call close() there, or write to a folder of your "
+            "own: any number of readers may go on"
+        )
+
+
+def require(path: Path, holds: bool, reason: str) -> None:
+    """Raise if something does not hold of a file.
+
+    Raises:
+        CorruptSegmentError: If it does not hold, with the reason.
+    """
+    if not holds:
+        raise CorruptSegmentError(path, reason)
+
+
+@contextmanager
+def sensible(path: Path) -> Iterator[None]:
+    """Turn whatever fails while content is made sense of into damage of its file.
+
+    Raises:
+        CorruptSegmentError: If any error is raised that names no file.
+    """
+    try:
+        yield
+    except OSError:
+        raise
+    except Exception as error:  # what a crafted file leads to has no end
+        text = f"content that leads to {type(error).__name__}: {str(error):.200}"
+        raise CorruptSegmentError(path, text) from error
+
+
+def is_locked(folder: Path) -> bool:
+    """Return whether somebody has the right to write, without taking it.
+
+    Args:
+        folder: Folder of a store.
+    """
+    if not (folder / LOCK).exists():
+        return False
+    try:
+        with closing(connected(folder / LOCK, "ro", timeout=0.0)) as lock:
+            lock.execute("SELECT name FROM sqlite_master")
+    except sqlite3.OperationalError as error:
+        return "locked" in str(error)
+    return False
 
 
 def connected(path: Path, mode: str, *, timeout: float) -> sqlite3.Connection:
@@ -60,12 +141,18 @@ def connected(path: Path, mode: str, *, timeout: float) -> sqlite3.Connection:
         timeout: Seconds to wait for others.
 
     Raises:
+        OSError: If the file is a link, which would lead elsewhere.
         CorruptSegmentError: If there is a journal, which SQLite would write back, here
             and to whatever else it names.
     """
     journal = path.with_name(f"{path.name}-journal")
     require(path, not os.path.lexists(journal), f"{journal.name}, which none leaves")
-    require_no_link(path)
+    for file in (path, *(path.with_name(path.name + end) for end in ("-wal", "-shm"))):
+        if file.is_symlink():
+            raise OSError(
+                f"expected {file} as a file; got a link to {file.readlink()}; remove "
+                "it, after a look at where the folder comes from"
+            )
     return sqlite3.connect(
         f"file:{quote(str(path.absolute()))}?mode={mode}",
         uri=True,
@@ -80,91 +167,51 @@ def opened(path: Path, what: str) -> tuple[sqlite3.Connection, bool]:
 
     This is the case if not even the notes of a reader can be written beside the file:
     it is then read as it is, and others have to wait.
-
-    Args:
-        path: The file.
-        what: It is said to be in errors.
-
-    Raises:
-        ValueError: If there is none, or one of another format.
-        CorruptSegmentError: If it is no store.
     """
-    log = path.with_name(f"{NAME}-wal")
-    for file in (path, log, path.with_name(f"{NAME}-shm")):
-        require_no_link(file)
-    try:
-        size = regular_size(path)
-    except (FileNotFoundError, NotADirectoryError) as error:
+    if not os.path.lexists(path):
         make = "make one by Campaign(..., directory=...)"
         make = "give simulator= to make one" if what == "bank" else make
-        raise ValueError(
-            f"expected a {what}; got no {path}; {advice(path.parent, make)}"
-        ) from error
-    require(path, size > 0, "an empty file")
+        advice = _advice(path.parent, make)
+        raise ValueError(f"expected a {what}; got no {path}; {advice}")
+    if not path.is_symlink():  # which is said to be one
+        found = path.stat()  # a pipe or a device would be waited for
+        is_file = stat.S_ISREG(found.st_mode) and found.st_size > 0
+        require(path, is_file, "no file, or an empty one")
+    log = path.with_name(f"{NAME}-wal")
     has_log = log.exists() and log.stat().st_size
     last = ("rw", "locking_mode = EXCLUSIVE") if has_log else ("ro&immutable=1", "")
-    for mode, setting in (("rw", ""), ("ro", ""), last):
+    for mode, setting in (("rw", ""), last):
         connection = connected(path, mode, timeout=PATIENCE)
         try:
             _check(connection, path, what, (setting, *SETTINGS))
-        except sqlite3.OperationalError:
+        except Exception as error:
             connection.close()
-            if (mode, setting) == last:
+            is_last = (mode, setting) == last
+            if is_last or not isinstance(error, sqlite3.OperationalError):
                 raise
-        except BaseException:
-            connection.close()
-            raise
         else:
             return connection, (mode, setting) == last
     raise AssertionError
 
 
 def _check(
-    connection: sqlite3.Connection, path: Path, what: str, settings: Sequence[str]
+    connection: sqlite3.Connection, path: Path, what: str, settings: Iterable[str]
 ) -> None:
     for setting in filter(None, settings):
         connection.execute(f"PRAGMA {setting}")
-    found = connection.execute("SELECT name, sql FROM sqlite_master").fetchall()
-    plain = {(name, sql) for name, sql in found if sql is not None}
-    own = plain == {*SCHEMA.items()} and len(found) == 2 * len(SCHEMA)
-    require(path, own, "tables that are not those of a store")
     form = connection.execute("PRAGMA user_version").fetchone()[0]
     if form != FORMAT:
         raise ValueError(
             f"expected a {what} of format {FORMAT}; got {form} in {path}; use the "
             "release of sbi-active that wrote it"
         )
+    found = connection.execute("SELECT sql FROM sqlite_master").fetchall()
+    own = found == [(SCHEMA,), (None,)]  # the table, and the index of its key
+    require(path, own, "tables that are not those of a store")
 
 
-def is_locked(folder: Path) -> bool:
-    """Return whether somebody has the right to write, without taking it.
-
-    Args:
-        folder: Folder of a store.
-    """
-    if not (folder / LOCK).exists():
-        return False
-    lock = connected(folder / LOCK, "ro", timeout=0.0)
-    try:
-        lock.execute("SELECT name FROM sqlite_master")
-    except sqlite3.OperationalError as error:
-        return "locked" in str(error)
-    finally:
-        lock.close()
-    return False
-
-
-def made(folder: Path, what: str) -> None:
-    """Make a store in a folder of its own.
-
-    Args:
-        folder: Folder, made where there is none.
-        what: The store is said to be.
-
-    Raises:
-        ValueError: If the folder holds anything else.
-        OSError: If it cannot be made.
-    """
+def make_store(folder: Path, what: str) -> None:
+    """Make a store in a folder of its own, which is made where there is none."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         found = sorted(path.name for path in folder.iterdir())
@@ -173,10 +220,10 @@ def made(folder: Path, what: str) -> None:
         if other:
             raise ValueError(
                 f"expected a {what} or an empty folder; got {folder} with "
-                f"{other[0]!r}; {advice(folder, 'choose another folder')}"
+                f"{other[0]!r}; {_advice(folder, 'choose another folder')}"
             )
-        fresh = folder / f"{TEMPORARY}{os.getpid()}-{NAME}"
-        finished(created(fresh, secrets.randbits(31)), fresh)
+        name = secrets.randbits(31)
+        fresh = written(folder, name, [sealed(name, CATALOG, 0, {})])
         if not (folder / NAME).exists():  # nobody was faster
             os.replace(fresh, folder / NAME)
             synchronize(folder)
@@ -190,36 +237,48 @@ def made(folder: Path, what: str) -> None:
         ) from error
 
 
-def created(path: Path, name: int) -> sqlite3.Connection:
-    """Return a new file with its tables and name, in a transaction that has begun."""
+def written(folder: Path, name: int, records: Iterable[tuple[Any, ...]]) -> Path:
+    """Return a new file with records, all of it on the disk."""
+    path = folder / f"{TEMPORARY}{os.getpid()}-{NAME}"
     path.unlink(missing_ok=True)
     connection = sqlite3.connect(path, isolation_level=None)
-    connection.execute("PRAGMA journal_mode = WAL")
+    settings = f"user_version = {FORMAT}", f"application_id = {name}"
+    for setting in ("journal_mode = WAL", *settings):
+        connection.execute(f"PRAGMA {setting}")
     connection.execute("BEGIN IMMEDIATE")
-    for statement in SCHEMA.values():
-        connection.execute(statement)
-    connection.execute(f"PRAGMA user_version = {FORMAT}")
-    connection.execute(f"PRAGMA application_id = {name}")
-    return connection
-
-
-def finished(connection: sqlite3.Connection, path: Path) -> None:
-    """Close a new file: all is in it, and on the disk."""
+    connection.execute(SCHEMA)
+    connection.executemany(INSERT.format("IGNORE"), records)
     connection.execute("COMMIT")
     connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     connection.close()
     for suffix in ("-wal", "-shm"):
         path.with_name(path.name + suffix).unlink(missing_ok=True)
+    return path
+
+
+def sealed(
+    name: int, kind: str, number: int, head: Any, body: Any = b""
+) -> tuple[Any, ...]:
+    """Return a record with its digests, in the order of the columns."""
+    if isinstance(head, Mapping):
+        head = json.dumps(head, allow_nan=False).encode()
+    parts = {"head": head, "body": body}
+    digests = (digest_of(name, part, kind, number, c) for part, c in parts.items())
+    return (kind, number, head, *digests, body)
+
+
+def digest_of(name: int, part: str, kind: str, number: int, content: Any) -> Any:
+    """Return the checksum of a part of a record, in a store of a name."""
+    if not isinstance(content, bytes | memoryview):  # as anybody can write there
+        return None
+    digest = hashlib.sha256(f"{name} {part} {kind} {number} ".encode())
+    digest.update(content)
+    return digest.digest()
 
 
 def explained(error: Exception, path: Path, what: str) -> Exception:
     """Return an error of SQLite as one of this library."""
     text = str(error)
-    if isinstance(error, sqlite3.DataError) or "too big" in text:
-        return ValueError(
-            "expected rows of at most 1 GB, which SQLite keeps; got a larger one; keep "
-            "what is needed of it"
-        )
     for words, number in OF_THE_DISK.items():
         if words in text:
             return OSError(
@@ -232,8 +291,23 @@ def explained(error: Exception, path: Path, what: str) -> Exception:
     return CorruptSegmentError(path, f"what SQLite cannot read ({text})")
 
 
-def advice(folder: Path, otherwise: str) -> str:
+def _advice(folder: Path, otherwise: str) -> str:
     """Return advice on a folder that has no store."""
     if any((folder / name).exists() for name in ("bank.json", "campaign.json")):
         return f"bring it up to date by: sbi-active migrate {folder}"
     return otherwise
+
+
+def keep_aside(path: Path) -> None:
+    """Keep a copy under a name ending in ".damaged", beside those of before."""
+    names = (f"{path.name}.damaged" + f"-{n}" * (n > 1) for n in itertools.count(1))
+    copies = (path.with_name(name) for name in names)
+    shutil.copy2(path, next(copy for copy in copies if not os.path.lexists(copy)))
+
+
+def synchronize(folder: Path) -> None:
+    """Make the names in a folder durable; file systems differ in whether they are."""
+    if os.name == "posix":  # elsewhere a folder cannot be opened, nor needs it
+        descriptor = os.open(folder, os.O_RDONLY)
+        os.fsync(descriptor)
+        os.close(descriptor)

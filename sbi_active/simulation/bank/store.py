@@ -1,14 +1,14 @@
-"""One file of SQLite for banks and campaigns: sealed records, and one writer at a time.
+"""A store of sealed records, with one writer at a time: of banks and of campaigns.
 
-A record has a kind and a number, and a SHA-256 over these, its content and the file's
-own name, so that bytes that were changed, exchanged or come from elsewhere are noticed:
-SQLite itself has checksums of its log alone. Records of a series are numbered from 1
-and counted, so that lost ones are noticed too.
+A record has a kind, a number, a head and a body, which is read apart: that of rows is
+what they measure. Records of a series are numbered from 1, and a catalog says which
+there are. Checksums cover kind, number and the file's own name, so that bytes that were
+changed, exchanged, lost or come from elsewhere are noticed: SQLite itself has checksums
+of its log alone.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import platform
@@ -17,30 +17,31 @@ import threading
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sbi_active.simulation.bank.damage import (
-    CorruptSegmentError,
-    LockedError,
-    is_count,
-    parsed,
-    require,
-)
-from sbi_active.simulation.bank.files import TEMPORARY, keep_aside, synchronize
 from sbi_active.simulation.bank.sqlite import (
+    CATALOG,
+    INSERT,
     LOCK,
     NAME,
-    OBJECTS,
-    TABLES,
+    TEMPORARY,
+    CorruptSegmentError,
+    LockedError,
     connected,
-    created,
+    digest_of,
     explained,
-    finished,
-    made,
+    keep_aside,
+    make_store,
     opened,
+    require,
+    sealed,
+    sensible,
+    synchronize,
+    written,
 )
+
+MOST_LISTED = 1_000  # problems; a catalog may be made up
 
 _OPEN: weakref.WeakSet[Store] = weakref.WeakSet()
 
@@ -73,7 +74,7 @@ class Store:
         self._depth, self._is_alone = 0, False
         _OPEN.add(self)
         if make and not self.path.exists():
-            made(folder, what)
+            make_store(folder, what)
         with self.reading():
             pass
 
@@ -124,86 +125,89 @@ class Store:
                     raise LockedError(self.folder, *self._holder()) from error
                 raise explained(error, self.path, self._what) from error
 
-    def get(self, table: str, kind: str, number: int = 0) -> bytes | None:
-        """Return the content of a record; None if there is none."""
+    def get(self, kind: str, number: int = 0) -> bytes | None:
+        """Return the head of a record; None if there is none."""
+        return self._read("head", kind, number)
+
+    def body(self, kind: str, number: int = 0) -> bytes:
+        """Return the body of a record that is there."""
+        content = self._read("body", kind, number)
+        require(self.path, content is not None, f"no {kind!r} {number}")
+        return content or b""
+
+    def _read(self, part: str, kind: str, number: int) -> bytes | None:
         with self.reading() as connection:
             found = connection.execute(
-                f"SELECT content, digest FROM {table} WHERE kind = ? AND number = ?",
+                f"SELECT {part}, {part}_digest FROM records WHERE kind = ? AND number "
+                "= ?",
                 (kind, number),
             ).fetchone()
-        where = f"{table} {kind!r} {number}"
-        if found is None:  # or not found, as a page is damaged
-            wrong = self._structure(table) if table == OBJECTS else []
-            require(self.path, not wrong, f"no {where} ({wrong})")
-            return None
-        same = self._is_whole(table, (kind, number, *found))
-        require(self.path, same, f"{where} with another checksum")
+            if found is None:
+                listed = kind == CATALOG or number <= self.catalog.get(kind, -1)
+                require(self.path, not listed, f"no {kind!r} {number}: a gap")
+                return None
+            same = found[1] == digest_of(self._id, part, kind, number, found[0])
+        require(self.path, same, f"{kind!r} {number} with another checksum")
         return found[0]
 
-    def size(self, table: str, kind: str, number: int = 0) -> int | None:
-        """Return the bytes of a record without reading it; None if there is none."""
-        return self._look("length(content)", table, kind, number)
+    def remains(self, kind: str, number: int) -> str:
+        """Return what is left of the head of a damaged record, for people."""
+        with suppress(Exception), self.reading() as connection:
+            read = "SELECT head FROM records WHERE kind = ? AND number = ?"
+            found = connection.execute(read, (kind, number)).fetchone()
+            return found[0].decode(errors="replace")
+        return ""
 
-    def remains(self, table: str, kind: str, number: int) -> str:
-        """Return the rest of a damaged record, for people."""
-        try:
-            left = self._look("content", table, kind, number)
-            return left.decode(errors="replace")
-        except Exception:  # whatever is there, or nothing
-            return ""
+    def json(self, kind: str, number: int = 0) -> dict[str, Any] | None:
+        """Return the JSON object in a record; None if there is none."""
+        content = self.get(kind, number)
+        with sensible(self.path):
+            return None if content is None else dict(json.loads(content))
 
-    def _look(self, what: str, table: str, kind: str, number: int) -> Any:
-        with self.reading() as connection:
-            found = connection.execute(
-                f"SELECT {what} FROM {table} WHERE kind = ? AND number = ?",
-                (kind, number),
-            ).fetchone()
-        return None if found is None else found[0]
+    @property
+    def catalog(self) -> dict[str, int]:
+        """The last number of each kind."""
+        found = self.json(CATALOG) or {}
+        own = all(type(number) is int for number in found.values())
+        require(self.path, own, "a catalog that none writes")
+        return found
 
-    def text(self, kind: str, number: int = 0) -> dict[str, Any] | None:
-        """Return an object that was kept as JSON."""
-        content = self.get(OBJECTS, kind, number)
-        return None if content is None else parsed(self.path, content)
-
-    def length(self, table: str, series: str) -> int:
+    def length(self, series: str) -> int:
         """Return the number of records of a series."""
-        found = self.text(f"{table} of {series}")
-        count: Any = 0 if found is None else found.get("length")
-        require(self.path, is_count(count), f"{count!r} as length of {series!r}")
-        return count
+        return self.catalog.get(series, 0)
 
-    def kinds(self) -> list[str]:
-        """Return the kinds of the objects."""
-        with self.reading() as connection:
-            rows = connection.execute("SELECT kind FROM objects ORDER BY kind")
-            return [str(row[0]) for row in rows]
-
-    def put(self, table: str, kind: str, number: int, content: Any) -> None:
+    def put(self, kind: str, number: int, head: Any, body: Any = b"") -> None:
         """Write a record in place of another; for use in :meth:`writing`.
 
         Args:
-            table: Name of the table.
             kind: Kind of the record.
-            number: Number of the record.
-            content: Bytes, or JSON data of an object.
+            number: Number of the record; 0 of one that is no series.
+            head: Bytes, or JSON data.
+            body: Bytes.
         """
-        if isinstance(content, dict):
-            content = json.dumps(content, allow_nan=False).encode()
-        digest = self._digest(table, kind, number, content)
         assert self._connection is not None
-        self._connection.execute(
-            f"INSERT INTO {table} VALUES (?, ?, ?, ?) ON CONFLICT DO UPDATE "
-            "SET content = excluded.content, digest = excluded.digest",
-            (kind, number, content, digest),
-        )
+        record = sealed(self._id, kind, number, head, body)
+        self._connection.execute(INSERT.format("REPLACE"), record)
+        if kind != CATALOG and number > (catalog := self.catalog).get(kind, -1):
+            self.put(CATALOG, 0, {**catalog, kind: number})
+
+    def append(self, series: str, head: Any, body: Any = b"") -> int:
+        """Write the next record of a series, in :meth:`writing`; return its number."""
+        number = self.length(series) + 1
+        self.put(series, number, head, body)
+        return number
+
+    def delete(self, *kinds: str) -> None:
+        """Remove records; for use in :meth:`writing`."""
+        assert self._connection is not None
+        for kind in kinds:
+            self._connection.execute("DELETE FROM records WHERE kind = ?", (kind,))
+        kept = {k: n for k, n in self.catalog.items() if k not in kinds}
+        self.put(CATALOG, 0, kept)
 
     @contextmanager
-    def writing(self, series: tuple[str, str] | None = None) -> Iterator[int]:
+    def writing(self) -> Iterator[None]:
         """Write all that is put in the block, or nothing; on the disk at its end.
-
-        Args:
-            series: Table and name of a series that gets one more record; its number is
-                yielded.
 
         Raises:
             LockedError: If somebody else has the right to write.
@@ -212,31 +216,19 @@ class Store:
         with self._guard:
             self.acquire()
             with self.reading() as connection:
-                is_inner = connection.in_transaction  # of one that writes more
-                if not is_inner:
-                    same = self._found() == self._signature
-                    reason = "another file; nothing was written to it now"
-                    require(self.path, same, reason)
-                    connection.execute("BEGIN IMMEDIATE")
+                if connection.in_transaction:  # of one that writes more
+                    yield
+                    return
+                same = self._found() == self._signature
+                require(self.path, same, "another file; nothing was written to it now")
+                connection.execute("BEGIN IMMEDIATE")
                 try:
-                    number = 0 if series is None else self.length(*series) + 1
-                    yield number
-                    if series is not None:
-                        key = "{} of {}".format(*series)
-                        self.put(OBJECTS, key, 0, {"length": number})
-                    if not is_inner:
-                        connection.execute("COMMIT")
-                        self._signature = self._found()
+                    yield
+                    connection.execute("COMMIT")
+                    self._signature = self._found()
                 finally:
-                    if not is_inner and connection.in_transaction:
+                    if connection.in_transaction:
                         connection.execute("ROLLBACK")
-
-    def delete(self, table: str, kind: str, *, first: int = 0) -> None:
-        """Remove records from a number on; for use in :meth:`writing`."""
-        assert self._connection is not None
-        self._connection.execute(
-            f"DELETE FROM {table} WHERE kind = ? AND number >= ?", (kind, first)
-        )
 
     def acquire(self) -> None:
         """Take the right to write, which ends with :meth:`close` or the process.
@@ -260,8 +252,7 @@ class Store:
                 self._connection.execute("PRAGMA synchronous = OFF")
                 # Only a note; and a file that cannot be written to may be repaired.
                 with suppress(CorruptSegmentError), self.writing():
-                    holder = {"pid": os.getpid(), "host": platform.node()}
-                    self.put(OBJECTS, "writer", 0, holder)
+                    self.put("writer", 0, {"pid": os.getpid(), "host": platform.node()})
                 self._connection.execute("PRAGMA synchronous = FULL")
             except BaseException:
                 self._lock = None
@@ -279,73 +270,59 @@ class Store:
             if lock is not None:
                 lock.close()
 
-    def _disconnect(self) -> None:
-        if self._connection is not None:
-            self._connection.close()
-        self._connection, self._signature = None, ()
-
     def problems(self) -> list[str]:
-        """Return the problems of the file and its objects, one line each."""
-        wrong = self._structure("9")  # as many as are listed
-        for kind in [] if wrong else self.kinds():
-            try:
-                self.get(OBJECTS, kind)
-            except CorruptSegmentError as error:
-                wrong.append(error.reason)
-        return wrong
-
-    def _structure(self, what: str) -> list[str]:
-        """Return the problems that SQLite finds in the file, or in a table of it."""
+        """Return the problems of the file and its records, one line each."""
         try:
             with self.reading() as connection:
-                check = f"PRAGMA integrity_check({what})"
-                found = connection.execute(check).fetchall()
+                found = connection.execute("PRAGMA integrity_check(9)").fetchall()
+                catalog = self.catalog
         except CorruptSegmentError as error:
             return [error.reason]
-        return [str(row[0]) for row in found if row[0] != "ok"]
+        wrong = [str(row[0]) for row in found if row[0] != "ok"]
+        for kind, last in [] if wrong else catalog.items():
+            for number in range(min(last, 1), last + 1):
+                try:
+                    self.get(kind, number)
+                    self.body(kind, number)
+                except CorruptSegmentError as error:
+                    wrong.append(error.reason)
+                    if len(wrong) > MOST_LISTED:
+                        return wrong
+        return wrong
 
     def salvage(self) -> None:
-        """Write the file anew from the records that are whole.
+        """Write the file anew from the records that are whole, and number them anew.
 
         The former file is kept, its name ending in ".damaged".
         """
         self.acquire()
-        fresh = self.folder / f"{TEMPORARY}{os.getpid()}-{NAME}"
-        lengths: dict[tuple[str, str], int] = {}
-        copy = created(fresh, self._id)
         with self.reading() as connection:
-            for table in TABLES:
-                for order in ("", " DESC"):  # from both ends up to what is damaged
-                    with suppress(sqlite3.Error):
-                        rows = connection.execute(
-                            f"SELECT kind, number, content, digest FROM {table} "
-                            f"NOT INDEXED ORDER BY rowid{order}"
-                        )
-                        for row in filter(partial(self._is_whole, table), rows):
-                            key = table, row[0].partition("/")[0]
-                            lengths[key] = max(lengths.get(key, 0), row[1])
-                            insert = f"INSERT OR IGNORE INTO {table} VALUES (?,?,?,?)"
-                            copy.execute(insert, row)
-        finished(copy, fresh)
+            whole: dict[int, tuple[str, int]] = {}
+            for order in ("", " DESC"):  # from both ends up to what is damaged
+                with suppress(sqlite3.Error):
+                    for row in connection.execute(
+                        "SELECT rowid, kind, number, head, head_digest, body_digest, "
+                        f"body FROM records NOT INDEXED ORDER BY rowid{order}"
+                    ):
+                        if row[1:] == sealed(self._id, row[1], row[2], row[3], row[6]):
+                            whole[row[0]] = row[1:3]
+            catalog: dict[str, int] = {}
+
+            def renumbered() -> Iterator[tuple[Any, ...]]:
+                for rowid, (kind, number) in sorted(whole.items(), key=lambda w: w[1]):
+                    read = "SELECT head, body FROM records WHERE rowid = ?"
+                    content = connection.execute(read, (rowid,)).fetchone()
+                    number = number and catalog.get(kind, 0) + 1
+                    if kind != CATALOG:
+                        catalog[kind] = number
+                        yield sealed(self._id, kind, number, content[0], content[1])
+                yield sealed(self._id, CATALOG, 0, catalog)
+
+            fresh = written(self.folder, self._id, renumbered())
         self.close()
         keep_aside(self.path)
         os.replace(fresh, self.path)
         synchronize(self.folder)
-        for (table, series), length in lengths.items():
-            if table != OBJECTS and self.length(table, series) < length:
-                with self.writing():
-                    self.put(OBJECTS, f"{table} of {series}", 0, {"length": length})
-
-    def _is_whole(self, table: str, row: tuple[Any, ...]) -> bool:
-        kind, number, content, digest = row
-        if (type(kind), type(number), type(content)) != (str, int, bytes):
-            return False
-        return digest == self._digest(table, kind, number, content)
-
-    def _digest(self, table: str, kind: str, number: int, content: Any) -> bytes:
-        digest = hashlib.sha256(f"{self._id} {table} {kind} {number} ".encode())
-        digest.update(content)
-        return digest.digest()
 
     def _found(self) -> tuple[int, ...]:
         """Return a value that changes if the file is another one, or is changed."""
@@ -361,9 +338,14 @@ class Store:
         self._id = name.fetchone()[0]
         self._signature = self._found()
 
+    def _disconnect(self) -> None:
+        if self._connection is not None:
+            self._connection.close()
+        self._connection, self._signature = None, ()
+
     def _holder(self) -> tuple[int | None, str]:
         with suppress(Exception):  # it locked a moment ago, or the file is damaged
-            found = self.text("writer") or {}
+            found = self.json("writer") or {}
             return int(found["pid"]), str(found["host"])
         return None, platform.node()
 
@@ -375,7 +357,7 @@ def _before_fork() -> None:
         store._disconnect()
 
 
-def _after_fork(*, child: bool) -> None:
+def _after_fork(*, child: bool = False) -> None:
     for store in [*_OPEN]:
         if child and store._lock is not None:  # a child has no right of its parent's
             store._lock.close()
@@ -387,6 +369,6 @@ def _after_fork(*, child: bool) -> None:
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(
         before=_before_fork,
-        after_in_parent=partial(_after_fork, child=False),
-        after_in_child=partial(_after_fork, child=True),
+        after_in_parent=_after_fork,
+        after_in_child=lambda: _after_fork(child=True),
     )

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from sbi_active import Campaign
-from sbi_active.campaign.storage import DamagedCampaignError
+from sbi_active.simulation.bank import CorruptSegmentError
 from sbi_active.simulation.bank.store import Store
 from tests.campaign.storage.campaigns import drawn, draws, facts, go_on, new
 from tests.simulation.bank.filled import crafted, execute, flip
@@ -44,7 +44,7 @@ def folder(made, tmp_path):
 def line(folder, number):
     """Return the place of a line of the log in the file, and its bytes."""
     ((text,),) = execute(
-        folder, "SELECT content FROM events WHERE kind = 'log' AND number = ?", number
+        folder, "SELECT head FROM records WHERE kind = 'log' AND number = ?", number
     )
     return (folder / FILE).read_bytes().index(text), text
 
@@ -77,7 +77,7 @@ def test_every_byte_of_the_log_is_looked_at(folder, number):
     content = (folder / FILE).read_bytes()
     for position in range(start, start + len(text), 23):
         flip(folder / FILE, position)
-        with pytest.raises(DamagedCampaignError, match=rf"'log' {number} with anoth"):
+        with pytest.raises(CorruptSegmentError, match=rf"'log' {number} with anoth"):
             Campaign.load(folder)
         (folder / FILE).write_bytes(content)
     Campaign.load(folder)
@@ -85,9 +85,7 @@ def test_every_byte_of_the_log_is_looked_at(folder, number):
 
 def test_a_damaged_line_is_given_up_by_name(made, folder):
     flip_line(folder, 2)  # the first tell
-    with pytest.raises(
-        DamagedCampaignError, match=r"1 of 5 lines damaged.*repair=True"
-    ):
+    with pytest.raises(CorruptSegmentError, match="'log' 2 with .*repair=True"):
         Campaign.load(folder)
     with pytest.warns(UserWarning, match="given up, tell it again: .*told"):
         campaign = Campaign.load(folder, simulator=drawn, repair=True)
@@ -122,9 +120,9 @@ def test_a_trial_without_any_line_leaves_a_gap(tmp_path):
 @pytest.mark.parametrize("name", ["state", "belief"])
 def test_what_can_be_computed_again_is(made, folder, name):
     for change in (
-        "UPDATE objects SET content = x'00' WHERE kind = ?",
-        "UPDATE objects SET digest = x'00' WHERE kind = ?",
-        "DELETE FROM objects WHERE kind = ?",
+        "UPDATE records SET head = x'00' WHERE kind = ?",
+        "UPDATE records SET head_digest = x'00' WHERE kind = ?",
+        "DELETE FROM records WHERE kind = ?",
     ):
         execute(folder, change, name)
         campaign = Campaign.load(folder, simulator=drawn)
@@ -134,8 +132,8 @@ def test_what_can_be_computed_again_is(made, folder, name):
 
 
 def test_a_manifest_has_a_copy(made, folder):
-    execute(folder, "UPDATE objects SET content = x'00' WHERE kind = 'campaign'")
-    with pytest.raises(DamagedCampaignError, match="the log of the trials apart"):
+    execute(folder, "UPDATE records SET head = x'00' WHERE kind = 'campaign'")
+    with pytest.raises(CorruptSegmentError, match="'campaign' 0 with another checksum"):
         Campaign.load(folder)
     campaign = Campaign.load(folder, simulator=drawn, repair=True)
     assert facts(campaign) == facts(made[1])
@@ -145,8 +143,8 @@ def test_a_manifest_has_a_copy(made, folder):
 def test_another_schema_names_the_release(folder):
     manifest = {**Campaign.load(folder)._storage.disk.manifest, "schema": 9}
     manifest["packages"]["sbi-active"] = "9.9"
-    crafted(folder, "objects", "campaign", 0, manifest)
-    with pytest.raises(ValueError, match=r"schema 2; got .* of schema 9.*9\.9"):
+    crafted(folder, "campaign", 0, manifest)
+    with pytest.raises(ValueError, match=r"schema 3; got 9 in .*9\.9"):
         Campaign.load(folder)
 
 
@@ -172,27 +170,25 @@ def short(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    ("table", "kind", "number"),
+    ("kind", "number"),
     [
-        ("objects", "state", 0),
-        ("objects", "belief", 0),
-        ("objects", "campaign", 0),
-        ("events", "log", 1),
+        *(("state", 0), ("belief", 0), ("campaign", 0), ("log", 1)),
+        *(("prior", 0), ("actions", 0), ("options", 0)),
     ],
 )
-def test_nothing_is_executed(short, tmp_path, table, kind, number):
+def test_nothing_is_executed(short, tmp_path, kind, number):
     folder = shutil.copytree(short, tmp_path / "c")
     for content in (
         pickle.dumps(Bomb()),
         zlib.compress(pickle.dumps(Bomb())),
         zlib.compress(_saved({"structure": "{}", "arrays": Bomb()})),
     ):
-        crafted(folder, table, kind, number, content)
+        crafted(folder, kind, number, content)
         with contextlib.suppress(ValueError, OSError):
             Campaign.load(folder, simulator=drawn).update()
         assert not (tmp_path / "exploded").exists()
     (folder / FILE).write_bytes(pickle.dumps(Bomb()))
-    with pytest.raises(DamagedCampaignError):
+    with pytest.raises(CorruptSegmentError):
         Campaign.load(folder)
     assert not (tmp_path / "exploded").exists()
 

@@ -65,7 +65,7 @@ def test_left_after_every_step(tmp_path, method, simulator):
 def test_what_follows_is_computed_again_from_the_log_without_simulating(tmp_path):
     whole = go_on(new(tmp_path / "c", simulator=counted), 2)
     whole.close()
-    execute(tmp_path / "c", "DELETE FROM objects WHERE kind IN ('state', 'belief')")
+    execute(tmp_path / "c", "DELETE FROM records WHERE kind IN ('state', 'belief')")
     CALLS.clear()
 
     campaign = Campaign.load(tmp_path / "c", simulator=counted)

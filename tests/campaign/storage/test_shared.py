@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from sbi_active import Campaign, GaussianNoise, SimulatorModel
-from sbi_active.campaign.storage import DamagedCampaignError
 from sbi_active.campaign.storage.codec import decode, encode
-from sbi_active.campaign.storage.damage import LogChangedError
-from sbi_active.simulation.bank import LockedError, store
+from sbi_active.campaign.storage.directory import LogChangedError
+from sbi_active.simulation.bank import CorruptSegmentError, LockedError, store
+from sbi_active.simulation.bank.store import Store
 from tests.campaign.storage.campaigns import (
     MODEL,
     facts,
@@ -128,7 +128,7 @@ def test_a_file_that_is_harmed_meanwhile_is_not_written_to(tmp_path, harm):
         (folder / FILE).unlink()
     if left is not None:
         (folder / FILE).write_bytes(left)
-    with pytest.raises(DamagedCampaignError, match="nothing was written to it now"):
+    with pytest.raises(CorruptSegmentError, match="nothing was written to it now"):
         c.attach([2.0], number(2))
     assert ((folder / FILE).read_bytes() if left is not None else None) == left
     assert len(c.history) == 1  # and the second is not taken for recorded
@@ -141,10 +141,11 @@ def test_a_log_shorter_than_the_state_is_damage_and_is_repaired(tmp_path, harm):
     c = go_on(new(folder), 3)
     c.close()
     left = {"empty": 0, "uncounted": 0, "older": 1}[harm]
-    execute(folder, "DELETE FROM events WHERE kind = 'log' AND number > ?", left)
+    execute(folder, "DELETE FROM records WHERE kind = 'log' AND number > ?", left)
     if harm != "empty":
-        crafted(folder, "objects", "events of log", 0, {"length": left})
-    with pytest.raises(DamagedCampaignError):
+        catalog = Store(folder, "campaign").catalog
+        crafted(folder, "catalog", 0, {**catalog, "log": left})
+    with pytest.raises(CorruptSegmentError):
         Campaign.load(folder)
     with Campaign.load(folder, repair=True) as again:
         assert [t.x.tolist() for t in again.history] == [
@@ -231,25 +232,25 @@ def test_crafted_files_are_one_error_that_names_the_file(tmp_path):
     changes = []
     for key in manifest:
         for k in rng.choice(len(SPOILS), 2, replace=False):
-            changes.append(("objects", "campaign", 0, {**manifest, key: SPOILS[k]}))
+            changes.append(("campaign", 0, {**manifest, key: SPOILS[k]}))
     for entry in whole.events:
         line, trial = entry["line"], entry.get("trial", {})
         for key in entry.keys() - {"line"}:
             spoil = SPOILS[rng.integers(len(SPOILS))]
-            changes.append(("events", "log", line, {**entry, key: spoil}))
+            changes.append(("log", line, {**entry, key: spoil}))
         for key in trial:
             spoil = {**trial, key: SPOILS[rng.integers(len(SPOILS))]}
-            changes.append(("events", "log", line, {**entry, "trial": spoil}))
+            changes.append(("log", line, {**entry, "trial": spoil}))
     assert len(changes) > 60
     survived = 0
-    for table, kind, number, spoiled in changes:
+    for kind, number, spoiled in changes:
         (folder / FILE).write_bytes(content)
-        crafted(folder, table, kind, number, spoiled)
+        crafted(folder, kind, number, spoiled)
         try:
             found = Campaign.load(folder)
             found.history, found.health, str(found.belief)  # noqa: B018
             survived += facts(found) == facts(whole)
-        except (DamagedCampaignError, LogChangedError):
+        except (CorruptSegmentError, LogChangedError):
             survived += 1
         except ValueError as error:  # what a reader has to give again
             survived += str(error).startswith("expected")

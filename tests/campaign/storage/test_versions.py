@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from sbi_active import Bank, Campaign
-from sbi_active.campaign.storage import DamagedCampaignError
 from sbi_active.cli import main
 from sbi_active.migration import migrate
 from sbi_active.simulation.bank import CorruptSegmentError
@@ -158,7 +157,7 @@ def test_damage_is_named_and_nothing_is_moved(old, name):
     path.write_bytes(content)
     if name == "campaign.json":
         (old / "campaign.json.copy").unlink()
-    with pytest.raises((DamagedCampaignError, CorruptSegmentError), match=path.name):
+    with pytest.raises(CorruptSegmentError, match=path.name):
         migrate(old)
     assert not (old / "store.db").exists()
     assert (old / "campaign.json").exists()
@@ -174,7 +173,7 @@ def test_without_h5py_it_says_what_to_install(old, monkeypatch):
 def test_computed_again_from_its_log(folder):
     from tests.simulation.bank.filled import execute
 
-    execute(folder, "DELETE FROM objects WHERE kind IN ('state', 'belief')")
+    execute(folder, "DELETE FROM records WHERE kind IN ('state', 'belief')")
     with Campaign.load(folder, simulator=simulator) as campaign:
         campaign.update()
         mean = campaign.belief.mean.tolist()

@@ -7,7 +7,6 @@ import torch
 
 from sbi_active import Bank
 from sbi_active.simulation import Simulations
-from sbi_active.simulation.bank.segments import COLUMNS
 from sbi_active.simulation.bank.store import Store
 
 FILE = "store.db"
@@ -48,20 +47,18 @@ def execute(folder, statement, *values):
     return found
 
 
-def crafted(folder, table, kind, number, content):
+def crafted(folder, kind, number, head, body=None):
     """Put a record with the right checksum."""
     store = Store(folder)
     with store.writing():
-        store.put(table, kind, number, content)
+        store.put(
+            kind, number, head, store.body(kind, number) if body is None else body
+        )
     store.close()
 
 
-def kinds():
-    return ["rows", *(f"rows/{name}" for name in COLUMNS)]
-
-
 def remove(folder, number):
-    execute(folder, "DELETE FROM segments WHERE number = ?", number)
+    execute(folder, "DELETE FROM records WHERE kind = 'rows' AND number = ?", number)
 
 
 def flip(path, position):

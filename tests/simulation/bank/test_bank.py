@@ -13,7 +13,7 @@ from sbi_active import Bank, GaussianNoise, SimulatorModel, simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import Simulations
 from sbi_active.simulation.bank import LockedError
-from sbi_active.simulation.bank import bank as module
+from sbi_active.simulation.bank import rows as module
 
 
 def simulator(theta, action, seeds):
@@ -49,7 +49,7 @@ def test_rows_come_back_as_they_went_in(bank):
     assert len(reader) == 500
     assert reader.counts == stored.counts
     assert 20 < reader.counts["invalid"] < 80
-    column = reader.columns("index", "seed", "log_proposal", "log_action")
+    column = reader.columns("index", "seed", "log_proposal")
     assert column["index"].tolist() == list(range(500))
     assert (column["seed"] == 3).all()
     assert column["log_proposal"].isnan().all()
@@ -101,7 +101,7 @@ def test_same_rows_are_stored_once(bank):
 
 
 def test_rows_by_position_slice_and_mask(bank, monkeypatch):
-    monkeypatch.setattr(module, "SEGMENT_BYTES", 60 * 60)  # about 60 rows a segment
+    monkeypatch.setattr(module, "SEGMENT_BYTES", 45 * 60)  # about 60 rows a segment
     rows = simulate(simulator, *draw(200), seed=0)
     bank.append(rows, seed=0)
     assert len(bank._rows.segments()) > 2
@@ -246,7 +246,7 @@ def test_the_lock_goes_with_its_process(bank):
 
     with forked(hold) as is_running:
         other = Bank(bank.path, simulator=simulator)
-        while (other._store.text("writer") or {}).get("pid") != is_running.pid:
+        while (other._store.json("writer") or {}).get("pid") != is_running.pid:
             assert is_running()
         text = f"got process {is_running.pid} on"
         with pytest.raises(LockedError, match=text) as raised:
@@ -305,14 +305,6 @@ def test_names_and_settings_are_in_the_header(tmp_path):
     assert header["simulator"]["noise"]["sd"] == 0.5
     assert header["simulator"]["fn"]["name"].endswith("test_bank.simulator")
     assert Bank(tmp_path / "bank").simulator_name.endswith("test_bank.simulator")
-
-
-def test_log_density_of_the_actions(bank):
-    rows = simulate(simulator, *draw(3), seed=0)
-    bank.append(rows, seed=0, log_action=torch.tensor([-1.0, -2.0, -3.0]))
-    bank.append(rows, seed=1, log_action=-4.0)
-    expected = [-1, -2, -3, -4, -4, -4]
-    assert bank.columns("log_action")["log_action"].tolist() == expected
 
 
 class forked:  # noqa: N801

@@ -1,5 +1,6 @@
 """Damaged, crafted and strange files of a bank: one error names them."""
 
+import json
 import os
 from contextlib import suppress
 from typing import Any
@@ -12,6 +13,8 @@ from sbi_active import Bank
 from sbi_active.cli import main
 from sbi_active.simulation import Simulations
 from sbi_active.simulation.bank import CorruptSegmentError
+from sbi_active.simulation.bank.rows import row_type
+from sbi_active.simulation.bank.store import Store
 from tests.simulation.bank.filled import FILE, crafted, execute, filled, simulator
 
 
@@ -32,7 +35,7 @@ HEADERS = {
 
 @pytest.mark.parametrize("content", HEADERS.values(), ids=HEADERS.keys())
 def test_crafted_headers(folder, content):
-    crafted(folder, "objects", "bank rows", 0, content)
+    crafted(folder, "bank rows", 0, content)
     with pytest.raises(CorruptSegmentError, match=r"store\.db as it was written"):
         Bank(folder)
     assert main(["bank", "inspect", str(folder)]) == 2
@@ -54,7 +57,7 @@ def test_files_that_are_no_store(folder, make):
             Bank(folder, **options)
 
 
-ENTRIES = ["version", "simulator", "parameter_names", "shapes", "created", "lost"]
+ENTRIES = ["version", "simulator", "parameter_names", "shapes", "created"]
 
 
 @pytest.mark.parametrize("name", ENTRIES)
@@ -63,36 +66,50 @@ def test_entries_of_other_types(folder, name):
     for value in (-1, 1.5, [1.5], [[[]]], {"theta": 3}):
         if (name, value) == ("simulator", {"theta": 3}):
             continue  # any object describes a simulator
-        crafted(folder, "objects", "bank rows", 0, {**header, name: value})
+        crafted(folder, "bank rows", 0, {**header, name: value})
         with pytest.raises(CorruptSegmentError, match=r"store\.db"):
             Bank(folder)
     del header[name]
-    crafted(folder, "objects", "bank rows", 0, header)
+    crafted(folder, "bank rows", 0, header)
     with pytest.raises(CorruptSegmentError, match=r"store\.db"):
         Bank(folder)
 
 
-KNOWN = {"run": "r", "seed": 1, "label": "", "num_rows": 5, "counts": [5, 0, 0]}
-SEGMENTS: dict[str, tuple[str, Any]] = {
-    "negative rows": ("rows", {**KNOWN, "num_rows": -5}),
-    "many rows": ("rows", {**KNOWN, "num_rows": 10**18, "counts": [10**18, 0, 0]}),
-    "a run as a number": ("rows", {**KNOWN, "run": 3}),
-    "a seed of a text": ("rows", {**KNOWN, "seed": "1"}),
-    "other counts": ("rows", {**KNOWN, "counts": [0, 5, 0]}),
-    "negative counts": ("rows", {**KNOWN, "counts": [10, -5, 0]}),
-    "more": ("rows", {**KNOWN, "more": 1}),
-    "no JSON": ("rows", b"\xff\xfe"),
-    "deep": ("rows", b"[" * 100_000 + b"]" * 100_000),
-    "an outcome of 7": ("rows/status", bytes([7, 0, 0, 0, 0])),
-    "an index of -1": ("rows/index", np.full(5, -1).tobytes()),
-    "a short column": ("rows/x", np.zeros((2, 2), np.float32).tobytes()),
+KNOWN = {"run": "r", "seed": 1, "label": ""}
+ROWS = np.zeros(5, row_type({"theta": [2], "action": [1], "x": [2]}))
+
+
+def head(rows=ROWS, **known):
+    return json.dumps({**KNOWN, **known}).encode() + b"\n" + rows.tobytes()
+
+
+def changed(name, place, value):
+    rows = ROWS.copy()
+    rows[name][place] = value
+    return head(rows)
+
+
+X = np.zeros((5, 2), np.float32).tobytes()
+SEGMENTS = {
+    "no rows": (b"", X),
+    "part of a row": (head()[:-3], X),
+    "other rows than x": (head(ROWS[:3]), X),
+    "a run as a number": (head(run=3), X),
+    "a seed of a text": (head(seed="1"), X),
+    "more": (head(more=1), X),
+    "no JSON": (b"\xff\xfe", X),
+    "deep": (b"[" * 100_000 + b"]" * 100_000, X),
+    "an outcome of 7": (changed("status", 0, 7), X),
+    "an outcome of -1": (changed("status", 4, -1), X),
+    "an index of -1": (changed("index", 2, -1), X),
+    "a short column": (head(), X[:-16]),
+    "part of a number": (head(), X[:-3]),
 }
 
 
 @pytest.mark.parametrize("change", SEGMENTS.values(), ids=SEGMENTS.keys())
 def test_crafted_segments(folder, change):
-    kind, content = change
-    crafted(folder, "segments", kind, 2, content)
+    crafted(folder, "rows", 2, *change)
     with pytest.raises(CorruptSegmentError, match=str(folder)):
         Bank(folder).columns("x", "status", "seed", "index")
     (line,) = Bank(folder).verify()
@@ -101,35 +118,43 @@ def test_crafted_segments(folder, change):
 
 LARGE = "x'" + "00" * 1000 + "'"
 STATEMENTS = {
-    "a text": "UPDATE segments SET content = 'abc' WHERE kind = 'rows/x'",
-    "another content": f"UPDATE segments SET content = {LARGE} WHERE kind = 'rows/x'",
-    "a checksum of text": "UPDATE segments SET digest = 'abc' WHERE kind = 'rows/x'",
+    "a text": "UPDATE records SET body = 'abc' WHERE kind = 'rows'",
+    "a number": "UPDATE records SET body = 7 WHERE kind = 'rows'",
+    "a head of text": "UPDATE records SET head = 'abc' WHERE kind = 'rows'",
+    "another content": f"UPDATE records SET body = {LARGE} WHERE kind = 'rows'",
+    "a checksum of text": "UPDATE records SET body_digest = 'abc' WHERE kind = 'rows'",
     "another name": "PRAGMA application_id = 7",
-    "no length": "DELETE FROM objects WHERE kind = 'segments of rows'",
-    "no header": "UPDATE objects SET content = 'a' WHERE kind = 'bank rows'",
-    "a trigger": "CREATE TRIGGER t AFTER INSERT ON segments BEGIN DELETE FROM segments;"
+    "no catalog": "DELETE FROM records WHERE kind = 'catalog'",
+    "no header": "UPDATE records SET head = 'a' WHERE kind = 'bank rows'",
+    "a trigger": "CREATE TRIGGER t AFTER INSERT ON records BEGIN DELETE FROM records;"
     " END",
     "another table": "CREATE TABLE t (a)",
-    "an index": "CREATE INDEX i ON segments (upper(kind))",
+    "an index": "CREATE INDEX i ON records (upper(kind))",
 }
 
 
 @pytest.mark.parametrize("statement", STATEMENTS.values(), ids=STATEMENTS.keys())
 def test_what_anybody_can_do_with_sqlite(folder, statement):
     execute(folder, statement)
-    if "segments of rows" in statement:  # as if none had been written
-        assert len(Bank(folder)) == 0
-        return
     with pytest.raises(CorruptSegmentError, match=str(folder)):
         Bank(folder).columns("x")
 
 
+@pytest.mark.parametrize("catalog", [{"rows": "4"}, {"rows": 10**18}, None])
+def test_crafted_catalogs(folder, catalog):
+    content = json.dumps({"bank rows": 0, **catalog} if catalog else catalog).encode()
+    crafted(folder, "catalog", 0, content)
+    with pytest.raises((CorruptSegmentError, ValueError), match=str(folder)):
+        Bank(folder).columns("x")
+    assert Store(folder).problems()
+
+
 def test_a_view_in_place_of_a_table_is_not_read(folder):
-    execute(folder, "DROP TABLE segments")
+    execute(folder, "DROP TABLE records")
     endless = (
-        "CREATE VIEW segments AS WITH RECURSIVE n(kind) AS (SELECT 1 UNION ALL SELECT "
-        "kind + 1 FROM n) SELECT kind, kind AS number, x'' AS content, x'' AS digest "
-        "FROM n"
+        "CREATE VIEW records AS WITH RECURSIVE n(kind) AS (SELECT 1 UNION ALL SELECT "
+        "kind + 1 FROM n) SELECT kind, kind AS number, x'' AS head, x'' AS "
+        "head_digest, x'' AS body_digest, x'' AS body FROM n"
     )
     execute(folder, endless)
     with pytest.raises(CorruptSegmentError, match="tables that are not those"):
@@ -191,7 +216,7 @@ def test_the_log_of_another_file_is_noticed(folder, tmp_path):
 
 def test_control_characters_do_not_reach_the_terminal(folder, capsys):
     header = {**Bank(folder).header, "created": "\x1b[2J\ud800"}
-    crafted(folder, "objects", "bank rows", 0, header)
+    crafted(folder, "bank rows", 0, header)
     assert main(["bank", "inspect", str(folder)]) == 0
     assert r"created: '\x1b[2J\ud800'" in capsys.readouterr().out
 

@@ -115,7 +115,7 @@ def test_other_shapes_and_lengths(bank):
 def test_other_formats_and_folders(bank, tmp_path):
     bank.close()
     execute(bank.path, "PRAGMA user_version = 99")
-    with pytest.raises(ValueError, match="expected a bank of format 2; got 99"):
+    with pytest.raises(ValueError, match="expected a bank of format 3; got 99"):
         Bank(bank.path)
     with pytest.raises(ValueError, match=r"got no .*store.db; give simulator="):
         Bank(tmp_path / "none")

@@ -92,9 +92,6 @@ def test_effective_sample_size_is_that_of_kish(bank):
     weights = (TARGET.log_prob(theta).exp() / mixture).double()
     expected = float(weights.sum() ** 2 / (weights**2).sum())
     assert reused.effective_sample_size == pytest.approx(expected, rel=1e-4)
-    assert reused.denominator == "mixture"
-    assert sum(reused.share.values()) == pytest.approx(1)
-    assert reused.share["prior"] > reused.share["round 1"]
     # The target itself needs no weights.
     only = Bank(bank.path.parent / "only", simulator=simulator)
     only.append(bank.read(slice(0, 2_000)), seed=0, proposal=PRIOR, label="prior")

@@ -9,8 +9,9 @@ import torch
 
 from sbi_active import CampaignOptions, RefinementOptions, simulate
 from sbi_active.campaign.options import CampaignDetails
-from sbi_active.campaign.storage.described import describe_options, options_from
+from sbi_active.campaign.storage.codec import decode, encode
 from sbi_active.messages import RenamedWarning
+from sbi_active.migration.described import options_from
 from sbi_active.simulation import Workers
 
 
@@ -62,7 +63,7 @@ def test_former_options_of_a_campaign_are_taken_for_one_version():
         _ = options.num_rows
     stored = {"settings": "CampaignOptions", **former, "num_samples": 10}
     assert options_from(stored) == options
-    assert options_from(describe_options(options)) == options
+    assert decode(encode(options, known={}), known={}) == options
     state = options.__getstate__()
     del state["workers"], state["details"]
     loaded = object.__new__(CampaignOptions)
