@@ -14,15 +14,14 @@ import json
 import math
 import os
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from datetime import datetime, timezone
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 from sbi_active.campaign.storage.damage import naming
-from sbi_active.cli.declared import read_declared
-from sbi_active.cli.options import flat
+from sbi_active.cli.numbers import flat
+from sbi_active.cli.trust import read_declared
 from sbi_active.simulation.bank.sqlite import EVENTS, NAME, OBJECTS
 from sbi_active.simulation.bank.store import Store
 
@@ -43,7 +42,7 @@ def sum_up(folder: Path, known: Mapping[str, Any]) -> None:
         known: Facts that :class:`Record` needs.
     """
     with _stored(folder) as store:
-        content = {**known, "of": _mark(store, store.length(EVENTS, LOG))}
+        content = {**known, "of": _mark(store)}
     temporary = folder / f".{os.getpid()}-{SUMMARY}"
     with contextlib.suppress(OSError):  # as in a folder that is read only
         with open(temporary, "x", encoding="utf-8") as file:  # follows no link
@@ -58,12 +57,13 @@ def digest(folder: Path) -> str:
         folder: Folder of the campaign.
     """
     with contextlib.suppress(OSError, ValueError, Unsure), _stored(folder) as store:
-        return str(_mark(store, store.length(EVENTS, LOG)))
+        return str(_mark(store))
     return ""
 
 
-def _mark(store: Store, num: int) -> list[Any]:
-    """Return the length of the log, and a checksum of its end and of the state."""
+def _mark(store: Store, num: int | None = None) -> list[Any]:
+    """Return a length of the log, and a checksum of its end and of the state."""
+    num = store.length(EVENTS, LOG) if num is None else num
     last = store.get(EVENTS, LOG, num) if num else None
     content = (last or b"") + (store.get(OBJECTS, STATE) or b"")
     return [num, hashlib.sha256(content).hexdigest()]
@@ -86,14 +86,11 @@ class Record:
     Attributes:
         directory: Folder of the campaign.
         x_shape: Shape of an outcome.
-        state: State of the campaign, with its trials.
 
     Raises:
         Unsure: If there is no summary, or more was done since than told.
         ValueError: If the folder's programs are not declared as they are written.
     """
-
-    simulator = None
 
     def __init__(self, folder: Path) -> None:
         read_declared(folder)
@@ -102,19 +99,18 @@ class Record:
             self._summary = json.loads((folder / SUMMARY).read_bytes())
             self.x_shape: list[int] = self._summary["x_shape"]
             self._status = self._summary["status"]
-            self.state = SimpleNamespace(trials=self._status["trials"])
-            num = self._summary["of"][0]
+            self._trials: list[dict[str, Any]] = self._status["trials"]
             with _stored(folder) as store:
-                self._num = store.length(EVENTS, LOG)
+                num = self._summary["of"][0]
                 if self._summary["of"] != _mark(store, num):
                     raise Unsure
-                numbers = range(1, self._num + 1)
-                lines = [store.get(EVENTS, LOG, k) or b"{}" for k in numbers]
-            for number, entry in enumerate(map(json.loads, lines), start=1):
-                self._take(entry, is_new=number > num)
-            if len(self._facts) != len(self.state.trials):
+                self._num = store.length(EVENTS, LOG)
+                for number in range(1, self._num + 1):
+                    entry = json.loads(store.get(EVENTS, LOG, number) or b"{}")
+                    self._take(entry, is_new=number > num)
+            if len(self._facts) != len(self._trials):
                 raise Unsure
-        except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
+        except (OSError, ValueError, RecursionError, LookupError, TypeError) as error:
             raise Unsure from error
 
     @property
@@ -130,13 +126,12 @@ class Record:
 
     def tell(self, x: Any, *, trial: int | None, action: Any, status: str) -> Any:
         """Record the outcome of the pending trial, or of a new one with an action."""
-        trials = self.state.trials
-        pending = [t["trial"] for t in trials if t["status"] == "pending"]
-        index = [*pending, len(trials)][0] if trial is None else trial
+        pending = [t["trial"] for t in self._trials if t["status"] == "pending"]
+        index = [*pending, len(self._trials)][0] if trial is None else trial
         before = {"index": index, "action": None, "target": None, "reason": ""}
         if index in pending:
             before = self._facts[index]
-        elif index != len(trials) or action is None:  # a trial told again, or none
+        elif index != len(self._trials) or action is None:  # one told again, or none
             raise Unsure
         return self._write("told", self._told(before, x, action, status))
 
@@ -144,7 +139,7 @@ class Record:
         self, trial: int, x: Any, *, action: Any, status: str, reason: str
     ) -> Any:
         """Replace what was told of a trial."""
-        before = self._facts[trial]
+        before = self._known(trial)
         told = self._told(before, x, action, status)
         # One told as before stays as it was scored.
         if before["status"] == "pending" or told == before:
@@ -153,15 +148,25 @@ class Record:
 
     def withdraw(self, trial: int, *, reason: str) -> Any:
         """Take a trial out."""
-        facts = {**self._facts[trial], "status": "withdrawn", "reason": reason}
+        facts = {**self._known(trial), "status": "withdrawn", "reason": reason}
         return self._write("withdrawn", facts)
+
+    def _known(self, trial: int) -> dict[str, Any]:
+        if trial not in self._facts:
+            raise Unsure
+        return self._facts[trial]
 
     def _told(
         self, before: Mapping[str, Any], x: Any, action: Any, status: str
     ) -> dict[str, Any]:
-        executed = before["action"] if action is None else _single(action)
-        if action is not None and not self._permits(executed):
-            raise Unsure
+        executed = before["action"]
+        if action is not None:
+            executed, limits = _single(action), self._summary["limits"]
+            if len(limits) != len(executed) or not all(
+                low <= a <= high
+                for (low, high), a in zip(limits, executed, strict=True)
+            ):
+                raise Unsure
         if x is not None:
             x = _single(x)
         elif status == "ok":  # the action alone is corrected
@@ -172,16 +177,6 @@ class Record:
             x = shaped([None] * math.prod(self.x_shape), self.x_shape)
         return {**before, "action": executed, "x": x, "status": status}
 
-    def _permits(self, action: list[float]) -> bool:
-        """Return whether an action is plainly one of the campaign's."""
-        space: dict[str, Any] = self._summary["actions"] or {}
-        if space.get("kind") == "list":
-            return action in space["values"]
-        if space.get("kind") != "box" or len(action) != len(space["low"]):
-            return False
-        limits = zip(space["low"], action, space["high"], strict=True)
-        return all(low <= a <= high for low, a, high in limits)
-
     def _write(self, event: str, facts: dict[str, Any]) -> dict[str, Any]:
         time = datetime.now(timezone.utc).isoformat(timespec="seconds")
         with _stored(self.directory) as store, store.writing((EVENTS, LOG)) as number:
@@ -190,7 +185,7 @@ class Record:
             line = {"line": number, "time": time, "event": event, "trial": facts}
             store.put(EVENTS, LOG, number, line)
         self._take(line, is_new=True)
-        return self.state.trials[facts["index"]]
+        return self._trials[facts["index"]]
 
     def _take(self, entry: Mapping[str, Any], *, is_new: bool) -> None:
         """Take a line of the log, which a new one changes the trials by."""
@@ -206,17 +201,17 @@ class Record:
             told = {
                 "trial": index,
                 **{name: facts[name] for name in ("status", "action")},
-                **{name: self._summary[name] for name in ("names", "units")},
+                **self._summary["labels"],
                 "x": numbers and [math.nan if v is None else v for v in numbers],
                 **{"information_gained": None, "surprise": None},
                 "reason": facts["reason"],
             }
-            self.state.trials[index : index + 1] = [told]
+            self._trials[index : index + 1] = [told]
             waiting = {*self._status["not_in_belief"], index}
             self._status["not_in_belief"] = sorted(waiting)
 
 
-def shaped(numbers: list[Any], shape: Sequence[int]) -> Any:
+def shaped(numbers: list[Any], shape: list[int]) -> Any:
     """Return numbers as nested lists of a shape."""
     if len(shape) < 2:
         return numbers if shape else numbers[0]

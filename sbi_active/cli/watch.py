@@ -12,12 +12,12 @@ import threading
 from html import escape
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from typing import Any
 
-from sbi_active.campaign import Campaign
-from sbi_active.campaign.display.page import page
+from click import IntRange
+
+from sbi_active.cli import declare as cli
 from sbi_active.cli.record import digest
-from sbi_active.display import Page
-from sbi_active.progress import in_words
 from sbi_active.simulation.bank.sqlite import is_locked
 from sbi_active.simulation.bank.store import Store
 
@@ -66,6 +66,8 @@ class Watched:
                 try:
                     text = self.drawn()
                 except (ValueError, OSError) as error:
+                    from sbi_active.display import Page
+
                     text = _with_news(Page("Campaign", []).html(), str(error))
                 script = SCRIPT.replace("VERSION", version)
                 self._page = text.replace("</body>", f"{script}</body>")
@@ -74,21 +76,37 @@ class Watched:
 
     def drawn(self) -> str:
         """Return the page as it is now."""
+        from sbi_active.campaign import Campaign
+        from sbi_active.campaign.display.page import page
+
         with Campaign.load(self._folder) as campaign:
             return _with_news(page(campaign), _news(campaign, self._folder))
 
 
-def watch(folder: Path, *, port: int, once: Path | None) -> None:
-    """Show a campaign until an interrupt, or write its page once."""
+@cli.command(
+    cli.DIR,
+    cli.option(
+        "--port",
+        "of this machine alone; 0 is any free one",
+        IntRange(0, 65_535),
+        default=8642,
+    ),
+    cli.option("--once", "write the page, and end", cli.FILE, "FILE.html"),
+)
+def watch(folder: Path, port: int, once: Path | None) -> None:
+    """Show a campaign in a browser while another process runs it.
+
+    The page is drawn again when the folder changes; the folder is only read.
+    """
     import matplotlib
 
     matplotlib.use("Agg")  # figures are drawn by threads, which may open no window
     watched = Watched(folder)
+    text = watched.drawn()  # what is wrong with it is said here
     if once is not None:
-        once.write_text(watched.drawn(), encoding="utf-8")
+        once.write_text(text, encoding="utf-8")
         print(f"saved: {once}")
         return
-    Campaign.load(folder).close()  # what is wrong with it is said here
     with served(watched, port) as server:
         place = f"http://{HOST}:{server.server_port}"
         print(f"{folder} is shown at {place} until Ctrl-C", flush=True)
@@ -142,8 +160,10 @@ def served(watched: Watched, port: int) -> ThreadingHTTPServer:
         ) from error
 
 
-def _news(campaign: Campaign, folder: Path) -> str:
+def _news(campaign: Any, folder: Path) -> str:
     """Return what is being computed, as far as the folder says."""
+    from sbi_active.progress import in_words
+
     late = [t.index for t in campaign.history if not campaign.contains(t)]
     if campaign.pending is not None:
         doing, stage = f"trial {campaign.pending.index} waits for its outcome", ""
