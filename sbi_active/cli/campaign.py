@@ -64,7 +64,7 @@ def ask(campaign: Any, target: str) -> Answer:
     trial = campaign.ask(target=target)
     gain, error = (v if v == v else None for v in trial.expected_gain)
     found = {"expected_information_gain": gain, "standard_error": error}
-    data = {**trial_of(campaign, trial), "target": trial.target, **found}
+    data = {**trial_of(campaign, trial), **found}
     lines = [f"trial {trial.index}: {place_of(data)}"]
     if gain is not None:
         lines += [f"it is expected to tell {gain:.2f} nats about {trial.target}"]

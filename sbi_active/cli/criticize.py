@@ -69,12 +69,6 @@ def criticize(trials: Path, **given: Any) -> Answer:
             f"{', '.join(sorted(wrong))}; write one of these"
         )
     if trials.is_dir():
-        if not [*trials.glob("*.csv")]:
-            raise ValueError(
-                f"expected a campaign or recordings in {trials}; got neither a store "
-                "nor a file *.csv; make a campaign by sbi-active init, or write one "
-                "table of all trials, or one a trial"
-            )
         _take_module(trials / MODULE, given)
     return _compared(trials, given, settings)
 
@@ -135,12 +129,6 @@ def _compared(path: Path, given: dict[str, Any], settings: dict[str, Any]) -> An
     model, prior, actions, own = problem_of(**options, needs=["prior"])
     how = {"order": given["order"], "inputs": given["inputs"]}
     trials = Trials.from_csv(path, columns=columns or None, units=units, **how)
-    num, held = len(trials), len(trials.held_out_positions)
-    if num - held < 2:
-        raise ValueError(
-            f"expected at least two trials to fit; got {num - held} in {path} ({num} "
-            f"in all, {held} held out); measure more, since one trial fits any model"
-        )
     labels = trials.action_labels or ()
     for unit, label in zip(actions.units if actions else (), labels, strict=False):
         stated = label.partition(" [")[2].removesuffix("]")

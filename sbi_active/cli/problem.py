@@ -213,15 +213,9 @@ def problem_of(
         raise ValueError(f"{BOUNDS}; got none; give bounds as in --theta-low=0,-1")
     if space is None and "actions" in needs:
         raise ValueError("expected --actions; got none; write, say, --actions 0:5:11")
-    for what, text in (("names", names), ("units", units)):
-        labels, num = (text or "").split(","), getattr(space, "action_dim", 0)
-        if text is not None and len(labels) != num:
-            raise ValueError(
-                f"expected --{what} of {num} entries; got {text!r}; separate them by "
-                "commas, one an entry of the action"
-            )
-        if text is not None:
-            setattr(space, what, labels)
+    if names or units:
+        labels = names.split(",") if names else space.names
+        space._label(labels, units.split(",") if units else space.units)
     own += effects_of(effects, folder)
     return Problem(with_noise(model, noise), bounded, space, own)
 

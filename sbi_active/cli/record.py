@@ -27,7 +27,6 @@ from sbi_active.simulation.bank.store import Store
 
 SUMMARY = "status.json"
 LOG, STATE = "log", "state"  # records of a campaign, see its storage
-TOLD = ("told", "corrected", "withdrawn")  # events that compute nothing
 
 
 class Unsure(Exception):  # noqa: N818
@@ -94,7 +93,7 @@ class Record:
 
     def __init__(self, folder: Path) -> None:
         read_declared(folder)
-        self.directory, self._facts = folder, {}
+        self.directory = folder
         try:
             self._summary = json.loads((folder / SUMMARY).read_bytes())
             self.x_shape: list[int] = self._summary["x_shape"]
@@ -105,11 +104,8 @@ class Record:
                 if self._summary["of"] != _mark(store, num):
                     raise Unsure
                 self._num = store.length(EVENTS, LOG)
-                for number in range(1, self._num + 1):
-                    entry = json.loads(store.get(EVENTS, LOG, number) or b"{}")
-                    self._take(entry, is_new=number > num)
-            if len(self._facts) != len(self._trials):
-                raise Unsure
+                for number in range(num + 1, self._num + 1):
+                    self._take(json.loads(store.get(EVENTS, LOG, number) or b"{}"))
         except (OSError, ValueError, RecursionError, LookupError, TypeError) as error:
             raise Unsure from error
 
@@ -128,10 +124,11 @@ class Record:
         """Record the outcome of the pending trial, or of a new one with an action."""
         pending = [t["trial"] for t in self._trials if t["status"] == "pending"]
         index = [*pending, len(self._trials)][0] if trial is None else trial
-        before = {"index": index, "action": None, "target": None, "reason": ""}
-        if index in pending:
-            before = self._facts[index]
-        elif index != len(self._trials) or action is None:  # one told again, or none
+        if index == len(self._trials) and action is not None:  # that nobody asked for
+            before = {"index": index, "action": None, "target": None, "reason": ""}
+        elif index in pending:
+            before = self._facts(index)
+        else:
             raise Unsure
         return self._write("told", self._told(before, x, action, status))
 
@@ -139,7 +136,7 @@ class Record:
         self, trial: int, x: Any, *, action: Any, status: str, reason: str
     ) -> Any:
         """Replace what was told of a trial."""
-        before = self._known(trial)
+        before = self._facts(trial)
         told = self._told(before, x, action, status)
         # One told as before stays as it was scored.
         if before["status"] == "pending" or told == before:
@@ -148,13 +145,17 @@ class Record:
 
     def withdraw(self, trial: int, *, reason: str) -> Any:
         """Take a trial out."""
-        facts = {**self._known(trial), "status": "withdrawn", "reason": reason}
+        facts = {**self._facts(trial), "status": "withdrawn", "reason": reason}
         return self._write("withdrawn", facts)
 
-    def _known(self, trial: int) -> dict[str, Any]:
-        if trial not in self._facts:
+    def _facts(self, index: int) -> dict[str, Any]:
+        """Return a trial as the log has it."""
+        if not 0 <= index < len(self._trials):
             raise Unsure
-        return self._facts[trial]
+        trial = self._trials[index]
+        kept = {name: trial[name] for name in ("action", "status", "target", "reason")}
+        x = trial["x"] and shaped(_single(trial["x"]), self.x_shape)
+        return {"index": index, **kept, "x": x}
 
     def _told(
         self, before: Mapping[str, Any], x: Any, action: Any, status: str
@@ -184,31 +185,22 @@ class Record:
                 raise Unsure
             line = {"line": number, "time": time, "event": event, "trial": facts}
             store.put(EVENTS, LOG, number, line)
-        self._take(line, is_new=True)
+        self._take(line)
         return self._trials[facts["index"]]
 
-    def _take(self, entry: Mapping[str, Any], *, is_new: bool) -> None:
-        """Take a line of the log, which a new one changes the trials by."""
-        if is_new and entry["event"] not in TOLD:
+    def _take(self, entry: Mapping[str, Any]) -> None:
+        """Take a line of the log that was written after the summary."""
+        if entry["event"] not in ("told", "corrected", "withdrawn"):
             raise Unsure
-        facts = entry.get("trial")
-        if facts is None:
-            return
-        index = facts["index"]
-        self._facts[index] = facts
-        if is_new:
-            numbers = None if facts["x"] is None else flat(facts["x"])
-            told = {
-                "trial": index,
-                **{name: facts[name] for name in ("status", "action")},
-                **self._summary["labels"],
-                "x": numbers and [math.nan if v is None else v for v in numbers],
-                **{"information_gained": None, "surprise": None},
-                "reason": facts["reason"],
-            }
-            self._trials[index : index + 1] = [told]
-            waiting = {*self._status["not_in_belief"], index}
-            self._status["not_in_belief"] = sorted(waiting)
+        facts = dict(entry["trial"])
+        index = facts.pop("index")
+        if facts["x"] is not None:
+            facts["x"] = [math.nan if v is None else v for v in flat(facts["x"])]
+        unknown = {"information_gained": None, "surprise": None}
+        told = {"trial": index, **self._summary["labels"], **unknown, **facts}
+        self._trials[index : index + 1] = [told]
+        waiting = {*self._status["not_in_belief"], index}
+        self._status["not_in_belief"] = sorted(waiting)
 
 
 def shaped(numbers: list[Any], shape: list[int]) -> Any:

@@ -67,6 +67,7 @@ def trial_of(campaign: Any, trial: Any) -> dict[str, Any]:
         "x": None if trial.x is None else trial.x.flatten().tolist(),
         "information_gained": trial.information_gained,
         "surprise": trial.surprise,
+        "target": trial.target,
         "reason": trial.reason,
     }
 

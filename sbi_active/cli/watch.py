@@ -7,12 +7,12 @@ imported. Requests from other machines, or for anything else, are refused.
 from __future__ import annotations
 
 import contextlib
-import errno
 import threading
 from html import escape
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from socketserver import ThreadingMixIn
 from typing import Any
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 from click import IntRange
 
@@ -27,6 +27,7 @@ POLICY = (
     "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
     "img-src data:; connect-src 'self'; base-uri 'none'; frame-ancestors 'none'"
 )
+HEADERS = [("Content-Security-Policy", POLICY), ("Cache-Control", "no-store")]
 #: Asks every two seconds whether there is another page, and says when nobody answers.
 SCRIPT = """<script>
 setInterval(async () => {
@@ -51,7 +52,6 @@ class Watched:
         self._folder, self._drawing = folder, threading.Lock()
         self._page = self._version = ""
 
-    @property
     def version(self) -> str:
         """Text that changes with the store and with whoever begins or ends to write."""
         with contextlib.suppress(ValueError, OSError):  # of a lock that is none
@@ -61,7 +61,7 @@ class Watched:
     def page(self) -> str:
         """Return the page, which asks for newer ones."""
         with self._drawing:
-            version = self.version  # of before, so that nothing later is missed
+            version = self.version()  # of before, so that nothing later is missed
             if version != self._version:
                 try:
                     text = self.drawn()
@@ -113,7 +113,7 @@ def watch(folder: Path, port: int, once: Path | None) -> None:
         server.serve_forever()
 
 
-def served(watched: Watched, port: int) -> ThreadingHTTPServer:
+def served(watched: Watched, port: int) -> WSGIServer:
     """Return a server of a page, for this machine alone.
 
     Args:
@@ -124,40 +124,43 @@ def served(watched: Watched, port: int) -> ThreadingHTTPServer:
         ValueError: If another program listens there, or only others may.
     """
 
-    class Handler(BaseHTTPRequestHandler):
-        def handle(self) -> None:
-            with contextlib.suppress(ConnectionError):  # a reader may leave
-                super().handle()
-
-        def do_GET(self) -> None:  # noqa: N802
-            # A page from elsewhere that has its name point here asks by that name.
-            host = self.headers.get("Host", "").partition(":")[0]
-            if host not in (HOST, "localhost") or self.path not in ("/", "/version"):
-                self.send_error(404)
-                return
-            is_page = self.path == "/"
-            content = (watched.page() if is_page else watched.version).encode()
-            self.send_response(200)
-            kind = "html" if is_page else "plain"
-            self.send_header("Content-Type", f"text/{kind}; charset=utf-8")
-            self.send_header("Content-Length", str(len(content)))
-            self.send_header("Content-Security-Policy", POLICY)
-            self.send_header("Cache-Control", "no-store")
-            self.end_headers()
-            self.wfile.write(content)
-
-        def log_message(self, format: str, *_: object) -> None:
-            """Say nothing of each request."""
+    def answer(asked: dict[str, Any], begin: Any) -> list[bytes]:
+        # A page from elsewhere that has its name point here asks by that name.
+        is_here = asked.get("HTTP_HOST", "").partition(":")[0] in (HOST, "localhost")
+        pages = {"/": ("html", watched.page), "/version": ("plain", watched.version)}
+        if not is_here or asked["REQUEST_METHOD"] != "GET":
+            begin("403 Forbidden", [])
+            return []
+        kind, text = pages.get(asked["PATH_INFO"], ("", None))
+        if text is None:
+            begin("404 Not Found", [])
+            return []
+        begin("200 OK", [("Content-Type", f"text/{kind}; charset=utf-8"), *HEADERS])
+        return [text().encode()]
 
     try:
-        return ThreadingHTTPServer((HOST, port), Handler)
+        return make_server(HOST, port, answer, _Server, _Quiet)
     except OSError as error:
-        if error.errno not in (errno.EADDRINUSE, errno.EACCES):
-            raise
         raise ValueError(
             f"expected a port that is free; got {port} ({error.strerror}); choose "
             "another by --port, or 0 for any"
         ) from error
+
+
+class _Server(ThreadingMixIn, WSGIServer):
+    daemon_threads = True
+
+
+class _Quiet(WSGIRequestHandler):
+    """Says nothing of each request, nor of a reader that leaves."""
+
+    def handle(self) -> None:
+        """Answer a request."""
+        with contextlib.suppress(ConnectionError):
+            super().handle()
+
+    def log_message(self, format: str, *_: object) -> None:
+        """Say nothing."""
 
 
 def _news(campaign: Any, folder: Path) -> str:

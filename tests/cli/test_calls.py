@@ -144,7 +144,7 @@ CALLS = [
         for text, words in (
             ("expected finite", "--noise nan"),
             ("expected --noise > 0", "--noise -1"),
-            ("separate them by commas", "--names a,b"),
+            ("names and units, one an entry", "--names a,b"),
             ("expected a Distribution", "--prior odd.py:NUMBER"),
             ("low below high", "--theta-low 1,1"),
             ("expected num_simulations", "--num-simulations 0"),

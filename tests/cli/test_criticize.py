@@ -147,7 +147,7 @@ def test_a_task_brings_prior_noise_and_actions(compared):
 @pytest.mark.parametrize(
     ("rows", "options", "message"),
     [
-        (["1,2"], OPTIONS, "at least two trials to fit; got 1 in trials.csv"),
+        (["1,2"], OPTIONS, "at least two valid trials to fit; got 1"),
         (["1,2", "2,3"], OPTIONS[:2], "at least 3 repeats of one action"),
         (["1,2", "2,3"], [*OPTIONS[:2], "--noise", "0"], "expected --noise > 0"),
         (["1,2", "2,3"], OPTIONS[2:], "expected --theta-low and --theta-high"),
@@ -286,7 +286,7 @@ simulator = place
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: [p.unlink() for p in d.glob("*.csv")], "campaign or recordings in"),
+        (lambda d: [p.unlink() for p in d.glob("*.csv")], "expected recordings in"),
         (lambda d: (d / "problem.toml").unlink(), "expected --simulator or --task"),
         (
             lambda d: (d / "problem.toml").write_text('simulater = "a:b"'),

@@ -96,7 +96,7 @@ WRONG = [
     ({"command": "init"}, "got 'init'"),
     ({"command": "tell", "x": [0.3], "speed": 3}, "expected options among"),
     ({"command": "tell", "x": ["fast"]}, "write them with a point"),
-    ({"command": "tell", "x": [None], "action": 1}, "a number that was measured"),
+    ({"command": "tell", "x": [None], "action": 1}, "one of them measured"),
     ({"command": "tell", "x": 1}, "expected a pending trial; got none"),
     ({"command": "withdraw"}, "Missing argument 'TRIAL'"),
     ({"command": "withdraw", "trial": "first"}, "'first' is not a valid integer"),
