@@ -41,7 +41,7 @@ def slide(theta, action):
 """
 INIT = (
     "init camp --simulator sled.py:slide --noise 0.02 --theta-low 0.2,0 "
-    "--theta-high 1,1 --actions 0.5:3 --method nsbi --num-simulations 200"
+    "--theta-high 1,1 --actions 0.5:3 --method nsbi --set num_simulations=200"
 )
 ROUND = (
     "ask camp",

@@ -1,8 +1,8 @@
 """The command line ``sbi-active``.
 
-This package contains the commands with their options, and one module for each kind of
-them, which takes options, calls the library and prints. It contains nothing that a user
-of Python might need.
+This package contains the commands, each a function whose options are declared above it
+and whose docstring is its help. It contains nothing that a user of Python might need.
+Nothing in it imports torch before a command needs it: commands import what they call.
 """
 
 from __future__ import annotations
@@ -13,26 +13,17 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from click.exceptions import Exit
 from click.shell_completion import shell_complete
 
-from sbi_active.cli.commands import main as program
-from sbi_active.cli.declared import in_campaign
-from sbi_active.cli.output import (
-    FAILED,
-    Answer,
-    as_line,
-    failure,
-    flush,
-    output_to_errors,
-    say,
-)
+from sbi_active.cli.declare import NAME, program
+from sbi_active.cli.output import Answer, as_line, failure, output_to_errors, say
+from sbi_active.cli.trust import in_campaign
 
 __all__ = ["main"]
 
-NAME, COMPLETE = "sbi-active", "_SBI_ACTIVE_COMPLETE"
+COMPLETE = "_SBI_ACTIVE_COMPLETE"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -46,37 +37,43 @@ def main(argv: Sequence[str] | None = None) -> int:
         be changed, 130 after an interrupt.
     """
     words = sys.argv[1:] if argv is None else [*argv]
+    if in_campaign(here := Path.cwd()):  # nothing is imported because it lies there
+        sys.path[:] = [p for p in sys.path if p and Path(p).resolve() != here]
+    from sbi_active.cli import campaign, criticize, session, simulators, watch  # noqa: F401
+
     shell = os.environ.get(COMPLETE)
     if shell:
         return shell_complete(program, {}, NAME, COMPLETE, shell)
-    is_json, answer = "--json" in words, None
+    is_json, status, error = "--json" in words, 0, None
     with contextlib.suppress(AttributeError, ValueError):
         # A terminal that has no such letter shows its number.
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore
     try:
-        _leave_out_campaigns()
         answer = _answer(words, is_json)
         if isinstance(answer, Answer):
             print(as_line(answer.data) if is_json else answer.text)
+        elif isinstance(answer, int):
+            status = answer
         if sys.stdout is not None:
             sys.stdout.flush()
-        return answer if isinstance(answer, int) else 0
     except Exit as ended:  # of help and version
-        return ended.exit_code
-    except BrokenPipeError:  # as in "| head": nobody reads on
-        status = FAILED
-    except (Exception, KeyboardInterrupt) as error:
-        found = failure(error)
-        status = found["status"]
-        say(found["message"])
-        if is_json and answer is None:
-            with contextlib.suppress(OSError, ValueError):
-                print(as_line({"error": found}))
-    flush()
+        status = ended.exit_code
+    except (Exception, KeyboardInterrupt) as raised:
+        error = failure(raised)
+        status = error["status"]
+        if not isinstance(raised, BrokenPipeError):  # as in "| head": nobody reads on
+            say(error["message"])
+    with contextlib.suppress(AttributeError):  # of an output that was closed before
+        try:
+            if error and is_json:
+                print(as_line({"error": error}))
+            sys.stdout.flush()  # type: ignore
+        except OSError:  # the end of the process has then nothing to complain of
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     return status
 
 
-def _answer(words: list[str], is_json: bool) -> Any:
+def _answer(words: list[str], is_json: bool) -> object:
     """Run a command; the answer for programs has standard output for itself."""
     with (
         output_to_errors() if is_json else contextlib.nullcontext(),
@@ -85,10 +82,3 @@ def _answer(words: list[str], is_json: bool) -> Any:
         warnings.showwarning = lambda message, *_: say(f"note: {message}")
         with program.make_context(NAME, words) as context:
             return program.invoke(context)
-
-
-def _leave_out_campaigns() -> None:
-    """Import nothing from a campaign's folder because somebody stands in it."""
-    here = Path.cwd()
-    if in_campaign(here):
-        sys.path[:] = [p for p in sys.path if p and Path(p).resolve() != here]

@@ -1,230 +1,198 @@
-"""Commands on a campaign that compute, and the campaign of a folder for them."""
+"""Commands on a campaign."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sbi_active.campaign import Campaign, CampaignOptions
-from sbi_active.campaign.options import GROUPS
-from sbi_active.campaign.storage.manifest import read_manifest
-from sbi_active.cli.declared import (
-    Declared,
-    declare,
-    read_declared,
-    write_declared,
-)
-from sbi_active.cli.given import (
-    effects_of,
-    load_object,
-    make_task,
-    problem_of,
-    simulator_of,
-    with_generic,
-)
+from sbi_active.cli import declare as cli
+from sbi_active.cli.config import CONFIG
+from sbi_active.cli.numbers import numbers_in
 from sbi_active.cli.output import Answer, say
-from sbi_active.cli.trials import status, sum_up_campaign
-from sbi_active.criticism import Effect
-from sbi_active.renamed import grouped
-from sbi_active.simulation.bank.store import Store
+from sbi_active.cli.record import shaped
+from sbi_active.cli.session import on_campaign
+from sbi_active.cli.summary import (
+    answer_of,
+    numbers_of,
+    place_of,
+    sum_up_campaign,
+    trial_of,
+)
+from sbi_active.cli.trust import absolute, read_declared, write_declared
 
-SIZES = ("num_simulations", "num_samples", "num_workers", "time_limit")
+MANY = 5  # numbers, more than somebody types
+TRIAL = cli.argument("trial", "TRIAL", cli.INTEGER)
+REASON = cli.option("--reason", "kept with the trial", default="")
+OUTCOME = [
+    cli.argument("x", "[X]...", cli.MEASURED, nargs=-1, required=False),
+    cli.option("--file", "with the numbers", cli.FILE, "X.csv"),
+    cli.option("--invalid", "it ran and gave no measurement", None),
+    cli.option("--missing", "a fault that tells nothing hit it", None),
+    cli.option("--action", "executed, if another one", cli.NUMBERS, "A,B,..."),
+]
 
 
-def init(
-    folder: Path,
-    *,
-    config: Path | None,
-    effects: str | None,
-    method: str,
-    seed: int,
-    names: str | None,
-    units: str | None,
-    **options: Any,
-) -> None:
-    """Make a campaign in a new folder."""
-    sizes = {name: options.pop(name) for name in SIZES}
-    sizes = {name: size for name, size in sizes.items() if size is not None}
-    declared = declare(effects=effects, **options)
-    simulator, prior, space, _ = problem_of(**options)
-    _label(space, "names", names)
-    _label(space, "units", units)
-    with Campaign(
-        simulator,
-        prior,
-        space,
-        method=method,
-        effects=effects_of(declared["effects"]),
-        seed=seed,
-        options=CampaignOptions(**grouped(sizes, GROUPS)),
-        directory=folder,
-    ) as campaign:
-        write_declared(folder, declared)
+@cli.command(
+    *(cli.DIR, CONFIG, cli.A_TASK, cli.OF_TASK, cli.SIMULATOR, *cli.SPACE, cli.EFFECTS),
+    cli.option("--names", "of the action's entries", metavar="A,B,..."),
+    cli.option("--units", "of the action's entries", metavar="A,B,..."),
+    *(cli.METHOD, cli.SEED, cli.OF_CAMPAIGN),
+)
+def init(folder: Path, set: list[str], **given: Any) -> None:  # noqa: A002
+    """Make a campaign in a new folder, also by --config."""
+    from sbi_active import Campaign
+    from sbi_active.cli.problem import campaign_options, problem_of
+
+    how = {name: given.pop(name) for name in ("method", "seed")}
+    simulator, prior, actions, effects = problem_of(**given)
+    how |= {"options": campaign_options(set), "directory": folder, "effects": effects}
+    with Campaign(simulator, prior, actions, **how) as campaign:
+        write_declared(folder, **given)
         sum_up_campaign(campaign)
-        print(f"{folder}: a campaign of {campaign.actions}")
-    print(f"next: sbi-active ask {folder}")
+    print(f"{folder}: a campaign of {actions}\nnext: sbi-active ask {folder}")
 
 
-def _label(actions: Any, what: str, text: str | None) -> None:
-    """Give the entries of actions names or units, as --names and --units say."""
-    if text is None:
-        return
-    labels = text.split(",")
-    if len(labels) != actions.action_dim:
-        raise ValueError(
-            f"expected --{what} of {actions.action_dim} entries; got {text!r}; "
-            "separate them by commas, one an entry of the action"
-        )
-    setattr(actions, what, labels)
+@on_campaign(
+    cli.SIMULATOR,
+    cli.option("--target", "theta, model or a parameter's name", default="auto"),
+    need="simulator",
+)
+def ask(campaign: Any, target: str) -> Answer:
+    """Design the next trial, or show the pending one."""
+    trial = campaign.ask(target=target)
+    gain, error = (v if v == v else None for v in trial.expected_gain)
+    found = {"expected_information_gain": gain, "standard_error": error}
+    data = {**trial_of(campaign, trial), **found}
+    lines = [f"trial {trial.index}: {place_of(data)}"]
+    if gain is not None:
+        lines += [f"it is expected to tell {gain:.2f} nats about {trial.target}"]
+    num = math.prod(campaign.x_shape)
+    numbers = "--file X.csv" if num > MANY else " ".join("X" * num)
+    lines += [f"then: sbi-active tell {campaign.directory} {numbers}"]
+    return Answer(data, "\n".join(lines))
 
 
-def criticize(
-    campaign: Campaign, *, effects: str | None, out: Path | None = None
+@on_campaign(
+    *OUTCOME,
+    cli.option("--trial", "None is the pending one, or a new one", cli.INTEGER, "K"),
+    need="record",
+)
+def tell(campaign: Any, trial: int | None, action: Any, **outcome: Any) -> Answer:
+    """Record what a trial gave. X are the numbers, nan for one not measured."""
+    x, status = _outcome(campaign, **outcome)
+    told = campaign.tell(x, trial=trial, action=action, status=status)
+    return _confirmed(campaign, told)
+
+
+@on_campaign(TRIAL, *OUTCOME, REASON, need="record")
+def correct(
+    campaign: Any, trial: int, action: Any, reason: str, **outcome: Any
 ) -> Answer:
-    """Return the report of a comparison of the simulator with the trials."""
-    if out is not None:  # else all is computed before this fails
-        out.mkdir(parents=True, exist_ok=True)
-    report = campaign.criticize(library_of(campaign, effects_of([effects])))
-    text = [str(report)]
-    if out is not None:
-        text.append(f"saved: {report.save(out)}")
-    if report.tracing.chosen:
-        named = "" if effects is None else f" --effects {effects}"
-        text.append(f"to go on with it: sbi-active adopt {campaign.directory}{named}")
-    return Answer(report.to_dict(), "\n\n".join(text))
+    """Replace what was told of a trial."""
+    is_of_action = action is not None and not any(outcome.values())
+    x, status = (None, "ok") if is_of_action else _outcome(campaign, **outcome)
+    what = {"action": action, "status": status, "reason": reason}
+    return _confirmed(campaign, campaign.correct(trial, x, **what))
 
 
-def adopt(campaign: Campaign, *, effects: str | None) -> Answer:
-    """Go on with the simulator that the verdict names."""
-    report = campaign.criticize(
-        library_of(campaign, effects_of([effects])), evaluate=False
-    )
+@on_campaign(TRIAL, REASON, need="record")
+def withdraw(campaign: Any, trial: int, reason: str) -> Answer:
+    """Take a trial out of the belief."""
+    return _confirmed(campaign, campaign.withdraw(trial, reason=reason))
+
+
+def _outcome(
+    campaign: Any, *, x: Sequence[float], file: Path | None, **flags: bool
+) -> tuple[Any, str]:
+    """Return what was measured, in the shape of the simulator's x, and its status."""
+    said = [name for name, value in flags.items() if value]
+    if len(said) + bool(x) + (file is not None) > 1:
+        raise ValueError(
+            "expected numbers, --file, --invalid or --missing; got several; write one"
+        )
+    if said:
+        return None, said[0]
+    numbers = [*x] if file is None else numbers_in(file)
+    shape = [*campaign.x_shape]
+    if len(numbers) != math.prod(shape) or all(map(math.isnan, numbers)):
+        raise ValueError(
+            f"expected {math.prod(shape)} numbers, as the simulator gives, and one of "
+            f"them measured; got {len(numbers)} ({numbers!s:.80}); write nan for one "
+            "that was not measured, --invalid where the trial ran and gave none, which "
+            "tells about the parameters, or --missing where it failed"
+        )
+    return shaped(numbers, shape), "ok"
+
+
+def _confirmed(campaign: Any, trial: Any) -> Answer:
+    data = trial_of(campaign, trial)
+    what = f"{data['status']} at {place_of(data)}{numbers_of(data, ', x = ')}"
+    text = f"trial {data['trial']}: {what}\nnext: sbi-active ask {campaign.directory}"
+    return Answer(data, text)
+
+
+@on_campaign(need="record")
+def status(campaign: Any) -> Answer:
+    """Show the trials, the belief and the health."""
+    return answer_of(campaign)
+
+
+@on_campaign(need="repair")
+def repair(campaign: Any) -> Answer:
+    """Give up what is damaged, and say what that is."""
+    return answer_of(campaign)
+
+
+@on_campaign(
+    cli.SIMULATOR,
+    cli.option("--simulator-changed", "take another, compute all again", None),
+    need="simulator",
+)
+def update(campaign: Any) -> Answer:
+    """Bring the belief up to date."""
+    campaign.update()
+    return answer_of(campaign)
+
+
+@on_campaign(cli.SIMULATOR, cli.EFFECTS, need="simulator")
+def adopt(campaign: Any, effects: list[str]) -> Answer:
+    """Go on with the effects that a verdict names."""
+    from sbi_active.cli.problem import library_of
+
+    report = campaign.criticize(library_of(campaign, effects), evaluate=False)
     campaign.adopt(report)
-    if effects is not None:
-        _declare_effects(Path(str(campaign.directory)), effects)
+    if effects:  # let the commands to come find them
+        options = read_declared(campaign.directory)
+        named = dict.fromkeys([*options.get("effects", ()), *map(absolute, effects)])
+        write_declared(campaign.directory, **{**options, "effects": [*named]})
     say(f"adopted: {report.verdict}")
-    return status(campaign)
+    return answer_of(campaign)
 
 
-def _declare_effects(folder: Path, name: str) -> None:
-    """Let the commands to come find effects that the campaign was made without."""
-    declared = read_declared(folder)
-    module, colon, attribute = name.partition(":")
-    if module.endswith(".py"):
-        name = f"{Path(module).resolve()}{colon}{attribute}"
-    effects = [*declared["effects"], name]
-    write_declared(folder, {**declared, "effects": [*dict.fromkeys(effects)]})
-
-
-def report(campaign: Campaign, *, out: Path | None) -> Answer:
+@on_campaign(cli.option("--out", "where to", cli.FILE, "PAGE.html"), need="reader")
+def report(campaign: Any, out: Path | None) -> Answer:
     """Write one page that shows the campaign."""
     from sbi_active.campaign.display.page import write_page
 
-    path = out or Path(str(campaign.directory), "report.html")
-    return _saved(write_page(campaign, path))
+    path = write_page(campaign, out or Path(campaign.directory, "report.html"))
+    return Answer({"saved": str(path)}, f"saved: {path}")
 
 
-def export(campaign: Campaign, *, netcdf: Path, seed: int) -> Answer:
-    """Write the belief and the trials as ArviZ reads them."""
-    from sbi_active.export import to_inference_data
+@on_campaign(
+    *(cli.SIMULATOR, cli.SEED),
+    cli.option("--netcdf", "where to", cli.FILE, "FILE.nc", required=True),
+    need="reader",
+)
+def export(campaign: Any, netcdf: Path, seed: int) -> Answer:
+    """Write belief and trials for ArviZ."""
+    from sbi_active import to_inference_data
 
     if campaign.simulator is None:
         say(
             "note: without predictions and likelihoods, for which the simulator runs: "
             "add --simulator, or --trust"
         )
-    data = to_inference_data(campaign, seed=seed)
-    try:
-        data.to_netcdf(str(netcdf))
-    except (ImportError, ValueError) as error:
-        raise ValueError(
-            f"expected a library that writes netCDF; got none ({error}); install one: "
-            "pip install h5netcdf"
-        ) from error
-    return _saved(netcdf)
-
-
-def _saved(path: object) -> Answer:
-    return Answer({"saved": str(path)}, f"saved: {path}")
-
-
-def open_campaign(
-    folder: Path,
-    *,
-    simulates: bool,
-    simulator: str | None = None,
-    trust: bool = False,
-    simulator_changed: bool = False,
-    repair: bool = False,
-) -> Campaign:
-    """Return the campaign of a folder.
-
-    Args:
-        folder: Folder of the campaign.
-        simulates: Whether its simulator is needed; else nothing of the folder is
-            imported without --trust.
-        simulator: Place of the simulator; None if the folder says it.
-        trust: Whether to import what the folder names.
-        simulator_changed: Whether to take another simulator than before.
-        repair: Whether to give up what is damaged.
-
-    Raises:
-        ValueError: If there is no campaign, or its simulator is not known, or
-            only the folder says so.
-    """
-    declared = Declared(folder, trusts=trust)
-    given = {}
-    if simulates or trust:
-        own = read_manifest(Store(folder, "campaign"))["own"]
-        lacking = [what for what in ("prior", "actions") if what in own]
-        given = {what: _object_of(declared, what) for what in lacking}
-    reader = Campaign.load(folder, repair=repair, **given)
-    if not simulates:
-        return reader
-    model = _simulator_of(declared, simulator)
-    effects = effects_of(declared.names("effects"), declared.place)
-    if reader.state.version.effects:
-        effects = _with_usual(effects, model, reader)
-    changed = {"simulator_changed": simulator_changed}
-    return Campaign.load(folder, simulator=model, effects=effects, **changed, **given)
-
-
-def _object_of(declared: Declared, what: str) -> Any:
-    """Return an object of the task or the program that a folder declares."""
-    if declared.task is not None:
-        return getattr(make_task(declared.task, declared.options), what)
-    names = declared.names(what)
-    return load_object(names[0], declared.place) if names else None
-
-
-def _simulator_of(declared: Declared, name: str | None) -> Any:
-    if name is not None:
-        return simulator_of(name, declared.noise)
-    if declared.task is not None:
-        return _object_of(declared, "simulator")
-    names = declared.names("simulator")
-    if not names:
-        raise ValueError(
-            "expected --simulator, since the campaign was made by a program; got none; "
-            "name it, as in --simulator my_robot.py:fn"
-        )
-    return simulator_of(names[0], declared.noise, declared.place)
-
-
-def library_of(campaign: Campaign, own: Sequence[Effect] = ()) -> list[Effect]:
-    """Return the effects to compare, once each.
-
-    Args:
-        campaign: Campaign whose own effects follow, and then the usual ones.
-        own: Effects that come first.
-    """
-    taken = {effect.name for effect in own}
-    known = [effect for effect in campaign.effects if effect.name not in taken]
-    # An adopted effect is declared for the simulator without it.
-    base = getattr(campaign.simulator, "base", campaign.simulator)
-    return _with_usual([*own, *known], base, campaign)
-
-
-def _with_usual(own: list[Effect], simulator: Any, reader: Campaign) -> list[Effect]:
-    return with_generic(own, simulator, reader.actions, reader.first_prior)
+    to_inference_data(campaign, seed=seed).to_netcdf(str(netcdf))
+    return Answer({"saved": str(netcdf)}, f"saved: {netcdf}")

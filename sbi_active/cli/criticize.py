@@ -2,100 +2,78 @@
 
 from __future__ import annotations
 
-import functools
+import inspect
 import sys
-import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import click
-import torch
 from click.core import ParameterSource
-from torch import Tensor
 
-from sbi_active.actions import ActionSpace, DiscreteActions
-from sbi_active.campaign.storage.manifest import has_manifest
-from sbi_active.cli.given import (
-    effects_of,
-    load_object,
-    problem_of,
-    with_generic,
-    with_noise,
-)
-from sbi_active.cli.output import Answer, say
+from sbi_active.cli import declare as cli
+from sbi_active.cli.config import CONFIG, PROBLEM_FILE, as_json, pairs_of
+from sbi_active.cli.output import Answer
 from sbi_active.cli.session import Session
-from sbi_active.criticism import Trials, close_loop
-from sbi_active.criticism.data.recordings import read_trials
-from sbi_active.criticism.data.table import TrialTable
-from sbi_active.simulation import SimulatorModel
-from sbi_active.simulation.bank.sqlite import NAME
 
 #: What a folder of recordings may hold, and what of its simulator that may name.
 MODULE, NAMED = "problem.py", ("simulator", "prior", "actions", "effects")
 #: Options that say what the trials are compared with.
-PROBLEM = ("simulator", "task", "prior", "theta_low", "theta_high", "actions")
+PROBLEM = (*NAMED, "task", "theta_low", "theta_high")
+ORDER = click.Choice(("known", "unknown"))
 OF_CAMPAIGN = ("simulator", "effects", "out", "trust")
 
 
-def criticize(trials: Path, *, json: bool = False, **given: Any) -> Answer | None:
-    """Return the report of a comparison of a simulator with measured trials.
+@cli.command(
+    cli.argument("trials", "TRIALS.csv", cli.FILE, **PROBLEM_FILE),
+    *(CONFIG, cli.A_TASK, cli.OF_TASK, cli.SIMULATOR, *cli.SPACE, cli.EFFECTS),
+    *(cli.SEED, cli.TRUST, cli.JSON),
+    cli.option(
+        "--columns",
+        "trial, time, action, x, input, start, role, index or repeat_of where they are "
+        "named otherwise, as in trial=ball,drop x=height_m",
+        cli.SEVERAL,
+        "KEY=NAME[,NAME...] ...",
+    ),
+    cli.option("--units", "of columns without", cli.SEVERAL, "NAME=UNIT ..."),
+    cli.option("--order", "unknown if not that of rows", ORDER, default="known"),
+    cli.option("--inputs", "at times of their own", cli.FILE, "INPUTS.csv"),
+    cli.option("--set", "of close_loop: warm_up=0.5", cli.SEVERAL, "NAME=VALUE ..."),
+    cli.option("--out", "folder for the report", cli.FOLDER, "DIR"),
+)
+def criticize(trials: Path, **given: Any) -> Answer:
+    """Find what a simulator lacks, from measured trials.
 
-    Args:
-        trials: Table of trials, folder of recordings, or campaign.
-        json: Whether a program asked, which the caller knows how to answer.
-        **given: Options by name.
+    Find the residual, trace it to an effect that the simulator lacks, add it, and
+    report the error before and after.
+
+    TRIALS.csv has one row a trial, with columns action_* and x_* and optionally role
+    (fit or 'held out'), index and repeat_of; or one row a sample, with columns trial
+    and time besides, and with input_* in place of actions that vary in time. start_* is
+    a measured start state. Units stand in brackets, as in x_height[m], and are those of
+    the simulator. An empty cell is what was not measured. In its place a folder: of a
+    campaign, which knows its simulator and its prior, or of recordings, with trials.csv
+    or one file *.csv a trial.
     """
-    if trials.is_dir():
-        if has_manifest(trials):
-            return _criticize_campaign(trials, given)
-        if not [*trials.glob("*.csv")]:
-            raise ValueError(
-                f"expected a campaign or recordings in {trials}; got neither "
-                f"{NAME} nor a file *.csv; make a campaign by sbi-active init, or "
-                "write one table of all trials, or one a trial"
-            )
-        _take_module(trials / MODULE, given)
-    if given["task"] is None and given["simulator"] is None:
-        raise ValueError(
-            "expected --simulator or --task with a table of trials; got neither; name "
-            "it, as in --simulator my_robot.py:simulator, or in problem.toml beside "
-            "recordings in a folder"
-        )
-    table, measured = _trials(trials, given)
-    options = {name: given[name] for name in PROBLEM}
-    simulator, prior, actions, effects = problem_of(**options, needs_actions=False)
-    if actions is not None:
-        _require_units(actions, measured, trials)
-    if given["task"] is None and not isinstance(simulator, SimulatorModel):
-        simulator = _with_times(SimulatorModel(simulator), measured, trials)
-    simulator = with_noise(simulator, given["noise"])
-    # Only scales are taken from these where the permitted actions are unknown.
-    space = actions or DiscreteActions(measured.action.unique(dim=0).float())
-    known = space if measured.inputs is None else measured
-    own = [*effects, *effects_of([given["effects"]])]
+    from sbi_active.campaign.storage.manifest import has_manifest
+    from sbi_active.criticism import close_loop
+
     if given["out"] is not None:  # else all is computed before this fails
         given["out"].mkdir(parents=True, exist_ok=True)
-    report = close_loop(
-        simulator,
-        prior,
-        measured,
-        effects=with_generic(own, simulator, known, prior),
-        actions=actions,
-        thin=not given["no_thin"],
-        seed=given["seed"],
-        designed=given["designed"],
-        show_progress=sys.stderr.isatty(),
-    )
-    text = [str(report)]
-    if table.columns.time is not None or any(table.columns.units.values()):
-        text.append(_described(trials, table, measured))
-    if given["out"] is not None:
-        text.append(f"saved: {report.save(given['out'])}")
-    return Answer(report.to_dict(), "\n\n".join(text))
+    if trials.is_dir() and has_manifest(trials):
+        return _of_campaign(trials, given)
+    settings = {k: as_json(v) for k, v in pairs_of(given["set"]).items()}
+    known = {*inspect.signature(close_loop).parameters} - {"seed", *NAMED}
+    if wrong := {*settings} - known:
+        raise ValueError(
+            f"expected settings among {', '.join(sorted(known))}; got "
+            f"{', '.join(sorted(wrong))}; write one of these"
+        )
+    if trials.is_dir():
+        _take_module(trials / MODULE, given)
+    return _compared(trials, given, settings)
 
 
-def _criticize_campaign(folder: Path, given: dict[str, Any]) -> Answer | None:
+def _of_campaign(folder: Path, given: dict[str, Any]) -> Answer:
     """Compare a campaign with its own trials; it brings most of what a table lacks."""
     source = click.get_current_context().get_parameter_source
     for name in given:
@@ -106,107 +84,91 @@ def _criticize_campaign(folder: Path, given: dict[str, Any]) -> Answer | None:
                 f"{folder} has its own"
             )
     with Session(folder) as session:
-        return session.call("criticize", **{name: given[name] for name in OF_CAMPAIGN})
+        named = {name: given[name] for name in OF_CAMPAIGN}
+        return session.call(_criticized, "simulator", **named)
+
+
+def _criticized(campaign: Any, effects: list[str], out: Path | None) -> Answer:
+    from sbi_active.cli.problem import library_of
+
+    report = campaign.criticize(library_of(campaign, effects))
+    named = " ".join(["", "--effects", *effects]) if effects else ""
+    adopt = f"to go on with it: sbi-active adopt {campaign.directory}{named}"
+    return _answer(report, out, [adopt] if report.tracing.chosen else [])
+
+
+def _answer(report: Any, out: Path | None, notes: list[str]) -> Answer:
+    if out is not None:
+        notes = [f"saved: {report.save(out)}", *notes]
+    return Answer(report.to_dict(), "\n\n".join([str(report), *notes]))
 
 
 def _take_module(path: Path, given: dict[str, Any]) -> None:
     """Take objects under the options' own names where no option names them."""
     if not path.is_file() or given["task"] is not None:
         return
+    from sbi_active.cli.problem import load_object
+
     load_object(f"{path}:__name__")
     has_bounds = given["theta_low"] is not None or given["theta_high"] is not None
     for name in NAMED:
         is_given = given[name] or name == "prior" and has_bounds
         if not is_given and hasattr(sys.modules[path.stem], name):
             value = f"{path}:{name}"
-            given[name] = [value] if name == "actions" else value
+            given[name] = [value] if isinstance(given[name], list) else value
 
 
-def _trials(path: Path, given: dict[str, Any]) -> tuple[TrialTable, Trials]:
-    """Return what the file holds; what it lacks in a small way is noted on stderr."""
-    columns = _pairs(given["columns"], "--columns")
-    with warnings.catch_warnings(record=True) as noted:
-        warnings.simplefilter("always", UserWarning)
-        table = read_trials(
-            path,
-            columns={key: text.split(",") for key, text in columns.items()} or None,
-            units=_pairs(given["units"], "--units"),
-            inputs=given["inputs"],
-        )
-        order = {name: given[name] for name in ("order", "input_hold")}
-        trials = Trials(**table.arguments, **order)
-    for note in noted:
-        say(f"note: {note.message}")
-    num, held = len(trials), len(trials.held_out_positions)
-    if num - held < 2:
-        raise ValueError(
-            f"expected at least two trials to fit; got {num - held} in {path} ({num} "
-            f"in all, {held} held out); measure more, since one trial fits any model"
-        )
-    return table, trials
+def _compared(path: Path, given: dict[str, Any], settings: dict[str, Any]) -> Answer:
+    """Compare a simulator with the trials of a table, or of a folder of recordings."""
+    from sbi_active import DiscreteActions
+    from sbi_active.cli.problem import problem_of, with_generic, with_noise
+    from sbi_active.criticism import Trials, close_loop
 
-
-def _pairs(texts: Sequence[str], option: str) -> dict[str, str]:
-    found = {}
-    for text in texts:
-        key, _, value = text.partition("=")
-        if not (key and value):
+    columns = {k: v.split(",") for k, v in pairs_of(given["columns"]).items()}
+    units, options = pairs_of(given["units"]), {k: given[k] for k in PROBLEM}
+    model, prior, actions, own = problem_of(**options, needs=["prior"])
+    how = {"order": given["order"], "inputs": given["inputs"]}
+    trials = Trials.from_csv(path, columns=columns or None, units=units, **how)
+    labels = trials.action_labels or ()
+    for unit, label in zip(actions.units if actions else (), labels, strict=False):
+        stated = label.partition(" [")[2].removesuffix("]")
+        if unit and stated and unit != stated:
             raise ValueError(
-                f"expected {option} KEY=NAME; got {text!r}; write, say, x=height_m"
+                f"expected actions in {unit}; got {label} in {path}; convert the "
+                "column, and state the unit in brackets"
             )
-        found[key] = value
-    return found
+    model = with_noise(_with_times(model, trials, path), given["noise"])
+    # Only scales are taken from these where the permitted actions are unknown.
+    space = actions or DiscreteActions(trials.action.unique(dim=0).float())
+    known = space if trials.inputs is None else trials
+    report = close_loop(
+        model,
+        prior,
+        trials,
+        effects=with_generic(own, model, known, prior),
+        actions=actions,
+        seed=given["seed"],
+        **{"show_progress": sys.stderr.isatty(), **settings},
+    )
+    labels = [*labels] * (not trials.action_is_label)
+    labels += [*(trials.input_labels or ()), *(trials.channel_labels or ())]
+    read = f"{len(trials)} trials of {path}: {', '.join(labels)}"
+    return _answer(report, given["out"], [read] if labels else [])
 
 
-def _described(path: Path, table: TrialTable, trials: Trials) -> str:
-    """Return what was read, with its units."""
-    columns = table.columns
-    parts = {
-        "action": map(columns.label, columns.action),
-        "inputs": trials.input_labels or (),
-        "x": map(columns.label, columns.x),
-    }
-    named = {key: ", ".join(names) for key, names in parts.items()}
-    what = "; ".join(f"{key} {names}" for key, names in named.items() if names)
-    what = f"{len(trials)} trials of {path}: {what}"
-    if columns.time is None:
-        return what
-    counts = trials.mask.flatten(2).any(-1) if trials.x.ndim > 2 else trials.mask
-    few, many = int(counts.sum(1).min()), int(counts.sum(1).max())
-    return f"{what}; {few} to {many} samples a trial, time [s]"
-
-
-def _with_times(model: SimulatorModel, trials: Trials, path: Path) -> SimulatorModel:
+def _with_times(fn: Any, trials: Any, path: Path) -> Any:
     """Return a user's function as the simulator of trials with sample times."""
-    times = trials.template()[1]
-    if times is None:
-        return model
-    own, fn = trials.sample_times, model.fn
-    assert own is not None
-    ragged = not torch.equal(own.expand(len(trials), -1), times.expand(len(trials), -1))
-    if "times" not in model.conditions:
-        if ragged:
-            raise ValueError(
-                "expected a simulator that takes times=, shape (n, k), where trials "
-                f"are sampled at different times, as in {path}; got one without; add "
-                "it, or give a SimulatorModel with sample_times"
-            )
-        return SimulatorModel(fn, sample_times=times)
+    from sbi_active import SimulatorModel
 
-    @functools.wraps(fn)
-    def timed(theta: Tensor, action: Tensor, **keywords: Any) -> Tensor:
-        keywords.setdefault("times", times.to(theta).expand(len(theta), -1))
-        return fn(theta, action, **keywords)
-
-    return SimulatorModel(timed, sample_times=times)
-
-
-def _require_units(actions: ActionSpace, trials: Trials, path: Path) -> None:
-    """Raise if the file states another unit of the action than the simulator."""
-    for unit, label in zip(actions.units, trials.action_labels or (), strict=False):
-        given = label.partition(" [")[2].removesuffix("]")
-        if unit and given and unit != given:
-            raise ValueError(
-                f"expected actions in {unit}; got {label} in {path}; "
-                "convert the column, and state the unit in brackets"
-            )
+    if isinstance(fn, SimulatorModel):
+        return fn
+    times, sampled = trials.template()[1], trials.sample_times
+    model = SimulatorModel(fn, sample_times=times)
+    is_ragged = times is not None and bool((sampled != times).any())
+    if is_ragged and "times" not in model.conditions:
+        raise ValueError(
+            "expected a simulator that takes times=, shape (n, k), where trials are "
+            f"sampled at different times, as in {path}; got one without; add it, or "
+            "give a SimulatorModel with sample_times"
+        )
+    return model

@@ -50,7 +50,8 @@ def failure(error: BaseException) -> dict[str, Any]:
     elif isinstance(error, click.ClickException):
         status, text = MISUSED, error.format_message()
     elif isinstance(error, ValueError | OSError):
-        status, text = MISUSED, str(error)
+        is_broken = isinstance(error, BrokenPipeError)
+        status, text = FAILED if is_broken else MISUSED, str(error)
     message = TRACEBACK.sub(r"\3 (\1, line \2)", text)
     return {"type": type(error).__name__, "message": message, "status": status}
 
@@ -63,19 +64,18 @@ def place_of(error: BaseException) -> str:
     return f" ({frames[-1].filename}, line {frames[-1].lineno})"
 
 
-def as_json(value: Any) -> Any:
-    """Return an answer as JSON has it: null for a number that is not finite."""
+def as_line(value: Any) -> str:
+    """Return an answer as one line of JSON, null for a number that is not finite."""
+    return json.dumps(_finite(value), allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: as_json(part) for key, part in value.items()}
+        return {key: _finite(part) for key, part in value.items()}
     if isinstance(value, list | tuple):
-        return [as_json(part) for part in value]
+        return [_finite(part) for part in value]
     is_number = not isinstance(value, float) or math.isfinite(value)
     return value if is_number else None
-
-
-def as_line(value: Any) -> str:
-    """Return an answer as one line of JSON."""
-    return json.dumps(as_json(value), allow_nan=False)
 
 
 @contextlib.contextmanager
@@ -94,14 +94,3 @@ def output_to_errors() -> Iterator[None]:
 def _flush_c() -> None:
     with contextlib.suppress(Exception):  # a platform without it
         ctypes.CDLL(None).fflush(None)
-
-
-def flush() -> None:
-    """Write what is left, so that the end of the process has nothing to complain of."""
-    try:
-        sys.stdout.flush()
-    except OSError:
-        with contextlib.suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except AttributeError:
-        pass  # closed from the start

@@ -14,20 +14,18 @@ import json
 import math
 import os
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from datetime import datetime, timezone
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-from sbi_active.cli.declared import read_declared
-from sbi_active.cli.options import flat
+from sbi_active.cli.numbers import flat
+from sbi_active.cli.trust import read_declared
 from sbi_active.simulation.bank.sqlite import NAME
 from sbi_active.simulation.bank.store import Store
 
 SUMMARY = "status.json"
 LOG, STATE = "log", "state"  # records of a campaign, see its storage
-TOLD = ("told", "corrected", "withdrawn")  # events that compute nothing
 
 
 class Unsure(Exception):  # noqa: N818
@@ -42,7 +40,7 @@ def sum_up(folder: Path, known: Mapping[str, Any]) -> None:
         known: Facts that :class:`Record` needs.
     """
     with _stored(folder) as store:
-        content = {**known, "of": _mark(store, store.length(LOG))}
+        content = {**known, "of": _mark(store)}
     temporary = folder / f".{os.getpid()}-{SUMMARY}"
     with contextlib.suppress(OSError):  # as in a folder that is read only
         with open(temporary, "x", encoding="utf-8") as file:  # follows no link
@@ -57,12 +55,13 @@ def digest(folder: Path) -> str:
         folder: Folder of the campaign.
     """
     with contextlib.suppress(OSError, ValueError, Unsure), _stored(folder) as store:
-        return str(_mark(store, store.length(LOG)))
+        return str(_mark(store))
     return ""
 
 
-def _mark(store: Store, num: int) -> list[Any]:
-    """Return the length of the log, and a checksum of its end and of the state."""
+def _mark(store: Store, num: int | None = None) -> list[Any]:
+    """Return a length of the log, and a checksum of its end and of the state."""
+    num = store.length(LOG) if num is None else num
     last = store.get(LOG, num) if num else None
     content = (last or b"") + (store.get(STATE) or b"")
     return [num, hashlib.sha256(content).hexdigest()]
@@ -85,35 +84,28 @@ class Record:
     Attributes:
         directory: Folder of the campaign.
         x_shape: Shape of an outcome.
-        state: State of the campaign, with its trials.
 
     Raises:
         Unsure: If there is no summary, or more was done since than told.
         ValueError: If the folder's programs are not declared as they are written.
     """
 
-    simulator = None
-
     def __init__(self, folder: Path) -> None:
         read_declared(folder)
-        self.directory, self._facts = folder, {}
+        self.directory = folder
         try:
             self._summary = json.loads((folder / SUMMARY).read_bytes())
             self.x_shape: list[int] = self._summary["x_shape"]
             self._status = self._summary["status"]
-            self.state = SimpleNamespace(trials=self._status["trials"])
-            num = self._summary["of"][0]
+            self._trials: list[dict[str, Any]] = self._status["trials"]
             with _stored(folder) as store:
-                self._num = store.length(LOG)
+                num = self._summary["of"][0]
                 if self._summary["of"] != _mark(store, num):
                     raise Unsure
-                numbers = range(1, self._num + 1)
-                lines = [store.get(LOG, k) or b"{}" for k in numbers]
-            for number, entry in enumerate(map(json.loads, lines), start=1):
-                self._take(entry, is_new=number > num)
-            if len(self._facts) != len(self.state.trials):
-                raise Unsure
-        except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
+                self._num = store.length(LOG)
+                for number in range(num + 1, self._num + 1):
+                    self._take(json.loads(store.get(LOG, number) or b"{}"))
+        except (OSError, ValueError, RecursionError, LookupError, TypeError) as error:
             raise Unsure from error
 
     @property
@@ -129,13 +121,13 @@ class Record:
 
     def tell(self, x: Any, *, trial: int | None, action: Any, status: str) -> Any:
         """Record the outcome of the pending trial, or of a new one with an action."""
-        trials = self.state.trials
-        pending = [t["trial"] for t in trials if t["status"] == "pending"]
-        index = [*pending, len(trials)][0] if trial is None else trial
-        before = {"index": index, "action": None, "target": None, "reason": ""}
-        if index in pending:
-            before = self._facts[index]
-        elif index != len(trials) or action is None:  # a trial told again, or none
+        pending = [t["trial"] for t in self._trials if t["status"] == "pending"]
+        index = [*pending, len(self._trials)][0] if trial is None else trial
+        if index == len(self._trials) and action is not None:  # that nobody asked for
+            before = {"index": index, "action": None, "target": None, "reason": ""}
+        elif index in pending:
+            before = self._facts(index)
+        else:
             raise Unsure
         return self._write("told", self._told(before, x, action, status))
 
@@ -143,7 +135,7 @@ class Record:
         self, trial: int, x: Any, *, action: Any, status: str, reason: str
     ) -> Any:
         """Replace what was told of a trial."""
-        before = self._facts[trial]
+        before = self._facts(trial)
         told = self._told(before, x, action, status)
         # One told as before stays as it was scored.
         if before["status"] == "pending" or told == before:
@@ -152,15 +144,29 @@ class Record:
 
     def withdraw(self, trial: int, *, reason: str) -> Any:
         """Take a trial out."""
-        facts = {**self._facts[trial], "status": "withdrawn", "reason": reason}
+        facts = {**self._facts(trial), "status": "withdrawn", "reason": reason}
         return self._write("withdrawn", facts)
+
+    def _facts(self, index: int) -> dict[str, Any]:
+        """Return a trial as the log has it."""
+        if not 0 <= index < len(self._trials):
+            raise Unsure
+        trial = self._trials[index]
+        kept = {name: trial[name] for name in ("action", "status", "target", "reason")}
+        x = trial["x"] and shaped(_single(trial["x"]), self.x_shape)
+        return {"index": index, **kept, "x": x}
 
     def _told(
         self, before: Mapping[str, Any], x: Any, action: Any, status: str
     ) -> dict[str, Any]:
-        executed = before["action"] if action is None else _single(action)
-        if action is not None and not self._permits(executed):
-            raise Unsure
+        executed = before["action"]
+        if action is not None:
+            executed, limits = _single(action), self._summary["limits"]
+            if len(limits) != len(executed) or not all(
+                low <= a <= high
+                for (low, high), a in zip(limits, executed, strict=True)
+            ):
+                raise Unsure
         if x is not None:
             x = _single(x)
         elif status == "ok":  # the action alone is corrected
@@ -171,50 +177,31 @@ class Record:
             x = shaped([None] * math.prod(self.x_shape), self.x_shape)
         return {**before, "action": executed, "x": x, "status": status}
 
-    def _permits(self, action: list[float]) -> bool:
-        """Return whether an action is plainly one of the campaign's."""
-        space: dict[str, Any] = self._summary["actions"] or {}
-        if space.get("kind") == "list":
-            return action in space["values"]
-        if space.get("kind") != "box" or len(action) != len(space["low"]):
-            return False
-        limits = zip(space["low"], action, space["high"], strict=True)
-        return all(low <= a <= high for low, a, high in limits)
-
     def _write(self, event: str, facts: dict[str, Any]) -> dict[str, Any]:
         time = datetime.now(timezone.utc).isoformat(timespec="seconds")
         line = {"time": time, "event": event, "trial": facts}
         with _stored(self.directory) as store, store.writing():
             if store.append(LOG, line) != self._num + 1:  # another process was faster
                 raise Unsure
-        self._take(line, is_new=True)
-        return self.state.trials[facts["index"]]
+        self._take(line)
+        return self._trials[facts["index"]]
 
-    def _take(self, entry: Mapping[str, Any], *, is_new: bool) -> None:
-        """Take a line of the log, which a new one changes the trials by."""
-        if is_new and entry["event"] not in TOLD:
+    def _take(self, entry: Mapping[str, Any]) -> None:
+        """Take a line of the log that was written after the summary."""
+        if entry["event"] not in ("told", "corrected", "withdrawn"):
             raise Unsure
-        facts = entry.get("trial")
-        if facts is None:
-            return
-        index = facts["index"]
-        self._facts[index] = facts
-        if is_new:
-            numbers = None if facts["x"] is None else flat(facts["x"])
-            told = {
-                "trial": index,
-                **{name: facts[name] for name in ("status", "action")},
-                **{name: self._summary[name] for name in ("names", "units")},
-                "x": numbers and [math.nan if v is None else v for v in numbers],
-                **{"information_gained": None, "surprise": None},
-                "reason": facts["reason"],
-            }
-            self.state.trials[index : index + 1] = [told]
-            waiting = {*self._status["not_in_belief"], index}
-            self._status["not_in_belief"] = sorted(waiting)
+        facts = dict(entry["trial"])
+        index = facts.pop("index")
+        if facts["x"] is not None:
+            facts["x"] = [math.nan if v is None else v for v in flat(facts["x"])]
+        unknown = {"information_gained": None, "surprise": None}
+        told = {"trial": index, **self._summary["labels"], **unknown, **facts}
+        self._trials[index : index + 1] = [told]
+        waiting = {*self._status["not_in_belief"], index}
+        self._status["not_in_belief"] = sorted(waiting)
 
 
-def shaped(numbers: list[Any], shape: Sequence[int]) -> Any:
+def shaped(numbers: list[Any], shape: list[int]) -> Any:
     """Return numbers as nested lists of a shape."""
     if len(shape) < 2:
         return numbers if shape else numbers[0]

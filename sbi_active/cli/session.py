@@ -10,21 +10,50 @@ import contextlib
 import json
 import os
 import sys
-from importlib import import_module
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
 
-from sbi_active.cli import trials
-from sbi_active.cli.options import as_written
+from sbi_active.cli import declare as cli
+from sbi_active.cli.config import named
+from sbi_active.cli.numbers import flat
 from sbi_active.cli.output import Answer, as_line, failure, output_to_errors
 from sbi_active.cli.record import Record, Unsure, digest
+from sbi_active.cli.summary import sum_up_campaign
 
-#: Commands for which the simulator runs.
-SIMULATE = ("ask", "update", "criticize", "adopt")
-SUMMED = ("ask", "update", "adopt")  # of these, that hold the right to write
-LIGHT = ("tell", "correct", "withdraw", "status")
+#: What a command works on: trials without torch where these suffice; the campaign as it
+#: is read; one that simulates; one that is mended.
+Need = Literal["record", "reader", "simulator", "repair"]
+#: Commands on a campaign by name, which a request may call too.
+ON_CAMPAIGN: set[str] = set()
+
+
+def on_campaign(
+    *params: click.Parameter, need: Need
+) -> Callable[[Callable[..., Answer]], Callable[..., Answer]]:
+    """Make a function of a campaign and options a command on a folder.
+
+    Args:
+        *params: Arguments and options of the command.
+        need: Kind of campaign that it works on.
+    """
+
+    def decorate(function: Callable[..., Answer]) -> Callable[..., Answer]:
+        more: Any = {"ignore_unknown_options": need == "record"}  # as numbers are: -1
+
+        @cli.command(cli.DIR, *params, cli.JSON, cli.TRUST, **more)
+        @wraps(function)
+        def call(folder: Path, **options: Any) -> Answer:
+            with click.get_current_context().obj or Session(folder) as session:
+                return session.call(function, need, **options)
+
+        ON_CAMPAIGN.add(function.__name__)
+        return call
+
+    return decorate
 
 
 class Session:
@@ -37,7 +66,7 @@ class Session:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._campaign: Any = None
-        self._opened: dict[str, Any] = {}
+        self._opened: tuple[object, ...] = ()
 
     def __enter__(self) -> Session:
         return self
@@ -45,64 +74,63 @@ class Session:
     def __exit__(self, kind: object, *_: object) -> None:
         if self._campaign is not None:
             self._campaign.close()  # let others write
-            self._opened["files"] = digest(self.folder)
+            self._opened = (*self._opened[:-1], digest(self.folder))
         if kind is not None:  # what went wrong may be that another process wrote
             self._campaign = None
 
     def call(
         self,
-        name: str,
+        function: Callable[..., Answer],
+        need: Need,
         *,
         trust: bool = False,
         simulator: str | None = None,
         simulator_changed: bool = False,
         **options: Any,
-    ) -> Answer | None:
+    ) -> Answer:
         """Return the answer of a command.
 
         Args:
-            name: Name of the command.
+            function: Function of the command.
+            need: Kind of campaign that it works on.
             trust: Whether to import what the folder names.
             simulator: Place of the simulator; None if the folder says it.
             simulator_changed: Whether to take another simulator than before.
             **options: Options of the command.
         """
-        wants = {"trust": trust, "simulator": simulator, "files": digest(self.folder)}
-        exports = name == "export" and (trust or simulator is not None)
-        simulates = name in SIMULATE or exports
-        held = self._campaign
-        is_same = held is not None and wants == self._opened
-        has_all = held is not None and (not simulates or held.simulator is not None)
-        if name in LIGHT and not trust and not is_same:
+        wants = (trust, simulator, digest(self.folder))
+        is_same = self._campaign is not None and wants == self._opened
+        if need == "record" and not trust and not is_same:
             with contextlib.suppress(Unsure):
-                return getattr(trials, name)(Record(self.folder), **options)
-        if not (is_same and has_all) or simulator_changed or name == "repair":
+                return function(Record(self.folder), **options)
+        # A report or an export shows more with a simulator.
+        simulates = need == "simulator" or need == "reader" and (trust or simulator)
+        if simulates and self._campaign is not None:
+            is_same = is_same and self._campaign.simulator is not None
+        if not is_same or simulator_changed or need == "repair":
+            from sbi_active.cli.problem import open_campaign
+
             self._opened, self._campaign = wants, None
-            self._campaign = import_module("sbi_active.cli.campaign").open_campaign(
+            self._campaign = open_campaign(
                 self.folder,
-                simulates=simulates,
+                simulates=bool(simulates),
                 simulator=simulator,
                 trust=trust,
                 simulator_changed=simulator_changed,
-                repair=name == "repair",
+                repair=need == "repair",
             )
-        # What a repair gave up is said by warnings; what is left is the answer.
-        home, function = trials, "status" if name == "repair" else name
-        if not hasattr(trials, function):
-            home = import_module("sbi_active.cli.campaign")
-        answer = getattr(home, function)(self._campaign, **options)
-        if name in SUMMED:
-            trials.sum_up_campaign(self._campaign)
+        answer = function(self._campaign, **options)
+        if need == "simulator":
+            sum_up_campaign(self._campaign)
         return answer
 
 
-def serve(folder: Path, *, simulator: str | None, trust: bool) -> None:
-    """Answer requests until standard input ends.
+@cli.command(cli.DIR, cli.SIMULATOR, cli.TRUST)
+def serve(folder: Path, **given: Any) -> None:
+    """Answer requests of a program, a JSON object a line, as {"command": "ask"}.
 
-    A request names a command and its options. What simulators print goes to standard
-    error, in C and in workers too.
+    They end with standard input. What simulators print goes to standard error.
     """
-    given = {"simulator": simulator, "trust": trust}
     session = Session(folder)
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     with answers, output_to_errors():
@@ -112,13 +140,13 @@ def serve(folder: Path, *, simulator: str | None, trust: bool) -> None:
 
 def _answer(line: bytes, session: Session, given: dict[str, Any]) -> dict[str, Any]:
     """Return the answer to a request, or its error; both with the id that it has."""
-    named: dict[str, Any] = {}
+    name: dict[str, Any] = {}
     try:
         request = _request(line)
-        named = {"id": request.pop("id")} if "id" in request else {}
-        return {**named, "answer": _called(request, session, given)}
+        name = {"id": request.pop("id")} if "id" in request else {}
+        return {**name, "answer": _called(request, session, given)}
     except Exception as error:
-        return {**named, "error": failure(error)}
+        return {**name, "error": failure(error)}
 
 
 def _request(line: bytes) -> dict[str, Any]:
@@ -135,24 +163,17 @@ def _request(line: bytes) -> dict[str, Any]:
 def _called(
     request: dict[str, Any], session: Session, given: dict[str, Any]
 ) -> dict[str, Any]:
-    root = click.get_current_context().find_root()
-    assert isinstance(root.command, click.Group)
-    known = {
-        name: {str(param.name): param for param in command.params}
-        for name, command in root.command.commands.items()
-        if {"folder", "json"} <= {param.name for param in command.params}
-    }
     name = request.pop("command", None)
-    if not isinstance(name, str) or name not in known:
+    if not isinstance(name, str) or name not in ON_CAMPAIGN:
         raise ValueError(
-            f"expected a command among {', '.join(known)}; got {name!r:.80}; "
-            'write one of these, as in {"command": "ask"}'
+            f"expected a command among {', '.join(sorted(ON_CAMPAIGN))}; got "
+            f'{name!r:.80}; write one of these, as in {{"command": "ask"}}'
         )
-    options = known[name]
-    written = {key: value for key, value in given.items() if key in options}
-    written["folder"] = session.folder
-    del options["folder"]
-    written |= as_written([*options.values()], request, "the request")
-    command, held = root.command.commands[name], {"default_map": written}
-    with command.make_context(name, [], parent=root, obj=session, **held) as context:
-        return command.invoke(context).data
+    called = cli.program.commands[name]
+    written = named(called, request, "the request")
+    if "x" in written:  # numbers of any shape, null for one not measured
+        written["x"] = ["nan" if v is None else v for v in flat(written["x"])]
+    held = {"default_map": {**given, **written, "folder": session.folder}}
+    root = click.get_current_context().find_root()
+    with called.make_context(name, [], parent=root, obj=session, **held) as context:
+        return called.invoke(context).data

@@ -7,17 +7,17 @@ imported. Requests from other machines, or for anything else, are refused.
 from __future__ import annotations
 
 import contextlib
-import errno
 import threading
 from html import escape
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from socketserver import ThreadingMixIn
+from typing import Any
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
-from sbi_active.campaign import Campaign
-from sbi_active.campaign.display.page import page
+from click import IntRange
+
+from sbi_active.cli import declare as cli
 from sbi_active.cli.record import digest
-from sbi_active.display import Page
-from sbi_active.progress import in_words
 from sbi_active.simulation.bank.sqlite import is_locked
 from sbi_active.simulation.bank.store import Store
 
@@ -27,6 +27,7 @@ POLICY = (
     "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
     "img-src data:; connect-src 'self'; base-uri 'none'; frame-ancestors 'none'"
 )
+HEADERS = [("Content-Security-Policy", POLICY), ("Cache-Control", "no-store")]
 #: Asks every two seconds whether there is another page, and says when nobody answers.
 SCRIPT = """<script>
 setInterval(async () => {
@@ -51,7 +52,6 @@ class Watched:
         self._folder, self._drawing = folder, threading.Lock()
         self._page = self._version = ""
 
-    @property
     def version(self) -> str:
         """Text that changes with the store and with whoever begins or ends to write."""
         with contextlib.suppress(ValueError, OSError):  # of a lock that is none
@@ -61,11 +61,13 @@ class Watched:
     def page(self) -> str:
         """Return the page, which asks for newer ones."""
         with self._drawing:
-            version = self.version  # of before, so that nothing later is missed
+            version = self.version()  # of before, so that nothing later is missed
             if version != self._version:
                 try:
                     text = self.drawn()
                 except (ValueError, OSError) as error:
+                    from sbi_active.display import Page
+
                     text = _with_news(Page("Campaign", []).html(), str(error))
                 script = SCRIPT.replace("VERSION", version)
                 self._page = text.replace("</body>", f"{script}</body>")
@@ -74,28 +76,44 @@ class Watched:
 
     def drawn(self) -> str:
         """Return the page as it is now."""
+        from sbi_active.campaign import Campaign
+        from sbi_active.campaign.display.page import page
+
         with Campaign.load(self._folder) as campaign:
             return _with_news(page(campaign), _news(campaign, self._folder))
 
 
-def watch(folder: Path, *, port: int, once: Path | None) -> None:
-    """Show a campaign until an interrupt, or write its page once."""
+@cli.command(
+    cli.DIR,
+    cli.option(
+        "--port",
+        "of this machine alone; 0 is any free one",
+        IntRange(0, 65_535),
+        default=8642,
+    ),
+    cli.option("--once", "write the page, and end", cli.FILE, "FILE.html"),
+)
+def watch(folder: Path, port: int, once: Path | None) -> None:
+    """Show a campaign in a browser while another process runs it.
+
+    The page is drawn again when the folder changes; the folder is only read.
+    """
     import matplotlib
 
     matplotlib.use("Agg")  # figures are drawn by threads, which may open no window
     watched = Watched(folder)
+    text = watched.drawn()  # what is wrong with it is said here
     if once is not None:
-        once.write_text(watched.drawn(), encoding="utf-8")
+        once.write_text(text, encoding="utf-8")
         print(f"saved: {once}")
         return
-    Campaign.load(folder).close()  # what is wrong with it is said here
     with served(watched, port) as server:
         place = f"http://{HOST}:{server.server_port}"
         print(f"{folder} is shown at {place} until Ctrl-C", flush=True)
         server.serve_forever()
 
 
-def served(watched: Watched, port: int) -> ThreadingHTTPServer:
+def served(watched: Watched, port: int) -> WSGIServer:
     """Return a server of a page, for this machine alone.
 
     Args:
@@ -106,44 +124,49 @@ def served(watched: Watched, port: int) -> ThreadingHTTPServer:
         ValueError: If another program listens there, or only others may.
     """
 
-    class Handler(BaseHTTPRequestHandler):
-        def handle(self) -> None:
-            with contextlib.suppress(ConnectionError):  # a reader may leave
-                super().handle()
-
-        def do_GET(self) -> None:  # noqa: N802
-            # A page from elsewhere that has its name point here asks by that name.
-            host = self.headers.get("Host", "").partition(":")[0]
-            if host not in (HOST, "localhost") or self.path not in ("/", "/version"):
-                self.send_error(404)
-                return
-            is_page = self.path == "/"
-            content = (watched.page() if is_page else watched.version).encode()
-            self.send_response(200)
-            kind = "html" if is_page else "plain"
-            self.send_header("Content-Type", f"text/{kind}; charset=utf-8")
-            self.send_header("Content-Length", str(len(content)))
-            self.send_header("Content-Security-Policy", POLICY)
-            self.send_header("Cache-Control", "no-store")
-            self.end_headers()
-            self.wfile.write(content)
-
-        def log_message(self, format: str, *_: object) -> None:
-            """Say nothing of each request."""
+    def answer(asked: dict[str, Any], begin: Any) -> list[bytes]:
+        # A page from elsewhere that has its name point here asks by that name.
+        is_here = asked.get("HTTP_HOST", "").partition(":")[0] in (HOST, "localhost")
+        pages = {"/": ("html", watched.page), "/version": ("plain", watched.version)}
+        if not is_here or asked["REQUEST_METHOD"] != "GET":
+            begin("403 Forbidden", [])
+            return []
+        kind, text = pages.get(asked["PATH_INFO"], ("", None))
+        if text is None:
+            begin("404 Not Found", [])
+            return []
+        begin("200 OK", [("Content-Type", f"text/{kind}; charset=utf-8"), *HEADERS])
+        return [text().encode()]
 
     try:
-        return ThreadingHTTPServer((HOST, port), Handler)
+        return make_server(HOST, port, answer, _Server, _Quiet)
     except OSError as error:
-        if error.errno not in (errno.EADDRINUSE, errno.EACCES):
-            raise
         raise ValueError(
             f"expected a port that is free; got {port} ({error.strerror}); choose "
             "another by --port, or 0 for any"
         ) from error
 
 
-def _news(campaign: Campaign, folder: Path) -> str:
+class _Server(ThreadingMixIn, WSGIServer):
+    daemon_threads = True
+
+
+class _Quiet(WSGIRequestHandler):
+    """Says nothing of each request, nor of a reader that leaves."""
+
+    def handle(self) -> None:
+        """Answer a request."""
+        with contextlib.suppress(ConnectionError):
+            super().handle()
+
+    def log_message(self, format: str, *_: object) -> None:
+        """Say nothing."""
+
+
+def _news(campaign: Any, folder: Path) -> str:
     """Return what is being computed, as far as the folder says."""
+    from sbi_active.progress import in_words
+
     late = [t.index for t in campaign.history if not campaign.contains(t)]
     if campaign.pending is not None:
         doing, stage = f"trial {campaign.pending.index} waits for its outcome", ""

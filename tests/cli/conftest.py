@@ -1,15 +1,10 @@
 import shutil
 import sys
-from functools import partial
 from pathlib import Path
 
 import pytest
 
-from sbi_active import CampaignOptions
-from sbi_active.campaign.options import CampaignDetails
-from sbi_active.cli import campaign as commands
 from sbi_active.cli import main
-from tests.campaign.sizes import REFINEMENT
 from tests.cli.sled import INIT, SIMULATOR
 
 
@@ -18,15 +13,11 @@ def made(tmp_path_factory):
     """A campaign with a trial that was told and one to come; made once."""
     place = tmp_path_factory.mktemp("sled")
     (place / "sled.py").write_text(SIMULATOR)
-    small = partial(
-        CampaignOptions, details=CampaignDetails(num_scored=500), refinement=REFINEMENT
-    )
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(place)
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.getbasetemp() / "state"))
         patch.setattr(sys, "path", [*sys.path])
         patch.delitem(sys.modules, "sled", raising=False)
-        patch.setattr(commands, "CampaignOptions", small)
         assert main([*INIT, "sled.py:slide", "--names=speed", "--units=m/s"]) == 0
         assert main(["tell", "camp", "0.3", "--action", "1"]) == 0
         assert main(["ask", "camp"]) == 0

@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from sbi_active import Bank
-from sbi_active.cli import bank as command
-from sbi_active.cli import main
+from sbi_active.cli import main, simulators
 from sbi_active.tasks import get_task
 from tests.simulation.bank.filled import remove
 
@@ -38,7 +37,7 @@ def build(folder, rows, **options):
 
 
 def test_build_goes_on_to_the_rows_wanted(monkeypatch, capsys):
-    monkeypatch.setattr(command, "BLOCK", 200)
+    monkeypatch.setattr(simulators, "BLOCK", 100)
     assert build("direct", 500, task="numerical", seed=3) == 0
     assert "direct: 500 rows, {'ok': 500" in capsys.readouterr().out
     for rows in (150, 330, 330, 500, 100):
@@ -68,7 +67,7 @@ def test_inspect_shows_what_a_bank_holds(robot, capsys):
     assert f"simulator: {robot}.simulator" in printed
     assert f"rows: {counts}; on disk: 0.0" in printed
     assert "checksums: ok" in printed
-    assert "drawn from prior: 400" in printed
+    assert "drawn from: prior" in printed
 
 
 def test_inspect_names_a_damaged_file(capsys):

@@ -92,12 +92,12 @@ CALLS = [
         (2, "expected", ["tell", "camp", "1", "--action", a])
         for a in ("", "inf", "1,2")
     ),
-    (2, "expected a trial from 0", "tell camp 1 --trial 99 --action 1"),
+    (2, "expected the index of", "tell camp 1 --trial 99 --action 1"),
     (2, "expected 1 numbers", "tell camp 1 2"),
     (2, "got several; write one", "tell camp 1 --file bom.csv"),
     (2, "got several; write one", "tell camp --invalid --missing"),
-    (2, "expected a trial from 0", "tell camp 1 --trial -1"),
-    (2, "expected a trial from 0", "correct camp 7 0.1"),
+    (2, "expected the index of", "tell camp 1 --trial -1"),
+    (2, "expected the index of", "correct camp 7 0.1"),
     (2, "expected 1 numbers", "correct camp 0 --reason typo"),
     (0, "", ["withdraw", "camp", "0", "--reason", "\n\x1b[31m", "--json"]),
     # Files.
@@ -135,7 +135,7 @@ CALLS = [
             ("", "nan:1"),
             ("expected finite numbers", "1,,2"),
             ("No module named 'a'", "a:b"),
-            ("expected a space", "odd.py:NUMBER"),
+            ("expected a ActionSpace", "odd.py:NUMBER"),
         )
     ),
     (0, "", [*SLED, "--actions", "-1:1", "-5,-4"]),
@@ -144,12 +144,12 @@ CALLS = [
         for text, words in (
             ("expected finite", "--noise nan"),
             ("expected --noise > 0", "--noise -1"),
-            ("separate them by commas", "--names a,b"),
-            ("expected a torch distribution", "--prior odd.py:NUMBER"),
+            ("names and units, one an entry", "--names a,b"),
+            ("expected a Distribution", "--prior odd.py:NUMBER"),
             ("low below high", "--theta-low 1,1"),
             ("expected num_simulations", "--num-simulations 0"),
-            ("expected num_workers", "--num-workers 0"),
-            ("expected time_limit", "--time-limit nan"),
+            ("expected num_workers", "--set workers.num_workers=0"),
+            ("expected time_limit", "--set workers.time_limit=-1"),
             ("is not a valid integer", "--seed 1.5"),
         )
     ),
@@ -165,7 +165,7 @@ CALLS = [
         for text, name in (
             ("expected MODULE:NAME", "sled"),
             ("expected MODULE:NAME", ":slide"),
-            ("expected 'none' in module", "sled.py:none"),
+            ("under 'none' in 'sled'", "sled.py:none"),
             ("expected a file; got none", "none.py:fn"),
             ("expected a function", "odd.py:NUMBER"),
             ("got ZeroDivisionError", "divides.py:f"),
@@ -180,8 +180,8 @@ CALLS = [
     (1, "", "check odd.py:broken --theta-low 0 --theta-high 1 --actions 1,2"),
     (2, "at most 100000 actions", [*CHECK, "--actions", "1:2:1000000000"]),
     (2, "got no nowhere/store.db", "bank inspect nowhere"),
-    (2, "expected options of 'numerical'", "run numerical --out o --option target=2"),
-    (2, "expected --option NAME=VALUE", "run numerical --out o --option variant"),
+    (2, "expected what 'numerical' needs", "run numerical --out o --option target=2"),
+    (2, "expected NAME=VALUE", "run numerical --out o --option variant"),
 ]
 
 
@@ -239,11 +239,11 @@ def test_numbers_that_are_not_finite_are_null(camp, capfd, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "workers", [[], pytest.param(["--num-workers", "2"], marks=pytest.mark.slow)]
+    "workers", [[], pytest.param(["--set", "workers=2"], marks=pytest.mark.slow)]
 )
 def test_standard_output_holds_the_answer_alone(files, workers):
     box = ["--theta-low", "-1,0", "--theta-high", "1,1"]
-    words = ["--simulator", "odd.py:loud", *box, *ASK, *SMALL[:4], *workers]
+    words = ["--simulator", "odd.py:loud", *box, *ASK, *SMALL[:2], *SMALL[4:], *workers]
     assert main(["init", "loud", *words]) == 0
     process = run(["ask", "loud", "--json"], stdout=subprocess.PIPE)
     shown, error = process.communicate()

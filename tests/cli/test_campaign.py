@@ -6,7 +6,7 @@ from pathlib import Path
 import arviz as az
 import pytest
 
-from sbi_active.cli import given, main
+from sbi_active.cli import main, problem
 from tests.cli.sled import SIMULATOR, SMALL, read
 
 CONFIG = """
@@ -18,7 +18,7 @@ names = "speed"
 units = "m/s"
 noise = 0.02
 method = "nsbi"
-num-simulations = 200
+set = ["num_simulations=200"]
 seed = 4
 """
 
@@ -59,7 +59,7 @@ def test_another_place_of_the_simulator(camp, made, capsys):
     Path("sled.py").unlink()
     Path("camp/command.json").unlink()
     assert main(["update", "camp"]) == 2
-    assert "name it, as in --simulator" in capsys.readouterr().err
+    assert "as in --simulator" in capsys.readouterr().err
     words = ["--simulator", f"{made / 'sled.py'}:slide"]
     # Its noise was in the file, so that it is another one, and told to be.
     assert main(["update", "camp", *words]) == 2
@@ -86,7 +86,7 @@ def line(theta, action):
 
 
 def test_a_missing_effect_is_found_and_adopted(capsys, monkeypatch, tmp_path):
-    monkeypatch.setattr(given, "generic_effects", lambda *_, **__: [])
+    monkeypatch.setattr(problem, "generic_effects", lambda *_, **__: [])
     monkeypatch.setattr(sys, "path", [*sys.path])
     Path("line.py").write_text(LINE)
     Path("tape.py").write_text(TAPE)

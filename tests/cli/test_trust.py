@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sbi_active.cli import main
-from tests.cli.sled import SIMULATOR, run
+from tests.cli.sled import SIMULATOR, SMALL, run
 
 ROOT = Path(__file__).parents[2]
 
@@ -34,7 +34,6 @@ prior = Mine(Uniform(torch.tensor([0.2, 0.0]), torch.ones(2)), 1)
 speeds = Speeds([1.0, 2.0], names=["speed"], units=["m/s"])
 """
 RUN = "Path('{}').write_text('ran')"
-SIZES = ["--noise", "0.02", "--num-simulations", "200", "--method", "nsbi"]
 READING = [
     ["status", "camp", "--json"],
     ["tell", "camp", "0.3", "--action", "1"],
@@ -54,7 +53,7 @@ def mine(tmp_path, monkeypatch):
     (tmp_path / "sled.py").write_text(SIMULATOR)
     (tmp_path / "mine.py").write_text(MINE.format(run=RUN.format(ran)))
     words = ["--simulator", "sled.py:slide", "--prior", "mine.py:prior"]
-    assert main(["init", "camp", *words, "--actions", "mine.py:speeds", *SIZES]) == 0
+    assert main(["init", "camp", *words, "--actions", "mine.py:speeds", *SMALL]) == 0
     main(["tell", "camp", "0.3", "--action", "1"])
     forget(ran)
     return ran

@@ -72,11 +72,11 @@ def place(tmp_path_factory):
     watched = watch.Watched(folder / "camp")
     pages, versions = [], []
     for _ in range(3):
-        versions += [watched.version]
+        versions += [watched.version()]
         pages += [watched.page()]
         campaigner.goes_on()
     campaigner.ends()
-    return folder / "camp", [*pages, watched.page()], [*versions, watched.version]
+    return folder / "camp", [*pages, watched.page()], [*versions, watched.version()]
 
 
 @pytest.fixture
@@ -131,13 +131,13 @@ def test_a_browser_is_answered(server):
 
 def test_it_listens_on_this_machine_alone(server):
     assert server.server_address[0] == "127.0.0.1"
-    assert asked(server, Host="example.org")[0] == 404
+    assert asked(server, Host="example.org")[0] == 403
     assert asked(server, Host=f"localhost:{server.server_port}")[0] == 200
 
 
 @pytest.mark.parametrize("method", ["POST", "HEAD"])
 def test_it_is_only_read(server, method):
-    assert asked(server, method=method)[0] == 501
+    assert asked(server, method=method)[0] == 403
 
 
 @pytest.mark.parametrize(

@@ -211,7 +211,7 @@ def test_a_slow_simulator_is_run_less():
 
 
 def test_the_command_says_it(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("sbi_active.cli.check._time_round", lambda *_: 1.0)
+    monkeypatch.setattr("sbi_active.cli.simulators.time_round", lambda *_: 1.0)
     file = tmp_path / "my_checked_body.py"
     file.write_text(
         "import torch\n"

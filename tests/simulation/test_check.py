@@ -7,9 +7,9 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import DiscreteActions, SimulatorModel
+from sbi_active import CampaignOptions, DiscreteActions, SimulatorModel
 from sbi_active.cli import main
-from sbi_active.cli.check import _time_round
+from sbi_active.cli.simulators import time_round
 from sbi_active.simulation import check_simulator
 
 HEAD = "import numpy as np\nimport torch\nfrom sbi_active import *\n"
@@ -99,7 +99,7 @@ def _same_path(monkeypatch):
 @pytest.fixture
 def check(tmp_path, capsys, request, monkeypatch):
     """Return exit status and printed text of the command on a module of this text."""
-    monkeypatch.setattr("sbi_active.cli.check._time_round", lambda *_: 1.0)
+    monkeypatch.setattr("sbi_active.cli.simulators.time_round", lambda *_: 1.0)
 
     def run(text, *options):
         name = f"robot_{abs(hash(request.node.name))}"
@@ -186,7 +186,7 @@ def test_lost_rows_are_told_by_action(check):
 
 
 def test_tasks_are_ready(capsys, monkeypatch):
-    monkeypatch.setattr("sbi_active.cli.check._time_round", lambda *_: 1.0)
+    monkeypatch.setattr("sbi_active.cli.simulators.time_round", lambda *_: 1.0)
     assert main(["check", "--task", "numerical", "--rows", "32"]) == 0
     assert "x: shape (n, 1)" in capsys.readouterr().out
 
@@ -239,7 +239,7 @@ def simulator(theta, action):
 def test_a_campaign_costs_what_its_rounds_cost(check, monkeypatch):
     shown = check(CLEAN, "--rounds", "3")[1]
     assert "about 3 seconds on 1 worker\n" in shown
-    monkeypatch.setattr("sbi_active.cli.check.LONG", -1.0)
+    monkeypatch.setattr("sbi_active.cli.simulators.LONG", -1.0)
     shown = check(CLEAN, "--rounds", "3")[1]
     assert "on 1 worker for them, and some to learn\n" in shown
 
@@ -251,7 +251,7 @@ def test_the_round_that_is_timed_is_one_of_a_campaign():
     prior = BoxUniform(torch.zeros(1), torch.ones(1))
     model, actions = SimulatorModel(simulator, noise=0.1), DiscreteActions([1.0, 2.0])
     start = time.perf_counter()
-    seconds = _time_round(model, prior, actions, 1, 0)
+    seconds = time_round(model, prior, actions, CampaignOptions(), 0)
     assert 0.1 < seconds <= time.perf_counter() - start
 
 

@@ -1,0 +1,211 @@
+"""The program ``sbi-active``: how commands are declared, and the types of options."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from sbi_active.cli.numbers import number_of
+
+NAME = "sbi-active"
+#: Names of the tasks, as in ``sbi_active.tasks.TASKS``.
+TASKS = (
+    *("numerical", "oscillator", "box_collision", "pouring", "pouring_real"),
+    *("servo_pendulum", "ball_drops", "location_finding", "chain"),
+)
+#: Names of the methods, as in ``sbi_active.campaign.learning.methods.METHODS``.
+METHODS = ("asbi", "nsbi", "alhi", "nlhi", "seqbed")
+#: Options of the last version, now settings.
+FORMER = {
+    "num-simulations": "num_simulations",
+    "simulations": "num_simulations",
+    "num-samples": "num_samples",
+    "num-workers": "workers.num_workers",
+    "time-limit": "workers.time_limit",
+}
+BOUNDARY = "\0"  # between the words of an option of several; no word has it
+
+
+class Text(click.ParamType):
+    """A word in UTF-8, whatever the locale; in a file or a request also a list."""
+
+    name = "text"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> str:
+        """Return the text of a value."""
+        text = ",".join(map(str, value)) if isinstance(value, list) else str(value)
+        if text.startswith("--"):  # the next option
+            said = f"Option {param.opts[0]!r} requires an argument."
+            raise click.BadOptionUsage(param.opts[0], said, ctx)
+        return text.encode(errors="surrogateescape").decode()
+
+
+class Numbers(Text):
+    """Finite numbers with commas between them, or a list of these."""
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        """Return the numbers of a value."""
+        text = super().convert(value, param, ctx)
+        return [number_of(part) for part in text.split(",")]
+
+
+class Several(click.ParamType):
+    """All words up to the next option; in a file a list, or a table of NAME=VALUE."""
+
+    name = "words"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> list[str]:
+        """Return the words of a value."""
+        if isinstance(value, dict):  # as in columns = {trial = "ball", x = "height"}
+            value = [f"{k}={TEXT.convert(v, param, ctx)}" for k, v in value.items()]
+        several = value.split(BOUNDARY) if isinstance(value, str) else value
+        several = several if isinstance(several, list) else [several]
+        return [TEXT.convert(word, param, ctx) for word in several]
+
+
+class Measured(click.ParamType):
+    """A number that was measured, or nan."""
+
+    name = "x"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> float:
+        """Return the number, which a slip of the pen is not."""
+        if re.match(r"-[^\d.]", str(value)):
+            raise click.NoSuchOption(value, ctx=ctx)
+        return number_of(str(value), is_outcome=True)
+
+
+TEXT, NUMBERS, SEVERAL, MEASURED = Text(), Numbers(), Several(), Measured()
+COUNT = click.IntRange(min=1)
+FILE, FOLDER = click.Path(path_type=Path), click.Path(path_type=Path, file_okay=False)
+
+
+class Command(click.Command):
+    """A command whose options of the type :class:`Several` take several words."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Set the parameters of the context by words."""
+        options = [param for param in self.params if param.type is SEVERAL]
+        several = {name for param in options for name in param.opts}
+        taken: dict[str, list[str]] = {}
+        words, name, left = [], "", iter([] if ctx.resilient_parsing else args)
+        for word in left:
+            if re.match(r"-[^\d.]", word):
+                name, equals, value = word.partition("=")
+                setting = FORMER.get(name[2:]) if "--set" in several else None
+                if setting is not None:
+                    value = value if equals else next(left, "")
+                    taken.setdefault("--set", []).append(f"{setting}={value}")
+                elif name in several:
+                    taken.setdefault(name, []).extend([value] if equals else [])
+                    continue
+                else:
+                    words.append(word)
+                name = ""
+            elif name:
+                taken[name].append(word)
+            else:
+                words.append(word)
+        joined = [f"{name}={BOUNDARY.join(taken[name])}" for name in taken]
+        return super().parse_args(ctx, [*joined, *words] or args)
+
+
+program = click.Group(
+    NAME,
+    help="Tune a black-box simulator from a handful of real trials.",
+    epilog="Exit status: 0; 1 where something failed, as in the simulator; 2 where the "
+    "call or a file has to be changed; 130 after an interrupt.",
+    context_settings={"help_option_names": ["-h", "--help"]},
+    no_args_is_help=False,
+)
+VERSION = {"message": "%(version)s", "help": "Show the version and exit."}
+click.version_option(package_name=NAME, **VERSION)(program)
+
+
+def command(
+    *params: click.Parameter, name: str = "", group: click.Group = program, **more: Any
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Make a function a command, whose docstring is its help.
+
+    Args:
+        *params: Arguments and options of the command, in the order of the help.
+        name: Name of the command; that of the function otherwise.
+        group: Commands that it belongs to.
+        **more: Settings of its context.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        settings = {**program.context_settings, **more}
+        title = name or function.__name__.strip("_")
+        help_text = function.__doc__
+        group.add_command(Command(title, settings, function, [*params], help=help_text))
+        return function
+
+    return decorate
+
+
+def option(
+    name: str, help: str, type: Any = TEXT, metavar: str | None = None, **settings: Any
+) -> click.Option:
+    """Return an option.
+
+    Args:
+        name: Name with its dashes.
+        help: Text that says what it does.
+        type: Type of its value; None for a flag.
+        metavar: Value as the help shows it.
+        **settings: Further settings of :class:`click.Option`.
+    """
+    if type is SEVERAL:
+        settings["default"] = []
+    shows = settings.get("default") not in (None, "", [])
+    flag = {"is_flag": True} if type is None else {}
+    settings = {**flag, "show_default": shows, **settings}
+    return click.Option([name], help=help, type=type, metavar=metavar, **settings)
+
+
+def argument(name: str, metavar: str, type: Any = FOLDER, **more: Any) -> Any:
+    """Return an argument."""
+    return click.Argument([name], metavar=metavar, type=type, **more)
+
+
+INTEGER = click.INT
+DIR = argument("folder", "DIR")
+A_TASK = option("--task", "with all that is declared of it", click.Choice(TASKS))
+OF_TASK = option(
+    "--option", "of the task: variant=sinh target=2", SEVERAL, "NAME=VALUE ..."
+)
+OF_CAMPAIGN = option(
+    "--set",
+    "fields of CampaignOptions: num_simulations=2000 workers.time_limit=3",
+    SEVERAL,
+    "NAME=VALUE ...",
+)
+METHOD = option("--method", "by which it learns", click.Choice(METHODS), default="asbi")
+SEED = option("--seed", "of all that is random", INTEGER, default=0)
+ROUNDS = option("--rounds", "real trials", COUNT, default=4)
+WORKERS = option("--workers", "processes", COUNT, default=1)
+JSON = option("--json", "for programs, errors too", None, expose_value=False)
+TRUST = option("--trust", "import what a folder from elsewhere names", None)
+SIMULATOR = option(
+    "--simulator", "or file.py:FUNCTION, where it is now", metavar="MODULE:FUNCTION"
+)
+SPACE = [
+    option("--prior", "in place of bounds", metavar="MODULE:NAME"),
+    option("--theta-low", "one a parameter", NUMBERS, "A,B,..."),
+    option("--theta-high", "one a parameter", NUMBERS, "A,B,..."),
+    option(
+        "--actions",
+        "for each entry LOW:HIGH, LOW:HIGH:COUNT or A,B,...; or one MODULE:NAME",
+        SEVERAL,
+        "SPEC ...",
+    ),
+    option("--noise", "standard deviation of x or its entries", NUMBERS, "SD[,SD...]"),
+]
+EFFECTS = option(
+    "--effects", "each a list of Effect, or gives one", SEVERAL, "MODULE:NAME ..."
+)
