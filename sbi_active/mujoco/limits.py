@@ -119,6 +119,11 @@ class MotionLimits:
             drawn = (belief or robot.prior).sample((num_draws,))
         self._theta = drawn.double()
 
+    def __repr__(self) -> str:
+        rows = zip(self._labels, self._low, self._high, strict=True)
+        limits = ", ".join(f"{n} in [{a:g}, {b:g}]" for n, a, b in rows)
+        return f"MotionLimits({limits})"
+
     def __call__(self, action: Tensor) -> Tensor:
         """Return a mask of actions (n, action_dim) within all limits, bool (n,)."""
         action = torch.as_tensor(action).double()

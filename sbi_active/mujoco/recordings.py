@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from sbi_active.criticism.data.table_rows import (
     seconds,
 )
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.expected import did_you_mean
 from sbi_active.messages import warn
 from sbi_active.mujoco.models.names import held_places, names_of, start_places
 from sbi_active.mujoco.simulator import Channel
@@ -141,18 +141,16 @@ def _frame(
     spare = [c for c in frame.columns if c not in {*wanted, *starts}]
     for name in wanted:
         if name not in frame.columns:
-            near = difflib.get_close_matches(name, spare, n=3, cutoff=0.4)
-            hint = f"rename {' or '.join(map(repr, near))}" if near else "rename or add"
+            hint = did_you_mean(name, spare, "rename or add it")
             raise ValueError(
                 f"expected a column {name!r} in {what}; got {', '.join(frame.columns)};"
                 f" {hint}"
             )
     for name in spare:
         if name.startswith(START):
-            near = difflib.get_close_matches(name, starts, n=1) or starts[:1]
+            hint = did_you_mean(name, starts, f"did you mean {starts[0]!r}?")
             raise ValueError(
-                f"expected start states of joints in {what}; got {name!r}; did you "
-                f"mean {near[0]!r}?"
+                f"expected start states of joints in {what}; got {name!r}; {hint}"
             )
     frame = _as_numbers(frame, wanted + [c for c in frame if c in starts], what)
     for name in [TIME, *controls]:

@@ -14,6 +14,7 @@ from torch import Tensor
 from sbi_active.actions import ActionSpace, MixedActions
 from sbi_active.actions.signals import SignalActions
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.expected import suggests
 from sbi_active.mujoco.idle import warn_of_idle
 from sbi_active.mujoco.models.machine import Machine
 from sbi_active.mujoco.models.names import (
@@ -76,6 +77,7 @@ class Robot(NamedTuple):
     trials: Trials | None = None
 
 
+@suggests
 def from_mjcf(
     spec_or_path: Any,
     parameters: Mapping[str, Any],

@@ -22,6 +22,7 @@ from sbi_active.actions import ActionSpace, DiscreteActions
 from sbi_active.actions.signals import SignalActions
 from sbi_active.actions.waveforms import Recorded
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.expected import suggests
 from sbi_active.mujoco.idle import warn_of_idle
 from sbi_active.mujoco.models.machine import Machine
 from sbi_active.mujoco.models.names import names_of, start_places
@@ -47,6 +48,7 @@ STATES = {"MjStateQPos": "_qpos", "MjStateQVel": "_qvel"}
 SPEED = "MjStateQVel"
 
 
+@suggests
 def from_sysid(
     model_sequences: Any,
     params: Any,

@@ -13,6 +13,7 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect
 from sbi_active.criticism.effects.patterns import as_patterns, picked, unmatched
+from sbi_active.expected import suggests
 from sbi_active.mujoco.effects.changes import QuantityChange
 from sbi_active.mujoco.effects.elements import elements
 from sbi_active.mujoco.effects.nominal import nominal
@@ -25,6 +26,7 @@ from sbi_active.simulation import SimulatorModel
 __all__ = ["likely_effects", "mjcf_effects"]
 
 
+@suggests
 def mjcf_effects(
     model: Any,
     *,
