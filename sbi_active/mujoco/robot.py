@@ -119,7 +119,7 @@ def from_mjcf(
             positions, velocities, controls that are held ("motor control") and poses of
             mocap bodies ("target mocap[0]") by name, or the name of a keyframe, which
             gives all of these. None is the model's.
-        recordings: Logs, one a trial, as in :func:`.trials_of`.
+        recordings: Logs, one a trial, as in :func:`.trials_of`, or a folder of them.
         threads: Number of threads of MuJoCo's rollout, in each process. Results do
             not depend on it.
 

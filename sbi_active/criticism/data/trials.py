@@ -220,7 +220,7 @@ class Trials:
         Optional are "role", "index" (the place in the order of execution; without it
         that of the first row) and "repeat_of" (the index of the trial that is
         repeated). An empty cell of x is what was not measured. A unit stands in
-        brackets, as in "x_height[m]", and goes into reports. "start_\*" is the measured
+        brackets: "x_height[mm]" becomes m, as reports say. "start_\*" is the measured
         start state. "input_\*" varies within a trial, in a table with one row a sample,
         which then needs no action; rows may have an input and no x.
 
@@ -231,8 +231,8 @@ class Trials:
                 "input", "start", "role", "index" and "repeat_of", where they have other
                 names; those left out are then ignored. Several columns may name a trial
                 together.
-            units: Units by column, where the header has none. Numbers are taken as they
-                are, but for the time, which is converted to seconds.
+            units: Units by column, where the header has none. Numbers become SI, such
+                as ms, mm and deg; what is not known, such as px, stays as it is.
             order: Order of execution; "unknown" where rows are in any order.
             inputs: Another file, or a data frame, with the inputs at times of their
                 own: "time", "input_\*", and "trial" unless all trials share them.
