@@ -57,12 +57,13 @@ def read_trials(
         _require_same_columns(frame, file, frames, paths[0])
         frame, told = _named(frame, file.stem, columns)
         if inputs is None:  # by itself, so that what is wrong is said with the file
-            read_table(frame, columns=told, units=units, source=str(file))
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", message=".* now converted")  # later
+                read_table(frame, columns=told, units=units, source=str(file))
         frames.append(frame)
     joined = pd.concat(frames, ignore_index=True)
     with warnings.catch_warnings():
-        said = ".* (hold no number|are now converted)"  # file by file
-        warnings.filterwarnings("ignore", message=said)
+        warnings.filterwarnings("ignore", message=".* hold no number")  # said before
         return read_table(
             joined, columns=told, units=units, inputs=inputs, source=str(path)
         )

@@ -136,8 +136,8 @@ def _note_converted(found: Columns, source: str) -> None:
     now = [c for c, factor in found.factors.items() if factor != 1 and c != found.time]
     if now:
         warn(
-            f"SA703 {', '.join(f'{c} [{found.units[c]}]' for c in now)} of {source} "
-            "are now converted to these units: let the simulator take them",
+            f"SA703 {', '.join(f'{c} to {found.units[c]}' for c in now)}: columns of "
+            f"{source} are now converted: let the simulator give these units",
             ChangedWarning,
             stacklevel=stack_level(),
         )

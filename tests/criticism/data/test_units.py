@@ -46,7 +46,7 @@ def test_numbers_of_a_table_become_si(where):
         names = [f"{name} [{unit}]" for name, unit in UNITS.items()]
         units = None
     frame = pd.DataFrame(ROWS, columns=names).assign(trial=1)
-    with pytest.warns(ChangedWarning, match="action_v.* x_y.* input_u.* converted"):
+    with pytest.warns(ChangedWarning, match="action_v.* to rad/s, x_y.* to m, input_u"):
         trials = Trials.from_dataframe(frame, units=units)
     assert trials.sample_times is not None
     assert trials.inputs is not None
