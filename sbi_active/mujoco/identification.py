@@ -12,8 +12,6 @@ from sbi_active.expected import suggests
 from sbi_active.mujoco.effects.library import likely_effects
 from sbi_active.mujoco.robot import Robot
 
-__all__ = ["identify_robot"]
-
 
 @suggests
 def identify_robot(

@@ -24,8 +24,6 @@ from sbi_active.mujoco.simulator import MujocoFunction
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
 
-__all__ = ["MotionLimits"]
-
 Array = NDArray[Any]
 
 #: Readings of all rows that are in memory at once.

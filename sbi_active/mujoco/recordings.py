@@ -25,8 +25,6 @@ from sbi_active.messages import warn
 from sbi_active.mujoco.models.names import held_places, names_of, start_places
 from sbi_active.mujoco.simulator import Channel
 
-__all__ = ["require_in_range", "trials_of"]
-
 Array = NDArray[Any]
 
 START = "start "

@@ -34,8 +34,6 @@ from sbi_active.mujoco.simulator import MODEL, MujocoFunction
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.noise.base import NoiseModel
 
-__all__ = ["Robot", "from_mjcf", "from_spec", "named_box", "require_alike"]
-
 
 def named_box(parameters: Sequence[Bounded]) -> BoxUniform:
     """Return a uniform prior whose sides have ``names`` and ``units``.

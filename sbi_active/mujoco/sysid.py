@@ -36,8 +36,6 @@ from sbi_active.mujoco.transforms import Signal, SignalReadout
 from sbi_active.simulation import AutocorrelatedNoise, SimulatorModel
 from sbi_active.simulation.noise.base import NoiseModel
 
-__all__ = ["from_sysid"]
-
 Array = NDArray[Any]
 
 #: Unknown errors, from this share of a signal's deviation up to all of it, lasting from

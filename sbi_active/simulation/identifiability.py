@@ -23,8 +23,6 @@ from sbi_active.simulation.sensitivities import (
     Simulate,
 )
 
-__all__ = ["Undetermined", "find_undetermined"]
-
 Array = NDArray[Any]
 
 OPEN = 0.3  # deviations, as in the belief's

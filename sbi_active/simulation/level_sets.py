@@ -14,8 +14,6 @@ from sbi_active.combinations.formula import Combination
 from sbi_active.simulation.sensitivities import Sensitivities
 from sbi_active.support import within_support
 
-__all__ = ["moved_along"]
-
 Array = NDArray[Any]
 
 FEWEST_MOVED = 0.25  # prior deviations that places lie apart to be compared at all

@@ -14,8 +14,6 @@ from torch.distributions import Distribution
 from sbi_active.seeding import forked_generators
 from sbi_active.support import within_support
 
-__all__ = ["EQUAL", "SAME", "STEP", "Sensitivities", "Simulate"]
-
 Array = NDArray[Any]
 #: Returns x (n, ...) of parameters (n, theta_dim) and actions (n, action_dim), row i
 #: with the same random numbers whatever the parameters; others for another key.

@@ -23,8 +23,6 @@ from sbi_active.mujoco.robot import Robot, from_spec
 from sbi_active.mujoco.simulator import MujocoFunction
 from sbi_active.simulation import SimulatorModel
 
-__all__ = ["likely_effects", "mjcf_effects"]
-
 
 @suggests
 def mjcf_effects(

@@ -30,8 +30,6 @@ from sbi_active.mujoco.effects.insertions import Transmission, least_compliance
 from sbi_active.mujoco.models.changes import ModelChange
 from sbi_active.mujoco.models.names import element_id
 
-__all__ = ["Row", "rows"]
-
 TABLE = Path(__file__).with_name("table.md")
 
 

@@ -8,17 +8,6 @@ from typing import Any
 from sbi_active.expected import did_you_mean
 from sbi_active.mujoco.models.spec import mujoco_of
 
-__all__ = [
-    "KINDS",
-    "element_id",
-    "held_places",
-    "meaning",
-    "names_of",
-    "require_name",
-    "scalar_joints",
-    "start_places",
-]
-
 #: Kinds of elements: what MuJoCo calls them, and the count in a model.
 KINDS = {
     "body": ("mjOBJ_BODY", "nbody"),
