@@ -1,8 +1,16 @@
-"""Errors of arguments, in one form of words for all settings."""
+"""Arguments of public classes and functions: checked, suggested and shown alike."""
 
 from __future__ import annotations
 
-from typing import Any
+import difflib
+import functools
+import inspect
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeVar
+
+Taking = TypeVar("Taking", bound=Callable[..., Any])
+
+SHOWN = 6  # names or numbers of a list in a repr
 
 
 def require(holds: bool, expected: str, got: Any, advice: str) -> None:
@@ -24,3 +32,99 @@ def require(holds: bool, expected: str, got: Any, advice: str) -> None:
     """
     if not holds:
         raise ValueError(f"expected {expected}; got {got}; {advice}")
+
+
+def did_you_mean(name: str, known: Iterable[str], otherwise: str) -> str:
+    """Return the advice of an error about a name: the nearest ones that exist.
+
+    Args:
+        name: Name that was given.
+        known: Names that exist.
+        otherwise: Advice where none is near.
+
+    Example:
+        >>> did_you_mean("num_sample", ["num_samples", "seed"], "correct it")
+        "did you mean 'num_samples'?"
+    """
+    near = difflib.get_close_matches(name, [*known], n=3, cutoff=0.5)
+    return f"did you mean {' or '.join(map(repr, near))}?" if near else otherwise
+
+
+def require_known(taking: str, given: Iterable[str], known: Sequence[str]) -> None:
+    """Raise if a keyword is not known, with the one that was probably meant.
+
+    Args:
+        taking: Name of what takes the keywords.
+        given: Keywords that were given.
+        known: Keywords that it takes.
+
+    Raises:
+        TypeError: If there is another.
+    """
+    for name in given:
+        if name not in known:
+            advice = did_you_mean(name, known, "correct or remove it")
+            raise TypeError(
+                f"expected keywords of {taking} among {', '.join(known)}; got "
+                f"{name!r}; {advice}"
+            )
+
+
+def suggests(taking: Taking) -> Taking:
+    """Let a function or a class name the keyword that was probably meant.
+
+    A subclass with its own ``__init__`` is not changed.
+    """
+    function: Any = taking.__init__ if isinstance(taking, type) else taking
+    kinds = inspect.Parameter
+    named = kinds.POSITIONAL_OR_KEYWORD, kinds.KEYWORD_ONLY
+    name = taking.__qualname__.removesuffix(".__init__")
+    entries = inspect.signature(function).parameters.values()
+    known = [
+        p.name for p in entries if p.kind in named and p.name not in ("self", "cls")
+    ]
+
+    @functools.wraps(function)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        require_known(name, kwargs, known)
+        return function(*args, **kwargs)
+
+    if not isinstance(taking, type):
+        return call  # pyright: ignore[reportReturnType]
+    made: Any = taking
+    made.__init__ = call
+    return made
+
+
+class Shown:
+    """A class whose repr has the arguments that differ from their defaults.
+
+    Only those are shown that an attribute of the same name keeps.
+    """
+
+    def __repr__(self) -> str:
+        parts = []
+        for entry in inspect.signature(type(self)).parameters.values():
+            value = getattr(self, entry.name, None)
+            is_plain = isinstance(value, bool | int | float | str)
+            is_default = value is entry.default or (is_plain and value == entry.default)
+            if value is None or is_default:
+                continue
+            is_first = entry.default is entry.empty and not parts
+            prefix = "" if is_first else f"{entry.name}="
+            parts.append(prefix + _short(value))
+        return f"{type(self).__name__}({', '.join(parts)})"
+
+
+def _short(value: Any) -> str:
+    """Return a value in a few words."""
+    if isinstance(value, list | tuple):
+        names = [str(getattr(entry, "name", entry)) for entry in value[:SHOWN]]
+        left = [f"{len(value) - SHOWN} more"] if len(value) > SHOWN else []
+        return f"[{', '.join([*names, *left])}]"
+    if getattr(value, "ndim", 0) == 1 and len(value) > 1:
+        return f"{len(value)} from {float(value[0]):g} to {float(value[-1]):g}"
+    text = " ".join(repr(value).split())
+    if text.startswith("<"):  # an address says nothing
+        return getattr(value, "__name__", type(value).__name__)
+    return text

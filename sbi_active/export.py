@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,17 +11,20 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.arviz_versions import Groups, data_tree, inference_data
+from sbi_active.expected import suggests
 from sbi_active.inference.beliefs.belief import names_of
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 
 if TYPE_CHECKING:
+    from sbi_active.actions import ActionSpace
     from sbi_active.campaign import Campaign
     from sbi_active.criticism import Report
 
 NUM_CHAINS = 4
 
 
+@suggests
 def to_inference_data(
     source: Distribution | Campaign | Report | Mapping[str, Any],
     *,
@@ -29,18 +32,22 @@ def to_inference_data(
     num_samples: int = 2_000,
     num_chains: int = NUM_CHAINS,
     model: str | None = None,
+    simulator: Callable[..., Any] | None = None,
+    action: Tensor | None = None,
+    x: Tensor | None = None,
     seed: int = 0,
 ) -> Any:
     """Return draws and data in ArviZ's format.
 
     Groups of a belief: posterior, sample_stats (the log density ``lp`` of each draw),
-    and prior where the belief knows it. A campaign adds posterior_predictive,
-    prior_predictive and observed_data (one outcome a trial), constant_data (actions)
-    and log_likelihood (where the simulator's noise has a density); the predictive ones
-    and the likelihood where it was loaded with its simulator, without which ``lp`` is
-    by kernels where it would be simulated. A report has the
-    posterior of its verdict's model, or of ``model``. A benchmark run is a dict of
-    variables, each of shape (draws,) or (draws, parameters): its rows as draws.
+    and prior where the belief knows it; with ``simulator`` and ``action`` also
+    posterior_predictive, one outcome an action and draw. A campaign adds
+    posterior_predictive, prior_predictive and observed_data (one outcome a trial),
+    constant_data (actions) and log_likelihood (where the simulator's noise has a
+    density); the predictive ones and the likelihood where it was loaded with its
+    simulator, without which ``lp`` is by kernels where it would be simulated. A report
+    has the posterior of its verdict's model, or of ``model``. A benchmark run is a dict
+    of variables, each of shape (draws,) or (draws, parameters): its rows as draws.
 
     Draws are independent; they are split over chains, so that r_hat and ess are
     defined. Coordinates name parameters, rounds, channels and entries of the action,
@@ -53,14 +60,19 @@ def to_inference_data(
         num_samples: Draws of all chains together.
         num_chains: Number of chains; draws that do not fill all are left out.
         model: Model of a report, by a name among ``report.tracing.evidences``.
+        simulator: Simulator that a belief predicts outcomes with.
+        action: Actions at which it does, shape (k, action_dim).
+        x: Outcomes measured there, shape (k, *x_shape), if any: observed_data, and
+            log_likelihood where the simulator declares its noise.
         seed: Seed of the draws.
 
     Returns:
         ``InferenceData`` of ArviZ 0.x, ``DataTree`` of 1.x.
 
     Raises:
-        ValueError: If names do not fit, chains are more than half of the draws, or a
-            report has no such model.
+        ValueError: If names do not fit, chains are more than half of the draws, a
+            report has no such model, or actions come without a simulator or not with a
+            belief.
 
     Example:
         >>> from sbi.utils import BoxUniform
@@ -68,11 +80,13 @@ def to_inference_data(
         >>> data["posterior"]["theta"].dims
         ('chain', 'draw', 'parameter')
     """
+    tried = simulator, action, x
     return inference_data(
-        _groups(source, parameter_names, num_samples, num_chains, model, seed)
+        _groups(source, parameter_names, num_samples, num_chains, model, tried, seed)
     )
 
 
+@suggests
 def to_datatree(
     source: Distribution | Campaign | Report | Mapping[str, Any],
     *,
@@ -80,6 +94,9 @@ def to_datatree(
     num_samples: int = 2_000,
     num_chains: int = NUM_CHAINS,
     model: str | None = None,
+    simulator: Callable[..., Any] | None = None,
+    action: Tensor | None = None,
+    x: Tensor | None = None,
     seed: int = 0,
 ) -> Any:
     """Return draws and data as an xarray ``DataTree``, which ArviZ 1.x takes.
@@ -94,10 +111,15 @@ def to_datatree(
         num_samples: Draws of all chains together.
         num_chains: Number of chains.
         model: Model of a report, by its name.
+        simulator: Simulator that a belief predicts with, as for
+            :func:`to_inference_data`.
+        action: Actions at which it does.
+        x: Outcomes measured there.
         seed: Seed of the draws.
     """
+    tried = simulator, action, x
     return data_tree(
-        _groups(source, parameter_names, num_samples, num_chains, model, seed)
+        _groups(source, parameter_names, num_samples, num_chains, model, tried, seed)
     )
 
 
@@ -107,6 +129,7 @@ def _groups(
     num_samples: int,
     num_chains: int,
     model: str | None,
+    tried: tuple[Any, Any, Any],
     seed: int,
 ) -> Groups:
     if not 1 <= num_chains <= num_samples // 2:
@@ -114,25 +137,33 @@ def _groups(
             "expected at least two draws a chain; got "
             f"{num_samples} draws in {num_chains} chains; raise num_samples"
         )
+    simulator, action, x = tried
+    is_belief = isinstance(source, Distribution)
+    if (simulator is None) != (action is None) or (action is not None) > is_belief:
+        raise ValueError(
+            "expected a belief with simulator and action, or neither; got "
+            f"{type(source).__name__}, simulator {simulator!r} and action {action}; "
+            "pass both with a belief: a campaign predicts its own trials"
+        )
     made = Groups(num_chains)
     num_samples -= num_samples % num_chains
     if isinstance(source, Mapping):
         _add_rows(made, source)
     elif hasattr(source, "tracing"):
         _add_report(made, source, num_samples, model, seed)
-    elif isinstance(source, Distribution):
+    elif is_belief:
         prior = getattr(source, "prior", None)
-        _add_belief(made, source, prior, names, num_samples, seed)
+        draws = _add_belief(made, source, prior, names, num_samples, seed)
+        if action is not None:
+            made.coords["round"] = [*range(1, len(action) + 1)]
+            _add_outcomes(made, simulator, draws, action, x, seed)
     elif hasattr(source, "history"):
         if names is None:
             names = source.parameter_names
         pair = source.belief, source.prior
         reads = source.simulator is None
-        theta, before = _add_belief(
-            made, *pair, names, num_samples, seed, is_smooth=reads
-        )
-        assert before is not None
-        _add_trials(made, source, theta, before, seed)
+        draws = _add_belief(made, *pair, names, num_samples, seed, is_smooth=reads)
+        _add_trials(made, source, draws, seed)
     else:
         raise TypeError(
             "expected a belief, a campaign, a report or a dict of arrays; got "
@@ -177,45 +208,75 @@ def _add_belief(
 
 
 def _add_trials(
-    made: Groups, campaign: Campaign, theta: Tensor, before: Tensor, seed: int
+    made: Groups, campaign: Campaign, draws: tuple[Tensor, Tensor | None], seed: int
 ) -> None:
     trials = [t for t in campaign.history if t.is_measured]
     if not trials:
         return
+    made.coords["round"] = [t.index + 1 for t in trials]
     action = torch.stack([t.action for t in trials])
     x = torch.stack([t.x for t in trials if t.x is not None])
-    dims = [f"x_dim_{i}" for i in range(x.ndim - 1)]
-    channels = campaign.channel_names
-    if channels is not None and x.ndim > 1 and len(channels) == x.shape[-1]:
+    space, channels = campaign.actions, campaign.channel_names
+    _add_outcomes(made, campaign.simulator, draws, action, x, seed, space, channels)
+
+
+def _add_outcomes(
+    made: Groups,
+    simulator: Callable[..., Any] | None,
+    draws: tuple[Tensor, Tensor | None],
+    action: Tensor,
+    x: Tensor | None,
+    seed: int,
+    space: ActionSpace | None = None,
+    channels: Sequence[str] | None = None,
+) -> None:
+    """Add what is predicted at actions, and what was measured there.
+
+    Args:
+        made: Groups to add to; the coordinate "round" numbers the actions.
+        simulator: Simulator; None predicts nothing.
+        draws: Draws of the posterior, and of the prior if it is known.
+        action: Actions, shape (k, action_dim).
+        x: Outcomes, shape (k, *x_shape); None if nothing was measured.
+        seed: Seed of the simulations.
+        space: Action space, which names the entries; None numbers them.
+        channels: Names of the channels; None takes the simulator's.
+    """
+    action = torch.as_tensor(action).reshape(len(action), -1).float()
+    x = None if x is None else torch.as_tensor(x)
+    names = getattr(space, "names", [f"action_{i + 1}" for i in range(action.shape[1])])
+    channels = channels or getattr(simulator, "channel_names", None)
+
+    def rows(theta: Tensor) -> tuple[Tensor, Tensor]:
+        return theta.repeat_interleave(len(action), 0), action.repeat(len(theta), 1)
+
+    # Predictive and likelihood use the same draws of the posterior.
+    values: dict[str, Tensor] = {}
+    for group, theta in zip(("posterior", "prior"), draws, strict=True):
+        if theta is not None and simulator is not None:
+            key = "predictive" if group == "posterior" else "prior predictive"
+            found = simulate(simulator, *rows(theta), seed=derive_seed(seed, key)).x
+            values[group] = found.reshape(-1, len(action), *found.shape[1:])
+    shape = values["posterior"].shape[2:] if x is None else x.shape[1:]
+    dims = [f"x_dim_{i}" for i in range(len(shape))]
+    if channels is not None and shape and len(channels) == shape[-1]:
         dims[-1] = "channel"
         made.coords["channel"] = [*channels]
-    made.coords["round"] = [t.index + 1 for t in trials]
-    made.coords["action_entry"] = [*campaign.actions.names]
-    shape = (len(theta), len(trials))
-    # Predictive and likelihood use the same draws of the posterior.
-    predicted = () if campaign.simulator is None else ("posterior", "prior")
-    for group, draws in zip(predicted, (theta, before), strict=False):
-        pairs = draws.repeat_interleave(len(trials), 0), action.repeat(len(draws), 1)
-        key = "predictive" if group == "posterior" else "prior predictive"
-        rows = simulate(campaign.simulator, *pairs, seed=derive_seed(seed, key))
-        values = rows.x.reshape(*shape, *x.shape[1:])
-        made.add(f"{group}_predictive", "x", values, ["round", *dims])
+    made.coords["action_entry"] = [*names]
+    for group, outcomes in values.items():
+        made.add(f"{group}_predictive", "x", outcomes, ["round", *dims])
+    units = {} if space is None else dict(zip(names, space.units, strict=True))
+    named = {f"unit_{name}": unit for name, unit in units.items() if unit}
+    made.add_data("constant_data", "action", action, ["round", "action_entry"], named)
+    if x is None:
+        return
     made.add_data("observed_data", "x", x, ["round", *dims])
-    units = {
-        f"unit_{name}": unit
-        for name, unit in zip(
-            campaign.actions.names, campaign.actions.units, strict=True
-        )
-        if unit
-    }
-    made.add_data("constant_data", "action", action, ["round", "action_entry"], units)
-    noise = getattr(campaign.simulator, "noise", None)
+    noise = getattr(simulator, "noise", None)
     if noise is not None:
-        simulator: Any = campaign.simulator
-        pairs = theta.repeat_interleave(len(trials), 0), action.repeat(len(theta), 1)
-        observed = x.repeat(len(theta), *[1] * (x.ndim - 1))
-        log_prob = noise.log_prob(observed, simulator.mean(*pairs)).reshape(shape)
-        made.add("log_likelihood", "x", log_prob, ["round"])
+        model: Any = simulator
+        observed = x.repeat(len(draws[0]), *[1] * (x.ndim - 1))
+        log_prob = noise.log_prob(observed, model.mean(*rows(draws[0])))
+        made.add("log_likelihood", "x", log_prob.reshape(-1, len(x)), ["round"])
 
 
 def _add_report(

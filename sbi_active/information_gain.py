@@ -7,10 +7,12 @@ __all__: list[str] = []
 __getattr__ = former_names(
     __name__,
     {
-        "CandidateSimulations": "sbi_active.design:CandidateSimulations",
+        "CandidateSimulations": (
+            "sbi_active.design.estimators.base:CandidateSimulations"
+        ),
         "ContrastiveGain": "sbi_active.design.estimators.likelihood:ContrastiveGain",
         "EntropyGain": "sbi_active.design:EntropyGain",
-        "InfoNCEGain": "sbi_active.design:InfoNCEGain",
+        "InfoNCEGain": "sbi_active.design.estimators.ratio:InfoNCEGain",
         "InformationGainEstimator": "sbi_active.design:InformationGainEstimator",
         "LikelihoodGain": "sbi_active.design:LikelihoodGain",
         "LinearGain": "sbi_active.design:LinearGain",

@@ -13,6 +13,7 @@ from dataclasses import fields, replace
 from typing import Any, TypeVar
 
 from sbi_active.callers import stack_level
+from sbi_active.expected import suggests
 from sbi_active.messages import warn
 
 Taking = TypeVar("Taking", bound=Callable[..., Any])
@@ -110,7 +111,7 @@ def takes_loose(**groups: Any) -> Callable[[Taking], Taking]:
         warn(text, stacklevel=stack_level())
 
     def decorate(taking: Any) -> Any:
-        function = taking.__init__ if isinstance(taking, type) else taking
+        function = suggests(taking.__init__ if isinstance(taking, type) else taking)
 
         @functools.wraps(function)
         def call(*args: Any, **kwargs: Any) -> Any:
@@ -126,7 +127,7 @@ def takes_loose(**groups: Any) -> Callable[[Taking], Taking]:
             warned(taking.__name__, name)
             return getattr(group, name)
 
-        if function is taking:
+        if not isinstance(taking, type):
             return call
         taking.__init__, taking.__getattr__ = call, find
         return taking
@@ -142,10 +143,12 @@ def set_later(*names: str) -> Callable[[Taking], Taking]:
     """
 
     def decorate(make: Any) -> Any:
+        suggesting = suggests(make)
+
         @functools.wraps(make)
         def call(self: Any, *args: Any, **kwargs: Any) -> Any:
             later = {name: kwargs.pop(name) for name in names if name in kwargs}
-            made = make(self, *args, **kwargs)
+            made = suggesting(self, *args, **kwargs)
             for name, value in later.items():
                 text = (
                     f"SA701 the keyword {name}= goes in the next version: set .{name}"

@@ -8,10 +8,10 @@ __getattr__ = former_names(
     __name__,
     {
         "BayesianOptimization": "sbi_active.design:GradientSearch",
-        "Evaluations": "sbi_active.design:Evaluations",
+        "Evaluations": "sbi_active.design.search:Evaluations",
         "ExhaustiveSearch": "sbi_active.design.search:ExhaustiveSearch",
         "GradientSearch": "sbi_active.design:GradientSearch",
-        "Objective": "sbi_active.design:Objective",
+        "Objective": "sbi_active.design.search:Objective",
         "Search": "sbi_active.design:Search",
     },
 )

@@ -47,6 +47,11 @@ class Task(ABC):
     simulator: SimulatorModel
     theta_true: Tensor
 
+    def __repr__(self) -> str:
+        return (
+            f"{type(self).__name__}({', '.join(self.parameter_names)}; {self.actions})"
+        )
+
     @property
     def parameter_names(self) -> list[str]:
         """One name a parameter."""

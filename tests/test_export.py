@@ -103,6 +103,38 @@ def test_a_belief_and_a_prior_alone(campaign):
     assert data.prior.theta.values.max() > data.posterior.theta.values.mean()
 
 
+def test_a_belief_predicts_outcomes_at_actions(campaign):
+    action = torch.tensor([[1.0], [1.5]])
+    x = torch.tensor([[0.5, 0.4], [0.7, 0.6]])
+    model = campaign.simulator
+    tried = {"simulator": model, "action": action, "x": x}
+    data = to_inference_data(campaign.belief, num_samples=2_000, **tried)
+    predicted = data.posterior_predictive.x
+    assert predicted.dims == ("chain", "draw", "round", "channel")
+    assert [*predicted.channel.values] == ["x", "y"]
+    # Linear with a noise of .2: mean and variance follow from the draws.
+    theta = data.posterior.theta.values.reshape(-1, 1, 2)
+    rows = predicted.values.reshape(-1, 2, 2)
+    expected = (theta * action.numpy()).mean(0)
+    sd = ((theta * action.numpy()).var(0) + 0.2**2) ** 0.5
+    assert (np.abs(rows.mean(0) - expected) < 5 * sd / 2_000**0.5).all()
+    assert rows.std(0) == pytest.approx(sd, rel=5 / 4_000**0.5)
+    assert data.log_likelihood.x.shape == (4, 500, 2)
+    assert np.allclose(data.observed_data.x, x)
+    assert az.plot_ppc(data, random_seed=0) is not None
+    bare = to_inference_data(PRIOR, simulator=model, action=action, num_samples=20)
+    assert {"posterior_predictive", "constant_data"} < {*bare.groups()}
+    assert not {"observed_data", "log_likelihood"} & {*bare.groups()}
+
+
+def test_actions_come_with_a_belief_and_a_simulator(campaign):
+    action = torch.ones(1, 1)
+    with pytest.raises(ValueError, match="expected a belief with simulator and action"):
+        to_inference_data(PRIOR, action=action)
+    with pytest.raises(ValueError, match="got Campaign"):
+        to_datatree(campaign, action=action, simulator=campaign.simulator)
+
+
 def test_a_plain_function_has_no_log_likelihood():
     def simulator(theta, action):
         return theta * action + 0.2 * torch.randn_like(theta)

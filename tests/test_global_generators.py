@@ -17,7 +17,8 @@ from sbi_active import (
 )
 from sbi_active.actions import BoxActions, MixedActions
 from sbi_active.criticism import Trials, close_loop
-from sbi_active.inference import Observation, refine
+from sbi_active.inference import refine
+from sbi_active.inference.rounds.rows import Observation
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import check_simulator, estimate_noise
 from tests.campaign.problem import (

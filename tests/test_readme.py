@@ -216,9 +216,17 @@ def test_question_thrown_ball(run, capsys):
     assert table.loc["rmse", "after"] < 0.03 < table.loc["rmse", "before"]
 
 
-def test_question_recordings(run):
+def test_question_recordings(run, capsys):
     pytest.importorskip("mcap")
-    (read,) = run("docs/howto/recordings.md")
+    log, read = run("docs/howto/recordings.md")
+    assert log.robot.trials.x.shape == (4, 150, 2)
+    assert log.robot.trials.x[0, :, 0].isfinite().sum() == 30
+    assert log.robot.trials.sample_times[-1].item() == pytest.approx(2.98)
+    assert log.report.verdict == "rail friction loss"
+    printed = capsys.readouterr().out
+    assert (
+        "('rail [m]', 'swing [rad]')\nVerdict: rail friction loss (P > .99" in printed
+    )
     assert list(read.frame.columns) == ["time", "angle", "motor"]
     assert read.frame.time.iloc[-1] == pytest.approx(0.99)
     assert read.frame.angle.iloc[-1] == pytest.approx(0.99)

@@ -50,7 +50,7 @@ from sbi_active import (
 )
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.criticism import close_loop, generic_effects
-from sbi_active.inference import Observation
+from sbi_active.inference.rounds.rows import Observation
 from sbi_active.seeding import forked_generators, row_normals
 from sbi_active.tasks import get_task
 

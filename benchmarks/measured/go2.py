@@ -40,7 +40,8 @@ from sbi_active.criticism import Criticism, Effect
 from sbi_active.criticism.report.summary import misfit_line
 from sbi_active.criticism.results import ModelKey, Tracing
 from sbi_active.display.table import Table
-from sbi_active.mujoco import Robot, force_effects, mjcf_effects
+from sbi_active.mujoco import force_effects, mjcf_effects
+from sbi_active.mujoco.robot import Robot
 
 __all__ = ["fit_leg", "judge", "main", "tables"]
 

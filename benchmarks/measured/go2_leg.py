@@ -14,8 +14,9 @@ from torch import Tensor
 
 from sbi_active.criticism import AugmentedSimulator, Effect
 from sbi_active.criticism.rivals.trial_simulator import conditions_of_trials
-from sbi_active.mujoco import Robot, from_mjcf
+from sbi_active.mujoco import from_mjcf
 from sbi_active.mujoco.models.spec import mujoco_of
+from sbi_active.mujoco.robot import Robot
 from sbi_active.simulation import AutocorrelatedNoise
 
 __all__ = ["DATA", "FITTED", "JOINTS", "LEGS", "Leg", "read_leg", "usual_parameters"]

@@ -44,8 +44,9 @@ from benchmarks.rows import append
 from sbi_active import GaussianNoise
 from sbi_active.criticism import close_loop
 from sbi_active.criticism.identification import identify
-from sbi_active.mujoco import Robot, from_sysid, mjcf_effects
+from sbi_active.mujoco import from_sysid, mjcf_effects
 from sbi_active.mujoco.identification import identify_robot
+from sbi_active.mujoco.robot import Robot
 from sbi_active.threads import single_thread
 
 RESULTS = Path(__file__).parent / "results/coverage.csv"

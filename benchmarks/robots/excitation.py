@@ -47,8 +47,9 @@ from benchmarks.rows import append, read
 from sbi_active import DiscreteActions, InformationGainDesigner, MixedActions
 from sbi_active.actions import SignalActions
 from sbi_active.criticism import Trials, identify
-from sbi_active.mujoco import MotionLimits, Robot, from_mjcf
+from sbi_active.mujoco import MotionLimits, from_mjcf
 from sbi_active.mujoco.models.spec import mujoco_of
+from sbi_active.mujoco.robot import Robot
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 
 __all__ = ["MACHINES", "main", "score", "summary"]

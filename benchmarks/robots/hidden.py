@@ -45,7 +45,8 @@ from benchmarks.robots.public import PUBLIC, Public
 from benchmarks.rows import append, read
 from sbi_active.criticism import AugmentedSimulator, Criticism, Effect, Trials
 from sbi_active.criticism.effects.trial_conditions import conditions_of_trials
-from sbi_active.mujoco import Robot, from_mjcf, mjcf_effects
+from sbi_active.mujoco import from_mjcf, mjcf_effects
+from sbi_active.mujoco.robot import Robot
 from sbi_active.threads import single_thread
 
 Array = NDArray[Any]

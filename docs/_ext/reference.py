@@ -29,10 +29,28 @@ FURTHER = {
         "sbi_active.criticism.contradictions": ("SevereTest",),
         "sbi_active.criticism.effects.first_samples": ("zero_from_first_samples",),
     },
-    "design": {"sbi_active.export": ("to_inference_data",)},
-    "inference": {"sbi_active.inference.beliefs.diagnostics": ()},
+    "design": {
+        "sbi_active.export": ("to_inference_data",),
+        "sbi_active.design.estimators.base": ("CandidateSimulations",),
+        "sbi_active.design.estimators.ratio": ("InfoNCEGain",),
+        "sbi_active.design.search": ("Evaluations", "Objective"),
+    },
+    "diagnostics": {
+        "sbi_active.diagnostics.beliefs": ("BeliefCheck",),
+        "sbi_active.diagnostics.calibration": ("Calibration", "Stratum"),
+    },
+    "inference": {
+        "sbi_active.inference.beliefs.diagnostics": (),
+        "sbi_active.inference.networks.ratio_network": ("RatioClassifier",),
+        "sbi_active.inference.rounds.rows": ("Observation",),
+    },
     "mujoco": {
         "sbi_active.mujoco.models.changes": ("ModelChange", "StateChange"),
+        "sbi_active.mujoco.robot": ("Robot",),
+    },
+    "pyro": {
+        "sbi_active.pyro.denoising": ("Denoised", "denoise"),
+        "sbi_active.pyro.models": ("PyroProblem",),
     },
     "simulation": {"sbi_active.simulation.report": ("SimulatorReport",)},
 }

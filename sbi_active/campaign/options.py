@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import cloudpickle
@@ -12,7 +12,7 @@ import torch
 from torch.distributions import Distribution
 
 from sbi_active.design.design import Design
-from sbi_active.expected import require
+from sbi_active.expected import require, suggests
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.renamed import grouped, takes_loose
@@ -20,6 +20,7 @@ from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 
+@suggests
 @dataclass(frozen=True, kw_only=True)
 class CampaignDetails:
     """Options that few campaigns change; the papers' experiments do.
@@ -60,6 +61,7 @@ class CampaignDetails:
         )
 
 
+@suggests
 @dataclass(frozen=True, kw_only=True)
 class StopRules:
     """Rules by which :meth:`.Campaign.run` ends before its last round.
@@ -230,11 +232,10 @@ class CampaignOptions:
         """
         if options is None or isinstance(options, cls):
             return options or cls()
-        known = {f.name for f in fields(cls)}
-        if not isinstance(options, Mapping) or not {*grouped(options, GROUPS)} <= known:
+        if not isinstance(options, Mapping):
             raise TypeError(
-                f"expected options among {', '.join(sorted(known))}; got {options!r}; "
-                "pass CampaignOptions(...), or a dict of these"
+                f"expected options of a campaign; got {options!r}; pass "
+                "CampaignOptions(...), or a dict of its fields"
             )
         return cls(**options)
 

@@ -96,6 +96,13 @@ class Trial:
     num_simulations: int = 0
     num_missing: int = 0
 
+    def __repr__(self) -> str:
+        outcome = "" if self.x is None else f", x [{_first(self.x)}]"
+        gain = self.information_gained
+        told = "" if gain is None else f", {gain:.2f} nats"
+        action = _first(self.action)
+        return f"Trial({self.index}: action [{action}], {self.status}{outcome}{told})"
+
     def _repr_html_(self) -> str:
         gain, error = map(number, self.expected_gain)
         pairs = [

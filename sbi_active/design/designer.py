@@ -31,6 +31,7 @@ from sbi_active.design.search import (
     Objective,
     Search,
 )
+from sbi_active.expected import Shown, suggests
 from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import Simulations
@@ -43,7 +44,7 @@ SEARCHES: dict[str, type[Search]] = {
 }
 
 
-class InformationGainDesigner:
+class InformationGainDesigner(Shown):
     r"""Choose :math:`\xi^* = \arg\max_\xi I(\theta; x | \xi) / c(\xi)`.
 
     A search finds the candidates: all actions of a list; in a continuous or mixed space
@@ -97,6 +98,7 @@ class InformationGainDesigner:
         TMLR 2023 (choice in proportion to a power of the utility).
     """
 
+    @suggests
     def __init__(
         self,
         actions: Actions,
@@ -116,6 +118,7 @@ class InformationGainDesigner:
         self.workers, self.most_numbers = workers, most_numbers
         find_estimator(estimator)  # an unknown name is an error here
 
+    @suggests
     def select(
         self,
         model: Any,

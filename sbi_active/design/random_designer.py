@@ -13,12 +13,13 @@ from torch.distributions import Distribution
 from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.design.design import Design, equal_errors, naming
 from sbi_active.design.limits import DesignLimits, rows_of, warn_missing
+from sbi_active.expected import Shown, suggests
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import MissingRowsWarning, Outcome, simulate
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 
-class RandomDesigner:
+class RandomDesigner(Shown):
     """Choose an action uniformly at random, the design of NSBI and NLHI.
 
     Args:
@@ -28,6 +29,7 @@ class RandomDesigner:
         workers: Workers that run these simulations.
     """
 
+    @suggests
     def __init__(
         self,
         actions: Actions,
@@ -39,6 +41,7 @@ class RandomDesigner:
         self.num_samples = num_samples
         self.workers = workers
 
+    @suggests
     def select(
         self,
         model: Any = None,

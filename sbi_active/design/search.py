@@ -12,6 +12,7 @@ from typing_extensions import override
 
 from sbi_active.actions import ActionSpace
 from sbi_active.design.coordinates import Coordinates
+from sbi_active.expected import Shown
 from sbi_active.inference.sampling.gaussian_process import GaussianProcess
 from sbi_active.seeding import derive_seed
 
@@ -74,7 +75,7 @@ class Objective:
     known: Evaluations | None = None
 
 
-class Search(ABC):
+class Search(Shown, ABC):
     """Find the actions that deserve an estimate on many simulations."""
 
     @abstractmethod

@@ -4,14 +4,17 @@ This package judges networks and beliefs by fresh simulations, with sbi's own to
 reports the result in words. It does not make beliefs, and does not use them further.
 """
 
-from sbi_active.diagnostics.beliefs import BeliefCheck, check_belief
-from sbi_active.diagnostics.calibration import Calibration, Stratum
+from sbi_active.diagnostics.beliefs import check_belief
 from sbi_active.diagnostics.check import check_calibration
+from sbi_active.renamed import former_names
 
-__all__ = [
-    "BeliefCheck",
-    "Calibration",
-    "Stratum",
-    "check_belief",
-    "check_calibration",
-]
+__all__ = ["check_belief", "check_calibration"]
+
+__getattr__ = former_names(
+    __name__,
+    {
+        "BeliefCheck": "sbi_active.diagnostics.beliefs:BeliefCheck",
+        "Calibration": "sbi_active.diagnostics.calibration:Calibration",
+        "Stratum": "sbi_active.diagnostics.calibration:Stratum",
+    },
+)

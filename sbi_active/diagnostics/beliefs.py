@@ -33,6 +33,7 @@ from torch.distributions import Distribution
 from sbi_active.diagnostics.calibration import Verdict, worst
 from sbi_active.diagnostics.check import is_campaign
 from sbi_active.diagnostics.log_score import smooth
+from sbi_active.expected import suggests
 from sbi_active.inference.beliefs.belief import names_of
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.refinement.refining import refine
@@ -98,7 +99,10 @@ class BeliefCheck:
             )
         return "\n".join(lines)
 
+    __repr__ = __str__
 
+
+@suggests
 def check_belief(
     inference: Any,
     simulator: Callable[..., Any] | None = None,

@@ -118,6 +118,8 @@ class Calibration:
             lines.append(f"{self.num_invalid} rows without a measurement left out")
         return "\n".join(lines)
 
+    __repr__ = __str__
+
     def plot(self) -> Figure:
         """Draw ranks as sbi does, coverage, and gaps and coverage by stratum."""
         from sbi_active.diagnostics.figure import plot_calibration

@@ -24,6 +24,7 @@ from sbi_active.diagnostics.log_score import (
 from sbi_active.diagnostics.rows import RowPosterior
 from sbi_active.diagnostics.strata import stratified_actions
 from sbi_active.diagnostics.verdict import Tolerance, judge
+from sbi_active.expected import suggests
 from sbi_active.inference.engine.potential import declares_noise
 from sbi_active.inference.models.posterior import ActionPosterior
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows, pack
@@ -52,6 +53,7 @@ class _Round:
     gap_method: str
 
 
+@suggests
 def check_calibration(
     inference: Any,
     simulator: Callable[..., Any] | None = None,

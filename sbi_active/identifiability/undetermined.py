@@ -60,6 +60,8 @@ class Undetermined:
     def __str__(self) -> str:
         return self.text
 
+    __repr__ = __str__
+
 
 def find_undetermined(
     simulate: Simulate,

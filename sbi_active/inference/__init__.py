@@ -9,10 +9,8 @@ from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.models.lfire import LFIRE
 from sbi_active.inference.models.posterior import ActionPosterior
 from sbi_active.inference.networks.mixture_density import MixtureDensity
-from sbi_active.inference.networks.ratio_network import RatioClassifier
 from sbi_active.inference.refinement.refining import refine
 from sbi_active.inference.rounds.condition import ActionEmbedding
-from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.trainers.alhi import ALHI
 from sbi_active.inference.trainers.asbi import ASBI
 from sbi_active.inference.trainers.base import ActiveInference
@@ -29,8 +27,6 @@ __all__ = [
     "Belief",
     "LFIRE",
     "MixtureDensity",
-    "Observation",
-    "RatioClassifier",
     "RefinementOptions",
     "SeqBED",
     "SeqBED_B",
@@ -47,6 +43,10 @@ __getattr__ = former_names(
         "KernelBelief": "sbi_active.inference.beliefs.kernel_belief:KernelBelief",
         "MixtureDensityNetwork": (
             "sbi_active.inference.networks.mixture_network:MixtureDensityNetwork"
+        ),
+        "Observation": "sbi_active.inference.rounds.rows:Observation",
+        "RatioClassifier": (
+            "sbi_active.inference.networks.ratio_network:RatioClassifier"
         ),
         "RefinedBelief": "sbi_active.inference.refinement.learned_belief:LearnedBelief",
         "Refinement": "sbi_active:RefinementOptions",

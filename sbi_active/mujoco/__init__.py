@@ -10,12 +10,12 @@ from sbi_active.mujoco.beliefs import belief_to_parameters, randomization
 from sbi_active.mujoco.effects.library import mjcf_effects
 from sbi_active.mujoco.identification import identify_robot
 from sbi_active.mujoco.limits import MotionLimits
-from sbi_active.mujoco.robot import Robot, from_mjcf
+from sbi_active.mujoco.robot import from_mjcf
 from sbi_active.mujoco.sysid import from_sysid
+from sbi_active.renamed import former_names
 
 __all__ = [
     "MotionLimits",
-    "Robot",
     "belief_to_parameters",
     "force_effects",
     "from_mjcf",
@@ -24,3 +24,10 @@ __all__ = [
     "mjcf_effects",
     "randomization",
 ]
+
+__getattr__ = former_names(
+    __name__,
+    {
+        "Robot": "sbi_active.mujoco.robot:Robot",
+    },
+)

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from sbi_active.seeding import forked_generators
 
-__all__ = ["Randomization", "belief_to_parameters", "randomization"]
-
 Array = NDArray[Any]
 
 NUM_DRAWS = 10_000

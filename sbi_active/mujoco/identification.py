@@ -8,12 +8,12 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.identification import IdentifiedBelief
 from sbi_active.criticism.identification import identify as identify_trials
+from sbi_active.expected import suggests
 from sbi_active.mujoco.effects.library import likely_effects
 from sbi_active.mujoco.robot import Robot
 
-__all__ = ["identify_robot"]
 
-
+@suggests
 def identify_robot(
     robot: Robot,
     *,

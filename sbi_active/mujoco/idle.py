@@ -11,8 +11,6 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.messages import warn
 from sbi_active.simulation import SimulatorModel
 
-__all__ = ["warn_of_idle"]
-
 #: Trials or actions that are tried.
 NUM_TRIED = 4
 

@@ -24,8 +24,6 @@ from sbi_active.mujoco.simulator import MujocoFunction
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
 
-__all__ = ["MotionLimits"]
-
 Array = NDArray[Any]
 
 #: Readings of all rows that are in memory at once.
@@ -118,6 +116,11 @@ class MotionLimits:
         with forked_generators(seed):
             drawn = (belief or robot.prior).sample((num_draws,))
         self._theta = drawn.double()
+
+    def __repr__(self) -> str:
+        rows = zip(self._labels, self._low, self._high, strict=True)
+        limits = ", ".join(f"{n} in [{a:g}, {b:g}]" for n, a, b in rows)
+        return f"MotionLimits({limits})"
 
     def __call__(self, action: Tensor) -> Tensor:
         """Return a mask of actions (n, action_dim) within all limits, bool (n,)."""

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["held", "num_steps", "sampled"]
-
 Array = NDArray[Any]
 
 #: Share of a step by which a time may be off and count as that of a step.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from sbi_active.callers import stack_level
+from sbi_active.criticism.data.recordings import find_recordings
 from sbi_active.criticism.data.table_rows import (
     is_stamp,
     read_csv,
@@ -19,15 +19,14 @@ from sbi_active.criticism.data.table_rows import (
     seconds,
 )
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.data.units import TIME, split, to_si
+from sbi_active.expected import did_you_mean
 from sbi_active.messages import warn
 from sbi_active.mujoco.models.names import held_places, names_of, start_places
 from sbi_active.mujoco.simulator import Channel
 
-__all__ = ["require_in_range", "trials_of"]
-
 Array = NDArray[Any]
 
-TIME = "time"
 START = "start "
 #: Relative excess over a range that is rounding.
 SLACK = 1e-6
@@ -52,27 +51,28 @@ def trials_of(
     Each log has a column "time", s from the start of the trial, one for each input and
     one for each sensor, and may have "start hinge" or "start hinge velocity", of which
     the first row counts. If a sensor has the name of an input, the input's column is
-    "hinge control". A sensor may have NaN where it was not read; an input is held.
+    "hinge control". A sensor may have NaN where it was not read; an input is held. A
+    unit in brackets, as in "hinge [deg]" or "time [ms]", is converted.
 
     Args:
         model: Compiled model.
-        recordings: A list of data frames, of dicts of arrays, or of paths of CSV files;
-            or one of these for a single trial.
+        recordings: A list of data frames, of dicts of arrays, of paths of CSV files or
+            of folders of such; or one of these.
         channels: Channels that the simulator returns.
         inputs: Actuators that are driven.
 
     Raises:
-        ValueError: If a column is missing or not known, the time does not increase, an
-            input is NaN, or a control is outside its range.
+        ValueError: If a column is missing, not known or in a unit that cannot be
+            converted, the time does not increase, an input is NaN, or a control is
+            outside its range.
     """
     if isinstance(recordings, pd.DataFrame | Mapping | str | Path):
         recordings = [recordings]
     if not len(recordings):
         raise ValueError("expected at least one recording; got none; pass logs")
     names = [c.name for c in channels]
-    frames = [
-        _frame(model, k, given, names, inputs) for k, given in enumerate(recordings)
-    ]
+    logs = [log for given in recordings for log in _logs(given)]
+    frames = [_frame(model, k, log, channels, inputs) for k, log in enumerate(logs)]
     times = [frame[TIME].to_numpy(float) for frame in frames]
     x = [frame[names].to_numpy(float) for frame in frames]
     for k, values in enumerate(x):
@@ -125,36 +125,50 @@ def require_in_range(model: Any, name: str, values: Array, what: str) -> None:
         )
 
 
+def _logs(given: Any) -> Sequence[Any]:
+    """Return a log, or the files of a folder of logs."""
+    is_folder = isinstance(given, str | Path) and Path(given).is_dir()
+    return find_recordings(Path(given)) if is_folder else [given]
+
+
 def _frame(
-    model: Any, k: int, given: Any, names: Sequence[str], inputs: Sequence[str]
+    model: Any, k: int, given: Any, channels: Sequence[Channel], inputs: Sequence[str]
 ) -> pd.DataFrame:
-    """Return a log whose columns are as they should be."""
+    """Return a log whose columns are as they should be, in SI."""
+    names = [channel.name for channel in channels]
     what = f"recording {k}"
     if isinstance(given, str | Path):
         what = f"{what} ({given})"
         given = read_csv(Path(given))
     frame = pd.DataFrame(given)
-    frame.columns = [str(c).strip() for c in frame.columns]
+    units = dict(split(str(c).strip()) for c in frame.columns)
+    if len(units) < len(frame.columns):
+        raise ValueError(
+            f"expected each column once in {what}; got {', '.join(frame.columns)}; "
+            "keep one"
+        )
+    frame.columns = [*units]
     starts = [START + name for name in (*start_places(model), *held_places(model))]
     controls = [_column(name, frame, names) for name in inputs]
     wanted = [TIME, *controls, *names]
     spare = [c for c in frame.columns if c not in {*wanted, *starts}]
     for name in wanted:
         if name not in frame.columns:
-            near = difflib.get_close_matches(name, spare, n=3, cutoff=0.4)
-            hint = f"rename {' or '.join(map(repr, near))}" if near else "rename or add"
+            hint = did_you_mean(name, spare, "rename or add it")
             raise ValueError(
                 f"expected a column {name!r} in {what}; got {', '.join(frame.columns)};"
                 f" {hint}"
             )
     for name in spare:
         if name.startswith(START):
-            near = difflib.get_close_matches(name, starts, n=1) or starts[:1]
+            hint = did_you_mean(name, starts, f"did you mean {starts[0]!r}?")
             raise ValueError(
-                f"expected start states of joints in {what}; got {name!r}; did you "
-                f"mean {near[0]!r}?"
+                f"expected start states of joints in {what}; got {name!r}; {hint}"
             )
-    frame = _as_numbers(frame, wanted + [c for c in frame if c in starts], what)
+    used = wanted + [c for c in frame if c in starts]
+    known = {TIME: "s", **{channel.name: channel.unit for channel in channels}}
+    scales = {c: _factor(c, units[c], known.get(c, ""), what) for c in used}
+    frame = _as_numbers(frame, scales, what)
     for name in [TIME, *controls]:
         lost = np.flatnonzero(~np.isfinite(frame[name].to_numpy(float)))
         if len(lost):
@@ -174,10 +188,31 @@ def _frame(
     return frame
 
 
-def _as_numbers(frame: pd.DataFrame, names: Sequence[str], what: str) -> pd.DataFrame:
-    """Return a log whose columns are numbers, dates as seconds since the first."""
+def _factor(name: str, unit: str, expected: str, what: str) -> float:
+    """Return the factor from the unit of a log's header to that of the model."""
+    if not unit:
+        return 1.0
+    factor, si = to_si(unit) or (1.0, "")
+    if not si or (expected and si != expected):
+        raise ValueError(
+            f"expected {name!r} in {expected or 'a unit of SI'}; got [{unit}] in "
+            f"{what}; convert the numbers, or leave their unit out"
+        )
+    return factor
+
+
+def _as_numbers(
+    frame: pd.DataFrame, scales: Mapping[str, float], what: str
+) -> pd.DataFrame:
+    """Return a log whose columns are numbers, dates as seconds since the first.
+
+    Args:
+        frame: The log.
+        scales: Factor of each column that is used.
+        what: Name of the log in messages.
+    """
     frame = frame.copy()
-    for name in names:
+    for name, scale in scales.items():
         cells: Any = frame[name]
         if name == TIME and is_stamp(cells):
             frame[name] = seconds(cells, what)
@@ -192,7 +227,7 @@ def _as_numbers(frame: pd.DataFrame, names: Sequence[str], what: str) -> pd.Data
                 f"{cells.iloc[wrong[0]]!r} in row {wrong[0]}; correct it, or leave "
                 "what was not read empty"
             )
-        frame[name] = numbers
+        frame[name] = numbers * scale
     return frame
 
 

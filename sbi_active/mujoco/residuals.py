@@ -15,8 +15,6 @@ from sbi_active.mujoco.models.parameters import Bounded
 from sbi_active.mujoco.robot import Robot, named_box
 from sbi_active.simulation import SimulatorModel
 
-__all__ = ["free_parameters", "from_residuals"]
-
 Array = NDArray[Any]
 
 

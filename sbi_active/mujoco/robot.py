@@ -14,6 +14,7 @@ from torch import Tensor
 from sbi_active.actions import ActionSpace, MixedActions
 from sbi_active.actions.signals import SignalActions
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.expected import suggests
 from sbi_active.mujoco.idle import warn_of_idle
 from sbi_active.mujoco.models.machine import Machine
 from sbi_active.mujoco.models.names import (
@@ -32,8 +33,6 @@ from sbi_active.mujoco.sensors import added_sensors, channels_of
 from sbi_active.mujoco.simulator import MODEL, MujocoFunction
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.noise.base import NoiseModel
-
-__all__ = ["Robot", "from_mjcf", "from_spec", "named_box", "require_alike"]
 
 
 def named_box(parameters: Sequence[Bounded]) -> BoxUniform:
@@ -76,6 +75,7 @@ class Robot(NamedTuple):
     trials: Trials | None = None
 
 
+@suggests
 def from_mjcf(
     spec_or_path: Any,
     parameters: Mapping[str, Any],
@@ -117,7 +117,7 @@ def from_mjcf(
             positions, velocities, controls that are held ("motor control") and poses of
             mocap bodies ("target mocap[0]") by name, or the name of a keyframe, which
             gives all of these. None is the model's.
-        recordings: Logs, one a trial, as in :func:`.trials_of`.
+        recordings: Logs, one a trial, as in :func:`.trials_of`, or a folder of them.
         threads: Number of threads of MuJoCo's rollout, in each process. Results do
             not depend on it.
 

@@ -11,8 +11,6 @@ from sbi_active.mujoco.models.quantities import units_of
 from sbi_active.mujoco.models.spec import Source, mujoco_of
 from sbi_active.mujoco.simulator import Channel
 
-__all__ = ["ActuatorSensor", "JointSensor", "added_sensors", "channels_of"]
-
 VELOCITY = " velocity"
 
 

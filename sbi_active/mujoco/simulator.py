@@ -24,8 +24,6 @@ from sbi_active.mujoco.models.running import held_states, readings
 from sbi_active.mujoco.models.spec import mujoco_of
 from sbi_active.mujoco.readout import held, num_steps, sampled
 
-__all__ = ["MODEL", "RECORDING", "Channel", "MujocoFunction"]
-
 Array = NDArray[Any]
 
 Watch = Callable[[Model, list[Any], Rows], Any]

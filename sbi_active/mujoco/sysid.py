@@ -22,6 +22,7 @@ from sbi_active.actions import ActionSpace, DiscreteActions
 from sbi_active.actions.signals import SignalActions
 from sbi_active.actions.waveforms import Recorded
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.expected import suggests
 from sbi_active.mujoco.idle import warn_of_idle
 from sbi_active.mujoco.models.machine import Machine
 from sbi_active.mujoco.models.names import names_of, start_places
@@ -35,8 +36,6 @@ from sbi_active.mujoco.transforms import Signal, SignalReadout
 from sbi_active.simulation import AutocorrelatedNoise, SimulatorModel
 from sbi_active.simulation.noise.base import NoiseModel
 
-__all__ = ["from_sysid"]
-
 Array = NDArray[Any]
 
 #: Unknown errors, from this share of a signal's deviation up to all of it, lasting from
@@ -47,6 +46,7 @@ STATES = {"MjStateQPos": "_qpos", "MjStateQVel": "_qvel"}
 SPEED = "MjStateQVel"
 
 
+@suggests
 def from_sysid(
     model_sequences: Any,
     params: Any,

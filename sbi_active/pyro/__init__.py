@@ -5,18 +5,24 @@ the trainer that averages over denoised outcomes, and the reader of a Pyro model
 needs the extra ``pyro``. Effects that a simulator lacks are in ``criticism``.
 """
 
-from sbi_active.pyro.denoising import Denoised, denoise
 from sbi_active.pyro.error_models import ChannelBias, SpikeAndSlab, StudentError
-from sbi_active.pyro.models import PyroProblem, from_pyro
+from sbi_active.pyro.models import from_pyro
 from sbi_active.pyro.robust import RobustASBI
+from sbi_active.renamed import former_names
 
 __all__ = [
     "ChannelBias",
-    "Denoised",
-    "PyroProblem",
     "RobustASBI",
     "SpikeAndSlab",
     "StudentError",
-    "denoise",
     "from_pyro",
 ]
+
+__getattr__ = former_names(
+    __name__,
+    {
+        "Denoised": "sbi_active.pyro.denoising:Denoised",
+        "PyroProblem": "sbi_active.pyro.models:PyroProblem",
+        "denoise": "sbi_active.pyro.denoising:denoise",
+    },
+)

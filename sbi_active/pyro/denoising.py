@@ -50,6 +50,8 @@ class Denoised:
             f"draws, {self.num_divergences} divergences"
         )
 
+    __repr__ = __str__
+
 
 def denoise(
     x_o: Tensor,

@@ -15,6 +15,7 @@ from torch import Tensor
 from sbi_active.actions.mixed import MixedActions
 from sbi_active.actions.signals import SignalActions
 from sbi_active.arrays import own_tensor
+from sbi_active.expected import Shown, suggests
 from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation.conditions import (
     as_arrays,
@@ -46,7 +47,7 @@ _contexts: dict[tuple[int, str], Any] = {}
 _setting_up = threading.Lock()
 
 
-class SimulatorModel:
+class SimulatorModel(Shown):
     r"""A simulator that owns its noise, :math:`x = f(\theta, \xi) + \epsilon`.
 
     Further keyword arguments of ``fn`` are its *effects*, given to the model by name:
@@ -96,6 +97,7 @@ class SimulatorModel:
         [[2.0], [3.0]]
     """
 
+    @suggests
     def __init__(
         self,
         fn: Callable[..., Any],
@@ -108,16 +110,12 @@ class SimulatorModel:
         sample_times: Tensor | None = None,
         inputs: SignalActions | MixedActions | None = None,
     ) -> None:
-        self.fn = fn
-        self.is_batched = batched
-        self.setup = setup
+        self.fn, self.setup, self.is_batched = fn, setup, batched
         self.parameter_names = None if parameter_names is None else [*parameter_names]
         self.channel_names = None if channel_names is None else [*channel_names]
-        self.sample_times = None
         if sample_times is not None:
-            self.sample_times = own_tensor(
-                sample_times, torch.float64, name="sample_times"
-            )
+            sample_times = own_tensor(sample_times, torch.float64, name="sample_times")
+        self.sample_times = sample_times
         if noise is not None and not isinstance(noise, NoiseModel):
             noise = GaussianNoise(noise)
         self.noise = noise

@@ -61,6 +61,12 @@ class Simulations:
         """Number of rows by outcome."""
         return {o.name.lower(): int((self.status == o).sum()) for o in Outcome}
 
+    def __repr__(self) -> str:
+        parts = ("theta", self.theta), ("action", self.action), ("x", self.x)
+        shapes = [f"{name} {tuple(part.shape[1:])}" for name, part in parts]
+        counts = [f"{num} {name}" for name, num in self.counts.items() if num]
+        return f"Simulations({', '.join(shapes)}: {', '.join(counts) or 'none'})"
+
     def __len__(self) -> int:
         return len(self.theta)
 

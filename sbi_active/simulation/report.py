@@ -119,6 +119,8 @@ class SimulatorReport:
         lines.append("ready" if self.is_ready else "not ready")
         return "\n".join(lines)
 
+    __repr__ = __str__
+
 
 def _duration(minutes: float) -> str:
     if minutes < 1:

@@ -14,7 +14,7 @@ from sbi_active import (
     SimulatorModel,
 )
 from sbi_active.campaign.options import CampaignDetails
-from sbi_active.inference import RatioClassifier
+from sbi_active.inference.networks.ratio_network import RatioClassifier
 from tests.campaign.sizes import REFINEMENT
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from sbi_active.design import CandidateSimulations
+from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.simulation import GaussianNoise
 
 PRIOR = MultivariateNormal(torch.zeros(1), torch.eye(1))

@@ -3,7 +3,7 @@
 import torch
 
 from sbi_active import BoxActions, DiscreteActions, MixedActions
-from sbi_active.design import Evaluations, Objective
+from sbi_active.design.search import Evaluations, Objective
 
 SPACE = MixedActions(BoxActions(0.0, 4.0), DiscreteActions([3.0, 5.0, 9.0]))
 CENTER, HEIGHT = torch.tensor([3.2, 0.6, 1.7]), torch.tensor([1.0, 1.6, 1.3])

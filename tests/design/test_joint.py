@@ -7,7 +7,8 @@ import torch
 from torch.distributions import MultivariateNormal, Normal
 
 from sbi_active import GaussianNoise, StudentTNoise
-from sbi_active.design import CandidateSimulations, LikelihoodGain
+from sbi_active.design import LikelihoodGain
+from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.design.outcomes import (
     conditional_gain,
     join_outcomes,

@@ -17,13 +17,8 @@ from sbi_active import (
     InformationGainDesigner,
     MixtureDensity,
 )
-from sbi_active.design import (
-    CandidateSimulations,
-    EntropyGain,
-    NestedGain,
-    PosteriorGain,
-)
-from sbi_active.design.estimators.base import standard_error
+from sbi_active.design import EntropyGain, NestedGain, PosteriorGain
+from sbi_active.design.estimators.base import CandidateSimulations, standard_error
 from sbi_active.design.estimators.presence import (
     held_out_logits,
     presence_information,

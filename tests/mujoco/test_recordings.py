@@ -74,7 +74,7 @@ def backwards(frame):
     [
         (out_of_range, "within its ctrlrange, -5 to 5"),
         (nan_input, "finite 'push' in recording 1; got NaN or inf in row 7"),
-        (renamed, "column 'push' in recording 1; .* rename 'pusher'"),
+        (renamed, "column 'push' in recording 1; .* did you mean 'pusher'"),
         (backwards, "time that increases in recording 1"),
     ],
 )

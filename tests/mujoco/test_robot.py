@@ -12,7 +12,8 @@ from sbi_active import BoxActions
 from sbi_active.actions.signals import SignalActions
 from sbi_active.actions.waveforms import step
 from sbi_active.criticism import Trials
-from sbi_active.mujoco import Robot, from_mjcf
+from sbi_active.mujoco import from_mjcf
+from sbi_active.mujoco.robot import Robot
 from sbi_active.simulation import Outcome, simulate
 
 RELEASE = BoxActions([-1.5], [1.5], names=["hinge"])

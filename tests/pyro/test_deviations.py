@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from sbi_active.pyro import SpikeAndSlab, denoise
+from sbi_active.pyro import SpikeAndSlab
+from sbi_active.pyro.denoising import denoise
 from sbi_active.pyro.deviations import SHARE, Coordinates, _normalized
 from sbi_active.pyro.predictive import Predictive
 

@@ -4,7 +4,8 @@ import pytest
 import torch
 from torch.distributions import Normal, StudentT
 
-from sbi_active.pyro import ChannelBias, SpikeAndSlab, StudentError, denoise
+from sbi_active.pyro import ChannelBias, SpikeAndSlab, StudentError
+from sbi_active.pyro.denoising import denoise
 from sbi_active.seeding import forked_generators
 
 pytest.importorskip("pyro")

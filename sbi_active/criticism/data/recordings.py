@@ -10,8 +10,9 @@ from pathlib import Path
 import pandas as pd
 
 from sbi_active.criticism.data.table import TrialTable, read_table
-from sbi_active.criticism.data.table_columns import TIME, TRIAL
+from sbi_active.criticism.data.table_columns import TRIAL
 from sbi_active.criticism.data.table_rows import read_csv
+from sbi_active.criticism.data.units import TIME, split
 
 #: The one table of a folder, where there is such; others are then not trials.
 TABLE = "trials.csv"
@@ -56,7 +57,9 @@ def read_trials(
         _require_same_columns(frame, file, frames, paths[0])
         frame, told = _named(frame, file.stem, columns)
         if inputs is None:  # by itself, so that what is wrong is said with the file
-            read_table(frame, columns=told, units=units, source=str(file))
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", message=".* now converted")  # later
+                read_table(frame, columns=told, units=units, source=str(file))
         frames.append(frame)
     joined = pd.concat(frames, ignore_index=True)
     with warnings.catch_warnings():
@@ -108,9 +111,8 @@ def _named(
     And which columns are what, where that was told.
     """
     if columns is None:
-        bare = [re.sub(r"\s*\[.*\]\s*$", "", name) for name in frame.columns]
-        is_long = any(re.fullmatch(rf"{TIME}(_[a-z]+)?", name) for name in bare)
-        parts = [TRIAL] if TRIAL in bare else []
+        names = [split(name)[0] for name in frame.columns]
+        is_long, parts = TIME in names, [TRIAL] if TRIAL in names else []
     else:
         is_long = TIME in columns
         told = columns.get(TRIAL, ())

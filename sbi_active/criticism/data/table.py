@@ -3,7 +3,8 @@ r"""Trials from a table, with one row a trial or one row a sample.
 A wide table has columns "action_\*" and "x_\*". A long one has besides them "trial" and
 "time", and what does not vary within a trial stands in each of its rows; it may have
 "input_\*", which do, and then needs no action. Both may have "start_\*", "role",
-"index" and "repeat_of". A unit stands in brackets, as in "x_height[m]".
+"index" and "repeat_of". A unit stands in brackets, as in "x_height[mm]", and numbers
+become SI.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from sbi_active.callers import stack_level
 from sbi_active.criticism.data.table_columns import Columns, bare, find_columns
 from sbi_active.criticism.data.table_rows import InputRows, Rows, read_frame
-from sbi_active.messages import warn
+from sbi_active.messages import ChangedWarning, warn
 
 Array = NDArray[Any]
 
@@ -97,6 +98,7 @@ def read_table(
             f"expected inputs in one table; got {', '.join(found.input)} in {source} "
             f"and more in {beside.source}; keep one"
         )
+    _note_converted(found, source)
     rows = _TrialRows(frame, found, source)
     return TrialTable(arguments=rows.trials(beside), columns=found)
 
@@ -127,6 +129,18 @@ def _inputs_beside(
     )
     rows = Rows(frame, found, source)
     return rows.inputs(rows.time()), names
+
+
+def _note_converted(found: Columns, source: str) -> None:
+    """Warn of numbers that the last version left in their unit."""
+    now = [c for c, factor in found.factors.items() if factor != 1 and c != found.time]
+    if now:
+        warn(
+            f"SA703 {', '.join(f'{c} to {found.units[c]}' for c in now)}: columns of "
+            f"{source} are now converted: let the simulator give these units",
+            ChangedWarning,
+            stacklevel=stack_level(),
+        )
 
 
 def _names(frame: pd.DataFrame) -> set[str]:

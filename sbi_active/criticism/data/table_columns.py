@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import difflib
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-TRIAL, TIME = "trial", "time"
+from sbi_active.criticism.data.units import TIME, split, time_unit, to_si
+from sbi_active.expected import did_you_mean
+
+TRIAL = "trial"
 #: Beginnings of the names of columns that there may be several of.
 PREFIXES = {"action": "action_", "x": "x_", "input": "input_", "start": "start_"}
 OPTIONAL = ("role", "index", "repeat_of")
 KEYS = (TRIAL, TIME, *PREFIXES, *OPTIONAL)
-#: Seconds in a unit of time.
-SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +28,8 @@ class Columns:
             empty if a row is a trial.
         time: Column of the time stamps; None if a row is a trial.
         optional: Columns of "role", "index" and "repeat_of", where there are such.
-        units: Units by column, "" if none is known.
+        units: Units by column, in SI where that is known; "" if none was said.
+        factors: Factors by column from the table's numbers to that unit.
     """
 
     action: tuple[str, ...]
@@ -40,6 +40,7 @@ class Columns:
     time: str | None
     optional: dict[str, str]
     units: dict[str, str]
+    factors: dict[str, float]
 
     def label(self, column: str) -> str:
         """Return the label of a column, with its unit, as in "speed [m/s]"."""
@@ -53,11 +54,6 @@ class Columns:
         for beginning in PREFIXES.values():
             name = name.removeprefix(beginning)
         return name
-
-    @property
-    def seconds(self) -> float:
-        """Seconds in a unit of the time column."""
-        return 1.0 if self.time is None else SECONDS[self.units[self.time] or "s"]
 
 
 def find_columns(
@@ -125,13 +121,13 @@ def find_columns(
     stated = _units(used, names, units or {}, source)
     time = found[TIME][0] if found[TIME] else None
     if time is not None:
-        unit = stated[time] or _suffix(time)
-        if unit not in ("", *SECONDS):
-            raise ValueError(
-                f"expected times in {', '.join(SECONDS)}; got {unit} in column {time} "
-                f"of {source}; convert them"
-            )
-        stated[time] = unit
+        stated[time] = stated[time] or time_unit(time)
+    converted = {c: to_si(unit) or (1.0, unit) for c, unit in stated.items()}
+    if time is not None and converted[time][1] not in ("", "s"):
+        raise ValueError(
+            f"expected times in s, ms, us, ns, min or h; got {stated[time]} in column "
+            f"{time} of {source}; convert them"
+        )
     return Columns(
         action=found["action"],
         x=found["x"],
@@ -140,7 +136,8 @@ def find_columns(
         trial=found[TRIAL],
         time=time,
         optional={key: found[key][0] for key in OPTIONAL if found[key]},
-        units=stated,
+        units={column: unit for column, (_, unit) in converted.items()},
+        factors={column: factor for column, (factor, _) in converted.items()},
     )
 
 
@@ -169,8 +166,6 @@ def _by_name(names: Sequence[str], source: str) -> dict[str, tuple[str, ...]]:
         key = word if word in (TRIAL, TIME, *OPTIONAL) else ""
         for kind, prefix in PREFIXES.items():
             key = kind if word.startswith(prefix) else key
-        if word.startswith(f"{TIME}_") and _suffix(word):
-            key = TIME
         found[key].append(name)
     for key in (TRIAL, TIME, *OPTIONAL):
         if len(found[key]) > 1:
@@ -203,11 +198,9 @@ def _as_told(
     for key, value in columns.items():
         told = [value] if isinstance(value, str) else [*value]
         for name in [name for name in told if name not in of]:
-            near = difflib.get_close_matches(name, names, n=1)
-            hint = f"; {near[0]} is close" if near else ""
             raise ValueError(
                 f"expected a column {name} for {key}; got {', '.join(names)} in "
-                f"{source}{hint}; correct the name"
+                f"{source}; {did_you_mean(name, names, 'correct the name')}"
             )
         if key in (TIME, *OPTIONAL) and len(told) > 1:
             raise ValueError(
@@ -229,8 +222,7 @@ def _units(
     found: dict[str, str] = {}
     seen: dict[str, str] = {}
     for name in used:
-        match = re.search(r"\[(.*)\]\s*$", name)
-        header = match.group(1).strip() if match else ""
+        header = split(name)[1]
         given = units.get(name, units.get(bare(name), ""))
         if header and given and header != given:
             raise ValueError(
@@ -248,11 +240,5 @@ def _units(
 
 
 def bare(name: str) -> str:
-    """Return a column's name without its unit in brackets."""
-    return re.sub(r"\s*\[.*\]\s*$", "", name)
-
-
-def _suffix(name: str) -> str:
-    """Return the unit in a name like "time_ms"; "" for none."""
-    unit = bare(name).rpartition("_")[2]
-    return unit if unit in SECONDS else ""
+    """Return a column's name without its unit."""
+    return split(name)[0]

@@ -145,7 +145,7 @@ class Rows:
             for at in self.members:
                 time[at] = seconds(cells.iloc[at], self.source)
         else:
-            time = self.numbers(self.columns.time) * self.columns.seconds
+            time = self.numbers(self.columns.time)
         self._require_order(time, self.columns.time)
         return time
 
@@ -182,7 +182,7 @@ class Rows:
         return np.array(words, dtype=object)
 
     def numbers(self, column: str, *, empty: bool = False) -> Array:
-        """Return a column as numbers, shape (n,), NaN where cells may be empty."""
+        """Return a column as numbers in SI, (n,), NaN where cells may be empty."""
         cells: Any = self.frame[column]
         require_real(cells, column, self.source)
         text = cells.map(lambda cell: str(cell).strip())
@@ -190,6 +190,7 @@ class Rows:
         is_number = pd.api.types.is_numeric_dtype(cells)
         parsed: Any = pd.to_numeric(cells if is_number else text, errors="coerce")
         values = parsed.to_numpy(dtype=float, na_value=np.nan)
+        values = values * self.columns.factors.get(column, 1.0)
         leave = "leave what was not measured empty"
         for i in np.flatnonzero(np.isnan(values) & ~blank):
             raise ValueError(

@@ -28,6 +28,7 @@ from sbi_active.criticism.data.arrays import (
 from sbi_active.criticism.data.input_series import Hold, inputs_of
 from sbi_active.criticism.data.recordings import read_trials
 from sbi_active.criticism.data.table import read_table
+from sbi_active.expected import suggests
 
 Order = Literal["known", "unknown"]
 
@@ -52,8 +53,7 @@ class Trials:
         order: "known", or "unknown" where the index does not say when a trial was
             executed: nothing is then traced to wear or drift from trial to trial.
         sample_times: Times of x's first axis, shape (k,), (n, k), or a list of n.
-        names: Names of the trials in reports; None takes their indices. A selection
-            keeps them.
+        names: Names of the trials in reports; None takes their indices.
         repeat_of: Position of the trial that each one repeats, (n,), -1 for none; None
             takes trials of equal actions. A repeat of a repeat is one of the first.
         action_labels: Labels of the action's entries in reports, with units.
@@ -89,15 +89,15 @@ class Trials:
         A motor's position every .5 s, its voltage every .1 s:
 
         >>> voltage, position = torch.randn(3, 21), torch.randn(3, 5)
-        >>> times = torch.linspace(0, 2, 5)
         >>> trials = Trials(
-        ...     None, position, sample_times=times,
+        ...     None, position, sample_times=torch.linspace(0, 2, 5),
         ...     inputs={"voltage": voltage}, input_times=torch.linspace(0, 2, 21),
         ... )
         >>> trials.action[:, 0].tolist(), trials.inputs["voltage"].shape
         ([0.0, 1.0, 2.0], torch.Size([3, 21]))
     """
 
+    @suggests
     def __init__(
         self,
         action: Any,
@@ -155,8 +155,8 @@ class Trials:
         self.index = self._rows("index", torch.arange(n) if index is None else index)
         if not bool(self.index.isfinite().all()):
             raise ValueError(
-                f"expected finite places in index; got {self.index.tolist()}; pass the "
-                "place of each trial in the order of execution, or leave index out"
+                f"expected finite places in index; got {self.index.tolist()}; pass "
+                "each trial's place, or leave index out"
             )
         if order not in get_args(Order):
             raise ValueError(
@@ -184,7 +184,7 @@ class Trials:
         self.input_labels = require_labels(
             "input_labels", input_labels, [len(self.inputs or ())]
         )
-        # A trajectory of one channel has none of its own axis.
+        # A trajectory of one channel has no axis for it.
         one = [1] if self.x.ndim == 2 and self.sample_times is not None else []
         self.channel_labels = require_labels(
             "channel_labels", channel_labels, [self.x.shape[-1], *one]
@@ -220,7 +220,7 @@ class Trials:
         Optional are "role", "index" (the place in the order of execution; without it
         that of the first row) and "repeat_of" (the index of the trial that is
         repeated). An empty cell of x is what was not measured. A unit stands in
-        brackets, as in "x_height[m]", and goes into reports. "start_\*" is the measured
+        brackets: "x_height[mm]" becomes m, as reports say. "start_\*" is the measured
         start state. "input_\*" varies within a trial, in a table with one row a sample,
         which then needs no action; rows may have an input and no x.
 
@@ -231,8 +231,8 @@ class Trials:
                 "input", "start", "role", "index" and "repeat_of", where they have other
                 names; those left out are then ignored. Several columns may name a trial
                 together.
-            units: Units by column, where the header has none. Numbers are taken as they
-                are, but for the time, which is converted to seconds.
+            units: Units by column, where the header has none. Numbers become SI, such
+                as ms, mm and deg; what is not known, such as px, stays as it is.
             order: Order of execution; "unknown" where rows are in any order.
             inputs: Another file, or a data frame, with the inputs at times of their
                 own: "time", "input_\*", and "trial" unless all trials share them.

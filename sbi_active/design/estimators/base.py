@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.expected import Shown
 from sbi_active.simulation import NoiseModel
 
 Bound = Literal["lower", "upper", "none"]
@@ -111,7 +112,7 @@ class CandidateSimulations:
         return {name: part for name, part in parts.items() if part is not None}
 
 
-class InformationGainEstimator(ABC):
+class InformationGainEstimator(Shown, ABC):
     r"""Estimator of :math:`I(\theta; x | \xi)` in nats for a set of candidates.
 
     Attributes:

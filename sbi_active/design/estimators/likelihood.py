@@ -157,7 +157,7 @@ class LikelihoodGain(InformationGainEstimator):
 
     Example:
         >>> import torch
-        >>> from sbi_active.design import CandidateSimulations
+        >>> from sbi_active.design.estimators.base import CandidateSimulations
         >>> class Scale:
         ...     exact_likelihood = True
         ...     def log_likelihood(self, x, theta, action):

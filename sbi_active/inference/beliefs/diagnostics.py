@@ -124,6 +124,8 @@ class Diagnostics:
             lines.append(f"tail probability of the trials {self.tail_probability:.2g}")
         return "\n".join(lines)
 
+    __repr__ = __str__
+
     def _repr_html_(self) -> str:
         kind, verdict = VERDICTS[self.trustworthy]
         broken = [name for name, a in self.assumptions.items() if not a.holds]

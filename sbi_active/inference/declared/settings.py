@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sbi_active.expected import require
+from sbi_active.expected import require, suggests
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 #: Number of parameters beyond which draws are more in proportion: a covariance of d
@@ -16,6 +16,7 @@ from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 MANY = 6
 
 
+@suggests
 @dataclass(frozen=True, kw_only=True)
 class RefinementOptions:
     """Settings of the refinement.

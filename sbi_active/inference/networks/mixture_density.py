@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 from torch.optim import Optimizer
 
-from sbi_active.expected import require
+from sbi_active.expected import require, suggests
 from sbi_active.inference.networks.mixture_network import (
     ACTIVATIONS,
     MixtureDensityNetwork,
@@ -21,6 +21,7 @@ from sbi_active.inference.networks.mixture_network import (
 )
 
 
+@suggests
 @dataclass(frozen=True, kw_only=True)
 class MixtureDensity:
     """Settings of the mixture density network.

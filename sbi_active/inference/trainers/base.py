@@ -101,6 +101,9 @@ class ActiveInference(ABC):
     _action_dim: int | None = None
     _outcome_shape: torch.Size | None = None
 
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({len(self.trials)} trials)"
+
     @property
     def belief(self) -> Distribution | None:
         """The current belief over parameters; the prior before any trial."""

@@ -4,7 +4,3 @@ This package makes effects of a compiled model: their names, units, null values 
 priors, and what they write into it. The comparison of effects with trials is in
 ``sbi_active.criticism``.
 """
-
-from sbi_active.mujoco.effects.library import mjcf_effects
-
-__all__ = ["mjcf_effects"]

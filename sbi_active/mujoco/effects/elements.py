@@ -21,8 +21,6 @@ from sbi_active.mujoco.models.quantities import (
 )
 from sbi_active.mujoco.simulator import Channel
 
-__all__ = ["Element", "elements"]
-
 
 @dataclass(frozen=True)
 class Element:

@@ -27,8 +27,6 @@ from sbi_active.mujoco.models.changes import Insertion
 from sbi_active.mujoco.models.names import element_id
 from sbi_active.mujoco.models.spec import mujoco_of
 
-__all__ = ["INSERTED", "Transmission", "least_compliance"]
-
 Array = NDArray[Any]
 
 #: What an inserted joint is called after its joint.

@@ -13,6 +13,7 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect
 from sbi_active.criticism.effects.patterns import picked
+from sbi_active.expected import suggests
 from sbi_active.mujoco.effects.changes import QuantityChange
 from sbi_active.mujoco.effects.elements import elements
 from sbi_active.mujoco.effects.nominal import nominal
@@ -21,9 +22,8 @@ from sbi_active.mujoco.robot import Robot, from_spec
 from sbi_active.mujoco.simulator import MujocoFunction
 from sbi_active.simulation import SimulatorModel
 
-__all__ = ["likely_effects", "mjcf_effects"]
 
-
+@suggests
 def mjcf_effects(
     model: Any,
     *,

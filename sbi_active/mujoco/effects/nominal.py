@@ -18,8 +18,6 @@ from sbi_active.mujoco.models.spec import mujoco_of
 from sbi_active.mujoco.simulator import MujocoFunction
 from sbi_active.simulation import SimulatorModel
 
-__all__ = ["Nominal", "nominal"]
-
 Array = NDArray[Any]
 
 #: Rows that are looked at, and states in each.

@@ -14,10 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
-from sbi_active.criticism.forces.force import Force
-
-__all__ = ["Force", "Insertion", "ModelChange", "StateChange", "require_changes"]
-
 Array = NDArray[Any]
 
 

@@ -17,8 +17,6 @@ from sbi_active.mujoco.models.parameters import Bounded, Writer, renew, writer_o
 from sbi_active.mujoco.models.quantities import copied, restore
 from sbi_active.mujoco.models.spec import Source, mujoco_of, quiet
 
-__all__ = ["Machine", "Model", "Rows"]
-
 Array = NDArray[Any]
 
 #: Models at a time: more gain nothing, and each has memory of its own.

@@ -2,22 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from typing import Any
 
+from sbi_active.expected import did_you_mean
 from sbi_active.mujoco.models.spec import mujoco_of
-
-__all__ = [
-    "KINDS",
-    "element_id",
-    "held_places",
-    "meaning",
-    "names_of",
-    "require_name",
-    "scalar_joints",
-    "start_places",
-]
 
 #: Kinds of elements: what MuJoCo calls them, and the count in a model.
 KINDS = {
@@ -71,8 +60,7 @@ def require_name(name: str, known: Iterable[str], what: str) -> None:
     known = [*known]
     if name in known:
         return
-    near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
-    hint = f"did you mean {' or '.join(map(repr, near))}?" if near else "correct it"
+    hint = did_you_mean(name, known, "correct it")
     listed = ", ".join(map(repr, known[:12])) or "none"
     more = f" and {len(known) - 12} more" if len(known) > 12 else ""
     article = "an" if what[0] in "aeiou" else "a"

@@ -33,8 +33,6 @@ from sbi_active.mujoco.models.quantities import (
 )
 from sbi_active.mujoco.models.spec import mujoco_of
 
-__all__ = ["Bounded", "Writer", "bounded", "renew", "writer_of"]
-
 Array = NDArray[Any]
 
 #: What ``mj_setConst`` makes of the other fields.

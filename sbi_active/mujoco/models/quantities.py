@@ -22,22 +22,6 @@ from sbi_active.mujoco.models.names import (
 )
 from sbi_active.mujoco.models.spec import mujoco_of
 
-__all__ = [
-    "ATTRIBUTES",
-    "FRAMES",
-    "Entry",
-    "Quantity",
-    "add_to",
-    "copied",
-    "field_of",
-    "find_quantity",
-    "is_movable",
-    "joint_of_actuator",
-    "restore",
-    "set_to",
-    "units_of",
-]
-
 
 @dataclass(frozen=True)
 class Entry:

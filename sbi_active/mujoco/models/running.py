@@ -20,8 +20,6 @@ from sbi_active.mujoco.models.names import element_id, start_places
 from sbi_active.mujoco.models.quantities import field_of
 from sbi_active.mujoco.models.spec import mujoco_of
 
-__all__ = ["begin", "held_states", "readings", "start_states"]
-
 Array = NDArray[Any]
 
 

@@ -7,8 +7,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-__all__ = ["INSTALL", "Source", "mujoco_of", "quiet"]
-
 #: What to install where MuJoCo is missing.
 INSTALL = "pip install 'sbi-active[mujoco]'"
 

@@ -8,7 +8,8 @@ import torch
 
 from sbi_active import CampaignOptions, MixtureDensity
 from sbi_active.campaign.learning.methods import METHODS, faithful_options
-from sbi_active.inference import LFIRE, RatioClassifier
+from sbi_active.inference import LFIRE
+from sbi_active.inference.networks.ratio_network import RatioClassifier
 from tests.campaign.problem import campaign, noisy
 from tests.campaign.sizes import REFINEMENT
 

@@ -234,7 +234,7 @@ def test_options_and_actions_are_taken_as_by_the_constructor(tmp_path):
     assert again.state.options == whole.state.options
     assert again.actions.listed()[:, 0].tolist() == listed
     assert torch.equal(draws(again), draws(whole))
-    with pytest.raises(TypeError, match="expected options among"):
+    with pytest.raises(TypeError, match="expected keywords of CampaignOptions among"):
         Campaign.load(tmp_path / "c", simulator=drawn, options={"rows": 3})
     with pytest.raises(TypeError, match="expected an action space or a list"):
         Campaign.load(tmp_path / "c", simulator=drawn, actions="fast")

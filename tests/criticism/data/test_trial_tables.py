@@ -31,8 +31,9 @@ def test_units_of_the_header_are_carried_along():
     assert trials.channel_labels == ("height [m]",)
     part = trials.select([1])
     assert part.channel_labels == ("height [m]",)
-    named = read(["1,2"], "action_v,x_y", units={"x_y": "mm"})
-    assert (named.action_labels, named.channel_labels) == (("v",), ("y [mm]",))
+    named = read(["1,2"], "action_v,x_y", units={"x_y": "px"})
+    assert (named.action_labels, named.channel_labels) == (("v",), ("y [px]",))
+    assert named.x.item() == 2
 
 
 def test_trials_are_called_as_in_the_table():
@@ -125,8 +126,8 @@ SHORT = "trial,time,action_v,x_y"
         ),
         (
             ["1,0,1,2"],
-            "trial,time[h],action_v,x_y",
-            "times in s, ms, us, ns, min; got h in",
+            "trial,time[m],action_v,x_y",
+            "times in s, ms, us, ns, min or h; got m in",
         ),
         (["1,0,1,2,3"], f"{SHORT},time_s", "one column time; got time, time_s"),
         (["1,0,1,5", "1,1,1,4 cm"], SHORT, r"row 2 \(trial 1\); got '4 cm' .*once, in"),
@@ -207,7 +208,7 @@ def test_a_table_in_another_encoding(encoding):
     ("options", "message"),
     [
         ({"columns": {"y": "x_y"}}, "columns of trial, time, .*; got y; say"),
-        ({"columns": {"x": "x_z"}}, "a column x_z for x; got .*; x_y is close"),
+        ({"columns": {"x": "x_z"}}, "a column x_z for x; got .*; did you mean 'x_y'"),
         ({"columns": {"time": ["time", "x_y"]}}, "one column for time; got time, x_y"),
         ({"units": {"x_z": "m"}}, "got one of x_z; correct the name"),
     ],

@@ -7,16 +7,15 @@ import torch
 from torch.distributions import Distribution
 
 from sbi_active import DiscreteActions, InformationGainDesigner
-from sbi_active.design import (
-    CandidateSimulations,
-    InfoNCEGain,
-    LikelihoodGain,
-    PosteriorGain,
-    RatioGain,
+from sbi_active.design import LikelihoodGain, PosteriorGain, RatioGain
+from sbi_active.design.estimators.automatic import (
+    choose_estimator,
+    disagreements,
+    find_estimator,
 )
-from sbi_active.design.estimators import choose_estimator
-from sbi_active.design.estimators.automatic import disagreements, find_estimator
+from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.design.estimators.likelihood import ContrastiveGain
+from sbi_active.design.estimators.ratio import InfoNCEGain
 from tests.linear_gaussian import (
     PRIOR,
     ExactLikelihood,

@@ -9,14 +9,10 @@ import math
 import pytest
 import torch
 
-from sbi_active.design import (
-    CandidateSimulations,
-    InfoNCEGain,
-    LikelihoodGain,
-    RatioGain,
-)
-from sbi_active.design.estimators.base import standard_error
+from sbi_active.design import LikelihoodGain, RatioGain
+from sbi_active.design.estimators.base import CandidateSimulations, standard_error
 from sbi_active.design.estimators.likelihood import ContrastiveGain
+from sbi_active.design.estimators.ratio import InfoNCEGain
 from tests.design.fragile import PRIOR as FRAGILE_PRIOR
 from tests.design.fragile import Fragile, log_normal
 from tests.linear_gaussian import (

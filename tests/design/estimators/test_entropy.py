@@ -9,7 +9,8 @@ import math
 import pytest
 import torch
 
-from sbi_active.design import CandidateSimulations, EntropyGain
+from sbi_active.design import EntropyGain
+from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.simulation import GaussianNoise
 from tests.linear_gaussian import PRIOR, information
 

@@ -6,17 +6,17 @@ import pytest
 import torch
 
 from sbi_active.design import (
-    CandidateSimulations,
     EntropyGain,
-    InfoNCEGain,
     LikelihoodGain,
     LinearGain,
     NestedGain,
     PosteriorGain,
     RatioGain,
 )
-from sbi_active.design.estimators import ESTIMATORS as NAMES
+from sbi_active.design.estimators.automatic import ESTIMATORS as NAMES
+from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.design.estimators.likelihood import ContrastiveGain
+from sbi_active.design.estimators.ratio import InfoNCEGain
 from sbi_active.simulation import GaussianNoise
 from tests.linear_gaussian import (
     PRIOR,

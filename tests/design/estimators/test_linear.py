@@ -12,7 +12,8 @@ from sbi_active import (
     InformationGainDesigner,
     SimulatorModel,
 )
-from sbi_active.design import CandidateSimulations, LinearGain
+from sbi_active.design import LinearGain
+from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.simulation import AutocorrelatedNoise, StudentTNoise
 from sbi_active.simulation.noise.whitening import whitened
 

@@ -8,7 +8,8 @@ import math
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active.design import CandidateSimulations, EntropyGain, NestedGain
+from sbi_active.design import EntropyGain, NestedGain
+from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.design.estimators.emulator import MeanEmulator, declare
 from sbi_active.design.estimators.entropy import with_control
 from sbi_active.simulation import GaussianNoise, NoiseModel

@@ -11,7 +11,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import MultivariateNormal
 
-from sbi_active.design import CandidateSimulations
+from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.design.estimators.densities import cross_fit, patterns_of_numbers
 from sbi_active.design.estimators.posterior import NormalScores, ParameterGain
 

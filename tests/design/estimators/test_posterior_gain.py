@@ -1,7 +1,8 @@
 import pytest
 import torch
 
-from sbi_active.design import CandidateSimulations, PosteriorGain
+from sbi_active.design import PosteriorGain
+from sbi_active.design.estimators.base import CandidateSimulations
 from tests.linear_gaussian import PRIOR, ExactModel, information, simulator
 
 

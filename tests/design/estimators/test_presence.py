@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from sbi_active.design import CandidateSimulations
+from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.design.estimators.emulator import MeanEmulator
 from sbi_active.design.estimators.presence import completeness
 

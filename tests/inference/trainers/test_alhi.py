@@ -10,9 +10,9 @@ from sbi.inference.potentials import likelihood_estimator_based_potential
 from sbi.utils import BoxUniform
 
 from sbi_active import ALHI, MixtureDensity, RefinementOptions
-from sbi_active.inference import Observation
 from sbi_active.inference.beliefs.kernel_belief import KernelBelief
 from sbi_active.inference.models.product import Product
+from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from tests.linear_gaussian import DIM, PRIOR, simulator
 

@@ -7,8 +7,9 @@ import torch
 from torch.distributions import MultivariateNormal
 
 from sbi_active import ASBI, MixtureDensity, RefinementOptions
-from sbi_active.inference import Observation, refine
+from sbi_active.inference import refine
 from sbi_active.inference.beliefs.belief import ChainedBelief, compare
+from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.trainers import asbi
 from tests.linear_gaussian import PRIOR, simulator
 

@@ -10,7 +10,8 @@ import torch
 from sbi.utils import BoxUniform
 
 from sbi_active import RefinementOptions, SeqBED, SeqBED_B
-from sbi_active.inference import LFIRE, RatioClassifier, SeqBED_LFIRE
+from sbi_active.inference import LFIRE, SeqBED_LFIRE
+from sbi_active.inference.networks.ratio_network import RatioClassifier
 from tests.linear_gaussian import DIM, PRIOR, moments, simulator
 
 ACTIONS = torch.tensor([[0.5], [2.0]])
