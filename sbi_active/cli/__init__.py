@@ -43,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Returns:
         The exit status: 0, 1 where something failed, 2 where the call or a file has to
-        be changed, 130 after an interrupt.
+        be changed, 10 to 14 where a gate is closed, 130 after an interrupt.
     """
     words = sys.argv[1:] if argv is None else [*argv]
     shell = os.environ.get(COMPLETE)
@@ -60,7 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(as_line(answer.data) if is_json else answer.text)
         if sys.stdout is not None:
             sys.stdout.flush()
-        return answer if isinstance(answer, int) else 0
+        return answer if isinstance(answer, int) else getattr(answer, "status", 0)
     except Exit as ended:  # of help and version
         return ended.exit_code
     except BrokenPipeError:  # as in "| head": nobody reads on

@@ -176,6 +176,11 @@ An empty cell is what was not measured. In its place a folder: of a campaign, wh
 knows its simulator and its prior, or of recordings, with trials.csv or one file *.csv a
 trial.
 """
+GATE = """
+Say whether a simulator may be used, as criticize finds it from the same TRIALS. Exit
+status: 0 SHIP, 10 NO_IMPROVEMENT, 11 NOT_IDENTIFIABLE, 12 OUT_OF_PRIOR, 13 WRONG_MODEL,
+14 NOT_ENOUGH_DATA.
+"""
 
 main = click.Group(
     "sbi-active",
@@ -259,6 +264,7 @@ _add(
     place="check.check",
 )
 _add("criticize", TRIALS_CSV, *CRITICIZE, place="criticize.criticize")
+_add("gate", GATE, *CRITICIZE, place="gate.gate")
 _add(
     "init",
     "Make a campaign in a new folder, also by --config.",
