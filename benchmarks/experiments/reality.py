@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -64,7 +65,7 @@ def _long_enough(truth: Truth, k: int) -> Truth:
     if not more:
         return truth
     early = truth.held_out[:more]
-    changed = {"action": torch.cat([truth.action, truth.action[early]])}
+    changed: dict[str, Any] = {"action": torch.cat([truth.action, truth.action[early]])}
     with forked_generators(derive_seed(n, "sensor", truth.machine.name)):
         error = torch.randn(more, *truth.error.shape[1:], dtype=torch.float64)
     changed["error"] = torch.cat([truth.error, truth.machine.noise_sd * error])
@@ -104,6 +105,6 @@ def spread_out(reality: Reality, num: int) -> Tensor:
     found: list[Tensor] = []
     for _ in range(num):
         done = torch.cat([tried, *[a[None] for a in found]])
-        scaled = ((one - low) / (high - low) for one in (values, done))
-        found.append(values[torch.cdist(*scaled).min(1).values.argmax()])
+        distance = torch.cdist(values / (high - low), done / (high - low))
+        found.append(values[distance.min(1).values.argmax()])
     return torch.stack(found)

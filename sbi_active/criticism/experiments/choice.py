@@ -8,6 +8,7 @@ from itertools import takewhile
 
 import numpy as np
 import torch
+from scipy.stats import binom
 
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.criticism import Criticism
@@ -20,6 +21,8 @@ from sbi_active.seeding import derive_seed
 
 #: Probability with which an outcome lies within the registered interval.
 COVERAGE = 0.9
+#: Probability of as many failed predictions below which they are a warning.
+SURPRISING = 0.05
 #: Draws of a registered prediction: its 90 % limit has a standard error of 1 %.
 NUM_DRAWS = 400
 
@@ -103,6 +106,23 @@ def _testing(report: Report, actions: ActionSpace, settling: Settling) -> Choice
         if is_permitted and test.difference >= settling.differs:
             return Choice(test.action, f"tests {report.tracing.model}")
     return None
+
+
+def failures(report: Report, tested: Sequence[TestedTrial]) -> list[str]:
+    """Return a warning if a verdict stands though its predictions failed.
+
+    As many failures have a probability below .05 if the intervals hold in .9.
+
+    Args:
+        report: Report with the verdict.
+        tested: Trials that were run.
+    """
+    own = [t for t in tested if t.registered.verdict == report.verdict]
+    failed = [f"{t.registered.index:g}" for t in own if not t.held]
+    if binom.sf(len(failed) - 1, len(own), 1 - COVERAGE) >= SURPRISING:
+        return []
+    told = f"SA531 {report.verdict} did not predict trials {', '.join(failed)}"
+    return [f"{told} of {len(own)} that tested it, and is the verdict still"]
 
 
 def is_settled(

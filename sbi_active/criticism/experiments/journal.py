@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -80,8 +81,9 @@ class Journal:
 
 
 def _registered(event: dict[str, Any]) -> Registered:
-    parts = {name: event[name] for name in Registered.__dataclass_fields__}
-    return Registered(**parts | {name: np.asarray(parts[name]) for name in ARRAYS})
+    parts = {f.name: event[f.name] for f in fields(Registered)}
+    arrays: dict[str, Any] = {name: np.asarray(parts[name]) for name in ARRAYS}
+    return Registered(**{**parts, **arrays})
 
 
 def _read(path: Path) -> list[dict[str, Any]]:

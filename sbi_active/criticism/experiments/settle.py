@@ -17,6 +17,7 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.experiments.choice import (
     Settling,
     choose,
+    failures,
     is_settled,
     register,
 )
@@ -25,15 +26,19 @@ from sbi_active.criticism.report.predicted import TestedTrial
 from sbi_active.criticism.report.report import Report
 from sbi_active.criticism.results import Array
 from sbi_active.criticism.rivals.further_trials import conditions_at, together
+from sbi_active.messages import Explained, Message
 from sbi_active.simulation import SimulatorModel
 
 
-class VerdictError(RuntimeError):
+class VerdictError(Explained, RuntimeError):
     """The verdict failed after trials were run, which are kept.
 
     Attributes:
+        code: Code of the message.
         trials: All trials, those that were run among them.
     """
+
+    code = "SA532"
 
     def __init__(self, message: str, trials: Trials) -> None:
         super().__init__(message)
@@ -105,7 +110,8 @@ def settle(
         criticism = _again(compare, trials)
     if evaluate and not scored:
         report = criticism.report(designed=bool(tested))
-    return replace(report, tested=(*tested,), stopped=stopped)
+    warnings = (*report.warnings, *map(Message, failures(report, tested)))
+    return replace(report, tested=(*tested,), stopped=stopped, warnings=warnings)
 
 
 def with_trial(
@@ -122,23 +128,23 @@ def with_trial(
     Raises:
         ValueError: If x has another shape than that of the trials.
     """
-    own = trials.template()
-    if np.size(x) != own[0].numel():
+    template, own_times = trials.template()
+    if np.size(x) != template.numel():
         raise ValueError(
-            f"expected x of shape {tuple(own[0].shape)} from the real system; got "
+            f"expected x of shape {tuple(template.shape)} from the real system; got "
             f"{np.shape(x)}; return the numbers of one trial, NaN for those missing"
         )
     new = torch.from_numpy(action)[None].to(trials.action)
     times = trials.sample_times
-    if times is not None and times.ndim > 1:
-        times = torch.cat([times, own[1][None]])
+    if times is not None and own_times is not None and times.ndim > 1:
+        times = torch.cat([times, own_times[None]])
     further = conditions_at(model, trials, new)
     index = float(trials.index.max()) + 1
     names = f"{index:.15g}"
     joined = Trials(
         torch.cat([trials.action, new]),
         torch.cat(
-            [trials.x, torch.from_numpy(x).to(trials.x).reshape(own[0][None].shape)]
+            [trials.x, torch.from_numpy(x).to(trials.x).reshape(template[None].shape)]
         ),
         role=[*trials.role, "fit"],
         index=torch.cat([trials.index, trials.index.new_tensor([index])]),

@@ -157,7 +157,8 @@ def _beyond_prior(report: Contents) -> Iterator[Gate]:
     """Yield that the prior is too narrow, if a wider one explains the trials."""
     bounds = report.tracing.bounds
     explains = bool(bounds.replaces) or bounds.p_value > GATE.level
-    moved = [p for p in bounds.parameters if p.model == NONE]
+    found = {(p.name, p.side): p for p in bounds.parameters if p.model == NONE}
+    moved = [*found.values()]
     if not (moved and explains and report.detection.alarm):
         return
     said = [f"{p.name} at its {p.side} bound {p.bound:.6g}" for p in moved]
@@ -207,8 +208,8 @@ def _wrong(report: Contents, errors: dict[str, float]) -> Iterator[Gate]:
 
 def _residuals(report: Contents) -> dict[str, Any]:
     """Return the trial, channel and time of the largest residual."""
-    table = report.residuals_by_trial
-    return {"worst": {} if table.empty else table.iloc[0].to_dict()}
+    table = report.residuals_by_trial.head(1).dropna(axis="columns")
+    return {"worst": next(iter(table.to_dict("records")), {})}
 
 
 def _open(report: Contents) -> list[str]:
