@@ -72,8 +72,8 @@ def close_loop(  # noqa: D417  (the rest are those of Criticism)
             show_progress=show_progress,
         )
 
+    options: dict[str, Any] = {"evaluate": evaluate, "designed": designed}
     if real_system is None:
-        options = {"plan": plan, "designed": designed}
-        return compare(trials).report(evaluate=evaluate, **options)
-    kept = {"max_trials": max_trials, "directory": directory}
-    return settle(compare, trials, real_system, evaluate=evaluate, **kept)
+        return compare(trials).report(plan=plan, **options)
+    options |= {"max_trials": max_trials, "directory": directory}
+    return settle(compare, trials, real_system, **options)

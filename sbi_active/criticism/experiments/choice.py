@@ -143,16 +143,20 @@ def is_settled(
     return held and probability_of(report) >= least
 
 
-def register(criticism: Criticism, report: Report, choice: Choice) -> Registered:
+def register(
+    criticism: Criticism, report: Report, choice: Choice, index: float
+) -> Registered:
     """Return what the verdict predicts of a trial.
 
     Args:
         criticism: The models, fitted to the trials so far.
         report: Report with their verdict.
         choice: The trial.
+        index: Place of the trial in the order of execution.
     """
     rivals = criticism.rivals
     trial = following(rivals, torch.from_numpy(choice.action)[None])
+    trial.index = torch.full_like(trial.index, index)
     prediction = predict(
         rivals,
         trial,
@@ -165,7 +169,7 @@ def register(criticism: Criticism, report: Report, choice: Choice) -> Registered
     z = (prediction.x - mean) / sd
     distance = np.sqrt((z**2).mean(1))
     return Registered(
-        index=float(trial.index[0]),
+        index=index,
         action=choice.action,
         purpose=choice.purpose,
         verdict=report.verdict,

@@ -29,6 +29,8 @@ from sbi_active.criticism.rivals.further_trials import conditions_at, together
 from sbi_active.messages import Explained, Message
 from sbi_active.simulation import SimulatorModel
 
+SETTLED = "settled"
+
 
 class VerdictError(Explained, RuntimeError):
     """The verdict failed after trials were run, which are kept.
@@ -53,6 +55,7 @@ def settle(
     max_trials: int,
     directory: str | Path | None = None,
     evaluate: bool = True,
+    designed: bool = False,
     settling: Settling = Settling(),  # noqa: B008  (frozen)
 ) -> Report:
     """Return the report after as many trials as settle its verdict.
@@ -70,6 +73,7 @@ def settle(
         directory: Folder that keeps predictions and measurements, from which a loop
             that was interrupted goes on; None keeps them in the report alone.
         evaluate: Whether the report has the error before and after.
+        designed: Whether the trials' actions were chosen for their information.
         settling: When a verdict is settled.
 
     Raises:
@@ -84,15 +88,15 @@ def settle(
     tested = journal.tested()
     for trial in tested:
         trials = with_trial(first.model, trials, trial.registered.action, trial.x)
-    criticism = compare(trials) if tested else first
     scored = evaluate and bool(trials.held_out_positions)
     while True:
-        report = criticism.report(evaluate=scored, designed=bool(tested))
+        options = {"evaluate": scored, "designed": designed or bool(tested)}
+        criticism, report = _verdict(compare, trials, options, first, tested)
         if tested:
             tested[-1] = replace(tested[-1], after=report.verdict)
             said = {"verdict": report.verdict, "held": tested[-1].held}
             journal.write("judged", index=tested[-1].registered.index, **said)
-        stopped = "settled" * is_settled(report, tested, settling)
+        stopped = SETTLED * is_settled(report, tested, settling)
         choice = None if stopped else choose(report, actions, tested, settling)
         if choice is None:
             stopped = stopped or "no permitted action tells more"
@@ -100,16 +104,17 @@ def settle(
             stopped = "no trials are left"
         if choice is None or stopped:
             break
-        registered = register(criticism, report, choice)
+        registered = register(criticism, report, choice, _next_index(trials))
         journal.write("registered", **vars(registered))
         action = torch.from_numpy(choice.action).float()
         x = np.array(torch.as_tensor(real_system(action)), dtype=float)
         journal.write("measured", index=registered.index, x=x)
         tested.append(TestedTrial(registered=registered, x=x, after=""))
         trials = with_trial(first.model, trials, choice.action, x)
-        criticism = _again(compare, trials)
     if evaluate and not scored:
-        report = criticism.report(designed=bool(tested))
+        report = criticism.report(designed=designed or bool(tested))
+        if stopped == SETTLED and not is_settled(report, tested, settling):
+            stopped = "left-out trials speak against the verdict"
     warnings = (*report.warnings, *map(Message, failures(report, tested)))
     return replace(report, tested=(*tested,), stopped=stopped, warnings=warnings)
 
@@ -139,7 +144,7 @@ def with_trial(
     if times is not None and own_times is not None and times.ndim > 1:
         times = torch.cat([times, own_times[None]])
     further = conditions_at(model, trials, new)
-    index = float(trials.index.max()) + 1
+    index = _next_index(trials)
     names = f"{index:.15g}"
     joined = Trials(
         torch.cat([trials.action, new]),
@@ -160,9 +165,22 @@ def with_trial(
     return joined
 
 
-def _again(compare: Callable[[Trials], Criticism], trials: Trials) -> Criticism:
+def _next_index(trials: Trials) -> float:
+    return float(trials.index.max()) + 1
+
+
+def _verdict(
+    compare: Callable[[Trials], Criticism],
+    trials: Trials,
+    options: dict[str, bool],
+    first: Criticism,
+    tested: list[TestedTrial],
+) -> tuple[Criticism, Report]:
+    if not tested:
+        return first, first.report(**options)
     try:
-        return compare(trials)
+        criticism = compare(trials)
+        return criticism, criticism.report(**options)
     except Exception as error:
         raise VerdictError(
             f"expected a verdict on {len(trials)} trials; got {error}; go on from the "

@@ -122,12 +122,16 @@ def test_a_registered_prediction_is_that_of_linear_least_squares():
 
 
 def comparing(fails_at=()):
-    """Return a comparison that fails with so many trials."""
+    """Return a comparison whose report fails with so many trials."""
 
     def compare(trials):
+        found = Criticism(MODEL, PRIOR, trials, effects=LIBRARY, actions=BOTH)
         if len(trials) in fails_at:
-            raise ArithmeticError("the solver diverged")
-        return Criticism(MODEL, PRIOR, trials, effects=LIBRARY, actions=BOTH)
+            found.report = diverge
+        return found
+
+    def diverge(**options):
+        raise ArithmeticError("the solver diverged")
 
     return compare
 
@@ -151,6 +155,19 @@ def test_a_measurement_is_kept_though_the_verdict_fails(tmp_path):
     assert len(robot.asked) == len(again.tested) == len(report.tested)
     with pytest.raises(ValueError, match="another directory"):
         settle(comparing(), trials[:-1], robot, **options)
+
+
+def test_a_trial_comes_after_those_that_were_held_out():
+    robot = Robot(FORMS["drag"], seed=7)
+    fitted, more = robot.trials(), Robot(FORMS["drag"], seed=8).trials()
+    x, action = torch.cat([fitted.x, more.x[:3]]), torch.cat([FORWARD, FORWARD[:3]])
+    role = ["fit"] * len(FORWARD) + ["held out"] * 3
+    report = loop(robot, Trials(action, x, role=role), evaluate=True)
+    assert report.verdict == "drag"
+    assert [t.registered.index for t in report.tested][0] == len(action)
+    assert report.evaluation.scheme == "held out"
+    table = report.before_after.set_index("metric")
+    assert table.loc["rmse", "ratio"] < 0.5
 
 
 def test_what_a_loop_over_trials_needs():
