@@ -1,7 +1,7 @@
 """What three chosen trials do to a verdict, beside random and spread-out ones.
 
     python -m benchmarks experiments --first 5000 --cases 12
-    python -m benchmarks experiments --summary-only
+    python -m benchmarks experiments --summary
 
 The machines, the effects and what nobody declared are those of the misfit benchmark, of
 its kinds E (the cause is declared) and R (the cause is removed from the library). All
@@ -113,7 +113,7 @@ def read_rows() -> list[Row]:
     return [json.loads(line) for line in RESULTS.read_text().splitlines()]
 
 
-def summary(rows: Sequence[Row]) -> list[str]:
+def lines_of(rows: Sequence[Row]) -> list[str]:
     """Return the lines of the summary, of cases that have all designs."""
     of: dict[tuple[Any, ...], dict[str, Row]] = {}
     for row in rows:
@@ -161,21 +161,19 @@ def _is_right(row: Row) -> bool:
     return bool(row["named"]) and {*row["named"]} <= {*row["right"]}
 
 
-def main(
-    first: int = FIRST_JUDGED, cases: int = 40, *, summary_only: bool = False
-) -> None:
+def main(first: int = FIRST_JUDGED, cases: int = 40, *, summary: bool = False) -> None:
     """Run what is not there yet, and print the summary.
 
     Args:
         first: Number of the first case.
         cases: Number of cases of each kind.
-        summary_only: Whether to run nothing.
+        summary: Whether to run nothing.
     """
     warnings.simplefilter(
         "ignore"
     )  # trials are at actions that are not permitted again
     done = {(r["group"], r["kind"], r["case"], r["design"]) for r in read_rows()}
-    for number in range(first, first + cases) if not summary_only else ():
+    for number in range(first, first + cases) if not summary else ():
         group = ("own", "letters")[number % 2]
         for kind in KINDS:
             for design in DESIGNS:
@@ -190,4 +188,4 @@ def main(
                 print(f"{kind} {number} {row['true']}, {design}: {said}", flush=True)
     is_judged = first >= FIRST_JUDGED
     rows = [r for r in read_rows() if (r["case"] >= FIRST_JUDGED) == is_judged]
-    print(*summary(rows), sep="\n")
+    print(*lines_of(rows), sep="\n")

@@ -89,6 +89,7 @@ TABLES = {
         "misfit.odds --summary",
         "misfit.start_states --summary",
     ),
+    "Trials that decide": ("experiments --summary",),
     "Forces that nobody declared": ("forces --summary",),
     "Robots from their MJCF": (
         "robots.hidden --summary",
