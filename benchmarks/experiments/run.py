@@ -1,6 +1,6 @@
 """What three chosen trials do to a verdict, beside random and spread-out ones.
 
-    python -m benchmarks experiments --first 5000 --cases 12
+    python -m benchmarks experiments --first 6000 --cases 40
     python -m benchmarks experiments --summary
 
 The machines, the effects and what nobody declared are those of the misfit benchmark, of
@@ -9,8 +9,8 @@ designs take trials from the same 32 permitted actions, drawn as the actions of 
 trials were: "chosen" by ``close_loop(real_system=)``, "random", "spread out" (farthest
 from all before); "none" is the verdict before any.
 
-Seeds are the numbers of cases. **Those from 5,000 on judge**, and no other benchmark
-has them; those below 1,000 are for tuning. Resumable: one row of JSON a case and
+Seeds are the numbers of cases. **Those from 6,000 on judge**, and no other benchmark
+has them; those below are for tuning. Resumable: one row of JSON a case and
 design, in benchmarks/experiments/results.jsonl. The groups of machines take turns.
 """
 
@@ -38,7 +38,7 @@ RESULTS = Path(__file__).parent / "results.jsonl"
 DESIGNS = ("chosen", "random", "spread out")
 KINDS: tuple[Kind, ...] = ("E", "R")
 NUM_TRIALS = 3
-FIRST_JUDGED = 5_000
+FIRST_JUDGED = 6_000
 NO_NAMES = {"none", "unexplained", "scatter", "outlier"}
 
 Row = dict[str, Any]

@@ -34,7 +34,7 @@ def test_spread_out_actions_are_permitted_and_apart():
 
 def row(kind, design, named, tested=()):
     return {
-        **{"group": "own", "kind": kind, "case": 5_000, "design": design},
+        **{"group": "own", "kind": kind, "case": 6_000, "design": design},
         **{"right": ["lag"] if kind == "E" else [], "named": named, "verdict": ""},
         **{"trials": 1, "tested": [*tested], "cpu_seconds": 2.0, "stopped": ""},
     }

@@ -8,6 +8,7 @@ from itertools import takewhile
 
 import numpy as np
 import torch
+from scipy.spatial.distance import cdist
 from scipy.stats import binom
 
 from sbi_active.actions import ActionSpace
@@ -15,7 +16,7 @@ from sbi_active.criticism.criticism import Criticism
 from sbi_active.criticism.next_trial.candidates import following
 from sbi_active.criticism.report.predicted import Registered, TestedTrial
 from sbi_active.criticism.report.report import Report
-from sbi_active.criticism.results import NONE, Array
+from sbi_active.criticism.results import NONE, UNEXPLAINED, Array
 from sbi_active.criticism.steps.predictive import predict
 from sbi_active.seeding import derive_seed
 
@@ -23,6 +24,8 @@ from sbi_active.seeding import derive_seed
 COVERAGE = 0.9
 #: Probability of as many failed predictions below which they are a warning.
 SURPRISING = 0.05
+#: Distance, in widths of the permitted actions, below which two are the same.
+SAME = 1e-6
 #: Draws of a registered prediction: its 90 % limit has a standard error of 1 %.
 NUM_DRAWS = 400
 
@@ -70,7 +73,8 @@ def choose(
     A verdict that names effects is first tested against a free residual, which stands
     for what nobody declared: an alias fits the trials so far, and errs where another
     action tells it from its cause. Once such a test was run, rivals among the declared
-    models are told apart.
+    models are told apart. If nothing explains the trials, models cannot say where to
+    look: it is where the residual is least known, farthest from all trials.
 
     Args:
         report: Report with its plan.
@@ -85,7 +89,24 @@ def choose(
     test = _testing(report, actions, settling)
     name = report.tracing.model
     is_new = all(trial.registered.purpose != f"tests {name}" for trial in tested)
-    return (test or told) if is_new else (told or test)
+    chosen = (test or told) if is_new else (told or test)
+    if chosen is None and report.verdict == UNEXPLAINED:
+        return _untried(report)
+    return chosen
+
+
+def _untried(report: Report) -> Choice | None:
+    """Return the permitted action that is farthest from all that were tried."""
+    if report.next_action is None or report.action_is_label:
+        return None
+    candidates, tried = report.next_action.candidates, report.residuals.action
+    width = np.ptp(candidates, axis=0)
+    width = np.where(width > 0, width, 1.0)
+    distance = cdist(candidates / width, tried / width).min(1)
+    best = int(np.argmax(distance))
+    if distance[best] < SAME:
+        return None
+    return Choice(candidates[best], "shows the residual where no trial was")
 
 
 def _telling(report: Report, actions: ActionSpace, settling: Settling) -> Choice | None:
