@@ -113,7 +113,7 @@ def test_methods(run, capsys):
 
 def test_closing_the_loop(run, capsys):
     pages = run("docs/closing_the_loop.md")
-    _, bare, _, forces, drag, starts, campaign, *motor = pages
+    _, bare, _, forces, drag, decides, starts, campaign, *motor = pages
     printed = capsys.readouterr().out
     assert bare.report.verdict == "unexplained"
     assert printed.startswith("unexplained\nVerdict: drag (P ")
@@ -122,6 +122,8 @@ def test_closing_the_loop(run, capsys):
     assert table.loc["rmse", "after"] < 0.005 + 4 * 0.0018
     assert table.loc["rmse", "ratio"] < 0.5
     assert drag.page.exists()
+    assert decides.report.verdict == "drag"
+    assert 1 <= len(decides.report.tested) <= 3
     assert starts.loop.trace().verdict == "drag"
     assert "sin 2q of hinge" in [effect.name for effect in forces.effects]
     assert "alarm\n('drag',)\n" in printed
@@ -203,6 +205,12 @@ def test_question_which_parameters(run, capsys):
 def test_question_two_models(run):
     (rivals,) = run("docs/howto/two_models.md")
     assert rivals.actions.contains(torch.as_tensor(rivals.found.action)[None]).all()
+
+
+def test_question_gate(run, capsys):
+    (own,) = run("docs/howto/gate.md")
+    assert (own.gate.decision, own.gate.exit_code) == ("SHIP", 0)
+    assert capsys.readouterr().out.startswith("SHIP: ")
 
 
 def test_question_thrown_ball(run, capsys):

@@ -89,6 +89,7 @@ TABLES = {
         "misfit.metamorphic --summary --first 5200",
         "misfit.start_states --summary",
     ),
+    "Trials that decide": ("experiments --summary",),
     "Forces that nobody declared": ("forces --summary",),
     "Robots from their MJCF": (
         "robots.hidden --summary",

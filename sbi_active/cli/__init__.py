@@ -34,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Returns:
         The exit status: 0, 1 where something failed, 2 where the call or a file has to
-        be changed, 130 after an interrupt.
+        be changed, 10 to 14 where a gate is closed, 130 after an interrupt.
     """
     words = sys.argv[1:] if argv is None else [*argv]
     if in_campaign(here := Path.cwd()):  # nothing is imported because it lies there
@@ -52,6 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         answer = _answer(words, is_json)
         if isinstance(answer, Answer):
             print(as_line(answer.data) if is_json else answer.text)
+            status = answer.status
         elif isinstance(answer, int):
             status = answer
         if sys.stdout is not None:

@@ -23,7 +23,7 @@ ORDER = click.Choice(("known", "unknown"))
 OF_CAMPAIGN = ("simulator", "effects", "out", "trust")
 
 
-@cli.command(
+OPTIONS = (
     cli.argument("trials", "TRIALS.csv", cli.FILE, **PROBLEM_FILE),
     *(CONFIG, cli.A_TASK, cli.OF_TASK, cli.SIMULATOR, *cli.SPACE, cli.EFFECTS),
     *(cli.SEED, cli.TRUST, cli.JSON),
@@ -40,6 +40,9 @@ OF_CAMPAIGN = ("simulator", "effects", "out", "trust")
     cli.option("--set", "of close_loop: warm_up=0.5", cli.SEVERAL, "NAME=VALUE ..."),
     cli.option("--out", "folder for the report", cli.FOLDER, "DIR"),
 )
+
+
+@cli.command(*OPTIONS)
 def criticize(trials: Path, **given: Any) -> Answer:
     """Find what a simulator lacks, from measured trials.
 
@@ -54,6 +57,22 @@ def criticize(trials: Path, **given: Any) -> Answer:
     campaign, which knows its simulator and its prior, or of recordings, with trials.csv
     or one file *.csv a trial.
     """
+    return _answered(trials, given)
+
+
+@cli.command(*OPTIONS)
+def gate(trials: Path, **given: Any) -> Answer:
+    """Say whether a simulator may be used, as criticize finds it from the same trials.
+
+    The exit status is 0 for SHIP, 10 for NO_IMPROVEMENT, 11 for NOT_IDENTIFIABLE, 12
+    for OUT_OF_PRIOR, 13 for WRONG_MODEL and 14 for NOT_ENOUGH_DATA.
+    """
+    found = _answered(trials, given).data["gate"]
+    text = f"{found['decision']}: {found['reason']}"
+    return Answer(found, text, found["exit_code"])
+
+
+def _answered(trials: Path, given: dict[str, Any]) -> Answer:
     from sbi_active.campaign.storage.manifest import has_manifest
     from sbi_active.criticism import close_loop
 

@@ -13,6 +13,7 @@ from scipy.stats import spearmanr
 from torch.distributions import Distribution
 
 from sbi_active.criticism.contradictions import SevereTest
+from sbi_active.criticism.report.predicted import TestedTrial
 from sbi_active.criticism.report.words import TOLD, called, parted, setting
 from sbi_active.criticism.results import (
     NONE,
@@ -59,6 +60,8 @@ class Contents:
         severe_tests: Actions that would put a verdict that names effects to the test
             most: a permitted action, and one beyond.
         action_is_label: Whether the action is only the trial's number.
+        tested: Trials that were run to test the verdict, in order.
+        stopped: Reason to run no more of them.
     """
 
     residuals: Residuals
@@ -78,6 +81,8 @@ class Contents:
     leave_one_out: tuple[LeaveOneOut, ...] = ()
     severe_tests: tuple[SevereTest, ...] = ()
     action_is_label: bool = False
+    tested: tuple[TestedTrial, ...] = ()
+    stopped: str = ""
 
     @property
     def verdict(self) -> str:

@@ -16,6 +16,7 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.report.cautions import cautions
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.figures import figures
+from sbi_active.criticism.report.gate import Gate, gate_of
 from sbi_active.criticism.report.sections import cautions_with_codes, page
 from sbi_active.criticism.report.summary import (
     first_paragraph,
@@ -63,6 +64,11 @@ class Report(Contents):
             items([f"{code} {said}" for code, said in cautions_with_codes(self)]),
         )
 
+    @property
+    def gate(self) -> Gate:
+        """Whether the simulator may be used, see :class:`.Gate`."""
+        return gate_of(self)
+
     def __reduce__(self) -> tuple[Any, ...]:
         # Effects are lambdas and local functions as a rule, which pickle refuses.
         parts = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -94,6 +100,7 @@ class Report(Contents):
                 **{name: table.to_dict("records") for name, table in tables.items()},
                 "next_action": plan,
                 "severe_tests": [asdict(test) for test in self.severe_tests],
+                "gate": self.gate.to_dict(),
                 "digest": self.digest,
                 "sections": [
                     {

@@ -8,6 +8,7 @@ import numpy as np
 
 from sbi_active.criticism.report import errors, models
 from sbi_active.criticism.report.contents import Contents
+from sbi_active.criticism.report.predicted import predicted_section
 from sbi_active.criticism.report.summary import first_paragraph, verdict_line
 from sbi_active.criticism.report.words import TOLD, listed, number, parted, probability
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, NextAction
@@ -50,6 +51,9 @@ def _sections(report: Contents) -> Iterator[Section]:
     if report.leave_one_out:
         yield models.leave_one_out(report)
     yield models.parameters(report)
+    if report.tested:
+        settings = [report.setting(t.registered.action) for t in report.tested]
+        yield predicted_section(report.tested, settings, report.stopped)
     yield next_action(report)
     yield _record(report)
 

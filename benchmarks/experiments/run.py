@@ -1,0 +1,191 @@
+"""What three chosen trials do to a verdict, beside random and spread-out ones.
+
+    python -m benchmarks experiments --first 6000 --cases 40
+    python -m benchmarks experiments --summary
+
+The machines, the effects and what nobody declared are those of the misfit benchmark, of
+its kinds E (the cause is declared) and R (the cause is removed from the library). All
+designs take trials from the same 32 permitted actions, drawn as the actions of the
+trials were: "chosen" by ``close_loop(real_system=)``, "random", "spread out" (farthest
+from all before); "none" is the verdict before any.
+
+Seeds are the numbers of cases. **Those from 6,000 on judge**, and no other benchmark
+has them; those below are for tuning. Resumable: one row of JSON a case and
+design, in benchmarks/experiments/results.jsonl. The groups of machines take turns.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.criticism.intervals import rate
+from benchmarks.experiments.reality import Reality, spread_out
+from benchmarks.misfit.cases import Case, Kind, draw_case
+from benchmarks.misfit.verdicts import read_report
+from sbi_active.criticism import Report, close_loop
+from sbi_active.criticism.experiments.settle import with_trial
+from sbi_active.display.table import Table
+from sbi_active.seeding import derive_seed
+
+RESULTS = Path(__file__).parent / "results.jsonl"
+DESIGNS = ("chosen", "random", "spread out")
+KINDS: tuple[Kind, ...] = ("E", "R")
+NUM_TRIALS = 3
+FIRST_JUDGED = 6_000
+NO_NAMES = {"none", "unexplained", "scatter", "outlier"}
+
+Row = dict[str, Any]
+
+
+def verdict_of(case: Case, number: int, design: str) -> Report:
+    """Return the report after the trials of a design.
+
+    Args:
+        case: The case.
+        number: Its number, also the loop's seed.
+        design: One of the designs.
+    """
+    problem, reality = case.problem, Reality.of(case, number)
+    options: dict[str, Any] = {"effects": problem.effects, "evaluate": False}
+    options |= {"seed": number, "actions": reality.actions}
+    given, trials = (problem.model, problem.prior), problem.trials
+    if design == "chosen":
+        run = {"real_system": reality.run, "max_trials": NUM_TRIALS}
+        return close_loop(*given, trials, **options, **run)
+    if design == "spread out":
+        actions = spread_out(reality, NUM_TRIALS)
+    else:
+        gen = torch.Generator().manual_seed(derive_seed(number, "random"))
+        values = reality.actions.values
+        actions = values[torch.randperm(len(values), generator=gen)[:NUM_TRIALS]]
+    for action in actions:
+        x = reality.run(action).numpy()
+        trials = with_trial(problem.model, trials, action.double().numpy(), x)
+    return close_loop(*given, trials, plan=False, **options)
+
+
+def row_of(group: str, kind: Kind, number: int, design: str) -> Row:
+    """Return the row of one case and design."""
+    case = draw_case(group, kind, number)
+    truth = case.truth
+    right = frozenset().union(*[truth.machine.equivalent(n) for n in truth.names])
+    row: Row = {"group": group, "kind": kind, "case": number, "design": design}
+    row |= {"machine": truth.machine.name, "true": [*truth.names]}
+    row |= {"right": sorted(right) if kind == "E" else []}
+    start = time.process_time()
+    try:
+        report = verdict_of(case, number, design)
+    except Exception as error:  # a crash is a result of the benchmark
+        return row | {"failure": f"{type(error).__name__}: {error}"[:300]}
+    tested = [
+        {
+            "action": [round(v, 4) for v in trial.registered.action.tolist()],
+            "purpose": trial.registered.purpose,
+            "before": trial.registered.verdict,
+            "after": trial.after,
+            "distance": round(trial.distance, 3),
+            "limit": round(trial.registered.limit, 3),
+            "held": bool(trial.held),
+        }
+        for trial in report.tested
+    ]
+    return row | {
+        "verdict": report.verdict,
+        "named": [*read_report(report, ()).named],
+        "trials": len(tested) if design == "chosen" else NUM_TRIALS,
+        "stopped": report.stopped,
+        "tested": tested,
+        "cpu_seconds": round(time.process_time() - start, 1),
+    }
+
+
+def read_rows() -> list[Row]:
+    """Return the rows so far."""
+    if not RESULTS.exists():
+        return []
+    return [json.loads(line) for line in RESULTS.read_text().splitlines()]
+
+
+def lines_of(rows: Sequence[Row]) -> list[str]:
+    """Return the lines of the summary, of cases that have all designs."""
+    of: dict[tuple[Any, ...], dict[str, Row]] = {}
+    for row in rows:
+        key = row["group"], row["kind"], row["case"]
+        of.setdefault(key, {})[row["design"]] = row
+    whole = [c for c in of.values() if {*DESIGNS} <= {*c}]
+    failed = [r for c in whole for r in c.values() if "failure" in r]
+    whole = [c for c in whole if not any("failure" in r for r in c.values())]
+    cells = []
+    for design in ("none", *DESIGNS):
+        own = [c[design] if design in c else _before(c["chosen"]) for c in whole]
+        e, r = ([row for row in own if row["kind"] == kind] for kind in KINDS)
+        trials = sum(row["trials"] for row in own) / max(len(own), 1)
+        seconds = sum(row["cpu_seconds"] for row in own) / max(len(own), 1)
+        right = rate([_is_right(row) for row in e])
+        wrong = rate([not {*row["named"]} <= {*row["right"]} for row in e])
+        alias = rate([bool(row["named"]) for row in r])
+        ends = f"{trials:.1f}", f"{seconds:.0f}"
+        cells.append((design, right, wrong, alias, *ends))
+    names = "design", "E: right", "E: a wrong name", "R: an alias", "trials", "CPU s"
+    lines = [f"{len(whole)} cases with all designs; {len(failed)} rows failed", ""]
+    lines += [Table(names, cells).markdown(), ""]
+    tested = [(t, c["chosen"]) for c in whole for t in c["chosen"]["tested"]]
+    parts: dict[str, list[bool]] = {}
+    for trial, row in tested:
+        named = {*trial["before"].split(" + ")}
+        nothing = NO_NAMES & named
+        kind = "right names" if named <= {*row["right"]} else "a wrong name"
+        parts.setdefault("no name" if nothing else kind, []).append(trial["held"])
+    lines += [f"90 % predictions after {k} held: {rate(v)}" for k, v in parts.items()]
+    return lines
+
+
+def _before(chosen: Row) -> Row:
+    """Return the row of the verdict before any trial, from that of the chosen ones."""
+    if not chosen["tested"]:
+        return chosen | {"cpu_seconds": float("nan")}
+    verdict = chosen["tested"][0]["before"]
+    named = [] if verdict in NO_NAMES else verdict.split(" + ")
+    unknown = {"cpu_seconds": float("nan"), "trials": 0}
+    return chosen | {"verdict": verdict, "named": named} | unknown
+
+
+def _is_right(row: Row) -> bool:
+    return bool(row["named"]) and {*row["named"]} <= {*row["right"]}
+
+
+def main(first: int = FIRST_JUDGED, cases: int = 40, *, summary: bool = False) -> None:
+    """Run what is not there yet, and print the summary.
+
+    Args:
+        first: Number of the first case.
+        cases: Number of cases of each kind.
+        summary: Whether to run nothing.
+    """
+    warnings.simplefilter(
+        "ignore"
+    )  # trials are at actions that are not permitted again
+    done = {(r["group"], r["kind"], r["case"], r["design"]) for r in read_rows()}
+    for number in range(first, first + cases) if not summary else ():
+        group = ("own", "letters")[number % 2]
+        for kind in KINDS:
+            for design in DESIGNS:
+                if (group, kind, number, design) in done:
+                    continue
+                row = row_of(group, kind, number, design)
+                with RESULTS.open("a") as file:
+                    file.write(json.dumps(row) + "\n")
+                said = (
+                    row.get("failure") or f"{row['verdict']} ({row['cpu_seconds']} s)"
+                )
+                print(f"{kind} {number} {row['true']}, {design}: {said}", flush=True)
+    is_judged = first >= FIRST_JUDGED
+    rows = [r for r in read_rows() if (r["case"] >= FIRST_JUDGED) == is_judged]
+    print(*lines_of(rows), sep="\n")

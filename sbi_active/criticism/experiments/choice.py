@@ -1,0 +1,211 @@
+"""Which trial puts a verdict to the test most, and what the verdict predicts of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import takewhile
+
+import numpy as np
+import torch
+from scipy.spatial.distance import cdist
+from scipy.stats import binom
+
+from sbi_active.actions import ActionSpace
+from sbi_active.criticism.criticism import Criticism
+from sbi_active.criticism.next_trial.candidates import following
+from sbi_active.criticism.report.predicted import Registered, TestedTrial
+from sbi_active.criticism.report.report import Report
+from sbi_active.criticism.results import NONE, UNEXPLAINED, Array
+from sbi_active.criticism.steps.predictive import predict
+from sbi_active.seeding import derive_seed
+
+#: Probability with which an outcome lies within the registered interval.
+COVERAGE = 0.9
+#: Probability of as many failed predictions below which they are a warning.
+SURPRISING = 0.05
+#: Distance, in widths of the permitted actions, below which two are the same.
+SAME = 1e-6
+#: Draws of a registered prediction: its 90 % limit has a standard error of 1 %.
+NUM_DRAWS = 400
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settling:
+    """When a verdict is settled, and when a trial is worth running.
+
+    Attributes:
+        probability: Probability of the verdict from which it may be settled.
+        cause: Probability of being the cause, if every model misses: its odds among
+            what nobody declared leave at most .92.
+        tells: Information about which model is right that is worth a trial, nats.
+        differs: Difference between the verdict's prediction and that of a free residual
+            that is worth a trial, in standard deviations of the former.
+    """
+
+    probability: float = 0.9
+    cause: float = 0.75
+    tells: float = 0.1
+    differs: float = 1.0
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A trial to run.
+
+    Attributes:
+        action: Action, shape (action_dim,).
+        purpose: What it is to tell, in words.
+    """
+
+    action: Array
+    purpose: str
+
+
+def choose(
+    report: Report,
+    actions: ActionSpace,
+    tested: Sequence[TestedTrial],
+    settling: Settling,
+) -> Choice | None:
+    """Return the permitted action that puts a verdict to the test most.
+
+    A verdict that names effects is first tested against a free residual, which stands
+    for what nobody declared: an alias fits the trials so far, and errs where another
+    action tells it from its cause. Once such a test was run, rivals among the declared
+    models are told apart. If nothing explains the trials, models cannot say where to
+    look: it is where the residual is least known, farthest from all trials.
+
+    Args:
+        report: Report with its plan.
+        actions: Permitted actions; no other is chosen.
+        tested: Trials that were run before.
+        settling: Least that a trial has to tell.
+
+    Returns:
+        None if no permitted action tells enough.
+    """
+    told = _telling(report, actions, settling)
+    test = _testing(report, actions, settling)
+    name = report.tracing.model
+    is_new = all(trial.registered.purpose != f"tests {name}" for trial in tested)
+    chosen = (test or told) if is_new else (told or test)
+    if chosen is None and report.verdict == UNEXPLAINED:
+        return _untried(report)
+    return chosen
+
+
+def _untried(report: Report) -> Choice | None:
+    """Return the permitted action that is farthest from all that were tried."""
+    if report.next_action is None or report.action_is_label:
+        return None
+    candidates, tried = report.next_action.candidates, report.residuals.action
+    width = np.ptp(candidates, axis=0)
+    width = np.where(width > 0, width, 1.0)
+    distance = cdist(candidates / width, tried / width).min(1)
+    best = int(np.argmax(distance))
+    if distance[best] < SAME:
+        return None
+    return Choice(candidates[best], "shows the residual where no trial was")
+
+
+def _telling(report: Report, actions: ActionSpace, settling: Settling) -> Choice | None:
+    plan = report.next_action
+    if plan is None or plan.action is None:
+        return None
+    told = float(np.max(plan.information_gain))
+    action = torch.from_numpy(plan.action)[None].float()
+    if told < settling.tells or not bool(actions.contains(action)):
+        return None
+    return Choice(plan.action, f"tells {', '.join(plan.separates)} apart")
+
+
+def _testing(report: Report, actions: ActionSpace, settling: Settling) -> Choice | None:
+    for test in report.severe_tests:
+        action = torch.from_numpy(test.action)[None].float()
+        is_permitted = test.is_permitted and bool(actions.contains(action))
+        if is_permitted and test.difference >= settling.differs:
+            return Choice(test.action, f"tests {report.tracing.model}")
+    return None
+
+
+def failures(report: Report, tested: Sequence[TestedTrial]) -> list[str]:
+    """Return a warning if a verdict stands though its predictions failed.
+
+    As many failures have a probability below .05 if the intervals hold in .9.
+
+    Args:
+        report: Report with the verdict.
+        tested: Trials that were run.
+    """
+    own = [t for t in tested if t.registered.verdict == report.verdict]
+    failed = [f"{t.registered.index:g}" for t in own if not t.held]
+    if binom.sf(len(failed) - 1, len(own), 1 - COVERAGE) >= SURPRISING:
+        return []
+    told = f"SA531 {report.verdict} did not predict trials {', '.join(failed)}"
+    return [f"{told} of {len(own)} that tested it, and is the verdict still"]
+
+
+def is_settled(
+    report: Report, tested: Sequence[TestedTrial], settling: Settling
+) -> bool:
+    """Return whether a verdict is probable, and predicted what tested it.
+
+    Args:
+        report: Report with the verdict.
+        tested: Trials that were run. Those since the verdict was reached have to agree
+            with its predictions, and there has to be one.
+        settling: Probability that the verdict has to have.
+    """
+    own = [*takewhile(lambda t: t.registered.verdict == report.verdict, tested[::-1])]
+    held = bool(own) and all(trial.held for trial in own)
+    misses = report.tracing.misfit is not None
+    least = settling.cause if misses else settling.probability
+    return held and probability_of(report) >= least
+
+
+def register(
+    criticism: Criticism, report: Report, choice: Choice, index: float
+) -> Registered:
+    """Return what the verdict predicts of a trial.
+
+    Args:
+        criticism: The models, fitted to the trials so far.
+        report: Report with their verdict.
+        choice: The trial.
+        index: Place of the trial in the order of execution.
+    """
+    rivals = criticism.rivals
+    trial = following(rivals, torch.from_numpy(choice.action)[None])
+    trial.index = torch.full_like(trial.index, index)
+    prediction = predict(
+        rivals,
+        trial,
+        key=report.tracing.key,
+        num_draws=NUM_DRAWS,
+        seed=derive_seed(rivals.seed, "registered", len(rivals.trials)),
+        scored=False,
+    )
+    mean, sd = prediction.moments()
+    z = (prediction.x - mean) / sd
+    distance = np.sqrt((z**2).mean(1))
+    return Registered(
+        index=index,
+        action=choice.action,
+        purpose=choice.purpose,
+        verdict=report.verdict,
+        mean=mean,
+        sd=sd,
+        position=prediction.position,
+        limit=float(np.quantile(distance, COVERAGE)),
+    )
+
+
+def probability_of(report: Report) -> float:
+    """Return the probability of a verdict; 0 if it names neither effects nor none."""
+    tracing = report.tracing
+    if tracing.instead_of or not (tracing.chosen or report.verdict == NONE):
+        return 0.0
+    if tracing.misfit is None:
+        return tracing.probabilities.get(report.verdict, 0.0)
+    return min((tracing.misfit.cause[n] for n in tracing.misfit.named), default=0.0)

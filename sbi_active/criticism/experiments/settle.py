@@ -1,0 +1,202 @@
+"""Verdicts and trials by turns, until the verdict is settled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sbi_active.actions import ActionSpace
+from sbi_active.criticism.criticism import Criticism
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.experiments.choice import (
+    Settling,
+    choose,
+    failures,
+    is_settled,
+    register,
+)
+from sbi_active.criticism.experiments.journal import Journal
+from sbi_active.criticism.report.predicted import TestedTrial
+from sbi_active.criticism.report.report import Report
+from sbi_active.criticism.results import Array
+from sbi_active.criticism.rivals.further_trials import conditions_at, together
+from sbi_active.messages import Explained, Message
+from sbi_active.simulation import SimulatorModel
+
+SETTLED = "settled"
+
+
+class VerdictError(Explained, RuntimeError):
+    """The verdict failed after trials were run, which are kept.
+
+    Attributes:
+        code: Code of the message.
+        trials: All trials, those that were run among them.
+    """
+
+    code = "SA532"
+
+    def __init__(self, message: str, trials: Trials) -> None:
+        super().__init__(message)
+        self.trials = trials
+
+
+def settle(
+    compare: Callable[[Trials], Criticism],
+    trials: Trials,
+    real_system: Callable[[Tensor], Any],
+    *,
+    max_trials: int,
+    directory: str | Path | None = None,
+    evaluate: bool = True,
+    designed: bool = False,
+    settling: Settling = Settling(),  # noqa: B008  (frozen)
+) -> Report:
+    """Return the report after as many trials as settle its verdict.
+
+    A trial is chosen so that it puts the verdict to the test most; what the verdict
+    predicts of it is written down; the trial is run, kept and scored, and the same rule
+    is asked for a verdict with the trial among the data. It ends if the verdict is
+    settled, if no permitted action tells more, or after ``max_trials``.
+
+    Args:
+        compare: Function that compares trials with the models.
+        trials: Trials so far.
+        real_system: Function that takes an action, shape (action_dim,), and gives x.
+        max_trials: Trials to run at most.
+        directory: Folder that keeps predictions and measurements, from which a loop
+            that was interrupted goes on; None keeps them in the report alone.
+        evaluate: Whether the report has the error before and after.
+        designed: Whether the trials' actions were chosen for their information.
+        settling: When a verdict is settled.
+
+    Raises:
+        ValueError: If there are no permitted actions, x is compared by summaries, or
+            the folder belongs to other trials.
+        VerdictError: If the comparison fails after a trial was run.
+    """
+    first = compare(trials)
+    actions = _require_actions(first)
+    journal = Journal(directory)
+    journal.begin(digest=first.digest, num_trials=len(trials))
+    tested = journal.tested()
+    for trial in tested:
+        trials = with_trial(first.model, trials, trial.registered.action, trial.x)
+    scored = evaluate and bool(trials.held_out_positions)
+    while True:
+        options = {"evaluate": scored, "designed": designed or bool(tested)}
+        criticism, report = _verdict(compare, trials, options, first, tested)
+        if tested:
+            tested[-1] = replace(tested[-1], after=report.verdict)
+            said = {"verdict": report.verdict, "held": tested[-1].held}
+            journal.write("judged", index=tested[-1].registered.index, **said)
+        stopped = SETTLED * is_settled(report, tested, settling)
+        choice = None if stopped else choose(report, actions, tested, settling)
+        if choice is None:
+            stopped = stopped or "no permitted action tells more"
+        elif len(tested) >= max_trials:
+            stopped = "no trials are left"
+        if choice is None or stopped:
+            break
+        registered = register(criticism, report, choice, _next_index(trials))
+        journal.write("registered", **vars(registered))
+        action = torch.from_numpy(choice.action).float()
+        x = np.array(torch.as_tensor(real_system(action)), dtype=float)
+        journal.write("measured", index=registered.index, x=x)
+        tested.append(TestedTrial(registered=registered, x=x, after=""))
+        trials = with_trial(first.model, trials, choice.action, x)
+    if evaluate and not scored:
+        report = criticism.report(designed=designed or bool(tested))
+        if stopped == SETTLED and not is_settled(report, tested, settling):
+            stopped = "left-out trials speak against the verdict"
+    warnings = (*report.warnings, *map(Message, failures(report, tested)))
+    return replace(report, tested=(*tested,), stopped=stopped, warnings=warnings)
+
+
+def with_trial(
+    model: SimulatorModel, trials: Trials, action: Array, x: Array
+) -> Trials:
+    """Return trials with one more, that may be fitted, behind them.
+
+    Args:
+        model: The simulator, which may know the inputs at an action.
+        trials: Trials so far.
+        action: Action of the new one, shape (action_dim,).
+        x: Its numbers, of the shape of x of a trial.
+
+    Raises:
+        ValueError: If x has another shape than that of the trials.
+    """
+    template, own_times = trials.template()
+    if np.size(x) != template.numel():
+        raise ValueError(
+            f"expected x of shape {tuple(template.shape)} from the real system; got "
+            f"{np.shape(x)}; return the numbers of one trial, NaN for those missing"
+        )
+    new = torch.from_numpy(action)[None].to(trials.action)
+    times = trials.sample_times
+    if times is not None and own_times is not None and times.ndim > 1:
+        times = torch.cat([times, own_times[None]])
+    further = conditions_at(model, trials, new)
+    index = _next_index(trials)
+    names = f"{index:.15g}"
+    joined = Trials(
+        torch.cat([trials.action, new]),
+        torch.cat(
+            [trials.x, torch.from_numpy(x).to(trials.x).reshape(template[None].shape)]
+        ),
+        role=[*trials.role, "fit"],
+        index=torch.cat([trials.index, trials.index.new_tensor([index])]),
+        order=trials.order,
+        sample_times=times,
+        names=[*trials.names, names],
+        action_labels=trials.action_labels,
+        channel_labels=trials.channel_labels,
+        input_labels=trials.input_labels,
+        **together(trials, further),
+    )
+    joined.action_is_label = trials.action_is_label
+    return joined
+
+
+def _next_index(trials: Trials) -> float:
+    return float(trials.index.max()) + 1
+
+
+def _verdict(
+    compare: Callable[[Trials], Criticism],
+    trials: Trials,
+    options: dict[str, bool],
+    first: Criticism,
+    tested: list[TestedTrial],
+) -> tuple[Criticism, Report]:
+    if not tested:
+        return first, first.report(**options)
+    try:
+        criticism = compare(trials)
+        return criticism, criticism.report(**options)
+    except Exception as error:
+        raise VerdictError(
+            f"expected a verdict on {len(trials)} trials; got {error}; go on from the "
+            "directory, or from .trials of this error",
+            trials,
+        ) from error
+
+
+def _require_actions(criticism: Criticism) -> ActionSpace:
+    if criticism.actions is None:
+        raise ValueError(
+            "expected the permitted actions with real_system; got None; pass actions="
+        )
+    if criticism.num_summaries:
+        raise ValueError(
+            "expected all numbers of x with real_system, whose outcome is predicted; "
+            f"got {criticism.num_summaries} summaries; pass summaries=0"
+        )
+    return criticism.actions

@@ -1,0 +1,114 @@
+"""Trials that were chosen to test a verdict: predicted, then measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sbi_active.display.page import Section
+from sbi_active.display.table import Table
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Registered:
+    """What a verdict predicts of a trial, written down before the trial is run.
+
+    Attributes:
+        index: Place of the trial in the order of execution.
+        action: Action of the trial, shape (action_dim,).
+        purpose: What the trial is to tell.
+        verdict: Verdict that predicts.
+        mean: Predicted numbers, shape (N,), in units of x.
+        sd: Their standard deviations, noise included, shape (N,).
+        position: Positions of these numbers in the flattened x, shape (N,).
+        limit: Distance within which an outcome lies with a probability of .9, root mean
+            square over x in ``sd``.
+    """
+
+    index: float
+    action: Array
+    purpose: str
+    verdict: str
+    mean: Array
+    sd: Array
+    position: Array
+    limit: float
+
+    def distance(self, x: Array) -> float:
+        """Return the distance of an outcome; NaN if nothing was measured.
+
+        Args:
+            x: Measured numbers, of the shape of x.
+        """
+        z = (np.ravel(x)[self.position] - self.mean) / self.sd
+        seen = np.isfinite(z)
+        return float(np.sqrt(np.mean(z[seen] ** 2))) if seen.any() else float("nan")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TestedTrial:
+    """A trial that was run to test a verdict.
+
+    Attributes:
+        registered: Prediction, made before the trial was run.
+        x: Measured numbers, of the shape of x.
+        after: Verdict with the trial among the data.
+    """
+
+    registered: Registered
+    x: Array
+    after: str
+
+    __test__ = False  # no test of pytest's
+
+    @property
+    def distance(self) -> float:
+        """Distance of the outcome from the prediction, in its standard deviations."""
+        return self.registered.distance(self.x)
+
+    @property
+    def held(self) -> bool:
+        """Whether the outcome lies within the 90 % interval of the prediction."""
+        return self.distance <= self.registered.limit
+
+    def in_words(self) -> tuple[str, str]:
+        """Return what was predicted and what was measured, in units of x."""
+        own = self.registered
+        x = np.ravel(self.x)[own.position]
+        if len(x) == 1:
+            half = own.limit * own.sd[0]
+            low, high = own.mean[0] - half, own.mean[0] + half
+            return f"{low:.4g} to {high:.4g}", f"{x[0]:.4g}"
+        size = float(np.sqrt(np.nanmean((x - own.mean) ** 2)))
+        half = own.limit * float(np.sqrt(np.mean(own.sd**2)))
+        return f"within {half:.3g} of its course", f"{size:.3g} off"
+
+
+def predicted_section(
+    tested: Sequence[TestedTrial], settings: Sequence[str], stopped: str
+) -> Section:
+    """Return the table "predicted, then measured".
+
+    Args:
+        tested: Trials in the order in which they were run.
+        settings: Action of each of them, in words.
+        stopped: Reason to run no more of them.
+    """
+    rows = []
+    for trial, setting in zip(tested, settings, strict=True):
+        own = trial.registered
+        held = "held" if trial.held else f"failed, {trial.distance:.2g} deviations"
+        words = *trial.in_words(), held, own.verdict, trial.after
+        rows.append((f"{own.index:g}: {setting}", *words))
+    names = ("trial", "predicted (90 %)", "measured", "prediction")
+    return Section(
+        "Predicted, then measured",
+        [f"Each was predicted before it was run; then it ended: {stopped}."],
+        table=Table((*names, "verdict before", "after"), rows),
+    )

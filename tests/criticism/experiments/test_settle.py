@@ -1,0 +1,187 @@
+"""Trials that decide, on models whose truth is known."""
+
+import json
+
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch.distributions import Independent, Normal
+
+from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active.criticism import Criticism, Effect, Trials, close_loop
+from sbi_active.criticism.experiments.journal import NAME
+from sbi_active.criticism.experiments.settle import VerdictError, settle
+
+NOISE = 0.1
+PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
+MODEL = SimulatorModel(
+    lambda theta, xi: theta * xi + 0 * xi, noise=GaussianNoise(NOISE)
+)
+#: Trials so far were all forward; the robot may go back as well.
+FORWARD = torch.tensor([1.0, 1.5, 2.0, 2.5, 3.0, 1.0, 2.0, 3.0])[:, None]
+BOTH = DiscreteActions(torch.tensor([-3.0, -2.0, -1.0, 1.0, 1.5, 2.0, 2.5, 3.0]))
+
+
+def effect(name, form):
+    return Effect(
+        name,
+        hook="observation",
+        prior=Independent(Normal(torch.zeros(1), torch.ones(1)), 1),
+        null=0.0,
+        apply=lambda x, phi, action, context: x + phi * form(action.to(x)),
+    )
+
+
+#: Forward they are the same to the last bit, backward they have opposite signs.
+EVEN = effect("lift", lambda xi: xi**2)
+ODD = effect("drag", lambda xi: xi * xi.abs())
+LIBRARY = [EVEN, ODD]
+FORMS = {"lift": lambda xi: xi**2, "drag": lambda xi: xi * xi.abs()}
+
+
+class Robot:
+    """A robot with one effect, that counts its trials."""
+
+    def __init__(self, form=None, size=0.5, seed=0):
+        self.form, self.size, self.asked = form, size, []
+        self.gen = torch.Generator().manual_seed(seed)
+
+    def __call__(self, action):
+        self.asked.append(float(action))
+        return self.read(action[None])[0]
+
+    def read(self, action):
+        x = 0.7 * action + NOISE * torch.randn(action.shape, generator=self.gen)
+        return x if self.form is None else x + self.size * self.form(action)
+
+    def trials(self):
+        return Trials(FORWARD, self.read(FORWARD))
+
+
+def loop(robot, trials, **options):
+    options = {"effects": LIBRARY, "actions": BOTH, "evaluate": False, **options}
+    return close_loop(MODEL, PRIOR, trials, real_system=robot, **options)
+
+
+@pytest.mark.parametrize("name", ["lift", "drag"])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_chosen_trial_tells_a_cause_from_its_exact_alias(name, seed):
+    robot = Robot(FORMS[name], seed=seed)
+    trials = robot.trials()
+    passive = close_loop(MODEL, PRIOR, trials, effects=LIBRARY, evaluate=False)
+    assert passive.probabilities[name] < 0.6
+    report = loop(robot, trials)
+    assert report.verdict == name
+    assert report.probabilities[name] > 0.95
+    assert report.stopped == "settled"
+    assert len(robot.asked) <= 3
+    assert min(robot.asked) < 0
+    assert report.num_trials == len(FORWARD) + len(robot.asked)
+    assert all(trial.after for trial in report.tested)
+
+
+def test_the_alias_is_withdrawn_by_the_rule_that_named_it():
+    """A library without the cause names its alias, until a trial backward."""
+    robot = Robot(FORMS["drag"], seed=3)
+    trials = robot.trials()
+    assert close_loop(MODEL, PRIOR, trials, effects=[EVEN]).verdict == "lift"
+    report = loop(robot, trials, effects=[EVEN])
+    assert report.verdict != "lift"
+    first = report.tested[0]
+    assert (first.registered.verdict, first.held) == ("lift", False)
+    assert first.distance > 3 * first.registered.limit
+    assert "Predicted, then measured" in str(report)
+    assert "failed" in str(report)
+
+
+def test_what_nothing_explains_is_looked_at_where_no_trial_was():
+    robot = Robot(lambda xi: torch.sin(3 * xi), size=1.0, seed=9)
+    report = loop(robot, robot.trials(), effects=[])
+    assert report.verdict == "unexplained"
+    assert report.stopped == "no trials are left"
+    assert len({*robot.asked}) == 3
+    assert robot.asked[0] == -3.0  # farthest from all forward ones
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_clean_simulator_loses_at_most_one_trial(seed):
+    robot = Robot(seed=seed)
+    report = loop(robot, robot.trials())
+    assert report.verdict == "none"
+    assert len(robot.asked) <= 1
+
+
+def test_a_registered_prediction_is_that_of_linear_least_squares():
+    robot = Robot(FORMS["drag"], seed=4)
+    trials = robot.trials()
+    report = loop(robot, trials, effects=[ODD], max_trials=1)
+    own = report.tested[0].registered
+    design = torch.cat([FORWARD, FORMS["drag"](FORWARD)], 1).double()
+    new = torch.tensor([float(own.action[0])]).double()
+    new = torch.stack([new, FORMS["drag"](new)], 1)
+    cov = torch.linalg.inv(
+        design.T @ design / NOISE**2 + torch.diag(torch.tensor([0.0, 1.0]))
+    )
+    mean = new @ cov @ design.T @ trials.x.double() / NOISE**2
+    sd = float((NOISE**2 + new @ cov @ new.T).sqrt())
+    assert own.verdict == "drag"
+    assert own.mean[0] == pytest.approx(float(mean), abs=4 * sd / 400**0.5)
+    assert own.sd[0] == pytest.approx(sd, rel=4 / 800**0.5)
+    assert own.limit == pytest.approx(1.645, abs=0.3)  # 4 errors of a quantile of 400
+
+
+def comparing(fails_at=()):
+    """Return a comparison whose report fails with so many trials."""
+
+    def compare(trials):
+        found = Criticism(MODEL, PRIOR, trials, effects=LIBRARY, actions=BOTH)
+        if len(trials) in fails_at:
+            found.report = diverge
+        return found
+
+    def diverge(**options):
+        raise ArithmeticError("the solver diverged")
+
+    return compare
+
+
+def test_a_measurement_is_kept_though_the_verdict_fails(tmp_path):
+    robot = Robot(FORMS["drag"], seed=5)
+    trials, num = robot.trials(), len(FORWARD)
+    options = {"max_trials": 3, "directory": tmp_path, "evaluate": False}
+    with pytest.raises(VerdictError, match="the solver diverged") as raised:
+        settle(comparing({num + 1}), trials, robot, **options)
+    assert len(raised.value.trials) == num + 1
+    kept = [json.loads(line) for line in (tmp_path / NAME).read_text().splitlines()]
+    assert [event["event"] for event in kept] == ["begun", "registered", "measured"]
+    assert kept[2]["x"] == pytest.approx(raised.value.trials.x[-1].tolist())
+    with (tmp_path / NAME).open("a") as file:
+        file.write('{"event": "judged", "ind')  # cut off by a crash
+    report = settle(comparing(), trials, robot, **options)
+    assert report.verdict == "drag"
+    assert len(robot.asked) == len(report.tested) < 3  # none was run twice
+    again = settle(comparing(), trials, robot, **options)
+    assert len(robot.asked) == len(again.tested) == len(report.tested)
+    with pytest.raises(ValueError, match="another directory"):
+        settle(comparing(), trials[:-1], robot, **options)
+
+
+def test_a_trial_comes_after_those_that_were_held_out():
+    robot = Robot(FORMS["drag"], seed=7)
+    fitted, more = robot.trials(), Robot(FORMS["drag"], seed=8).trials()
+    x, action = torch.cat([fitted.x, more.x[:3]]), torch.cat([FORWARD, FORWARD[:3]])
+    role = ["fit"] * len(FORWARD) + ["held out"] * 3
+    report = loop(robot, Trials(action, x, role=role), evaluate=True)
+    assert report.verdict == "drag"
+    assert [t.registered.index for t in report.tested][0] == len(action)
+    assert report.evaluation.scheme == "held out"
+    table = report.before_after.set_index("metric")
+    assert table.loc["rmse", "ratio"] < 0.5
+
+
+def test_what_a_loop_over_trials_needs():
+    robot = Robot(seed=6)
+    with pytest.raises(ValueError, match="permitted actions"):
+        loop(robot, robot.trials(), actions=None)
+    with pytest.raises(ValueError, match="expected x of shape"):
+        loop(lambda action: torch.zeros(3), Robot(FORMS["drag"]).trials())

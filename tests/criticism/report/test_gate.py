@@ -1,0 +1,121 @@
+"""The gate: each decision on a small case made for it."""
+
+import json
+from types import SimpleNamespace
+
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch.distributions import Independent, Normal
+
+from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active.cli import gate as command
+from sbi_active.cli.output import Answer
+from sbi_active.criticism import Effect, Trials, close_loop
+from sbi_active.criticism.report.gate import EXIT_CODES
+
+NOISE = 0.1
+PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
+MODEL = SimulatorModel(
+    lambda theta, xi: theta * xi + 0 * xi,
+    noise=GaussianNoise(NOISE),
+    parameter_names=["slope"],
+)
+ACTIONS = DiscreteActions(torch.linspace(-2, 2, 9))
+BIAS = Effect(
+    "bias",
+    hook="observation",
+    prior=Independent(Normal(torch.zeros(1), torch.ones(1)), 1),
+    null=0.0,
+    apply=lambda x, phi, action, context: x + phi,
+)
+
+
+def decided(form, *, model=MODEL, prior=PRIOR, fitted=9, held_out=4, seed=0):
+    """Return the gate of trials whose mean is a form of the action and its place."""
+    gen = torch.Generator().manual_seed(seed)
+    num = fitted + held_out
+    action = ACTIONS.values[torch.randperm(9, generator=gen).repeat(2)[:num]]
+    mean = form(action, torch.arange(num)[:, None] < fitted)
+    x = mean + NOISE * torch.randn(mean.shape, generator=gen)
+    trials = Trials(action, x, role=["fit"] * fitted + ["held out"] * held_out)
+    report = close_loop(model, prior, trials, effects=[BIAS], plan=False)
+    assert report.to_dict()["gate"] == json.loads(json.dumps(report.gate.to_dict()))
+    assert report.gate.exit_code == EXIT_CODES[report.gate.decision]
+    return report.gate
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_right_simulator_ships(seed):
+    gate = decided(lambda xi, fits: 0.7 * xi, seed=seed)
+    assert (gate.decision, gate.exit_code) == ("SHIP", 0)
+    assert gate.details["before"] < 3 * NOISE
+
+
+def test_an_effect_that_is_missing_is_named():
+    gate = decided(lambda xi, fits: 0.7 * xi + 0.8)
+    assert gate.decision == "WRONG_MODEL"
+    assert gate.details["effects"] == ["bias"]
+    assert gate.details["after"] < gate.details["before"] / 2
+
+
+def test_where_a_simulator_misses_is_said_if_nothing_is_named():
+    gate = decided(lambda xi, fits: 0.7 * xi + torch.sin(4 * xi))
+    assert gate.decision == "WRONG_MODEL"
+    assert not gate.details["effects"]
+    assert gate.details["worst"]["deviations"] > 1
+
+
+def test_held_out_trials_that_are_missed_close_the_gate():
+    gate = decided(lambda xi, fits: 0.7 * xi + torch.where(fits, 0.0, 2.0))
+    assert gate.decision == "WRONG_MODEL"
+    assert len(gate.details["trials"]) >= 3
+
+
+def test_an_effect_that_does_not_lower_the_error_is_no_improvement():
+    gate = decided(lambda xi, fits: 0.7 * xi + torch.where(fits, 0.8, 0.0))
+    assert gate.decision == "NO_IMPROVEMENT"
+    assert "bias" in gate.reason
+    assert gate.details["after"] > gate.details["before"]
+
+
+def test_a_truth_outside_the_prior_says_which_bound_to_move():
+    gate = decided(lambda xi, fits: 4.0 * xi)
+    assert gate.decision == "OUT_OF_PRIOR"
+    (bound,) = gate.details["bounds"]
+    assert (bound["name"], bound["side"], bound["bound"]) == ("slope", "upper", 3.0)
+    assert 4.0 < gate.details["box"]["slope"]["upper"] < 6.0
+
+
+def test_parameters_that_are_known_together_alone_are_not_identifiable():
+    model = SimulatorModel(
+        lambda theta, xi: theta[:, :1] * theta[:, 1:] * xi,
+        noise=GaussianNoise(NOISE),
+        parameter_names=["mass", "drag"],
+    )
+    prior = BoxUniform(0.2 * torch.ones(2), 3 * torch.ones(2))
+    gate = decided(lambda xi, fits: 1.2 * xi, model=model, prior=prior)
+    assert gate.decision == "NOT_IDENTIFIABLE"
+    assert "mass" in gate.reason
+    assert "drag" in gate.reason
+
+
+def test_few_trials_are_not_enough():
+    gate = decided(lambda xi, fits: 0.7 * xi, fitted=3, held_out=1)
+    assert gate.decision == "NOT_ENOUGH_DATA"
+    assert "measure more" in gate.reason
+
+
+def test_the_command_ends_with_the_code_of_its_decision(monkeypatch, tmp_path):
+    found = {"decision": "WRONG_MODEL", "reason": "it lacks drag", "exit_code": 13}
+    seen = SimpleNamespace()
+
+    def criticize(trials, **given):
+        seen.given = trials, given
+        return Answer({"gate": found}, "a report")
+
+    monkeypatch.setattr(command, "criticize", criticize)
+    answer = command.gate(tmp_path, json=True, seed=3)
+    assert seen.given == (tmp_path, {"json": True, "seed": 3})
+    assert (answer.data, answer.status) == (found, 13)
+    assert answer.text == "WRONG_MODEL: it lacks drag"
