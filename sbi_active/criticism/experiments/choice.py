@@ -36,15 +36,12 @@ class Settling:
 
     Attributes:
         probability: Probability of the verdict from which it may be settled.
-        cause: Probability of being the cause, if every model misses: its odds among
-            what nobody declared leave at most .92.
         tells: Information about which model is right that is worth a trial, nats.
         differs: Difference between the verdict's prediction and that of a free residual
             that is worth a trial, in standard deviations of the former.
     """
 
     probability: float = 0.9
-    cause: float = 0.75
     tells: float = 0.1
     differs: float = 1.0
 
@@ -139,6 +136,7 @@ def failures(report: Report, tested: Sequence[TestedTrial]) -> list[str]:
         tested: Trials that were run.
     """
     own = [t for t in tested if t.registered.verdict == report.verdict]
+    own = [t for t in own if t.is_measured]
     failed = [f"{t.registered.index:g}" for t in own if not t.held]
     if binom.sf(len(failed) - 1, len(own), 1 - COVERAGE) >= SURPRISING:
         return []
@@ -158,10 +156,9 @@ def is_settled(
         settling: Probability that the verdict has to have.
     """
     own = [*takewhile(lambda t: t.registered.verdict == report.verdict, tested[::-1])]
-    held = bool(own) and all(trial.held for trial in own)
-    misses = report.tracing.misfit is not None
-    least = settling.cause if misses else settling.probability
-    return held and probability_of(report) >= least
+    told = [trial for trial in own if trial.is_measured]
+    held = bool(told) and all(trial.held for trial in told)
+    return held and probability_of(report) >= settling.probability
 
 
 def register(
@@ -202,10 +199,14 @@ def register(
 
 
 def probability_of(report: Report) -> float:
-    """Return the probability of a verdict; 0 if it names neither effects nor none."""
+    """Return the probability of a verdict; 0 if it names neither effects nor none.
+
+    If every model misses, it is that of being there of the effect that is least sure.
+    """
     tracing = report.tracing
     if tracing.instead_of or not (tracing.chosen or report.verdict == NONE):
         return 0.0
     if tracing.misfit is None:
         return tracing.probabilities.get(report.verdict, 0.0)
-    return min((tracing.misfit.cause[n] for n in tracing.misfit.named), default=0.0)
+    own = [tracing.misfit.support[n].inclusion for n in tracing.misfit.named]
+    return min(own, default=0.0)

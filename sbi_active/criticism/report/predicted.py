@@ -73,6 +73,11 @@ class TestedTrial:
         return self.registered.distance(self.x)
 
     @property
+    def is_measured(self) -> bool:
+        """Whether it gave a number that was predicted; else it holds nothing to."""
+        return bool(np.isfinite(self.distance))
+
+    @property
     def held(self) -> bool:
         """Whether the outcome lies within the 90 % interval of the prediction."""
         return self.distance <= self.registered.limit
@@ -84,10 +89,14 @@ class TestedTrial:
         if len(x) == 1:
             half = own.limit * own.sd[0]
             low, high = own.mean[0] - half, own.mean[0] + half
-            return f"{low:.4g} to {high:.4g}", f"{x[0]:.4g}"
-        size = float(np.sqrt(np.nanmean((x - own.mean) ** 2)))
+            told = f"{x[0]:.4g}" if self.is_measured else "nothing"
+            return f"{low:.4g} to {high:.4g}", told
         half = own.limit * float(np.sqrt(np.mean(own.sd**2)))
-        return f"within {half:.3g} of its course", f"{size:.3g} off"
+        predicted = f"within {half:.3g} of its course"
+        if not self.is_measured:
+            return predicted, "nothing"
+        size = float(np.sqrt(np.nanmean((x - own.mean) ** 2)))
+        return predicted, f"{size:.3g} off"
 
 
 def predicted_section(
@@ -104,6 +113,7 @@ def predicted_section(
     for trial, setting in zip(tested, settings, strict=True):
         own = trial.registered
         held = "held" if trial.held else f"failed, {trial.distance:.2g} deviations"
+        held = held if trial.is_measured else "no measurement"
         words = *trial.in_words(), held, own.verdict, trial.after
         rows.append((f"{own.index:g}: {setting}", *words))
     names = ("trial", "predicted (90 %)", "measured", "prediction")

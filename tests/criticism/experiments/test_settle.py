@@ -185,3 +185,27 @@ def test_what_a_loop_over_trials_needs():
         loop(robot, robot.trials(), actions=None)
     with pytest.raises(ValueError, match="expected x of shape"):
         loop(lambda action: torch.zeros(3), Robot(FORMS["drag"]).trials())
+
+
+def test_a_trial_without_a_measurement_neither_holds_nor_fails():
+    robot = Robot(FORMS["lift"])
+    trials, asked = robot.trials(), []
+
+    def lost_first(action):
+        asked.append(action)
+        return torch.full((1,), torch.nan) if len(asked) == 1 else robot(action)
+
+    report = close_loop(
+        MODEL,
+        PRIOR,
+        trials,
+        effects=LIBRARY,
+        actions=BOTH,
+        real_system=lost_first,
+        max_trials=2,
+        evaluate=False,
+    )
+    first = report.tested[0]
+    assert not first.is_measured
+    assert not any("SA531" in str(w) for w in report.warnings)
+    assert "no measurement" in " ".join(str(report).split())
