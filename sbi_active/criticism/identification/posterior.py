@@ -12,10 +12,12 @@ eigenvectors of its precision.
 
 References:
     George & McCulloch, Statistica Sinica 7 (1997), for the presence of variables.
+    Goodnight, The American Statistician 33 (1979), for the sweep operator.
 """
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -125,9 +127,11 @@ def sample(
             linear -= gram[:, 1:, 0]
             chosen.append(h)
             sizes.append(np.sqrt(variance))
-        given = _Given(precision, linear, p)
-        present = _present(given, present, settings.absent, rng)
-        u = _moved(given, present, u, rng)
+        swept = _Swept(precision, linear).turned(np.flatnonzero(p.effect < 0))
+        for e, there in enumerate(present.T):
+            swept[there] = swept[there].turned(np.flatnonzero(p.effect == e))
+        present = _present(swept, p, present, settings.absent, rng)
+        u = _moved(u, precision, swept, p, rng)
         if sweep >= settings.burnt:
             parts = (u, present, np.stack(chosen, 1), np.stack(sizes, 1))
             kept.append(tuple(part.copy() for part in parts))
@@ -160,83 +164,105 @@ def _errors(
     return h, square[np.arange(len(u)), h] / (2 * rng.gamma(0.5 * count, size=len(u)))
 
 
-@dataclass(frozen=True)
-class _Given:
-    """Gaussians of u given the errors, without bounds.
+class _Swept:
+    r"""Gaussians of u without bounds, given what is free of it, by the sweep operator.
 
     Attributes:
-        precision: Precision of all of u, shape (n, d, d).
-        linear: Precision times mean, shape (n, d).
-        prior: Prior knowledge of u.
+        table: Minus the covariance of what is free, its mean in the last column, and
+            in the corner :math:`-b^T P^{-1} b`; shape (n, d + 1, d + 1).
+        log_det: Log determinant of the precision of what is free, shape (n,).
+        free: Shape (n, d).
     """
 
-    precision: Array
-    linear: Array
-    prior: Unknowns
+    def __init__(self, precision: Array, linear: Array) -> None:
+        table = np.concatenate([precision, linear[:, None]], 1)
+        right = np.concatenate([linear, np.zeros((len(linear), 1))], 1)
+        self.table = np.concatenate([table, right[:, :, None]], 2)
+        self.log_det = np.zeros(len(linear))
+        self.free = np.zeros(linear.shape, dtype=bool)
 
-    def where(self, present: Flags) -> tuple[Flags, Array, Array, Array]:
-        """Return what is free where some effects are there, and its distribution.
+    def __getitem__(self, rows: Any) -> _Swept:
+        new = copy(self)
+        new.table, new.free = self.table[rows].copy(), self.free[rows].copy()
+        new.log_det = self.log_det[rows].copy()
+        return new
 
-        Returns:
-            Mask of what is free, its precision (ones elsewhere) and mean, and the log
-            evidence up to what all share; shapes (n, d), (n, d, d), (n, d) and (n,).
-        """
-        p, there = self.prior, np.ones((len(present), 1), dtype=bool)
-        free = np.concatenate([present, there], 1)[:, p.effect]
-        both = free[:, :, None] & free[:, None]
-        precision = np.where(both, self.precision, np.eye(free.shape[1]))
-        cov = np.linalg.inv(precision)
-        linear = np.where(free, self.linear, 0.0)
-        mean = (cov @ linear[:, :, None])[..., 0]
+    def __setitem__(self, rows: Any, other: _Swept) -> None:
+        self.table[rows], self.free[rows] = other.table, other.free
+        self.log_det[rows] = other.log_det
+
+    def turned(self, places: NDArray[np.intp]) -> _Swept:
+        """Return those where some coordinates are free that were not, or vice versa."""
+        new = self[:]
+        for k in places:
+            row = new.table[:, k].copy()
+            pivot = row[:, [k]]
+            over = row / pivot
+            new.table -= over[:, :, None] * row[:, None]
+            over = np.where(new.free[:, [k]], -over, over)
+            new.table[:, k], new.table[:, :, k] = over, over
+            new.table[:, k, k] = -1 / pivot[:, 0]
+            new.log_det += np.log(np.abs(pivot[:, 0]))
+            new.free[:, k] = ~new.free[:, k]
+        return new
+
+    def log_evidence(self, p: Unknowns) -> Array:
+        """Return the log evidence of what is free, up to what all share, (n,)."""
         some = np.isfinite(p.low) | np.isfinite(p.high)
-        sd = np.sqrt(np.einsum("nii->ni", cov)[:, some])
-        inside = log_inside(mean[:, some], sd, p.low[some], p.high[some])
-        log_z = np.where(free[:, some], inside, 0.0).sum(1)
-        log_z += 0.5 * ((linear * mean).sum(1) - np.linalg.slogdet(precision)[1])
-        return free, precision, mean, log_z
+        free = self.free[:, some]
+        variance = -np.einsum("nii->ni", self.table)[:, :-1][:, some]
+        sd = np.sqrt(np.where(free, variance, 1.0))
+        mean = np.where(free, self.table[:, :-1, -1][:, some], 0.0)
+        inside = log_inside(mean, sd, p.low[some], p.high[some])
+        log_z = np.where(free, inside, 0.0).sum(1)
+        return log_z - 0.5 * (self.table[:, -1, -1] + self.log_det)
 
 
 def _present(
-    given: _Given, present: Flags, absent: float, rng: np.random.Generator
+    swept: _Swept, p: Unknowns, present: Flags, absent: float, rng: np.random.Generator
 ) -> Flags:
     """Return the effects that are there, one after the other given all others.
 
     Args:
-        given: Gaussians given the errors.
+        swept: Gaussians given the effects that are there; changed in place.
+        p: Priors of the unknowns.
         present: Mask of the effects that are there so far, shape (n, e).
         absent: Prior probability that none is there.
         rng: Source of the draws.
     """
-    p, num = given.prior, max(present.shape[1], 1)
+    present, num = present.copy(), max(p.num_effects, 1)
     log_odds = np.log(absent ** (-1 / num) - 1) + p.log_density
-    log_z = given.where(present)[-1]
+    log_z = swept.log_evidence(p)
     for e in rng.permutation(p.num_effects):
-        other = present.copy()
-        other[:, e] ^= True
-        log_other = given.where(other)[-1]
-        gain = log_other - log_z + np.where(other[:, e], 1, -1) * log_odds[e]
+        other = swept.turned(np.flatnonzero(p.effect == e))
+        log_other = other.log_evidence(p)
+        gain = log_other - log_z + np.where(present[:, e], -1, 1) * log_odds[e]
         flip = rng.logistic(size=len(gain)) < gain
-        present = np.where(flip[:, None], other, present)
+        present[:, e] ^= flip
         log_z = np.where(flip, log_other, log_z)
+        swept[flip] = other[flip]
     return present
 
 
-def _moved(given: _Given, present: Flags, u: Array, rng: np.random.Generator) -> Array:
+def _moved(
+    u: Array, precision: Array, swept: _Swept, p: Unknowns, rng: np.random.Generator
+) -> Array:
     """Return u drawn within its bounds.
 
     As if there were none, where that is within them; else along the eigenvectors of its
     precision. The first is exact, and whether it is chosen depends on no earlier u.
     """
-    p = given.prior
-    free, precision, mean, _ = given.where(present)
-    upper = np.swapaxes(np.linalg.cholesky(precision), 1, 2)
+    free = swept.free
+    mean = np.where(free, swept.table[:, :-1, -1], 0.0)
+    full = np.where(free[:, :, None] & free[:, None], precision, np.eye(len(p.low)))
+    upper = np.swapaxes(np.linalg.cholesky(full), 1, 2)
     new = np.linalg.solve(upper, rng.standard_normal((*u.shape, 1)))[..., 0]
     new = np.where(free, mean + new, 0.0)
     out = np.flatnonzero(((new < p.low) | (new > p.high)).any(1))
     if not len(out):
         return new
     u, mean, free = np.where(free, u, 0.0)[out], mean[out], free[out]
-    values, vectors = eigh(precision[out])
+    values, vectors = eigh(full[out])
     sd = 1 / np.sqrt(values)
     for j in range(u.shape[1]):
         e = np.where(free & (np.abs(vectors[:, :, j]) > 1e-12), vectors[:, :, j], 0.0)
