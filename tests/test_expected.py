@@ -3,6 +3,7 @@
 import pytest
 import torch
 from sbi.utils import BoxUniform
+from torch.distributions import HalfNormal
 
 from sbi_active import (
     ASBI,
@@ -20,7 +21,7 @@ from sbi_active import (
     to_inference_data,
 )
 from sbi_active.campaign import Trial
-from sbi_active.criticism import Trials
+from sbi_active.criticism import Criticism, Effect, Trials, close_loop, identify
 from sbi_active.design import GradientSearch, LikelihoodGain
 from sbi_active.diagnostics import check_belief, check_calibration
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
@@ -64,6 +65,10 @@ def slide(theta, action):
         (lambda **k: from_mjcf("", {}, **k), "sensor", "sensors"),
         (lambda **k: to_inference_data(PRIOR, **k), "num_chain", "num_chains"),
         (check_belief, "num_repeat", "num_repeats"),
+        (close_loop, "warmup", "warm_up"),
+        (Criticism, "summary", "summaries"),
+        (identify, "besides", "beside"),
+        (Effect, "prio", "prior"),
         (check_calibration, "num_simulation", "num_simulations"),
     ],
 )
@@ -106,6 +111,10 @@ def test_a_keyword_unlike_any_is_told_with_all():
         (RandomDesigner(ACTIONS), "RandomDesigner(DiscreteActions(2 x push))"),
         (LikelihoodGain(num_contrastive=9), "LikelihoodGain(num_contrastive=9)"),
         (ASBI(PRIOR), "ASBI(0 trials)"),
+        (
+            Effect.keyword("drag", prior=HalfNormal(0.1), units="1/m"),
+            "Effect(drag [1/m], of the dynamics)",
+        ),
         (
             Trial(1, torch.tensor([2.0]), torch.tensor([0.5]), "ok"),
             "Trial(1: action [2], ok, x [0.5])",

@@ -48,6 +48,7 @@ from sbi_active.criticism.steps.residuals import find_residuals
 from sbi_active.criticism.steps.sampled import Sampled
 from sbi_active.criticism.steps.tracing import trace
 from sbi_active.criticism.thinning import thinned_to_need
+from sbi_active.expected import suggests
 from sbi_active.progress import stage
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import SimulatorModel
@@ -112,6 +113,7 @@ class Criticism:
         'bias'
     """
 
+    @suggests
     def __init__(
         self,
         model: SimulatorModel,

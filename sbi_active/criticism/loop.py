@@ -15,12 +15,14 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.experiments.settle import settle
 from sbi_active.criticism.misfit.rule import Rule
+from sbi_active.expected import suggests
 from sbi_active.simulation import SimulatorModel
 
 if TYPE_CHECKING:
     from sbi_active.criticism.report.report import Report
 
 
+@suggests
 def close_loop(  # noqa: D417  (the rest are those of Criticism)
     model: SimulatorModel,
     prior: Distribution,

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.expected import suggests
 from sbi_active.inference.beliefs.priors import is_discrete
 from sbi_active.seeding import forked_generators
 from sbi_active.support import parts_of, support_of
@@ -53,6 +54,7 @@ class Context:
         )
 
 
+@suggests
 @dataclass(frozen=True)
 class Effect:
     r"""A nested extension of a simulator that vanishes at :math:`\phi = \phi_0`.
@@ -120,6 +122,11 @@ class Effect:
         _require_finite_draws(self)
         if self.family is None:
             object.__setattr__(self, "family", self.hook)
+
+    def __repr__(self) -> str:
+        unit = f" [{self.units}]" if self.units else ""
+        scope = ", a trial's own" if self.scope == "trial" else ""
+        return f"Effect({self.name}{unit}, of the {self.hook}{scope})"
 
     @classmethod
     def keyword(

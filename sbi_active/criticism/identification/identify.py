@@ -19,6 +19,7 @@ from sbi_active.criticism.effects.trial_conditions import conditions_for
 from sbi_active.criticism.identification.fitting import Fitted, fitted
 from sbi_active.criticism.identification.settings import IdentifySettings
 from sbi_active.criticism.identification.spread import spread
+from sbi_active.expected import suggests
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.kernel_belief import KernelBelief
 from sbi_active.inference.engine.importance import pareto_shape
@@ -75,6 +76,7 @@ class IdentifiedBelief(KernelBelief):
         return found
 
 
+@suggests
 def identify(
     model: SimulatorModel,
     prior: Distribution,
