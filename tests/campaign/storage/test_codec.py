@@ -1,6 +1,9 @@
 """Objects as data and back: the same numbers, and no code but ours."""
 
+import json
 import math
+import zlib
+from io import BytesIO
 
 import numpy as np
 import pytest
@@ -85,13 +88,28 @@ def test_only_classes_of_trusted_packages():
         Design(*[torch.zeros(1)] * 7, bound="none", index=0, num_simulations=3)
     )
     assert design.num_simulations == 3
-    import json
-    import zlib
-    from io import BytesIO
-
     for name in ("os:system", "subprocess:Popen", "sbi_active.cli.__main__:main"):
-        structure = json.dumps({"!": "object", "class": name, "state": []})
-        buffer = BytesIO()
-        torch.save({"structure": structure, "arrays": []}, buffer)
+        content = written({"!": "object", "class": name, "state": []})
         with pytest.raises(ValueError, match="no class"):
-            decode(zlib.compress(buffer.getvalue()), known={})
+            decode(content, known={})
+
+
+def written(structure):
+    buffer = BytesIO()
+    torch.save({"structure": json.dumps(structure), "arrays": []}, buffer)
+    return zlib.compress(buffer.getvalue())
+
+
+def test_fields_that_came_later_have_their_defaults():
+    kind = "sbi_active.campaign.state:Trial"
+    old = {"!": "object", "class": kind, "state": [["index", 3], ["action", None]]}
+    trial = decode(written(old), known={})
+    assert (trial.index, trial.status, trial.seconds) == (3, "pending", {})
+
+
+def test_priors_of_any_class_of_torch():
+    base = torch.distributions.Normal(torch.zeros(2), torch.ones(2))
+    transforms = [torch.distributions.ExpTransform()]
+    prior = torch.distributions.TransformedDistribution(base, transforms)
+    theta = torch.tensor([0.5, 2.0])
+    assert torch.equal(back(prior).log_prob(theta), prior.log_prob(theta))

@@ -13,6 +13,8 @@ import pytest
 import torch
 
 from sbi_active import Campaign
+from sbi_active.campaign import storage
+from sbi_active.messages import RenamedWarning
 from sbi_active.simulation.bank import CorruptSegmentError
 from sbi_active.simulation.bank.store import Store
 from tests.campaign.storage.campaigns import drawn, draws, facts, go_on, new
@@ -154,6 +156,11 @@ def test_people_read_what_it_is(folder):
     assert "BoxUniform" in found["prior"]
     (folder / "campaign.toml").unlink()  # which nothing reads
     Campaign.load(folder)
+
+
+def test_the_former_name_of_the_error():
+    with pytest.warns(RenamedWarning, match="bank.CorruptSegmentError"):
+        assert storage.DamagedCampaignError is CorruptSegmentError
 
 
 class Bomb:
