@@ -52,6 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         answer = _answer(words, is_json)
         if isinstance(answer, Answer):
             print(as_line(answer.data) if is_json else answer.text)
+            status = answer.status
         elif isinstance(answer, int):
             status = answer
         if sys.stdout is not None:

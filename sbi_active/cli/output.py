@@ -29,10 +29,12 @@ class Answer(NamedTuple):
     Attributes:
         data: Data for programs; numbers that are not finite become null.
         text: Text for people.
+        status: Exit status.
     """
 
     data: dict[str, Any]
     text: str
+    status: int = 0
 
 
 def say(said: object) -> None:

@@ -81,10 +81,10 @@ def write_declared(path: Path, **options: Any) -> None:
         path: Folder of the campaign.
         **options: Options by name; paths begin in the current folder otherwise.
     """
-    from sbi_active.simulation.bank.files import write_file
-
     kept = {"folder": os.getcwd(), **{k: v for k, v in options.items() if v}}
-    write_file(path / DECLARED, (json.dumps(kept, indent=2) + "\n").encode())
+    temporary = path / f".writing-{os.getpid()}-{DECLARED}"
+    temporary.write_text(json.dumps(kept, indent=2) + "\n", encoding="utf-8")
+    os.replace(temporary, path / DECLARED)
     _remember(path)
 
 
