@@ -23,7 +23,8 @@ ORDER = click.Choice(("known", "unknown"))
 OF_CAMPAIGN = ("simulator", "effects", "out", "trust")
 
 
-OPTIONS = (
+#: Arguments and options that say what is compared with what.
+CRITICIZE = [
     cli.argument("trials", "TRIALS.csv", cli.FILE, **PROBLEM_FILE),
     *(CONFIG, cli.A_TASK, cli.OF_TASK, cli.SIMULATOR, *cli.SPACE, cli.EFFECTS),
     *(cli.SEED, cli.TRUST, cli.JSON),
@@ -31,18 +32,18 @@ OPTIONS = (
         "--columns",
         "trial, time, action, x, input, start, role, index or repeat_of where they are "
         "named otherwise, as in trial=ball,drop x=height_m",
-        cli.SEVERAL,
+        cli.PAIRS,
         "KEY=NAME[,NAME...] ...",
     ),
-    cli.option("--units", "of columns without", cli.SEVERAL, "NAME=UNIT ..."),
+    cli.option("--units", "of columns without", cli.PAIRS, "NAME=UNIT ..."),
     cli.option("--order", "unknown if not that of rows", ORDER, default="known"),
     cli.option("--inputs", "at times of their own", cli.FILE, "INPUTS.csv"),
-    cli.option("--set", "of close_loop: warm_up=0.5", cli.SEVERAL, "NAME=VALUE ..."),
+    cli.option("--set", "of close_loop: warm_up=0.5", cli.PAIRS, "NAME=VALUE ..."),
     cli.option("--out", "folder for the report", cli.FOLDER, "DIR"),
-)
+]
 
 
-@cli.command(*OPTIONS)
+@cli.command(*CRITICIZE)
 def criticize(trials: Path, **given: Any) -> Answer:
     """Find what a simulator lacks, from measured trials.
 
@@ -60,7 +61,7 @@ def criticize(trials: Path, **given: Any) -> Answer:
     return _answered(trials, given)
 
 
-@cli.command(*OPTIONS)
+@cli.command(*CRITICIZE)
 def gate(trials: Path, **given: Any) -> Answer:
     """Say whether a simulator may be used, as criticize finds it from the same trials.
 

@@ -79,7 +79,8 @@ class Measured(click.ParamType):
         return number_of(str(value), is_outcome=True)
 
 
-TEXT, NUMBERS, SEVERAL, MEASURED = Text(), Numbers(), Several(), Measured()
+TEXT, NUMBERS, MEASURED = Text(), Numbers(), Measured()
+SEVERAL, PAIRS = Several(), Several()  # given again, the last counts, or all do
 COUNT = click.IntRange(min=1)
 FILE, FOLDER = click.Path(path_type=Path), click.Path(path_type=Path, file_okay=False)
 
@@ -89,8 +90,8 @@ class Command(click.Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Set the parameters of the context by words."""
-        options = [param for param in self.params if param.type is SEVERAL]
-        several = {name for param in options for name in param.opts}
+        several = {name: param.type for param in self.params for name in param.opts}
+        several = {n: kind for n, kind in several.items() if isinstance(kind, Several)}
         taken: dict[str, list[str]] = {}
         words, name, left = [], "", iter([] if ctx.resilient_parsing else args)
         for word in left:
@@ -101,7 +102,8 @@ class Command(click.Command):
                     value = value if equals else next(left, "")
                     taken.setdefault("--set", []).append(f"{setting}={value}")
                 elif name in several:
-                    taken.setdefault(name, []).extend([value] if equals else [])
+                    before = taken.get(name, []) if several[name] is PAIRS else []
+                    taken[name] = [*before, *([value] if equals else [])]
                     continue
                 else:
                     words.append(word)
@@ -160,7 +162,7 @@ def option(
         metavar: Value as the help shows it.
         **settings: Further settings of :class:`click.Option`.
     """
-    if type is SEVERAL:
+    if isinstance(type, Several):
         settings["default"] = []
     shows = settings.get("default") not in (None, "", [])
     flag = {"is_flag": True} if type is None else {}
@@ -177,12 +179,12 @@ INTEGER = click.INT
 DIR = argument("folder", "DIR")
 A_TASK = option("--task", "with all that is declared of it", click.Choice(TASKS))
 OF_TASK = option(
-    "--option", "of the task: variant=sinh target=2", SEVERAL, "NAME=VALUE ..."
+    "--option", "of the task: variant=sinh target=2", PAIRS, "NAME=VALUE ..."
 )
 OF_CAMPAIGN = option(
     "--set",
     "fields of CampaignOptions: num_simulations=2000 workers.time_limit=3",
-    SEVERAL,
+    PAIRS,
     "NAME=VALUE ...",
 )
 METHOD = option("--method", "by which it learns", click.Choice(METHODS), default="asbi")

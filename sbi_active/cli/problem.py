@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from sbi.utils import BoxUniform
@@ -141,22 +141,6 @@ def task_of(name: str, texts: Sequence[str]) -> Task:
         ) from error
 
 
-class Problem(NamedTuple):
-    """The problem that options declare.
-
-    Attributes:
-        simulator: Simulator with its noise.
-        prior: Prior of its parameters; None if none was declared.
-        actions: Permitted actions, likewise.
-        effects: Effects that the simulator may lack.
-    """
-
-    simulator: Any
-    prior: Any
-    actions: Any
-    effects: list[Effect]
-
-
 def problem_of(
     simulator: str | None,
     *,
@@ -172,8 +156,10 @@ def problem_of(
     effects: Sequence[str] = (),
     folder: str | None = None,
     needs: Sequence[str] = ("prior", "actions"),
-) -> Problem:
-    """Return the simulator, prior and actions that options of these names give.
+) -> tuple[Any, Any, Any, list[Effect]]:
+    """Return simulator, prior, actions and effects that options of these names give.
+
+    A prior or actions that are not declared are None.
 
     Args:
         simulator: Simulator as MODULE:NAME; None for a task's.
@@ -213,11 +199,11 @@ def problem_of(
         raise ValueError(f"{BOUNDS}; got none; give bounds as in --theta-low=0,-1")
     if space is None and "actions" in needs:
         raise ValueError("expected --actions; got none; write, say, --actions 0:5:11")
-    if names or units:
+    if space is not None and (names or units):
         labels = names.split(",") if names else space.names
         space._label(labels, units.split(",") if units else space.units)
     own += effects_of(effects, folder)
-    return Problem(with_noise(model, noise), bounded, space, own)
+    return with_noise(model, noise), bounded, space, own
 
 
 def with_noise(simulator: Any, sd: Sequence[float] | None) -> Any:

@@ -3,6 +3,7 @@
 import functools
 import json
 import math
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -245,6 +246,7 @@ role = "role"
 def folder_of_films(folder="films"):
     """Write one file a push, and the simulator beside them."""
     Path(folder).mkdir()
+    sys.modules.pop("my_swing", None)  # of another test
     film(f"{folder}/my_swing")
     table = pd.read_csv("trials.csv")
     for i, push in enumerate(table["push"].unique()):

@@ -127,3 +127,14 @@ def test_the_words_for_a_shell_are_printed(capsys, monkeypatch):
     monkeypatch.setenv("_SBI_ACTIVE_COMPLETE", "zsh_source")
     assert main([]) == 0
     assert "_SBI_ACTIVE_COMPLETE" in capsys.readouterr().out
+
+
+def test_of_an_option_given_twice_the_last_counts_but_pairs_add_up(capsys):
+    words = ["check", "--task", "numerical", "--actions", "1:2", "--actions=a:b", "--x"]
+    assert main(words) == 2
+    assert "No such option '--x'" in capsys.readouterr().err
+    options = "--option variant=sinh --option sized=3 --actions 1:2 --actions=1:2:0"
+    assert main(["check", "--task", "numerical", *options.split()]) == 2
+    assert "{'variant': 'sinh', 'sized': 3}" in capsys.readouterr().err
+    assert main(["check", "--task", "numerical", *options.split()[4:]]) == 2
+    assert "got '1:2:0'" in capsys.readouterr().err
