@@ -50,14 +50,17 @@ class GateSettings:
             them, if the size of the noise is not declared.
         open: Width of a posterior, in prior deviations, above which a parameter is
             hardly known.
-        likely: Probability of the bare model below which trials decide nothing.
+        likely: Probability of the bare model below which trials decide nothing, though
+            they raise no alarm.
+        kept: Share of a bound that a wider one keeps, where it would change its sign.
     """
 
     fewest: int = 3
     level: float = 0.01
     covered: float = 0.7
     open: float = 0.5
-    likely: float = 0.5
+    likely: float = 0.2
+    kept: float = 0.1
 
 
 GATE = GateSettings()
@@ -162,7 +165,12 @@ def _beyond_prior(report: Contents) -> Iterator[Gate]:
     if not (moved and explains and report.detection.alarm):
         return
     said = [f"{p.name} at its {p.side} bound {p.bound:.6g}" for p in moved]
-    box = {p.name: {p.side: p.bound + 2 * (p.beyond - p.bound)} for p in moved}
+    box: dict[str, dict[str, float]] = {}
+    for p in moved:
+        wider = p.bound + 2 * (p.beyond - p.bound)  # as much again beyond the fit
+        keeps_sign = wider * p.bound >= 0
+        end = wider if keeps_sign else GATE.kept * p.bound
+        box.setdefault(p.name, {})[p.side] = end
     ends = [f"{name}: {v:.4g}" for name, side in box.items() for v in side.values()]
     yield Gate(
         "OUT_OF_PRIOR",

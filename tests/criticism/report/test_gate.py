@@ -87,6 +87,13 @@ def test_a_truth_outside_the_prior_says_which_bound_to_move():
     assert 4.0 < gate.details["box"]["slope"]["upper"] < 6.0
 
 
+def test_a_wider_box_keeps_the_sign_of_what_is_positive():
+    prior = BoxUniform(torch.tensor([0.5]), torch.tensor([3.0]))
+    gate = decided(lambda xi, fits: 0.1 * xi, prior=prior)
+    assert gate.decision == "OUT_OF_PRIOR"
+    assert 0 < gate.details["box"]["slope"]["lower"] < 0.1
+
+
 def test_parameters_that_are_known_together_alone_are_not_identifiable():
     model = SimulatorModel(
         lambda theta, xi: theta[:, :1] * theta[:, 1:] * xi,
