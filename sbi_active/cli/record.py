@@ -21,7 +21,7 @@ from typing import Any
 
 from sbi_active.campaign.storage.damage import naming
 from sbi_active.cli.numbers import flat
-from sbi_active.cli.trust import read_declared
+from sbi_active.cli.trusted import read_declared
 from sbi_active.simulation.bank.sqlite import EVENTS, NAME, OBJECTS
 from sbi_active.simulation.bank.store import Store
 
