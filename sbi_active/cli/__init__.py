@@ -19,7 +19,7 @@ from click.shell_completion import shell_complete
 
 from sbi_active.cli.declare import NAME, program
 from sbi_active.cli.output import Answer, as_line, failure, output_to_errors, say
-from sbi_active.cli.trust import in_campaign
+from sbi_active.cli.trusted import in_campaign
 
 __all__ = ["main"]
 

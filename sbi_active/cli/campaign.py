@@ -20,7 +20,7 @@ from sbi_active.cli.summary import (
     sum_up_campaign,
     trial_of,
 )
-from sbi_active.cli.trust import absolute, read_declared, write_declared
+from sbi_active.cli.trusted import absolute, read_declared, write_declared
 
 MANY = 5  # numbers, more than somebody types
 TRIAL = cli.argument("trial", "TRIAL", cli.INTEGER)

@@ -18,6 +18,8 @@ from sbi_active.cli.session import Session
 #: What a folder of recordings may hold, and what of its simulator that may name.
 MODULE, NAMED = "problem.py", ("simulator", "prior", "actions", "effects")
 #: Options that say what the trials are compared with.
+#: Arguments of close_loop by which trials are run.
+RUN = ("real_system", "max_trials", "directory")
 PROBLEM = (*NAMED, "task", "theta_low", "theta_high")
 ORDER = click.Choice(("known", "unknown"))
 OF_CAMPAIGN = ("simulator", "effects", "out", "trust")
@@ -82,7 +84,7 @@ def _answered(trials: Path, given: dict[str, Any]) -> Answer:
     if trials.is_dir() and has_manifest(trials):
         return _of_campaign(trials, given)
     settings = {k: as_json(v) for k, v in pairs_of(given["set"]).items()}
-    known = {*inspect.signature(close_loop).parameters} - {"seed", *NAMED}
+    known = {*inspect.signature(close_loop).parameters} - {"seed", *NAMED, *RUN}
     if wrong := {*settings} - known:
         raise ValueError(
             f"expected settings among {', '.join(sorted(known))}; got "

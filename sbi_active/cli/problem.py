@@ -21,7 +21,7 @@ from sbi_active.campaign import Campaign, CampaignOptions
 from sbi_active.cli.config import as_json, pairs_of
 from sbi_active.cli.numbers import number_of
 from sbi_active.cli.output import place_of
-from sbi_active.cli.trust import (
+from sbi_active.cli.trusted import (
     absolute,
     in_campaign,
     names_object,
@@ -36,7 +36,6 @@ from sbi_active.tasks import TASKS, Task, get_task  # pyright: ignore
 #: part in each design; twice as many take twice the memory, and half are still more
 #: than any design tells apart.
 MOST_ACTIONS = 100_000
-BOUNDS = "expected --theta-low and --theta-high, or --prior"
 
 
 def load_object(name: str, folder: str | None = None, kind: Any = object) -> Any:
@@ -191,12 +190,15 @@ def problem_of(
     else:
         whole: Any = task_of(task, option)
         if bounded is not None:
-            raise ValueError(f"{BOUNDS}, without --task, which has one; got both")
+            raise ValueError("expected no prior beside --task; got both; drop one")
         model, bounded, found = whole.simulator, whole.prior, whole.actions
         own = getattr(whole, "effects", list)()
     space: Any = actions_of(actions, folder) if actions else found
     if bounded is None and "prior" in needs:
-        raise ValueError(f"{BOUNDS}; got none; give bounds as in --theta-low=0,-1")
+        raise ValueError(
+            "expected --theta-low and --theta-high, or --prior; got none; give bounds "
+            "as in --theta-low=0,-1 --theta-high=1,1"
+        )
     if space is None and "actions" in needs:
         raise ValueError("expected --actions; got none; write, say, --actions 0:5:11")
     if space is not None and (names or units):
@@ -244,7 +246,10 @@ def prior_of(
     if low is None and high is None:
         return None
     if low is None or high is None or len(low) != len(high):
-        raise ValueError(f"{BOUNDS}; got {low} and {high}; give one of each")
+        raise ValueError(
+            f"expected --theta-low and --theta-high; got {low} and {high}; give one of "
+            "each a parameter"
+        )
     if any(a >= b for a, b in zip(low, high, strict=True)):
         raise ValueError(f"expected low below high; got {low} and {high}; swap them")
     return BoxUniform(torch.tensor(low), torch.tensor(high))

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from sbi_active.cli.numbers import flat
-from sbi_active.cli.trust import read_declared
+from sbi_active.cli.trusted import read_declared
 from sbi_active.simulation.bank.sqlite import NAME
 from sbi_active.simulation.bank.store import Store
 

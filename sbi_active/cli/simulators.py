@@ -16,7 +16,7 @@ import click
 from sbi_active.cli import declare as cli
 from sbi_active.cli.output import say
 from sbi_active.cli.summary import answer_of, sum_up_campaign
-from sbi_active.cli.trust import write_declared
+from sbi_active.cli.trusted import write_declared
 
 MANY_ACTIONS = 50  # that stand for a space without a list, to count simulations
 LONG = 20.0  # seconds of simulation a round, beside which learning counts little
