@@ -38,7 +38,8 @@ def test_a_campaign_of_invalid_trials_alone():
         assert c.tell([torch.nan], action=[action]).status == "invalid"
         c.update()
     draws = c.belief.sample((2_000,))
-    assert float((draws > 0.8).float().mean()) > 0.97
+    # An edge between 200 simulations: .96 to .98 by seed.
+    assert float((draws > 0.8).float().mean()) > 0.94
     assert float(draws.mean()) == pytest.approx(0.9, abs=0.02)
 
 
