@@ -17,9 +17,9 @@ from sbi_active.cli.session import Session
 
 #: What a folder of recordings may hold, and what of its simulator that may name.
 MODULE, NAMED = "problem.py", ("simulator", "prior", "actions", "effects")
-#: Options that say what the trials are compared with.
 #: Arguments of close_loop by which trials are run.
 RUN = ("real_system", "max_trials", "directory")
+#: Options that say what the trials are compared with.
 PROBLEM = (*NAMED, "task", "theta_low", "theta_high")
 ORDER = click.Choice(("known", "unknown"))
 OF_CAMPAIGN = ("simulator", "effects", "out", "trust")
