@@ -62,7 +62,7 @@ def test_options_are_taken_from_a_dict():
     campaign = Campaign(MODEL, PRIOR, ACTIONS, options={"num_simulations": 300})
     assert campaign.state.options == CampaignOptions(num_simulations=300)
     for wrong in ({"simulations": 300}, 300):
-        with pytest.raises(TypeError, match="pass CampaignOptions"):
+        with pytest.raises(TypeError, match="did you mean|pass CampaignOptions"):
             Campaign(MODEL, PRIOR, ACTIONS, options=wrong)
 
 

@@ -143,10 +143,16 @@ class Regions(Stages):
         for k, count in enumerate(np.diff(ends, prepend=0)):
             # The first stage's first region is the whole space, seen from the prior.
             is_overview = is_first and k == 0
-            count -= histories.reuse(regions[k], int(count), is_overview=is_overview)
+            share = max(own.replicate_share, 12 / size)
+            count -= histories.reuse(
+                regions[k],
+                int(count),
+                num_repeated=int(share * count),
+                is_overview=is_overview,
+            )
             if count <= 0:
                 continue
-            num_repeated = int(max(own.replicate_share, 12 / size) * count)
+            num_repeated = int(share * count)
             missing = int(count) - num_repeated
             z = regions[k].sample_inside(missing, self.coordinates, self.rng)
             if len(z) == 0:  # it lies beside the support, as of an outcome far away

@@ -222,8 +222,11 @@ class Bank:
         own = [segment for segment in self._rows.segments() if segment.run == run]
         if not own:
             return None
-        rows = np.concatenate([segment.rows[["index", "status"]] for segment in own])
-        index, status = (np.ascontiguousarray(rows[n]) for n in ("index", "status"))
+        # Copies, since torch takes no column of a table of one row.
+        index, status = (
+            np.concatenate([segment.rows[name] for segment in own])
+            for name in ("index", "status")
+        )
         x = np.concatenate([self._rows.x(segment) for segment in own])
         return torch.from_numpy(index), torch.from_numpy(x), torch.from_numpy(status)
 

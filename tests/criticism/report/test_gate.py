@@ -9,7 +9,7 @@ from sbi.utils import BoxUniform
 from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
-from sbi_active.cli import gate as command
+from sbi_active.cli import criticize as command
 from sbi_active.cli.output import Answer
 from sbi_active.criticism import Effect, Trials, close_loop
 from sbi_active.criticism.report.gate import EXIT_CODES
@@ -117,11 +117,11 @@ def test_the_command_ends_with_the_code_of_its_decision(monkeypatch, tmp_path):
     found = {"decision": "WRONG_MODEL", "reason": "it lacks drag", "exit_code": 13}
     seen = SimpleNamespace()
 
-    def criticize(trials, **given):
+    def criticize(trials, given):
         seen.given = trials, given
         return Answer({"gate": found}, "a report")
 
-    monkeypatch.setattr(command, "criticize", criticize)
+    monkeypatch.setattr(command, "_answered", criticize)
     answer = command.gate(tmp_path, json=True, seed=3)
     assert seen.given == (tmp_path, {"json": True, "seed": 3})
     assert (answer.data, answer.status) == (found, 13)

@@ -93,3 +93,22 @@ def test_simulations_from_further_off_are_taken_where_they_agree(is_linear: bool
         assert len(wide.regressions[0].residual) > 300
     else:
         assert len(wide.regressions[0].residual) < 250
+
+
+def test_histories_that_are_taken_over_keep_their_repetitions():
+    """They tell the noise: without any nothing could be regressed."""
+    histories = histories_of(lambda theta: theta)
+    past = histories.record()
+    again = Histories(
+        histories.simulator,
+        torch.zeros(2, 1),
+        np.zeros((2, 20)),
+        histories.coordinates,
+        1,
+        past,
+    )
+    region = whole_space(DIM)
+    assert again.reuse(region, 100, num_repeated=20, is_overview=True) == 100
+    assert len(again.pairs[0]) == 20
+    assert again.reuse(region, 100, is_overview=True) == 100
+    assert len(again.pairs[0]) == 20

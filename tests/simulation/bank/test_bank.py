@@ -147,6 +147,14 @@ def test_memory_is_bounded_by_a_segment(tmp_path):
     assert growth < 130
 
 
+def test_a_run_of_one_row_goes_on(bank):
+    theta, action = draw(1)
+    first = simulate(simulator, theta, action, seed=3, store=bank)
+    again = simulate(simulator, theta, action, seed=3, store=bank)
+    assert same(first, again)
+    assert len(bank) == 1
+
+
 def test_many_small_sets_keep_their_places(bank):
     for seed in range(70):
         theta, action = draw(4)
