@@ -120,7 +120,8 @@ program = click.Group(
     NAME,
     help="Tune a black-box simulator from a handful of real trials.",
     epilog="Exit status: 0; 1 where something failed, as in the simulator; 2 where the "
-    "call or a file has to be changed; 130 after an interrupt.",
+    "call or a file has to be changed; 10 to 14 where a gate is closed; 130 after an "
+    "interrupt.",
     context_settings={"help_option_names": ["-h", "--help"]},
     no_args_is_help=False,
 )
