@@ -7,9 +7,10 @@
 A case of :mod:`benchmarks.misfit.cases`, its kind by turns, is judged as it is and
 again after each change: "irrelevant", four more declared effects that explain nothing;
 "units", outcomes in thousandths of their unit; "finer", the sensor declared ten times
-finer than it is; "denser", four times as many samples of the same trials; "order", the
-effects declared in the opposite order. The same names are due. With a finer sensor a
-clean case misses it, which is true; its names are due nevertheless.
+finer than it is; "denser", four times as many samples of the same trials, where there
+are any; "order", the effects declared in the opposite order. The same names are due.
+With a finer sensor a clean case misses it, which is true; its names are due
+nevertheless.
 
 Cases below 1,000 are for tuning, those from 1,000 on judge. Resumable: a case that
 stands in the CSV file is not run again.
@@ -102,7 +103,10 @@ def finer(case: Case) -> Problem:
 def denser(case: Case) -> Problem | None:
     """Return the problem with more samples of the same trials; None if it has none."""
     truth = case.truth
+    what = truth.discrepancy
     if truth.machine.name not in GROUPS["own"]:
+        return None
+    if what is not None and what.kind == "process":  # it was drawn sample by sample
         return None
     layout = _layout(case)
     machine = get_machine(truth.machine.name, (layout[0], DENSER * layout[1]))
