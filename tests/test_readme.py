@@ -33,7 +33,7 @@ def run(tmp_path, monkeypatch):
     """
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
-    before = {*sys.modules}
+    forget()  # those of other tests
 
     def page(name: str) -> list[SimpleNamespace]:
         ran = []
@@ -54,9 +54,13 @@ def run(tmp_path, monkeypatch):
         return ran
 
     yield page
-    for name in {*sys.modules} - before:
-        if name.startswith("my_"):
-            del sys.modules[name]
+    forget()
+
+
+def forget():
+    """Forget the modules that pages and other tests have written."""
+    for name in [name for name in sys.modules if name.startswith("my_")]:
+        del sys.modules[name]
 
 
 def test_readme(run, capsys):
