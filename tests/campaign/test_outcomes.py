@@ -6,6 +6,7 @@ import time
 import pytest
 import torch
 
+from sbi_active import RefinementOptions
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import Workers
 from tests.campaign.problem import campaign, noisy
@@ -33,13 +34,14 @@ def test_each_kind_of_outcome_counts():
 
 
 def test_a_campaign_of_invalid_trials_alone():
-    c = campaign(simulator=falls_off)
+    # Of an edge between 200 simulations the share is .94 to .98 by seed.
+    many = RefinementOptions(num_histories=800, num_effective=25)
+    c = campaign(simulator=falls_off, refinement=many)
     for action in (2.0, 1.0):
         assert c.tell([torch.nan], action=[action]).status == "invalid"
         c.update()
     draws = c.belief.sample((2_000,))
-    # An edge between 200 simulations: .96 to .98 by seed.
-    assert float((draws > 0.8).float().mean()) > 0.94
+    assert float((draws > 0.8).float().mean()) > 0.97
     assert float(draws.mean()) == pytest.approx(0.9, abs=0.02)
 
 

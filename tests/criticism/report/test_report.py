@@ -11,7 +11,7 @@ from sbi.utils import BoxUniform
 
 from sbi_active import AutocorrelatedNoise, SimulatorModel
 from sbi_active.criticism import Trials, joint_prior
-from sbi_active.criticism.contradictions import Bounds, MissedTrial, SevereTest
+from sbi_active.criticism.contradictions import MissedTrial, SevereTest
 from sbi_active.criticism.report.summary import sentences
 from sbi_active.criticism.report.words import with_error
 from sbi_active.criticism.under_misfit import Misfit, ModelError, Support
@@ -63,81 +63,12 @@ def test_many_held_out_trials_are_counted_in_the_line_and_named_below():
         assert any(f"held-out trial {i} is far" in w for w in made.warnings)
 
 
-def test_the_paragraph_is_four_sentences():
-    missing, errors, left, following = sentences(report())
-    assert missing == (
-        "The bare model misses the 8 trials: it lacks drag (a force against the "
-        "speed); not excluded: tilt (P = 0.12)."
-    )
-    rmse = report().before_after.set_index("metric").loc["rmse"]
-    before, after, ratio = (f"{rmse[n]:.3g}" for n in ("before", "after", "ratio"))
-    low, high = (f"{end:.3g}" for end in rmse["interval"])
-    assert f"goes from {before} to {after} (ratio {ratio}, 90 % interval" in errors
-    assert f"{low} to {high})." in errors
-    assert left.startswith("What drag leaves has a root mean square of ")
-    worst = report().residuals_by_trial.iloc[0]
-    assert f"trial {worst['trial']} has most, {worst['deviations']:.3g}" in left
-    assert following == "Measure next at speed = 3 m/s, to tell drag and tilt apart."
-    whole = " ".join(str(report()).split("\n\n")[0].split())
-    assert whole.endswith(" ".join([missing, errors, left, following]))
-
-
-@pytest.mark.parametrize(
-    ("verdict", "missing", "advice"),
-    [
-        ("none", "The bare model explains the 8 trials.", "Nothing asks for another"),
-        ("unexplained", "no declared effect explains", "declare what else may be"),
-        ("scatter", "scatter more than the declared noise", "an action again"),
-        ("outlier", "one trial does not agree", "Check and repeat one trial"),
-    ],
-)
-def test_the_sentences_of_what_names_no_effect(verdict, missing, advice):
-    plan = replace(report().next_action, action=None)
-    made = report(tracing=tracing(verdict), evaluation=None, next_action=plan)
-    first, errors, _, following = sentences(made)
-    assert missing in first
-    assert errors == "No trial was scored."
-    assert advice in following
-    assert "P holds among" not in flat(made)
-    assert "stop" not in flat(made).lower() or verdict == "none"
-
-
-def test_without_a_plan_nothing_is_said_of_further_trials():
-    made = report(tracing=tracing("none"), evaluation=None, next_action=None)
-    assert sentences(made)[3] == "No trial was planned."
-
-
 def test_a_dictionary_has_no_probabilities_where_they_contradict_the_verdict():
     plain = report().to_dict()
     assert plain["probabilities"] == pytest.approx(report().probabilities)
     assert plain["misfit"] is None
     withdrawn = report(tracing=tracing("unexplained", instead_of="drag")).to_dict()
     assert withdrawn["probabilities"] is withdrawn["credible_set"] is None
-
-
-@pytest.mark.parametrize(
-    ("verdict", "changes", "said"),
-    [
-        (
-            "outlier",
-            {"instead_of": "drag", "outliers": {3.0: 0.95}, "needed": (3.0,)},
-            "trial 3 does not agree with the others; drag is not named",
-        ),
-        (
-            "drag",
-            {"stand_in": ("its form is free",)},
-            "drag (a force against the speed) stands in for something undeclared",
-        ),
-        (
-            "drag",
-            {"bounds": Bounds(p_value=0.5)},
-            "it lacks drag (a force against the speed); but no permitted action tells",
-        ),
-    ],
-)
-def test_the_first_sentence_says_what_limits_the_verdict(verdict, changes, said):
-    made = report(tracing=tracing(verdict, **changes))
-    assert said in sentences(made)[0]
 
 
 @pytest.mark.parametrize(
