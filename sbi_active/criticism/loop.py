@@ -49,7 +49,8 @@ def close_loop(  # noqa: D417  (the rest are those of Criticism)
 
     With ``real_system`` trials are run until they settle the verdict: each is chosen
     among ``actions`` to put the verdict to the test most, and predicted before it is
-    run. ``report.tested`` has them, and ``report.stopped`` why it ended.
+    run. ``report.tested`` has them, and ``report.stopped`` why it ended. The plan
+    chooses them, and is made whatever ``plan`` says.
 
     Args:
         real_system: Function that runs a trial: it takes an action, shape

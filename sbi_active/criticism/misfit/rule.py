@@ -60,13 +60,11 @@ class Scored:
             of what is expected of it, (f,): trials to which a fit can but extrapolate
             tell little of a model.
         fitted: Mean squared residual of the fit, in sensor variances.
-        at_bounds: Parameters of the simulator that are at a bound.
     """
 
     log_p: float
     square: Array
     fitted: float
-    at_bounds: int = 0
 
     @property
     def error(self) -> float:

@@ -143,7 +143,7 @@ class Misfit:
         def score(c: Candidate) -> Scored:
             posterior = errors.posterior(c.model, c.grams, use)
             log_p = c.log_prior + posterior.log_process
-            return scored(self.search, c, log_p, standard(c))
+            return Scored(log_p, standard(c), c.model.rms**2)
 
         return settled(self.search, score, self.equivalent, self.rule).key
 
@@ -177,7 +177,7 @@ class Misfit:
             def score(c: Candidate, factor: float = factor) -> Scored:
                 posterior = errors.posterior(c.model, c.grams, factor=factor)
                 log_p = c.log_prior + posterior.log_process
-                return scored(self.search, c, log_p, self.standard(c))
+                return Scored(log_p, self.standard(c), c.model.rms**2)
 
             again = settled(self.search, score, self.equivalent, self.rule)
             if again.key != self.choice.key:
@@ -211,21 +211,6 @@ def standard_errors(
         return known[key]
 
     return standard
-
-
-def scored(search: Search, c: Candidate, log_p: float, square: Array) -> Scored:
-    """Return the scores of a model that the rule uses.
-
-    Args:
-        search: Search that has fitted it.
-        c: The model.
-        log_p: Unnormalized log posterior probability.
-        square: Mean squared errors on left-out parts, (f,).
-    """
-    model = c.model
-    of_all = search.columns(model.key, ModelKey()) & (model.trial_of < 0)
-    at_bounds = (model.u <= model.low) | (model.u >= model.high)
-    return Scored(log_p, square, model.rms**2, int(at_bounds[of_all].sum()))
 
 
 def find_misfit(
@@ -268,7 +253,7 @@ def find_misfit(
     standard = standard_errors(search)
 
     def score(c: Candidate) -> Scored:
-        return scored(search, c, c.log_p, standard(c))
+        return Scored(c.log_p, standard(c), c.model.rms**2)
 
     timed = rivals.measurements.is_sequence
     guessed = None if timed else partial(gained_by_guesses, search)
