@@ -11,6 +11,7 @@ from sbi_active.criticism.effects.effect import Context, Effect
 from sbi_active.criticism.effects.first_samples import start_from_first_samples
 from sbi_active.criticism.effects.generic import generic_effects
 from sbi_active.criticism.effects.joint_prior import joint_prior
+from sbi_active.criticism.effects.varying import varying_parameters
 from sbi_active.criticism.identification.identify import identify
 from sbi_active.criticism.loop import close_loop
 from sbi_active.criticism.report.report import Report
@@ -28,6 +29,7 @@ __all__ = [
     "identify",
     "joint_prior",
     "start_from_first_samples",
+    "varying_parameters",
 ]
 
 __getattr__ = former_names(
