@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -121,12 +120,14 @@ def varying_parameters(
     return effects
 
 
-def _variables(trials: Trials) -> Iterator[tuple[str, str, Any, float, float]]:
+def _variables(trials: Trials) -> Iterator[tuple[str, str, int | None, float, float]]:
     """Yield name, unit, entry of the action, middle and half range of each variable."""
     columns = [] if trials.action_is_label else [*trials.action.double().T]
     plain = [f"action {k + 1}" for k in range(len(columns))]
     labels = trials.action_labels or (["action"] if len(columns) == 1 else plain)
-    given = [*zip(labels, range(len(columns)), columns, strict=False)]
+    given: list[tuple[str, int | None, Tensor]] = [
+        *zip(labels, range(len(columns)), columns, strict=False)
+    ]
     if trials.order != "unknown":
         given.append(("trial", None, trials.index.double()))
     for label, entry, column in given:

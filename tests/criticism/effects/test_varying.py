@@ -3,6 +3,7 @@
 import pytest
 import torch
 from sbi.utils import BoxUniform
+
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Trials, close_loop, varying_parameters
 
