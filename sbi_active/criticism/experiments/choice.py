@@ -8,16 +8,18 @@ from itertools import takewhile
 
 import numpy as np
 import torch
+from scipy import stats
 from scipy.spatial.distance import cdist
-from scipy.stats import binom
 
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.criticism import Criticism
+from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.next_trial.candidates import following
 from sbi_active.criticism.report.predicted import Registered, TestedTrial
 from sbi_active.criticism.report.report import Report
 from sbi_active.criticism.results import NONE, UNEXPLAINED, Array
-from sbi_active.criticism.steps.predictive import predict
+from sbi_active.criticism.steps.predictive import Prediction, predict
+from sbi_active.criticism.under_misfit import Misfit
 from sbi_active.seeding import derive_seed
 
 #: Probability with which an outcome lies within the registered interval.
@@ -138,7 +140,7 @@ def failures(report: Report, tested: Sequence[TestedTrial]) -> list[str]:
     own = [t for t in tested if t.registered.verdict == report.verdict]
     own = [t for t in own if t.is_measured]
     failed = [f"{t.registered.index:g}" for t in own if not t.held]
-    if binom.sf(len(failed) - 1, len(own), 1 - COVERAGE) >= SURPRISING:
+    if stats.binom.sf(len(failed) - 1, len(own), 1 - COVERAGE) >= SURPRISING:
         return []
     told = f"SA531 {report.verdict} did not predict trials {', '.join(failed)}"
     return [f"{told} of {len(own)} that tested it, and is the verdict still"]
@@ -184,8 +186,13 @@ def register(
         scored=False,
     )
     mean, sd = prediction.moments()
-    z = (prediction.x - mean) / sd
-    distance = np.sqrt((z**2).mean(1))
+    distance = np.sqrt((((prediction.x - mean) / sd) ** 2).mean(1))
+    limit = float(np.quantile(distance, COVERAGE))
+    if report.tracing.misfit is not None:
+        mean = prediction.middle
+        sd, limit = _by_left_out(
+            *(rivals, report.tracing.misfit, report.tracing.model, prediction)
+        )
     return Registered(
         index=index,
         action=choice.action,
@@ -194,8 +201,42 @@ def register(
         mean=mean,
         sd=sd,
         position=prediction.position,
-        limit=float(np.quantile(distance, COVERAGE)),
+        limit=limit,
     )
+
+
+def _by_left_out(
+    rivals: RivalSet, misfit: Misfit, name: str, prediction: Prediction
+) -> tuple[Array, float]:
+    r"""Return deviations (N,) and a limit by what left-out trials were missed by.
+
+    The logarithm of the root mean square by which a model misses a trial that it was
+    not fitted to is taken as normal, so that of a further one lies below
+
+    .. math::
+        \bar\ell + t_{n-1, .9}\, s_\ell \sqrt{1 + 1/n}
+
+    with mean and standard deviation over the n trials, or parts of trials. Where the
+    new action is, refits differ by more, which the deviations have besides.
+
+    Args:
+        rivals: The models.
+        misfit: Errors on left-out trials, where every model misses.
+        name: Name of the model that predicts.
+        prediction: Its prediction of one trial.
+
+    References:
+        Barber et al., Annals of Statistics 49 (2021), on intervals by left-out errors.
+    """
+    own, m = misfit.of(name), rivals.measurements
+    size = 0.5 * np.log(own.parts)
+    num, spread = len(size), float(size.std(ddof=1))
+    channel = np.zeros(int(np.prod(m.shape[1:])), dtype=np.int64)
+    channel[m.position % len(channel)] = m.channel
+    typical = np.exp(size.mean()) / np.sqrt(np.mean(own.parts))
+    sd = typical * own.left_out[channel[prediction.position]]
+    limit = stats.t.ppf(COVERAGE, num - 1) * spread * np.sqrt(1 + 1 / num)
+    return np.sqrt(sd**2 + prediction.mean.var(0)), float(np.exp(limit))
 
 
 def probability_of(report: Report) -> float:

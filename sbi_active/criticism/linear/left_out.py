@@ -46,6 +46,11 @@ class LeftOut:
     fit: Array
 
     @property
+    def num_parts(self) -> int:
+        """Number of parts that count."""
+        return int(np.isfinite(self.square).sum())
+
+    @property
     def mean_square(self) -> float:
         """Over the parts that count, in sensor variances."""
         return float(np.nanmean(self.square))

@@ -67,7 +67,7 @@ def covariance(
     jackknife, apart = left.jackknife(), model.u - mean
     within = np.maximum(np.diag(cov), np.diag(jackknife)) + apart**2
     between = np.broadcast_to(between, apart.shape)
-    variance = _few(int(np.isfinite(left.square).sum())) ** 2 * within + between
+    variance = _few(left.num_parts) ** 2 * within + between
     # Parameters move together as in any of the three, whose sum is hardly wider.
     total = cov + jackknife + np.outer(apart, apart) + np.diag(between)
     sd = np.minimum(np.sqrt(variance), model.widened(WIDTHS[-1]))  # that of the prior

@@ -52,48 +52,44 @@ NUM_LOUDER = 200
 
 
 def is_linear(search: Search) -> bool:
-    """Return whether linear models follow the simulator, or have to.
+    """Return whether linear models tell the simulator's apart, or have to.
 
-    They follow no jumps, and without a time axis neither which trials have an outcome
-    nor a bend. Samples of trajectories of a large library would take too long.
+    They follow no jumps, and without a time axis not which trials have an outcome.
+    Samples of trajectories of a large library would take too long. Where models bend,
+    evidence about their best fits is that of samples to some tenths of a nat.
     """
     rivals = search.rivals
     jumps = not rivals.is_smooth or bool(rivals.roughness.any())
     if rivals.measurements.is_sequence:
         return is_large(rivals.library) or not jumps
-    return not (rivals.can_fail or jumps or bends(search))
+    return not (rivals.can_fail or jumps)
 
 
-def bends(search: Search, *, num: int = 16, most: float = 0.5) -> bool:
+def bends(search: Search, key: ModelKey, *, num: int = 16, most: float = 0.5) -> bool:
     """Return whether the simulator leaves a linear model where its posterior lies.
 
-    Linear evidence is then another number than the simulator's.
+    A normal posterior is then another one than the simulator's.
 
     Args:
-        search: Search, whose single effects are fitted.
-        num: Number of posterior draws of each that are simulated.
+        search: Search that has fitted the model.
+        key: Key of the model.
+        num: Number of posterior draws that are simulated.
         most: Standard deviation over the draws of the log density ratio of simulator
-            and linear model up to which a model counts as linear, nats. With twice as
-            much the evidence may be off by a nat; with half, more models are sampled.
+            and linear model up to which a model counts as linear, nats. With half, more
+            models are sampled.
     """
-    search.fit_singles()
-    rng = np.random.default_rng(derive_seed(search.rivals.seed, "bends"))
-    for key, c in search.found.items():
-        m = c.model
-        if len(key.effects) > 1:
-            continue
-        use = np.ones(search.errors.num_folds, bool)
-        own = search.errors.posterior(m, c.grams, use, process=False)
-        values, vectors = eigh(own.cov)
-        spread = vectors * np.sqrt(np.maximum(values, 0))
-        u = own.mean + rng.standard_normal((num, len(m.u))) @ spread.T
-        u = np.clip(u, m.low, m.high)
-        residual = search.rivals.rival(key).residual(u)[0]
-        linear = search.unit * (m.residual + (u - m.u) @ m.jacobian.T)
-        log_p = search.sensor.noise.log_likelihood
-        if not (log_p(residual) - log_p(linear)).std() < most:  # NaN: not simulated
-            return True
-    return False
+    c = search.found[key]
+    m, rng = c.model, np.random.default_rng(derive_seed(search.rivals.seed, "bends"))
+    use = np.ones(search.errors.num_folds, bool)
+    own = search.errors.posterior(m, c.grams, use, process=False)
+    values, vectors = eigh(own.cov)
+    spread = vectors * np.sqrt(np.maximum(values, 0))
+    u = own.mean + rng.standard_normal((num, len(m.u))) @ spread.T
+    u = np.clip(u, m.low, m.high)
+    residual = search.rivals.rival(key).residual(u)[0]
+    linear = search.unit * (m.residual + (u - m.u) @ m.jacobian.T)
+    log_p = search.sensor.noise.log_likelihood
+    return not (log_p(residual) - log_p(linear)).std() < most  # NaN: not simulated
 
 
 @dataclass
@@ -283,13 +279,28 @@ class LinearEvidence:
         return self.log_evidence(ModelKey(key.effects, UNEXPLAINED))
 
     def record(self, key: ModelKey) -> Evidence:
-        """Return the record of a model, and keep its draws."""
+        """Return the record of a model, and keep its draws.
+
+        The bare model and those that are likely have samples of the simulator's own
+        posterior where they bend.
+        """
         own, model = self._mixture(key), self.search.model(self._predicting(key))
+        if key not in self.rivals.fits and self._is_sampled(key):
+            found = self.rivals.fit(key).evidence
+            return replace(found, log_evidence=own.log_evidence)
         given = self.rivals, key, model, own.mean, own.cov, own.log_evidence
         if not self._louder(key):
             return keep_draws(*given, unit=self.search.unit)
         phi, square = self._louder_draws(key)[0], self._chi_square(key)[0]
         return keep_draws(*given, louder=phi, chi_square=square)
+
+    def _is_sampled(self, key: ModelKey) -> bool:
+        if self.rivals.measurements.is_sequence or key not in self.search.found:
+            return False
+        likely = max(mixture.log_evidence for mixture in self._summed.values())
+        if key.effects and self.log_evidence(key) < likely - THRESHOLD:
+            return False
+        return bends(self.search, key)
 
     def outliers(self) -> dict[float, float]:
         """Return the probability that each trial is the one with a gross error."""

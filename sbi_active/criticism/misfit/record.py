@@ -148,10 +148,14 @@ def with_intervals(tracing: Tracing, misfit: Misfit) -> Tracing:
 def _record(misfit: Misfit, key: ModelKey) -> Evidence:
     """Return a model's record, and keep its draws as its posterior sample."""
     model, log_z = misfit.model(key), misfit.search.found[key].posterior.log_process
-    cov = misfit.covariance(key)
     # Draws as wide as misfit asks leave the valleys of what bends: left-out trials are
     # predicted from the best fit, and so are others.
-    return keep_draws(misfit.rivals, key, model, model.u, cov, log_z, best=model.u)
+    return keep_draws(
+        *(misfit.rivals, key, model, model.u),
+        *(misfit.covariance(key, between=False), log_z),
+        best=model.u,
+        shown=misfit.covariance(key),
+    )
 
 
 def keep_draws(
@@ -163,6 +167,7 @@ def keep_draws(
     log_z: float,
     *,
     best: Array | None = None,
+    shown: Array | None = None,
     louder: Array | None = None,
     chi_square: float | None = None,
     unit: Array | None = None,
@@ -178,6 +183,8 @@ def keep_draws(
         log_z: Log evidence of the model, nats.
         best: Point from which other trials are predicted, shape (d,); None takes the
             draws.
+        shown: Covariance of the draws that intervals are of, shape (d, d); None takes
+            that of those which predict.
         louder: Draws of effects on the noise, natural values, shape (n, k).
         chi_square: Chi-square with these effects; None takes the fitted model's.
         unit: Unit of the model's residuals, shape (N,), where draws are to be weighed
@@ -204,6 +211,8 @@ def keep_draws(
         method="linear",
     )
     own = sum(rival.coordinates.joint.sizes)
+    if shown is not None:
+        u = _drawn(rivals, model, center, shown)
     evidence = Evidence(
         key=key,
         log_evidence=log_z,

@@ -78,8 +78,14 @@ class Misfit:
         found = self.search.found[key]
         return self.search.errors.posterior(found.model, found.grams, use)
 
-    def covariance(self, key: ModelKey) -> Array:
-        """Return the covariance of a model's coordinates about its best fit."""
+    def covariance(self, key: ModelKey, *, between: bool = True) -> Array:
+        """Return the covariance of a model's coordinates about its best fit, (d, d).
+
+        Args:
+            key: Key of the model.
+            between: Whether to add by what coordinates differ from model to model:
+                intervals have that, and predictions of one model do not.
+        """
         found = self.search.found[key]
         action = self.rivals.trials.action.numpy()
         action = action[np.unique(self.rivals.measurements.trial)]
@@ -89,7 +95,7 @@ class Misfit:
             found.left,
             self.search.errors,
             action,
-            between=self._between(key),
+            between=self._between(key) if between else 0.0,
         )
 
     def replaces(self, verdict: str) -> bool:

@@ -169,35 +169,22 @@ def test_what_is_asked_first_does_not_matter(hidden):
     assert str(one.report(evaluate=False)) == str(report)
 
 
-def curved(*names):
-    """A loop on a curve whose actions are off, beside some declared effects."""
-    action = torch.linspace(-1, 3, 8, dtype=torch.float64)[:, None]
+def test_likely_models_that_bend_have_samples_of_their_posterior():
+    """Of two gains in a row trials tell the product, on a hyperbola."""
     model = SimulatorModel(
-        lambda theta, a: theta * torch.exp(3 - a), noise=GaussianNoise(1.0)
+        lambda theta, a: theta.prod(1, keepdim=True) * a, noise=GaussianNoise(0.5)
     )
-    every = {
-        "offset": ("action", lambda a, phi, action, context: a + phi),
-        "bias": ("observation", lambda x, phi, action, context: x + phi),
-    }
-    effects = [
-        Effect(name, hook=hook, prior=Normal(0.0, 1.0), null=0.0, apply=apply)
-        for name, (hook, apply) in every.items()
-        if name in names
-    ]
-    rng = np.random.default_rng(4)
-    x = 2 * torch.exp(3 - action) + 2 + torch.as_tensor(rng.standard_normal((8, 1)))
-    prior = BoxUniform(torch.zeros(1), 5 * torch.ones(1))
-    return Criticism(model, prior, Trials(action, x), effects=effects, seed=0)
-
-
-@pytest.mark.parametrize(
-    ("names", "engines"),
-    [(("bias",), {"linear"}), (("bias", "offset"), {"importance", "laplace"})],
-)
-def test_models_that_bend_where_their_posterior_lies_are_sampled(names, engines):
-    tracing = curved(*names).trace()
+    action = torch.linspace(-1, 3, 8, dtype=torch.float64)[:, None]
+    error = torch.as_tensor(np.random.default_rng(4).standard_normal((8, 1)))
+    trials = Trials(action, 4 * action + 2 + 0.5 * error)
+    prior = BoxUniform(torch.zeros(2), 5 * torch.ones(2))
+    tracing = Criticism(model, prior, trials, effects=[BIAS], seed=0).trace()
     assert tracing.verdict == "bias"
-    assert {e.engine for e in tracing.evidences.values()} <= engines
+    assert tracing.evidences["scatter"].engine == "linear"
+    own = tracing.evidences["bias"]
+    assert own.engine in ("importance", "smc")
+    assert own.draws[:, :2].std(0).min() > 0.5
+    assert own.draws[:, 0] * own.draws[:, 1] == pytest.approx(4.0, abs=1.0)
 
 
 def scattered(size, *effects):
