@@ -1,9 +1,9 @@
 # %% [markdown]
 # # From the first alarm to a settled verdict
 #
-# A sled brakes on a floor. Its simulator has one friction; the real one grows with speed,
-# and nobody declared that. A campaign tunes the simulator until a trial contradicts it.
-# The loop then runs trials itself until its verdict is settled.
+# A sled brakes on a floor. Its simulator has one friction; the real one grows with
+# speed, and nobody declared that. A campaign tunes the simulator until a trial
+# contradicts it. The loop then runs trials itself until its verdict is settled.
 
 # %%
 import torch

@@ -177,14 +177,10 @@ def register(
     rivals = criticism.rivals
     trial = following(rivals, torch.from_numpy(choice.action)[None])
     trial.index = torch.full_like(trial.index, index)
-    prediction = predict(
-        rivals,
-        trial,
-        key=report.tracing.key,
-        num_draws=NUM_DRAWS,
-        seed=derive_seed(rivals.seed, "registered", len(rivals.trials)),
-        scored=False,
-    )
+    seed = derive_seed(rivals.seed, "registered", len(rivals.trials))
+    options = {"num_draws": NUM_DRAWS, "seed": seed, "scored": False}
+    prediction = predict(rivals, trial, key=report.tracing.key, **options)
+    bare = predict(rivals, trial, **options)
     mean, sd = prediction.moments()
     distance = np.sqrt((((prediction.x - mean) / sd) ** 2).mean(1))
     limit = float(np.quantile(distance, COVERAGE))
@@ -202,6 +198,7 @@ def register(
         sd=sd,
         position=prediction.position,
         limit=limit,
+        bare=bare.middle,
     )
 
 

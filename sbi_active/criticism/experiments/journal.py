@@ -14,7 +14,7 @@ from sbi_active.criticism.report.predicted import Registered, TestedTrial
 
 NAME = "trials.jsonl"
 #: Fields of a prediction that are arrays.
-ARRAYS = ("action", "mean", "sd", "position")
+ARRAYS = ("action", "mean", "sd", "position", "bare")
 
 
 class Journal:

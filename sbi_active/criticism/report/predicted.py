@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.criticism.results import NONE
 from sbi_active.display.page import Section
 from sbi_active.display.table import Table
 
@@ -29,6 +30,7 @@ class Registered:
         position: Positions of these numbers in the flattened x, shape (N,).
         limit: Distance within which an outcome lies with a probability of .9, root mean
             square over x in ``sd``.
+        bare: Numbers that the bare model predicts, shape (N,), in units of x.
     """
 
     index: float
@@ -39,6 +41,7 @@ class Registered:
     sd: Array
     position: Array
     limit: float
+    bare: Array
 
     def distance(self, x: Array) -> float:
         """Return the distance of an outcome; NaN if nothing was measured.
@@ -90,13 +93,24 @@ class TestedTrial:
             half = own.limit * own.sd[0]
             low, high = own.mean[0] - half, own.mean[0] + half
             told = f"{x[0]:.4g}" if self.is_measured else "nothing"
-            return f"{low:.4g} to {high:.4g}", told
+            return f"{low:.4g} to {high:.4g}", told + self._beside_bare()
         half = own.limit * float(np.sqrt(np.mean(own.sd**2)))
         predicted = f"within {half:.3g} of its course"
         if not self.is_measured:
             return predicted, "nothing"
-        size = float(np.sqrt(np.nanmean((x - own.mean) ** 2)))
-        return predicted, f"{size:.3g} off"
+        return predicted, f"{self._off(own.mean):.3g} off" + self._beside_bare()
+
+    def _off(self, predicted: Array) -> float:
+        """Return the root mean square by which a prediction missed, units of x."""
+        x = np.ravel(self.x)[self.registered.position]
+        return float(np.sqrt(np.nanmean((x - predicted) ** 2)))
+
+    def _beside_bare(self) -> str:
+        """Return by how much the bare model missed, where the verdict is another."""
+        own = self.registered
+        if own.verdict == NONE or not self.is_measured:
+            return ""
+        return f" (bare model: {self._off(own.bare):.3g} off)"
 
 
 def predicted_section(

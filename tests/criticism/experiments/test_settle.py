@@ -128,6 +128,47 @@ def test_a_registered_prediction_is_that_of_linear_least_squares():
     assert own.mean[0] == pytest.approx(float(mean), abs=4 * sd / 400**0.5)
     assert own.sd[0] == pytest.approx(sd, rel=4 / 800**0.5)
     assert own.limit == pytest.approx(1.645, abs=0.3)  # 4 errors of a quantile of 400
+    alone = FORWARD.double()
+    bare = float(own.action[0]) * float((alone * trials.x).sum() / (alone**2).sum())
+    assert own.bare[0] == pytest.approx(bare, abs=0.02)
+
+
+TIMES = torch.linspace(0.1, 3.0, 30)
+WAVE = SimulatorModel(
+    lambda theta, xi: xi * torch.sin(theta * TIMES),
+    noise=GaussianNoise(0.01),
+    sample_times=TIMES,
+)
+
+
+def wandering(num, seed):
+    """Return trials of a wave beside a process that nobody declared, and a further."""
+    gen = torch.Generator().manual_seed(seed)
+    action = torch.linspace(-1, 1, num)[:, None] + 2.0
+    phase = 6.28 * torch.rand((num, 1), generator=gen, dtype=torch.float64)
+    x = action * torch.sin(1.5 * TIMES) + 0.1 * torch.sin(2 * TIMES + phase)
+    return action, x + 0.01 * torch.randn(x.shape, generator=gen)
+
+
+def test_predictions_where_every_model_misses_are_as_wide_as_left_out_errors():
+    held, sizes = [], []
+    for seed in range(8):
+        action, x = wandering(9, seed)
+        prior = BoxUniform(torch.tensor([0.5]), torch.tensor([2.5]))
+        report = close_loop(
+            *(WAVE, prior, Trials(action[:8], x[:8], sample_times=TIMES)),
+            actions=DiscreteActions(action[8:]),
+            real_system=lambda action, x=x: x[8],
+            max_trials=1,
+            evaluate=False,
+        )
+        (trial,) = report.tested
+        assert report.tracing.misfit is not None
+        held.append(trial.held)
+        sizes.append(trial.registered.limit * trial.registered.sd.mean())
+    # The process has a root mean square of .07; t of 8 trials widens its 90 % limit.
+    assert sum(held) >= 5
+    assert 0.07 < sum(sizes) / len(sizes) < 0.2
 
 
 def comparing(fails_at=()):
