@@ -16,16 +16,15 @@ from sbi_active.criticism import (
     Trials,
     close_loop,
 )
-from sbi_active.criticism.evidence import RivalSet
+from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.rivals import (
+from sbi_active.criticism.rivals.trial_simulator import NUM_REPLICATES, TrialSimulator
+from sbi_active.criticism.rivals.validity import (
     DISAGREEMENT,
-    NUM_REPLICATES,
     UNKNOWN_RATES,
-    TrialSimulator,
     log_outcomes,
 )
-from sbi_active.criticism.steps import predict
+from sbi_active.criticism.steps.predictive import predict
 
 PRIOR = Independent(Normal(torch.zeros(2), torch.tensor([2.0, 1.0])), 1)
 NOISE = 0.5

@@ -12,10 +12,15 @@ from torch.distributions import Independent, Normal
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, StudentTNoise
 from sbi_active.criticism import Criticism, Effect, Trials, close_loop
 from sbi_active.criticism.data import Measurements
-from sbi_active.criticism.evidence import OneOutlier, RivalSet
+from sbi_active.criticism.evidence.outliers import OneOutlier
+from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.report.summary import suspects, verdict_line
-from sbi_active.criticism.rivals import NoiseCell, NoiseGrid
-from sbi_active.criticism.steps import is_left_to_chance, unless_refuted, withdrawn
+from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
+from sbi_active.criticism.steps.influence import (
+    is_left_to_chance,
+    unless_refuted,
+    withdrawn,
+)
 from tests.criticism.report.reports import evaluation, flat, report, tracing
 
 PRIOR = BoxUniform(-5 * torch.ones(2), 5 * torch.ones(2))

@@ -3,8 +3,3 @@
 This package contains optimizers and samplers over rivals. The conclusions from them are
 in ``steps``.
 """
-
-from sbi_active.criticism.evidence.outliers import OneOutlier
-from sbi_active.criticism.evidence.rival_set import RivalSet
-
-__all__ = ["OneOutlier", "RivalSet"]

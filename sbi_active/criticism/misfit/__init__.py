@@ -4,7 +4,3 @@ This package contains linearized models, the errors that all of them share, and 
 that selects helpful effects and names causes. The samplers of a posterior are in
 ``evidence``.
 """
-
-from sbi_active.criticism.misfit.verdict import find_misfit
-
-__all__ = ["find_misfit"]

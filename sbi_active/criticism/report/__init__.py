@@ -3,7 +3,3 @@
 This package contains the texts and figures of finished results. It does not simulate or
 fit.
 """
-
-from sbi_active.criticism.report.report import build_report
-
-__all__ = ["build_report"]

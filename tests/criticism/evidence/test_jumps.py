@@ -7,13 +7,13 @@ from torch.distributions import Independent, Normal
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Trials
-from sbi_active.criticism.evidence import RivalSet
 from sbi_active.criticism.evidence.jumps import (
     _beside_quadratic,
     look_for_jumps,
     probe_step,
     quadratic,
 )
+from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import ModelKey
 from tests.criticism.evidence.linear import linear_rival
 

@@ -8,8 +8,8 @@ from torch.distributions import Independent, Normal
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import AugmentedSimulator, Effect, Trials
-from sbi_active.criticism.evidence import RivalSet
-from sbi_active.criticism.rivals import TrialSimulator
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 
 NOISE, JUMP = 0.1, 0.2
 PRIOR = BoxUniform(-2 * torch.ones(2), 2 * torch.ones(2))

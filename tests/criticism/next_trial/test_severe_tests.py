@@ -11,7 +11,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.criticism import Criticism, Effect, Trials, generic_effects
 from sbi_active.criticism.next_trial.candidates import extrapolated
 from sbi_active.criticism.next_trial.severe_tests import severe_tests
-from sbi_active.criticism.steps import predict
+from sbi_active.criticism.steps.predictive import predict
 
 NOISE = 0.01
 ANGLES = DiscreteActions(

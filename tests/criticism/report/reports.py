@@ -10,7 +10,7 @@ from torch.distributions import Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials
-from sbi_active.criticism.report import build_report
+from sbi_active.criticism.report.report import build_report
 from sbi_active.criticism.results import (
     Detection,
     Estimate,
@@ -21,7 +21,7 @@ from sbi_active.criticism.results import (
     Residuals,
     Tracing,
 )
-from sbi_active.criticism.steps import LeaveOneOut
+from sbi_active.criticism.steps.leave_one_out import LeaveOneOut
 
 DRAG = Effect(
     "drag",

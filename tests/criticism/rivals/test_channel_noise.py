@@ -11,8 +11,8 @@ from scipy.stats import multivariate_normal, norm
 from sbi_active import AutocorrelatedNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials, close_loop
 from sbi_active.criticism.data import Measurements
-from sbi_active.criticism.rivals import declared_noise
 from sbi_active.criticism.rivals.channel_noise import ChannelNoise
+from sbi_active.criticism.rivals.noise_grid import declared_noise
 from sbi_active.criticism.steps.predictive import _log_density
 
 TIMES = np.array([0.0, 0.1, 0.3, 0.6])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sbi_active.criticism import Trials
-from sbi_active.criticism.evidence import RivalSet
+from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.combinations import grow, log_prior

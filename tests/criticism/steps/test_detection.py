@@ -12,8 +12,7 @@ from torch.distributions import Normal
 from sbi_active import GaussianNoise, SimulatorModel, StudentTNoise
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.steps import LEVEL, num_determined
-from sbi_active.criticism.steps.detection import is_found_again
+from sbi_active.criticism.steps.detection import LEVEL, is_found_again, num_determined
 from sbi_active.simulation import estimate_noise
 
 NOISE = 0.1

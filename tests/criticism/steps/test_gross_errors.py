@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sbi_active.criticism import Trials
-from sbi_active.criticism.evidence import RivalSet
+from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.steps.sampled import Sampled
 from tests.criticism.steps.linear_world import ACTION, NOISE, PRIOR, measured, rivals
 
