@@ -74,9 +74,14 @@ class Search:
         self._rivals: dict[ModelKey, Rival] = {}
         self._library: Library | None = None
         self._process: ResidualProcess | None = None
-        self._has_larger = False
+        self._looked_again = False
         self._seed = derive_seed(self.rivals.seed, "misfit")
-        bare = self._fit_bare()
+        self._begin(self._fit_bare())
+
+    def _begin(self, bare: LinearModel) -> None:
+        """Keep a fit of the bare model, from which all others begin."""
+        self.found.clear()
+        self._library, self._has_larger = None, False
         self.errors = Errors(
             self.rivals.measurements,
             self.unit,
@@ -86,6 +91,30 @@ class Search:
             varying=bare.jacobian[:, bare.trial_of < 0],
         )
         self.keep(bare)
+
+    def look_again(self) -> bool:
+        """Search the bare model from many more starts; return whether it fits better.
+
+        A mode that the first search missed would be a false alarm. All models are then
+        fitted again from it. It is done once.
+        """
+        if self._looked_again:
+            return False
+        self._looked_again = True
+        key, settings = ModelKey(), self.settings
+        found = self.rivals.found[key] = self.rivals.search(key)
+        own = self._rival(key)
+        best = min(
+            (self._polished(own, u) for u in found.modes[: settings.num_kept]),
+            key=lambda fit: fit.rms,
+        )
+        before = self.found[key].model
+        fall = len(before.residual) * (before.rms**2 - best.rms**2)
+        if fall < settings.worth * max(best.rms, 1.0) ** 2:
+            return False
+        self._begin(best)
+        self.fit_singles()
+        return True
 
     @property
     def unit(self) -> Array:

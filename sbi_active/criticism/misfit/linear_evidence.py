@@ -109,6 +109,8 @@ class LinearEvidence:
 
     def __post_init__(self) -> None:
         self.search.fit_singles()
+        if self.detected().alarm and self.search.look_again():
+            self._summed.clear()
         self.record(ModelKey())  # what is asked first does not matter
         if self.detected().alarm:
             self.search.fit_larger()

@@ -249,6 +249,8 @@ def find_misfit(
     search.fit_singles()
     if not is_known and not _misses(search):
         return None
+    if search.look_again() and not is_known and not _misses(search):
+        return None
     search.fit_larger()
     if not is_known:
         if is_large(rivals.library) and not _misses(search):
