@@ -67,10 +67,7 @@ def kept():
 
 @pytest.mark.parametrize(
     ("method", "simulator"),
-    [
-        *[("asbi", by_numpy), ("alhi", MODEL)],
-        *[pytest.param(m, noisy, marks=pytest.mark.slow) for m in ("nlhi", "seqbed")],
-    ],
+    [("asbi", by_numpy), ("alhi", MODEL)],
 )
 def test_a_campaign(kept, method, simulator):
     c = kept("Campaign", lambda: campaign(method, simulator, network="each round"))

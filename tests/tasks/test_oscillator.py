@@ -148,20 +148,6 @@ def test_no_trials_give_the_prior():
     assert prior.log_evidence == 0
 
 
-@pytest.mark.parametrize(
-    ("action", "x", "message"),
-    [
-        ([[1.0]], [[0.0] * 6], r"action of shape \(n, 2\); got \(1, 1\)"),
-        ([[1.0, 2.0]], [[0.0] * 5], r"x of shape \(n, 6\); got \(1, 5\)"),
-        ([[1.0, 2.0]] * 2, [[0.0] * 6], "one x per action; got 2 actions and 1 x"),
-        ([[1.0, 2.0]], [[math.nan] * 6], "finite x"),
-    ],
-)
-def test_reference_rejects_wrong_trials(action, x, message):
-    with pytest.raises(ValueError, match=message):
-        OscillatorReference(action, x)
-
-
 # ------------------------------------------------------- the information gain
 
 

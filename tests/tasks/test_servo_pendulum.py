@@ -5,8 +5,6 @@ import pandas as pd
 import pytest
 import torch
 
-from sbi_active.criticism import Criticism
-from sbi_active.simulation import AutocorrelatedNoise
 from sbi_active.tasks import get_task  # pyright: ignore
 from sbi_active.tasks.servo_pendulum import (  # pyright: ignore
     Recordings,
@@ -102,11 +100,6 @@ def test_effects_vanish_at_zero(task):
         assert np.abs(every_trial(task, **{keyword: 0.05}) - bare).max() > 0.01
 
 
-def test_an_action_that_was_not_recorded(task):
-    with pytest.raises(ValueError, match=r"expected the action of a recorded.*300"):
-        task.angles(THETA, torch.tensor([[300.0, 0.0]]))
-
-
 def test_the_real_system_replays(task):
     assert torch.equal(task.real_system(task.actions.values[1]), torch.zeros(30))
     other = task.with_truth([0.45, 5.0, 0.0045, 0.0015, -0.02])
@@ -160,72 +153,7 @@ def test_reading_interpolates_and_finds_when_the_motor_is_off(folder):
     ]
 
 
-def edited(folder, name, change):
-    table = pd.read_csv(folder / name)
-    change(table).to_csv(folder / name, index=False)
-    return folder
-
-
-@pytest.mark.parametrize(
-    ("name", "change", "message"),
-    [
-        ("samples.csv", lambda t: t.drop(columns="goal_rad"), "got no goal_rad among"),
-        ("trials.csv", lambda t: pd.concat([t, t]), "got trial 0 more than once"),
-        ("samples.csv", lambda t: t[t["trial"] == 0], "got none of trial 1"),
-        ("samples.csv", lambda t: t[t["time_s"] < 5], "got 4.999 s in trial 0"),
-        ("samples.csv", lambda t: t[::-1], "time_s that increases; got"),
-        (
-            "samples.csv",
-            lambda t: t.assign(position_rad=t["position_rad"].where(t.index != 3)),
-            "finite position_rad; got nan in sample 3 of trial 0",
-        ),
-    ],
-)
-def test_recordings_that_do_not_fit(folder, name, change, message):
-    with pytest.raises(ValueError, match=message):
-        read_recordings(edited(folder, name, change))
-
-
 # The closed loop
-
-
-def judged(friction, *, seed):
-    """The verdict on simulated trials with errors of .03 rad, correlated over .3 s."""
-    trials = [
-        (kp, name, 0.0)
-        for kp in (100.0, 800.0)
-        for name in ("sin_time_square", "lift_and_drop")
-    ]
-    quiet = ServoPendulumTask(data=recordings(*trials))
-    r = quiet.recordings
-    mean = torch.from_numpy(every_trial(quiet, **friction))
-    noise = AutocorrelatedNoise(0.03, 0.3)
-    seeds = torch.arange(len(r)) + 100 * seed
-    x = noise.sample(mean, seeds, times=torch.from_numpy(r.times))
-    found = Recordings(
-        r.kp, r.trajectory, r.goal, r.enabled, r.start, r.times, x.numpy()
-    )
-    real = ServoPendulumTask(data=found)
-    return Criticism(
-        real.simulator,
-        real.prior,
-        real.trials(range(len(r))),
-        effects=real.effects(),
-        actions=real.actions,
-    ).trace()
-
-
-@pytest.mark.slow
-def test_a_servo_without_friction_lacks_nothing():
-    assert judged({}, seed=0).verdict == "none"
-
-
-@pytest.mark.slow
-def test_coulomb_friction_is_found():
-    tracing = judged({"coulomb": 0.06}, seed=0)
-    assert tracing.verdict == "Coulomb"
-    mean, sd = tracing.estimates[0].mean[0], tracing.estimates[0].sd[0]
-    assert abs(mean - 0.06) < 4 * sd
 
 
 def test_viscous_friction_is_back_emf_until_the_motor_is_off(task):

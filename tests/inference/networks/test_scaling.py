@@ -1,67 +1,10 @@
 """Location and scale of outcomes given the action."""
 
-import math
-
 import pytest
 import torch
 
-from sbi_active.inference.networks.action_scaling import (
-    ActionScaling,
-    Polynomials,
-    exponents_of,
-)
 from sbi_active.inference.networks.baseline import Baseline, precision_factor
 from sbi_active.inference.networks.response import Response
-
-
-@pytest.mark.parametrize("shift", [0.0, -3.0], ids=["round 1", "sharp belief"])
-def test_location_and_scale_over_four_decades(shift):
-    """The true ones within five standard errors, at -9000 with spread 15 as well."""
-    torch.manual_seed(0)
-    n = 5_000
-    action = torch.randint(21, (n, 1)).double() * 0.5 - 5
-    spread = 0.005 if shift else 3.0
-    rate = torch.exp(3 - action)
-    x = (shift + spread * torch.randn(n, 1).double()) * rate + torch.randn(n, 1)
-    scaling = ActionScaling(x, action)
-    grid = torch.linspace(-5, 5, 41, dtype=torch.float64)[:, None]  # half of it unseen
-    location, scale = scaling.location_and_scale(grid)
-    rate = torch.exp(3 - grid)
-    truth = (1 + (spread * rate) ** 2).sqrt()
-    error = truth / math.sqrt(n / 41)  # each degree of freedom sees that many rows
-    assert ((location - shift * rate).abs() < 5 * error).all()
-    assert (scale / truth).log().abs().max() < 0.35
-    z = scaling(x, action)
-    assert abs(float(z.mean())) < 5 / math.sqrt(n)
-    assert float(z.std()) == pytest.approx(1.0, abs=0.1)
-
-
-@pytest.mark.parametrize(
-    ("x", "action"),
-    [
-        (torch.full((100, 1), 7.0), torch.rand(100, 1)),
-        (torch.randn(100, 1), torch.full((100, 1), 3.0)),
-        (torch.full((100, 2), 7.0), torch.full((100, 2), 3.0)),
-        (torch.randn(8, 1), torch.rand(8, 1)),
-    ],
-    ids=["constant x", "constant action", "both", "few rows"],
-)
-def test_degenerate_rows_are_scaled_to_finite_numbers(x, action):
-    z = ActionScaling(x, action)(x, action)
-    assert z.isfinite().all()
-    assert z.abs().max() < 10
-
-
-def test_derivatives_of_polynomials():
-    rows = torch.rand(50, 3, dtype=torch.float64)
-    exponents, sizes = exponents_of(rows, max_degree=4, max_terms=100)
-    assert sizes == [1, 4, 10, 20, 35]
-    polynomials = Polynomials(rows, exponents)
-    inside = (0.2 + 0.6 * rows[:5]).requires_grad_()
-    values, slopes = polynomials.with_jacobian(inside)
-    for j in range(35):
-        (slope,) = torch.autograd.grad(values[:, j].sum(), inside, retain_graph=True)
-        assert torch.allclose(slope, slopes[:, j])
 
 
 @pytest.mark.parametrize("seed", [1])
