@@ -77,6 +77,21 @@ def test_given_evaluations_are_enough():
     assert loss(found) < 0.05
 
 
+def test_each_is_the_best_of_those_that_are_far_from_better_ones():
+    generator = torch.Generator().manual_seed(0)
+    category = torch.randint(2, (60, 1), generator=generator).double()
+    point = torch.cat([torch.rand(60, 2, generator=generator).double(), category], 1)
+    score = torch.rand(60, generator=generator)
+    chosen = PLANE.spaced(point, score, 8, 0.3)
+    assert len(chosen) == 8
+    free = torch.ones(60, dtype=torch.bool)
+    for i in chosen:
+        assert i == torch.where(free, score, -1.0).argmax()
+        near = (point[:, :2] - point[i, :2]).norm(dim=1) < 0.3
+        free &= ~(near & (point[:, 2] == point[i, 2]))
+    assert len(PLANE.spaced(point, score, 60, 0.9)) < 10  # no room for more
+
+
 def test_influence_is_the_error_of_the_mean():
     """Over many data sets the mean varies as one data set says it does."""
     means, said = [], []

@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from sbi_active.inference import MixtureDensity
-from sbi_active.inference.networks.baseline import precision_factor
+from sbi_active.inference.networks.baseline import Baseline, local, precision_factor
 from sbi_active.tasks.numerical import NumericalTask
+from tests import linear_gaussian
 
 FULL = {"scaling": "action", "whiten": True, "baseline": "best"}
 SIMULATOR = {
@@ -40,6 +41,30 @@ def built(variant="linear", shake=True, n=2_000, **settings):
 
 
 # The baseline
+
+
+def gaussian_world(n=2_000, seed=0):
+    torch.manual_seed(seed)
+    theta, action = torch.randn(n, 2), 4 * torch.rand(n, 1) - 2
+    return theta, linear_gaussian.simulator(theta, action), action
+
+
+def test_the_linear_baseline_is_the_exact_posterior_of_a_linear_world():
+    theta, x, action = gaussian_world(5_000)
+    scale = x.double().std(0)
+    baseline = Baseline(theta.double(), x / scale, action.double(), kind="linear")
+    theta, x, action = gaussian_world(5_000, seed=1)
+    frames = baseline(x / scale, action.double())
+    mean, variance = linear_gaussian.moments(x, action)
+    covariance = torch.linalg.inv(frames.factor.mT @ frames.factor)[:, 0]
+    assert ((frames.mean[:, 0] - mean) / variance.sqrt()).square().mean() < 0.01
+    ratio = covariance.diagonal(dim1=1, dim2=2) / variance
+    assert ratio.log().abs().mean() < 0.06
+    # Kullback-Leibler divergence, an error of second order in both.
+    log_q = frames.log_det - 0.5 * local(theta, frames).square().sum(-1)
+    error = theta.double() - mean
+    log_p = -0.5 * (error.square() / variance + variance.log()).sum(-1, keepdim=True)
+    assert float((log_p - log_q).mean()) < 0.02
 
 
 @pytest.mark.parametrize(
