@@ -120,7 +120,7 @@ def test_a_belief_predicts_outcomes_at_actions(campaign):
     assert rows.std(0) == pytest.approx(sd, rel=5 / 4_000**0.5)
     assert data.log_likelihood.x.shape == (4, 500, 2)
     assert np.allclose(data.observed_data.x, x)
-    assert az.plot_ppc(data, random_seed=0) is not None
+    assert az.plot_ppc(data, num_pp_samples=10, random_seed=0) is not None
     bare = to_inference_data(PRIOR, simulator=model, action=action, num_samples=20)
     assert {"posterior_predictive", "constant_data"} < {*bare.groups()}
     assert not {"observed_data", "log_likelihood"} & {*bare.groups()}

@@ -121,7 +121,7 @@ def test_no_simulation_beyond_the_budget():
     options = CampaignOptions(max_simulations=160, planned_trials=2)
     c = Campaign(model, PRIOR, DiscreteActions([0.5, 1.0]), options=options)
     truth = torch.tensor([[0.6, 0.3]])
-    for _ in range(6):
+    for _ in range(3):
         if c.stop_reason:
             break
         c.run(lambda a: slide(truth, a[None])[0], num_rounds=1)

@@ -87,9 +87,9 @@ def test_mean_solves_the_equation_of_motion():
 def evidence_by_prior(
     action: Tensor, x: Tensor, noise_sd: float = NOISE_SD
 ) -> tuple[float, float]:
-    """Log evidence and standard error from a million draws of the prior."""
+    """Log evidence and standard error from half a million draws of the prior."""
     log_likelihood = []
-    for block in range(10):
+    for block in range(5):
         theta = uniform(100_000, PRIOR_LOW, PRIOR_HIGH, 50 + block)
         total = torch.zeros(len(theta), dtype=torch.float64)
         for xi, row in zip(action, x, strict=True):
@@ -193,7 +193,7 @@ def test_gain_lies_between_contrastive_bounds():
     action = ACTIONS[[2, 9, 16]].double()
     prior = OscillatorReference([], [])
     gain, error = prior.expected_information_gain(action)
-    n, m = 400, 20_000
+    n, m = 400, 6_000
     contrast = uniform(m, PRIOR_LOW, PRIOR_HIGH, 20)
     truth = uniform(n, PRIOR_LOW, PRIOR_HIGH, 21)
     noise = torch.randn(

@@ -68,8 +68,8 @@ def test_uninformed_parameters_keep_their_prior():
     )
 
 
-@pytest.mark.parametrize("seed", [138])
-def test_searches_that_agree_on_a_wrong_place_go_on(seed):
+def test_searches_that_agree_on_a_wrong_place_go_on():
+    seed = 138
     # Of these oscillations a quarter to one in sixty of the searches ends at the truth.
     task = get_task("chain", parameters=8)
     with forked_generators(seed, "truth"):

@@ -98,7 +98,7 @@ def test_groups_have_means_of_their_own_and_nan_is_left_out():
     assert sd.tolist() == pytest.approx([1.0, math.sqrt(0.5)])
 
 
-@pytest.mark.parametrize("rho", [0.5, 0.8, 0.95])
+@pytest.mark.parametrize("rho", [0.5, 0.95])
 def test_autocorrelated_noise_recovers_rho(rho):
     tau, step, sets = -0.02 / math.log(rho), 0.02, 100
     times = step * torch.arange(50).double()
