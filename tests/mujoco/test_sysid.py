@@ -224,3 +224,27 @@ def test_randomization_keeps_what_parameters_have_in_common():
         randomization(line, [95], names=["a", "b"])
     with pytest.raises(ValueError, match="names"):
         randomization(line)
+
+
+def test_bad_logs_and_parameters_are_said():
+    group = sequences()
+    group.control[1].data[4] = np.nan
+    with pytest.raises(ValueError, match="finite controls in sequence 'bare 1'"):
+        from_sysid(group, parameters())
+    group = sequences()
+    group.control[0].data[:] *= 9
+    with pytest.raises(ValueError, match="ctrlrange"):
+        from_sysid(group, parameters())
+    params = parameters()
+    for name in params.keys():  # noqa: SIM118
+        params[name].frozen = True
+    with pytest.raises(ValueError, match="not frozen"):
+        from_sysid(sequences(), params)
+    other = sequences()
+    other.sensordata[1] = sysid.TimeSeries.slice_by_name(
+        other.sensordata[1], ["position"]
+    )
+    with pytest.raises(ValueError, match="same signals in all sequences"):
+        from_sysid(other, parameters())
+    with pytest.raises(TypeError, match="expected ModelSequences"):
+        from_sysid([SPRING_MASS], parameters())

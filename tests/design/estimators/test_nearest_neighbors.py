@@ -1,8 +1,46 @@
 """The entropy by nearest neighbors, where there is a formula for it."""
 
+import math
+
+import pytest
 import torch
 
 from sbi_active.design.estimators.entropy import nearest_neighbor_entropy
+
+
+def gaussian(dim, *, num=2_000, seed=0):
+    """Return correlated normal draws and their entropy, nats."""
+    generator = torch.Generator().manual_seed(seed)
+    factor = torch.eye(dim).double() + 0.9 * torch.ones(dim, dim).double().tril(-1)
+    factor = 10.0 ** torch.arange(dim)[:, None].double() * factor
+    x = torch.randn(num, dim, generator=generator).double() @ factor.T
+    entropy = 0.5 * dim * math.log(2 * math.pi * math.e) + float(
+        factor.diagonal().log().sum()
+    )
+    return x.float().double() + 3, entropy
+
+
+@pytest.mark.parametrize(("dim", "k"), [(1, 1), (2, 4), (3, 4)])
+def test_the_entropy_of_a_gaussian_of_any_units(dim, k):
+    x, exact = gaussian(dim)
+    each = nearest_neighbor_entropy(x, k)
+    error = float(each.std()) / math.sqrt(len(x))
+    assert error < 0.05
+    assert float(each.mean()) == pytest.approx(exact, abs=4 * error)
+
+
+def test_the_spread_of_the_rows_is_the_error_of_their_mean():
+    means, errors = [], []
+    for seed in range(60):
+        x = torch.rand(
+            300, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+        )
+        each = nearest_neighbor_entropy(x, 3)
+        means.append(float(each.mean()))
+        errors.append(float(each.std()) / math.sqrt(300))
+    spread = float(torch.tensor(means).std())
+    # 60 sets know a deviation to 9 %.
+    assert spread == pytest.approx(sum(errors) / 60, rel=0.3)
 
 
 def test_outcomes_that_are_the_same_have_the_entropy_of_their_rounding():
