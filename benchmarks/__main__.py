@@ -4,7 +4,7 @@ A name is a module below ``benchmarks/``, with dots; that of a folder stands for
 ``run``. Options are the arguments of the module's ``main``, with their types, defaults
 and descriptions; where functions share them, those of a dataclass, ``main``'s only
 argument. ``Literal`` and ``Annotated[str, NAMES]`` are one of the names. Without a
-name, all are listed.
+name, all are listed. Benchmarks run on one thread, and warnings are not shown.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import re
 import sys
 import types
 import typing
+import warnings
 from collections.abc import Callable
 from dataclasses import is_dataclass
 from functools import lru_cache
@@ -143,7 +144,11 @@ def main(argv: list[str]) -> int:
     run = import_module(module).main
     given = vars(parser_of(run, name).parse_args(options))
     owner = options_of(run)
-    return (run(**given) if owner is run else run(owner(**given))) or 0
+    from sbi_active.threads import single_thread
+
+    with single_thread(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return (run(**given) if owner is run else run(owner(**given))) or 0
 
 
 if __name__ == "__main__":

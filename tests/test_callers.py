@@ -1,11 +1,8 @@
 """Warnings point at the user's line, from however deep."""
 
-import warnings
-
 import pytest
 import torch
 
-from sbi_active import callers
 from sbi_active.criticism import Trials
 from sbi_active.criticism.data.recordings import read_trials
 
@@ -27,12 +24,4 @@ def test_a_warning_of_a_table_points_at_who_read_it(read, tmp_path):
 def test_a_warning_of_an_array_points_at_who_passed_it():
     with pytest.warns(UserWarning, match="x is inf") as noted:
         Trials([1.0, 2.0], torch.tensor([1.0, torch.inf]))
-    assert noted[0].filename == __file__
-
-
-def test_outside_the_package_it_is_the_caller_itself():
-    assert callers.stack_level() == 1
-    with warnings.catch_warnings(record=True) as noted:
-        warnings.simplefilter("always")
-        warnings.warn("here", stacklevel=callers.stack_level())
     assert noted[0].filename == __file__

@@ -65,15 +65,8 @@ def kept():
     assert kept.changed == []
 
 
-@pytest.mark.parametrize(
-    ("method", "simulator"),
-    [
-        *[("asbi", by_numpy), ("alhi", MODEL)],
-        *[pytest.param(m, noisy, marks=pytest.mark.slow) for m in ("nlhi", "seqbed")],
-    ],
-)
-def test_a_campaign(kept, method, simulator):
-    c = kept("Campaign", lambda: campaign(method, simulator, network="each round"))
+def test_a_campaign(kept):
+    c = kept("Campaign", lambda: campaign("asbi", by_numpy, network="each round"))
     for _ in range(2):
         trial = kept("ask", c.ask)
         kept("tell", lambda trial=trial: c.tell(0.6 * trial.action))

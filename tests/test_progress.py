@@ -54,22 +54,6 @@ def test_steps_of_an_unknown_number_are_counted(caplog):
     assert "so far; 7 done" in lines(caplog)[0]
 
 
-def failing():
-    time.sleep(3 * SOON)
-    raise ZeroDivisionError
-
-
-def test_of_a_stage_within_another_nothing_is_told(caplog):
-    caplog.set_level(logging.INFO, "sbi_active")
-    with stage("outer"), stage("inner"):
-        time.sleep(3 * SOON)
-    with pytest.raises(ZeroDivisionError), stage("second"):
-        failing()
-    said = lines(caplog)
-    assert not any("inner" in line for line in said)
-    assert said[-1].startswith("second ended with an error after")
-
-
 def loop(**options):
     bias = Effect(
         "bias",

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import csv
 import time
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -39,7 +38,7 @@ from benchmarks.box_collision.summary import (
     coverage_table,
     summarize,
 )
-from benchmarks.rows import append, read, short
+from benchmarks.rows import read, resumed, short
 from sbi_active import Campaign, CampaignOptions, MixtureDensity, RefinementOptions
 from sbi_active.campaign import Trial
 from sbi_active.campaign.learning.methods import METHODS, find_method
@@ -344,24 +343,17 @@ def recorded(row: dict[str, str]) -> Trial:
 
 def run_missing(method: str, target: str, arguments: Settings) -> None:
     """Run the trials that are not in the file yet."""
+
+    def trial(seed: int) -> list[dict[str, object]]:
+        return run_trial(make_task(target, arguments, seed), method, seed, arguments)
+
+    seeds = [(seed,) for seed in range(arguments.first, arguments.num_trials)]
     path = path_of(method, target, arguments)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    done = {int(row["seed"]) for row in read(path)}
-    for seed in range(arguments.first, arguments.num_trials):
-        if seed in done:
-            continue
-        start = time.process_time()
-        task = make_task(target, arguments, seed)
-        rows = run_trial(task, method, seed, arguments)
-        append(path, COLUMNS, rows)
-        spent = time.process_time() - start
-        print(f"{path.stem} trial {seed}: {spent:.0f} CPU s", flush=True)
+    resumed(path, ["seed"], seeds, trial, columns=COLUMNS)
 
 
 def main(arguments: Settings) -> None:
     """Run the trials that are not there yet, and print the table."""
-    torch.set_num_threads(1)
-    warnings.filterwarnings("ignore", message="the posterior rests on")
     is_coverage = arguments.is_coverage
     methods = arguments.methods or (("asbi",) if is_coverage else ("asbi", "nsbi"))
     targets = [arguments.target] if arguments.target else ["1", "2"]

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.rows import keep
 from sbi_active.simulation import simulate
 from sbi_active.tasks import get_task  # pyright: ignore
 from sbi_active.tasks.box_collision.scene import (  # pyright: ignore
@@ -70,4 +71,4 @@ def main() -> None:
     }
     print(json.dumps(result, indent=2))
     path = Path(__file__).parent / "speed.json"
-    path.write_text(json.dumps(result, indent=2) + "\n")
+    keep(path, result)

@@ -9,14 +9,13 @@ import numpy as np
 from scipy import stats
 
 from benchmarks.published import published
-from benchmarks.rows import read
+from benchmarks.rows import column
 from sbi_active.display.table import Table
 
 __all__ = [
     "REPORTED",
     "STAGES",
     "coverage_table",
-    "read",
     "summarize",
 ]
 
@@ -39,12 +38,6 @@ COMPARED = 3  # round by which target 2 should be pushed more slowly
 LARGEST_ERROR = 0.5
 Rows = Sequence[Mapping[str, str]]
 Cells = Mapping[tuple[str, str], Rows]  # by method and target
-
-
-def column(rows: Rows, key: str, round_: int | None = None) -> Any:
-    """Return a column of one round, or of all, as an array; NaN where it is empty."""
-    kept = [r[key] for r in rows if round_ is None or int(r["round"]) == round_]
-    return np.array([float(v) if v else np.nan for v in kept])
 
 
 def num_rounds(rows: Rows) -> int:

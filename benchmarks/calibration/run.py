@@ -15,14 +15,13 @@ Resumable: a row that stands in the CSV is not run again. Seeds from 2000 on jud
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from benchmarks.calibration import beliefs, networks
-from benchmarks.rows import append, read
+from benchmarks.rows import grouped, read, resumed
 from sbi_active.diagnostics.verdict import clopper_pearson
 
 RESULTS = Path(__file__).parent / "results"
@@ -44,24 +43,14 @@ def path(table: str) -> Path:
 def run(table: str, problem: str, kind: str, seeds: range) -> None:
     """Run the seeds that are not there yet."""
     make, columns, _ = TABLES[table]
-    done = {(r["problem"], r["kind"], int(r["seed"])) for r in read(path(table))}
-    for seed in seeds:
-        if (problem, kind, seed) in done:
-            continue
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            row = make(problem, kind, seed)
-        append(path(table), columns, [row])
-        print(problem, kind, seed, row["verdict"], row["reason"], flush=True)
+    keys, jobs = ["problem", "kind", "seed"], [(problem, kind, s) for s in seeds]
+    resumed(path(table), keys, jobs, make, columns=columns)
 
 
 def summary(table: str, first: int) -> None:
     """Print the share flagged, by problem and kind."""
-    groups: dict[tuple[str, str], list[dict[str, str]]] = {}
-    for row in read(path(table)):
-        if int(row["seed"]) >= first:
-            groups.setdefault((row["problem"], row["kind"]), []).append(row)
-    for (problem, kind), rows in groups.items():
+    judged = [r for r in read(path(table)) if int(r["seed"]) >= first]
+    for (problem, kind), rows in grouped(judged, "problem", "kind").items():
         n = len(rows)
         k = sum(row["verdict"] != "trust" for row in rows)
         low, high = clopper_pearson(k, n, 0.05)

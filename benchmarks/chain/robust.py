@@ -13,8 +13,8 @@ judge.
 from __future__ import annotations
 
 import time
-import warnings
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ import pandas as pd
 import torch
 
 from benchmarks.chain.run import RESULTS
-from benchmarks.rows import append
+from benchmarks.rows import resumed
 from sbi_active import ASBI
 from sbi_active.display.table import Table
 from sbi_active.pyro import RobustASBI
@@ -102,20 +102,10 @@ class Settings:
 
 def main(options: Settings) -> None:
     """Run what is asked for and is not there yet, and print the table."""
-    warnings.simplefilter("ignore")
-    torch.set_num_threads(1)
+    seeds = () if options.summary else range(*options.seeds)
+    jobs = product(seeds, ("gross", "clean"), METHODS)
     path = options.out / "robust.csv"
-    path.parent.mkdir(exist_ok=True)
-    known: set[tuple[Any, ...]] = set()
-    if path.exists():
-        table = pd.read_csv(path)
-        known = {*zip(table["seed"], table["case"], table["method"], strict=True)}
-    for seed in range(*options.seeds) if not options.summary else ():
-        for case in ("gross", "clean"):
-            for method in METHODS:
-                if (seed, case, method) not in known:
-                    row = judged(seed, case, method)
-                    append(path, [*row], [row])
+    resumed(path, ["seed", "case", "method"], jobs, judged)
     print(summary(pd.read_csv(path)))
 
 

@@ -21,7 +21,6 @@ alone. Rows are added to results/, and those that are there are not run again.
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +32,7 @@ import torch
 from scipy.stats import binom, t
 from torch import Tensor
 
-from benchmarks.rows import append
+from benchmarks.rows import resumed
 from sbi_active import Campaign, RefinementOptions
 from sbi_active.display.table import Table
 from sbi_active.inference import refine
@@ -139,13 +138,6 @@ def rounds(parameters: int, seed: int) -> list[dict[str, Any]]:
     return rows
 
 
-def done(path: Path) -> set[tuple[int, int]]:
-    if not path.exists():
-        return set()
-    table = pd.read_csv(path)
-    return {*zip(table["parameters"], table["seed"], strict=True)}
-
-
 def summary(path: Path) -> str:
     """Return a line for each number of parameters."""
     lines = []
@@ -215,22 +207,15 @@ class Settings:
 
 def main(options: Settings) -> None:
     """Run what is asked for and is not there yet, and print the table."""
-    warnings.simplefilter("ignore")
-    torch.set_num_threads(1)
-    options.out.mkdir(parents=True, exist_ok=True)
-    name = "rounds.csv" if options.campaign else "beliefs.csv"
-    path = options.out / name
-    if options.summary:
-        print(round_summary(path) if options.campaign else summary(path))
-        return
-    for seed in range(*options.seeds):
-        for dim in options.parameters:
-            if (dim, seed) in done(path):
-                continue
-            if options.campaign:
-                rows = rounds(dim, seed)
-            else:
-                want = seed < options.seeds[0] + options.references
-                rows = [judged(dim, seed, with_reference=want)]
-            append(path, [*rows[0]], rows)
-            print(rows[-1], flush=True)
+
+    def made(dim: int, seed: int) -> Any:
+        if options.campaign:
+            return rounds(dim, seed)
+        want = seed < options.seeds[0] + options.references
+        return judged(dim, seed, with_reference=want)
+
+    path = options.out / ("rounds.csv" if options.campaign else "beliefs.csv")
+    if not options.summary:
+        jobs = [(d, s) for s in range(*options.seeds) for d in options.parameters]
+        resumed(path, ["parameters", "seed"], jobs, made)
+    print(round_summary(path) if options.campaign else summary(path))

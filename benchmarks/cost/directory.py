@@ -14,11 +14,9 @@ Writes directory.json beside this file.
 
 from __future__ import annotations
 
-import json
 import os
 import tempfile
 import time
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import date
@@ -31,6 +29,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor
 
+from benchmarks.rows import keep
 from sbi_active import (
     BoxActions,
     Campaign,
@@ -155,8 +154,6 @@ def load(folder: Path) -> dict[str, float]:
 
 def main() -> None:
     """Measure, print and write."""
-    torch.set_num_threads(1)
-    warnings.simplefilter("ignore")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         result: dict[str, Any] = {"date": str(date.today()), "tell_ms": tells(folder)}
@@ -171,4 +168,4 @@ def main() -> None:
     }
     result["update_cpu_s_near"] = near
     print(near)
-    RESULT.write_text(json.dumps(result, indent=1) + "\n")
+    keep(RESULT, result)

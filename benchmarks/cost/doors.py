@@ -19,6 +19,8 @@ import tempfile
 from datetime import date
 from pathlib import Path
 
+from benchmarks.rows import keep
+
 NUM_RUNS = 3
 
 _MAIN = "import sys; from sbi_active.cli import main; sys.exit(main(sys.argv[1:]))"
@@ -123,4 +125,4 @@ def main() -> None:
         print(f"{statement}: {listed} s")
     result = {"date": date.today().isoformat(), "cpu_s": medians, "imports_s": imports}
     path = Path(__file__).parent / "doors.json"
-    path.write_text(json.dumps(result, indent=2) + "\n")
+    keep(path, result)

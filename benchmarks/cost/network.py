@@ -14,15 +14,14 @@ from __future__ import annotations
 import json
 import os
 import time
-import warnings
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
+from benchmarks.rows import keep
 from sbi_active import Campaign, CampaignOptions
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task  # pyright: ignore
@@ -73,8 +72,6 @@ class Settings:
 
 def main(arguments: Settings) -> None:
     """Run both modes in turn, print and write their cost."""
-    warnings.simplefilter("ignore")
-    torch.set_num_threads(1)
     made: dict[str, list[Any]] = {mode: [] for mode in MODES}
     for mode in MODES:
         rounds(mode, 10_000, 1)
@@ -101,7 +98,7 @@ def main(arguments: Settings) -> None:
     both = [result[mode]["cpu_s_a_round"] for mode in MODES]
     result["ratio"] = both[0] / both[1]
     path = Path(__file__).with_name("network.json")
-    path.write_text(json.dumps(result, indent=2) + "\n")
+    keep(path, result)
     for mode in MODES:
         print(f"{mode}: {json.dumps(result[mode])}")
     print(f"ratio: {result['ratio']:.1f}")

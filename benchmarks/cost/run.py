@@ -11,15 +11,14 @@ design and update together. sbi runs first and so pays what torch does once a pr
 
 from __future__ import annotations
 
-import json
 import time
-import warnings
 from datetime import date
 from pathlib import Path
 
 import torch
 from sbi.inference import NPE_C
 
+from benchmarks.rows import keep
 from sbi_active import Campaign
 from sbi_active.inference.trainers.action_rounds import SilentTracker
 from sbi_active.seeding import derive_seed
@@ -56,8 +55,6 @@ def default_round(seed: int) -> dict[str, float]:
 
 
 def main() -> None:
-    warnings.simplefilter("ignore")
-    torch.set_num_threads(1)
     stock = stock_round(0)
     default = [default_round(seed) for seed in range(3)]
     theirs = stock["cpu_s"]
@@ -71,7 +68,7 @@ def main() -> None:
         "ratio": theirs / ours,
     }
     path = Path(__file__).parent / "result.json"
-    path.write_text(json.dumps(result, indent=2) + "\n")
+    keep(path, result)
     print(f"stock NPE_C(prior), training:    {theirs:7.2f} CPU s")
     print(f"default loop, a whole round:     {ours:7.2f} CPU s")
     print(f"ratio:                           {theirs / ours:7.1f}")

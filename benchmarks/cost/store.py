@@ -13,7 +13,6 @@ CPU and wall seconds, the file's bytes a row; writes store.json beside this file
 
 from __future__ import annotations
 
-import json
 import tempfile
 import time
 from collections.abc import Callable
@@ -24,6 +23,7 @@ from typing import Any
 import torch
 from torch.distributions import Independent, Normal
 
+from benchmarks.rows import keep
 from sbi_active import Bank
 from sbi_active.simulation import Simulations, reuse
 from sbi_active.simulation.workers.store import run_digest
@@ -127,12 +127,11 @@ def small_sets(folder: Path, results: dict[str, Any]) -> None:
 
 def main() -> None:
     """Measure, print and write."""
-    torch.set_num_threads(1)
     results: dict[str, Any] = {"date": str(date.today())}
     with tempfile.TemporaryDirectory() as name:
         for measure in (small_rows, large_rows, small_sets):
             measure(Path(name), results)
-    RESULT.write_text(json.dumps(results, indent=1) + "\n")
+    keep(RESULT, results)
 
 
 if __name__ == "__main__":

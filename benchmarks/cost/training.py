@@ -15,7 +15,6 @@ from __future__ import annotations
 import json
 import os
 import time
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import date
@@ -27,6 +26,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor
 
+from benchmarks.rows import keep
 from sbi_active import (
     ASBI,
     BoxActions,
@@ -144,8 +144,6 @@ class Settings:
 
 def main(arguments: Settings) -> None:
     """Run both settings in turn, print and write."""
-    warnings.simplefilter("ignore")
-    torch.set_num_threads(1)
     result: dict[str, Any] = {
         "command": "python -m benchmarks cost.training "
         f"--seeds {arguments.seeds} --rounds {arguments.rounds}",
@@ -179,4 +177,4 @@ def main(arguments: Settings) -> None:
                 row["gain_error"] = gap.std(ddof=1) / len(gap) ** 0.5
             print(f"{name}, {way}: {json.dumps(row)}", flush=True)
     path = Path(__file__).with_suffix(".json")
-    path.write_text(json.dumps(result, indent=2) + "\n")
+    keep(path, result)

@@ -26,6 +26,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor
 
+from benchmarks.rows import keep, stages
 from sbi_active import (
     BoxActions,
     Campaign,
@@ -107,9 +108,7 @@ def measure(kind: str, num: int) -> dict[str, float]:
 
 def main() -> None:
     """Run what is not there yet, and print the table."""
-    found: dict[str, Any] = {"rounds": {}}
-    if RESULT.exists():
-        found = json.loads(RESULT.read_text())
+    found = {"rounds": {}} | stages(RESULT)
     found["date"] = date.today().isoformat()
     for kind, sizes in SIZES.items():
         for num in sizes:
@@ -130,7 +129,7 @@ def main() -> None:
                 found["rounds"][name] = json.loads(done.stdout)
             except subprocess.TimeoutExpired:
                 found["rounds"][name] = {}
-            RESULT.write_text(json.dumps(found, indent=1) + "\n")
+            keep(RESULT, found)
     header = "size", "ask, CPU s", "tell and update, CPU s", "peak, GB"
     cells = [
         (name, *(f"{row[k]:.1f}" for k in row)) if row else (name, *("-" * 3))

@@ -23,8 +23,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -35,7 +36,7 @@ from torch.distributions import Distribution
 from benchmarks.criticism.intervals import rate
 from benchmarks.criticism.worlds import get_world
 from benchmarks.criticism.worlds.numerical import NOISE_SD, response
-from benchmarks.rows import append, read
+from benchmarks.rows import or_failure, resumed
 from sbi_active import Campaign, CampaignOptions
 from sbi_active.criticism import Report
 from sbi_active.seeding import derive_seed, forked_generators, row_normals
@@ -314,27 +315,17 @@ class Settings:
 
 def main(arguments: Settings) -> None:
     """Run what is asked for and print the table."""
-    arguments.out.mkdir(parents=True, exist_ok=True)
+
+    def made(number: int, kind: str) -> Mapping[str, Any]:
+        case = partial(run_case, kind, number, num_trials=arguments.trials)
+        row = or_failure(partial(case, policy=arguments.policy))
+        return {"case": number, "kind": kind, **row}
+
+    last = arguments.first + arguments.cases
     rows: list[dict[str, str]] = []
     for kind in KINDS:
+        is_run = not arguments.summary and arguments.kind in (None, kind)
+        jobs = [(n, kind) for n in range(arguments.first, last) if is_run]
         path = arguments.out / f"campaign_{kind}_{arguments.policy}.csv"
-        done = {int(row["case"]) for row in read(path)}
-        wanted = range(arguments.first, arguments.first + arguments.cases)
-        if not arguments.summary and arguments.kind in (None, kind):
-            for number in wanted:
-                if number in done:
-                    continue
-                try:
-                    row = run_case(
-                        kind,
-                        number,
-                        num_trials=arguments.trials,
-                        policy=arguments.policy,
-                    )
-                except Exception as error:  # a crash is a result of the benchmark
-                    failure = f"{type(error).__name__}: {error}"[:300]
-                    row = {"case": number, "kind": kind, "failure": failure}
-                append(path, COLUMNS, [row])
-                print({k: row.get(k) for k in COLUMNS if k in row}, flush=True)
-        rows += read(path)
+        rows += resumed(path, ["case", "kind"], jobs, made, columns=COLUMNS)
     print("\n".join(summary(rows)))

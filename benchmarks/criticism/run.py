@@ -24,14 +24,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from benchmarks.criticism import tables
 from benchmarks.criticism.active import ACTIVE_COLUMNS, score_active
 from benchmarks.criticism.cases import KINDS, draw_case
 from benchmarks.criticism.scores import COLUMNS, score_case
 from benchmarks.criticism.worlds import get_world
-from benchmarks.rows import append, read
+from benchmarks.rows import read, resumed
 
 RESULTS = Path(__file__).parent / "results"
 #: Which kinds of cases a table is made of.
@@ -84,15 +84,11 @@ def paths(arguments: Settings, kind: str) -> list[Path]:
 
 def run_setting(arguments: Settings, kind: str) -> None:
     """Run the cases that are in none of the files yet."""
-    path, *others = paths(arguments, kind)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    done = {int(row["case"]) for other in others for row in read(other)}
     options = {"assume_independent": True} if arguments.independent else {}
     world = get_world(arguments.world, **options)
-    active = arguments.table == "active"
-    for number in range(arguments.first, arguments.first + arguments.cases):
-        if number in done:
-            continue
+    is_active = arguments.table == "active"
+
+    def made(number: int) -> Any:
         case = draw_case(
             world,
             kind,  # type: ignore[arg-type]  # checked by the parser
@@ -100,20 +96,21 @@ def run_setting(arguments: Settings, kind: str) -> None:
             num_trials=arguments.trials,
             prior_scale=arguments.scale,
         )
-        if active:
-            rows = score_active(case, number)
-        else:
-            oracle = kind == "library" and case.truth.effects[0].hook != "noise"
-            oracle = oracle and not world.is_rough
-            rows = [score_case(case, number, oracle=oracle)]
-        append(path, ACTIVE_COLUMNS if active else COLUMNS, rows)
-        last = rows[-1]
-        print(
-            f"{path.stem} case {number}: {last.get('effects')} -> "
-            f"{last.get('failure') or last.get('verdict')}, "
-            f"{float(str(last.get('cpu_seconds') or 'nan')):.0f} CPU s",
-            flush=True,
-        )
+        if is_active:
+            return score_active(case, number)
+        oracle = kind == "library" and case.truth.effects[0].hook != "noise"
+        return score_case(case, number, oracle=oracle and not world.is_rough)
+
+    path, *others = paths(arguments, kind)
+    last = arguments.first + arguments.cases
+    resumed(
+        path,
+        ["case"],
+        [(number,) for number in range(arguments.first, last)],
+        made,
+        columns=ACTIVE_COLUMNS if is_active else COLUMNS,
+        others=others,
+    )
 
 
 def main(arguments: Settings) -> None:

@@ -21,7 +21,7 @@ import torch
 from sbi.inference import NPE_C
 from sbi.utils import RestrictedPrior, get_density_thresholder
 
-from benchmarks.rows import append, read
+from benchmarks.rows import append, column, grouped, read
 from sbi_active import Campaign
 from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
@@ -133,28 +133,19 @@ def write(rows: list[dict[str, Any]]) -> None:
     append(ROWS, COLUMNS, [{k: row.get(k) for k in COLUMNS} for row in rows])
 
 
-def cell(rows: list[dict[str, str]], key: str, rounds: tuple[int, ...]) -> Any:
-    """Return a column of some rounds."""
-    kept = [r[key] for r in rows if int(r["round"]) in rounds and r[key]]
-    return np.array([float(v) for v in kept])
-
-
 def table(rows: list[dict[str, str]]) -> str:
     """Return figures by task and method, and the best method by price."""
-    lines, names = [], {}
-    for row in rows:
-        key = row["task"], row["method"], row["per_round"]
-        names.setdefault(key, []).append(row)
+    lines: list[list[str]] = []
     costs: dict[str, list[tuple[str, float, float, float]]] = {}
-    every = (*range(1, ROUNDS + 1),)
-    for (task, method, per_round), own in names.items():
-        last, kl = cell(own, "gap", (ROUNDS,)), cell(own, "kl", (ROUNDS,))
-        regret = cell(own, "regret", every)
-        sims, cpu = cell(own, "num_simulations", (ROUNDS,)), cell(own, "cpu", (ROUNDS,))
-        used, work = sims.mean(), cpu.mean()
-        if method == "campaign":
-            used = cell(own, "num_simulations", every).mean()
-            work = cell(own, "cpu", every).mean()
+    for (task, method, per_round), own in grouped(
+        rows, "task", "method", "per_round"
+    ).items():
+        last, kl = column(own, "gap", ROUNDS), column(own, "kl", ROUNDS)
+        regret = column(own, "regret")
+        regret = regret[np.isfinite(regret)]
+        spent = None if method == "campaign" else ROUNDS
+        used = column(own, "num_simulations", spent).mean()
+        work = column(own, "cpu", spent).mean()
         lines.append(
             [
                 *(task, method, per_round, str(len(last))),
@@ -204,7 +195,6 @@ class Settings:
 
 def main(given: Settings) -> None:
     """Run what is asked for and is not there yet, and print the table."""
-    torch.set_num_threads(1)
     jobs = [
         (name, size, FIRST_SEED + k)
         for k in range(given.trials)

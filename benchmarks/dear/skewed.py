@@ -13,8 +13,7 @@ made at seeds below 100. Resumable; rows in benchmarks/dear/results/skewed.csv.
 from __future__ import annotations
 
 import time
-import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ from scipy.stats import t as student
 from torch import Tensor
 
 from benchmarks.dear.run import stock
-from benchmarks.rows import append, read
+from benchmarks.rows import resumed
 from sbi_active.display import Table
 from sbi_active.inference import RefinementOptions, refine
 from sbi_active.seeding import derive_seed, forked_generators
@@ -116,18 +115,9 @@ class Settings:
 
 def main(given: Settings) -> None:
     """Run what is asked for and is not there yet, and print the table."""
-    torch.set_num_threads(1)
-    warnings.simplefilter("ignore")
-    done = {(r["method"], r["histories"], r["seed"]) for r in read(ROWS)}
     task = Skewed()
-    jobs = [
-        (method, num, seed)
-        for seed in range(*given.seeds)
-        for num in given.histories
-        for method in given.methods
-        if (method, str(num), str(seed)) not in done
-    ]
-    for method, num, seed in jobs if not given.summary else ():
+
+    def made(method: str, num: int, seed: int) -> Mapping[str, object]:
         with forked_generators(derive_seed(seed, "real")):
             x = task.simulator(TRUTH.expand(len(ACTION), -1), ACTION)
         start = time.process_time()
@@ -141,9 +131,12 @@ def main(given: Settings) -> None:
             trials = [*zip(ACTION, x, strict=True)]
             belief, trust = stock(task, method, num * len(ACTION), trials, seed), ""
         row = {"method": method, "histories": num, "seed": seed, "trustworthy": trust}
-        row |= {"cpu": time.process_time() - start, **judged(task, belief, x)}
-        append(ROWS, COLUMNS, [row])
-    rows = pd.DataFrame(read(ROWS))
+        return row | {"cpu": time.process_time() - start, **judged(task, belief, x)}
+
+    seeds = () if given.summary else range(*given.seeds)
+    jobs = [(m, n, s) for s in seeds for n in given.histories for m in given.methods]
+    keys = ["method", "histories", "seed"]
+    rows = pd.DataFrame(resumed(ROWS, keys, jobs, made, columns=COLUMNS))
     if rows.empty:
         return
     numbers = rows.astype({"kl": float, "shift": float, "cpu": float})

@@ -17,7 +17,6 @@ process. CPU times are read by psutil, which comes with Dask.
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import random
@@ -36,6 +35,7 @@ import torch
 from joblib import Parallel, delayed
 from torch import Tensor
 
+from benchmarks.rows import keep
 from sbi_active.seeding import row_normals, row_seeds
 from sbi_active.simulation import MissingRowsWarning, Workers, simulate
 
@@ -271,7 +271,6 @@ class Settings:
 def main(arguments: Settings) -> None:
     """Run what is asked for and is not there yet, and print the table."""
     repetitions = arguments.repetitions
-    torch.set_num_threads(1)
     result: dict[str, Any] = {
         "command": f"python -m benchmarks engine --repetitions {repetitions}",
         "date": datetime.now().isoformat(timespec="minutes"),
@@ -304,4 +303,4 @@ def main(arguments: Settings) -> None:
     print(f"faults: {row['seconds']:.1f} s; {row['counts']}; {row['warning']}")
     print(f"x of the good rows unchanged: {row['x_of_good_rows_unchanged']}")
     result["load_average_at_end"] = os.getloadavg()[0]
-    arguments.out.write_text(json.dumps(result, indent=2) + "\n")
+    keep(arguments.out, result)

@@ -33,7 +33,7 @@ from torch import Tensor
 from benchmarks.forces.hidden import FITTED, HELD_OUT, NUM_TRIALS, Hidden, draw
 from benchmarks.forces.machines import MACHINES, Machine, machine
 from benchmarks.forces.summary import summary
-from benchmarks.rows import append, read
+from benchmarks.rows import resumed
 from sbi_active.criticism import (
     AugmentedSimulator,
     Criticism,
@@ -209,23 +209,15 @@ def main(arguments: Settings) -> None:
     names = [arguments.machine] if arguments.machine else [*MACHINES]
     kinds = [arguments.kind] if arguments.kind else [*KINDS]
     numbers = range(arguments.first, arguments.first + arguments.cases)
-    for number in numbers if not arguments.summary else ():
-        for name, kind in [(n, k) for n in names for k in kinds]:
-            if kind == "magnet" and name != "pendulum":
-                continue
-            done = {
-                (r["machine"], r["kind"], r["case"]) for r in read(arguments.result)
-            }
-            if (name, kind, str(number)) in done:
-                continue
-            row = run_case(name, kind, number)
-            append(arguments.result, COLUMNS, [row])
-            print(
-                f"{name} {kind} {number}: {row['form'] or 'nothing'} -> "
-                f"{row['verdict']}, {row['family']} {row['p_family']:.2f}; held out "
-                f"{row['held_bare']:.2f} -> {row['held_after']:.2f}; {row['stand_in']}",
-                flush=True,
-            )
+    jobs = [
+        (name, kind, number)
+        for number in numbers
+        for name in names
+        for kind in kinds
+        if not arguments.summary and (kind != "magnet" or name == "pendulum")
+    ]
+    keys = ["machine", "kind", "case"]
+    rows = resumed(arguments.result, keys, jobs, run_case, columns=COLUMNS)
     first = FIRST_JUDGED if arguments.first >= FIRST_JUDGED else 0
-    judged = [r for r in read(arguments.result) if int(r["case"]) >= first]
+    judged = [r for r in rows if int(r["case"]) >= first]
     print(*summary(judged), sep="\n")

@@ -195,7 +195,6 @@ def main(
         out: File of the results.
         only: Names, or parts of names, that are run; all by default.
     """
-    torch.set_num_threads(1)
     rows = []
     for i, world in enumerate(worlds()):
         for name, (given, method) in METHODS.items():

@@ -115,7 +115,6 @@ def main(
         seeds: Number of seeds (numerical task).
         oscillator_seeds: Number of seeds of the oscillator.
     """
-    torch.set_num_threads(1)
     rows: list[dict[str, object]] = []
     for name, task, belief, exact in worlds():
         heavy = task.name == "oscillator"

@@ -12,10 +12,8 @@ draws under every policy, so that policies are compared on paired roll-outs.
 
 from __future__ import annotations
 
-import csv
 import math
 import time
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +29,7 @@ from benchmarks.location_finding.bounds import (
 from benchmarks.location_finding.particles import ParticleBelief
 from benchmarks.location_finding.policies import POLICIES, Myopic
 from benchmarks.location_finding.summary import RESULTS, table
+from benchmarks.rows import resumed
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task
 
@@ -137,41 +136,20 @@ def run(policy: str, arguments: Settings) -> None:
     name = f"{policy}_{arguments.trials}"
     if arguments.contrastive != CONTRASTIVE:
         name += f"_L{arguments.contrastive}"
-    path: Path = arguments.out / f"{name}.csv"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    done: set[int] = set()
-    if path.exists():
-        with path.open(newline="") as file:
-            done = {int(row["rollout"]) for row in csv.DictReader(file)}
-    for rollout in range(arguments.first, arguments.first + arguments.rollouts):
-        if rollout in done:
-            continue
-        row = roll_out(policy, rollout, arguments.trials, arguments.contrastive)
-        new = not path.exists()
-        with path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS)
-            if new:
-                writer.writeheader()
-            writer.writerow({key: _short(value) for key, value in row.items()})
-        print(
-            f"{name} {rollout}: information in [{row['lower']:.2f}, "
-            f"{row['upper']:.2f}] nats, sPCE {row['spce']:.2f}, sNMC "
-            f"{row['snmc']:.2f}",
-            flush=True,
-        )
+
+    def made(rollout: int) -> dict[str, Any]:
+        return roll_out(policy, rollout, arguments.trials, arguments.contrastive)
+
+    last = arguments.first + arguments.rollouts
+    jobs = [(rollout,) for rollout in range(arguments.first, last)]
+    path = arguments.out / f"{name}.csv"
+    resumed(path, ["rollout"], jobs, made, columns=COLUMNS)
 
 
 def main(arguments: Settings) -> None:
     """Run what is asked for and is not there yet, and print the table."""
-    torch.set_num_threads(1)
-    # A belief that rests on few draws says so; its bounds do not rest on it.
-    warnings.filterwarnings("ignore", module="sbi_active")
     for policy in arguments.policy:
         run(policy, arguments)
     cap = math.log(arguments.contrastive + 1)
     print(table(arguments.out, arguments.trials, arguments.contrastive))
     print(f"sPCE cannot exceed log(L + 1) = {cap:.2f} nats.")
-
-
-def _short(value: object) -> object:
-    return f"{value:.6g}" if isinstance(value, float) else value

@@ -108,7 +108,6 @@ def main(
         trials: Number of trials.
         steps: Steps of the search.
     """
-    torch.set_num_threads(1)
     start = time.process_time()
     place = optimize(trials, num_steps=steps)
     with PATH.open("w", newline="") as file:

@@ -9,12 +9,12 @@ One row a trial and way of choosing, in benchmarks/numerical/results/exact.csv.
 
 from __future__ import annotations
 
-import csv
+from itertools import product
 
 import numpy as np
-import torch
 
 from benchmarks.numerical.run import NUM_EXACT, RESULTS, exact_limits
+from benchmarks.rows import resumed
 from sbi_active.seeding import derive_seed
 from sbi_active.tasks import get_task
 from sbi_active.tasks.numerical.exact_greedy import greedy_design
@@ -30,26 +30,22 @@ def main(*, summary: bool = False) -> None:
     Args:
         summary: Whether to run nothing, and print the table of the rows.
     """
-    torch.set_num_threads(1)
-    if not summary:
-        task = get_task("numerical")
-        actions = task.actions.values
-        with (RESULTS / "exact.csv").open("w", newline="") as file:
-            writer = csv.writer(file)
-            writer.writerow(FIELDS)
-            for way in ("exact", "random"):
-                for seed in range(NUM_EXACT):
-                    rng = np.random.default_rng(derive_seed(seed, "exact, random"))
-                    drawn = rng.integers(len(actions), size=NUM_ROUNDS).tolist()
-                    done = greedy_design(
-                        task.theta_true,
-                        actions,
-                        num_rounds=NUM_ROUNDS,
-                        seed=seed,
-                        chosen=None if way == "exact" else drawn,
-                    )
-                    values = [*done.log_prob, *done.reproduction_error[-1]]
-                    writer.writerow([way, seed, *(f"{float(v):.5g}" for v in values)])
-                    file.flush()
+
+    def trial(way: str, seed: int) -> dict[str, object]:
+        rng = np.random.default_rng(derive_seed(seed, "exact, random"))
+        drawn = rng.integers(len(task.actions), size=NUM_ROUNDS).tolist()
+        made = greedy_design(
+            task.theta_true,
+            task.actions.values,
+            num_rounds=NUM_ROUNDS,
+            seed=seed,
+            chosen=None if way == "exact" else drawn,
+        )
+        values = [way, seed, *made.log_prob, *made.reproduction_error[-1]]
+        return dict(zip(FIELDS, values, strict=True))
+
+    task = get_task("numerical")
+    jobs = [] if summary else product(("exact", "random"), range(NUM_EXACT))
+    resumed(RESULTS / "exact.csv", FIELDS[:2], jobs, trial)
     for name, values in exact_limits().items():
         print(name, *values, sep="  ")

@@ -20,8 +20,6 @@ method and setting, in benchmarks/numerical/results.
 
 from __future__ import annotations
 
-import time
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
@@ -35,14 +33,13 @@ from benchmarks.numerical.run import (
     COLUMNS,
     REPORTED,
     RESULTS,
-    column,
     exact_limits,
     make_task,
     reference,
     round_row,
 )
 from benchmarks.published import published
-from benchmarks.rows import append, read
+from benchmarks.rows import column, resumed
 from sbi_active import Campaign, CampaignOptions, RefinementOptions
 from sbi_active.campaign.learning.methods import METHODS, faithful_options
 from sbi_active.display.table import Table
@@ -118,17 +115,14 @@ def run_method(
     setting: str, method: str, trials: int, *, is_summary: bool = False
 ) -> list[dict[str, str]]:
     """Run the trials that are not in the file yet and return all its rows."""
+
+    def trial(seed: int) -> list[dict[str, Any]]:
+        return run_trial(make_task("linear", "fixed", seed), method, setting, seed)
+
     path = RESULTS / f"methods_{setting}_{method}.csv"
-    done = {int(row["seed"]) for row in read(path)}
-    for seed in range(trials):
-        if seed in done or is_summary:
-            continue
-        start = time.process_time()
-        rows = run_trial(make_task("linear", "fixed", seed), method, setting, seed)
-        append(path, [*COLUMNS, "c2st"], rows)
-        spent = time.process_time() - start
-        print(f"{setting} {method} trial {seed}: {spent:.0f} CPU s", flush=True)
-    return [row for row in read(path) if int(row["seed"]) < trials]
+    seeds = [(seed,) for seed in range(trials) if not is_summary]
+    rows = resumed(path, ["seed"], seeds, trial, columns=[*COLUMNS, "c2st"])
+    return [row for row in rows if int(row["seed"]) < trials]
 
 
 def summary(name: str, rows: list[dict[str, str]]) -> list[str]:
@@ -175,8 +169,6 @@ class Settings:
 
 def main(arguments: Settings) -> None:
     """Run what is asked for and is not there yet, and print the table."""
-    warnings.filterwarnings("ignore")
-    torch.set_num_threads(1)
     table = []
     for method in arguments.methods:
         rows = run_method(

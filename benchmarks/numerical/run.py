@@ -11,8 +11,6 @@ setting, in benchmarks/numerical/results; the table is printed at the end.
 
 from __future__ import annotations
 
-import time
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +21,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.published import published
-from benchmarks.rows import append, read
+from benchmarks.rows import column, read, resumed
 from sbi_active import Campaign, CampaignOptions, RefinementOptions
 from sbi_active.campaign import Trial
 from sbi_active.display.table import Table
@@ -176,18 +174,15 @@ def run_setting(arguments: Settings, method: str, setting: str) -> list[dict]:
     """Run the trials that are not in the file yet and return all its rows."""
     name = f"{arguments.task}_{arguments.truth}_{setting}_{method}"
     name += f"_jitter_{arguments.jitter:g}" if arguments.jitter else ""
-    path = RESULTS / f"{name}.csv"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    done = {int(row["seed"]) for row in read(path)}
-    for seed in range(arguments.trials):
-        if seed in done or arguments.summary:
-            continue
-        start = time.process_time()
+
+    def trial(seed: int) -> list[dict[str, object]]:
         task = make_task(arguments.task, arguments.truth, seed)
-        rows = run_trial(task, method, setting, seed, arguments)
-        append(path, COLUMNS, rows)
-        print(f"{name} trial {seed}: {time.process_time() - start:.0f} CPU s")
-    return [row for row in read(path) if int(row["seed"]) < arguments.trials]
+        return run_trial(task, method, setting, seed, arguments)
+
+    seeds = [(s,) for s in range(arguments.trials) if not arguments.summary]
+    path = RESULTS / f"{name}.csv"
+    rows = resumed(path, ["seed"], seeds, trial, columns=COLUMNS)
+    return [row for row in rows if int(row["seed"]) < arguments.trials]
 
 
 def exact_limits() -> dict[str, tuple[str, ...]]:
@@ -202,12 +197,6 @@ def exact_limits() -> dict[str, tuple[str, ...]]:
             *(f"{error.mean():.3g} +- {error.std():.2g}" for error in errors),
         )
     return found
-
-
-def column(rows: list[dict[str, str]], key: str, round_: int | None = None) -> Any:
-    """Return a column of one round, or of all, as an array."""
-    kept = [r[key] for r in rows if round_ is None or int(r["round"]) == round_]
-    return np.array([float(v) if v else np.nan for v in kept])
 
 
 def summary(name: str, rows: list[dict[str, str]]) -> list[str]:
@@ -263,9 +252,6 @@ def notes(rows: list[dict[str, str]]) -> str:
 
 def main(arguments: Settings) -> None:
     """Run what is asked for and is not there yet, and print the table."""
-    warnings.filterwarnings("ignore", message="the executed action")
-    torch.set_num_threads(1)
-
     table, lines = [], []
     for setting in arguments.settings:
         for method in arguments.methods:

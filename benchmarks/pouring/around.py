@@ -46,7 +46,7 @@ from benchmarks.pouring.learned import (
 from benchmarks.pouring.likelihood import ImageLikelihood, observed
 from benchmarks.pouring.power import best_power, grid, told_by
 from benchmarks.pouring.run import RESULTS, TEMPERED
-from benchmarks.rows import append, read
+from benchmarks.rows import read, resumed
 from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.tasks import get_task
@@ -325,7 +325,6 @@ def run_missing(
 ) -> None:
     """Make the rows of a target that are missing."""
     task: Any = get_task("pouring", target=int(target))
-    path = results / "around.csv"
     every = campaigns(target, learned.actions, results)
     beliefs = [
         belief_of(learned, own, own.images(task, learned.actions)) for own in every
@@ -335,12 +334,14 @@ def run_missing(
     places = sorted({place for own in every for place in own.places})
     found = pour_around(bank, target, box, learned.actions[places], num, task)
     pours = dict(zip(places, found, strict=True))
-    done = {row["seed"] for row in read(path) if row["target"] == target}
-    for own in every:
-        if str(own.seed) not in done:
-            row = {"target": target} | row_of(own, learned, box, pours, task)
-            append(path, COLUMNS, [row])
-            print(row, flush=True)
+    by_seed = {own.seed: own for own in every}
+
+    def made(target: str, seed: int) -> dict[str, object]:
+        row = row_of(by_seed[seed], learned, box, pours, task)
+        return {"target": target} | row
+
+    jobs = [(target, seed) for seed in by_seed]
+    resumed(results / "around.csv", COLUMNS[:2], jobs, made, columns=COLUMNS)
 
 
 @dataclass(frozen=True)
@@ -366,7 +367,6 @@ class Settings:
 
 def main(arguments: Settings) -> None:
     """Run what is asked for and is not there yet, and print the table."""
-    torch.set_num_threads(1)
     if not arguments.summary:
         if arguments.bank is None:
             raise SystemExit("expected --bank FOLDER; got none; make one, see bank.py")

@@ -196,7 +196,6 @@ def run_filling(filling: Filling, pours: Pours, drawn: Draw) -> None:
         pours: What pours rows.
         drawn: What draws them.
     """
-    torch.set_num_threads(1)
     if not filling.report:
         mine, of = map(int, filling.share.split("/"))
         fill(filling.folder, filling.part, filling.rows, (mine, of), pours, drawn)

@@ -43,7 +43,7 @@ from benchmarks.pouring.grid_belief import GridBelief
 from benchmarks.pouring.learned import PARTS, ByAction, learned_of
 from benchmarks.pouring.power import best_power
 from benchmarks.pouring.run import RESULTS
-from benchmarks.rows import append, read
+from benchmarks.rows import read, resumed
 from sbi_active.display.table import Table
 from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import images_of
@@ -224,7 +224,6 @@ def run_missing(
 ) -> None:
     """Make the rows of a target that are missing."""
     task: Any = get_task("pouring", target=int(target))
-    path = arguments.results / "refined.csv"
     every = campaigns(target, learned.actions, arguments.results)
     box = box_around(
         [belief_of(learned, own, own.images(task, learned.actions)) for own in every]
@@ -233,26 +232,20 @@ def run_missing(
     known = pour_around(
         bank, target, box, learned.actions[places], arguments.rows, task
     )
-    done = {row["seed"] for row in read(path) if row["target"] == target}
-    for own in every[: arguments.trials]:
-        if str(own.seed) not in done:
-            row = row_of(
-                bank,
-                target,
-                arguments.pours,
-                own,
-                learned,
-                box,
-                dict(zip(places, known, strict=True)),
-                task,
-            )
-            append(path, COLUMNS, [row])
-            print(row, flush=True)
+    pours = dict(zip(places, known, strict=True))
+    by_seed = {own.seed: own for own in every[: arguments.trials]}
+
+    def made(target: str, seed: int) -> dict[str, object]:
+        own = bank, target, arguments.pours, by_seed[seed], learned, box, pours, task
+        return row_of(*own)
+
+    path = arguments.results / "refined.csv"
+    jobs = [(target, seed) for seed in by_seed]
+    resumed(path, COLUMNS[:2], jobs, made, columns=COLUMNS)
 
 
 def main(arguments: Settings) -> None:
     """Run what is asked for and is not there yet, and print the table."""
-    torch.set_num_threads(1)
     if not arguments.summary:
         if arguments.bank is None:
             raise SystemExit("expected --bank FOLDER; got none; make one, see bank.py")

@@ -31,7 +31,7 @@ from benchmarks.pouring.grid_belief import GridBelief
 from benchmarks.pouring.learned import ByAction, Earlier, kept, learned_of
 from benchmarks.pouring.network import ByNetwork, learn_networks
 from benchmarks.pouring.summary import coverage_table, summarize
-from benchmarks.rows import append, read
+from benchmarks.rows import read, resumed
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task
 
@@ -165,28 +165,19 @@ def run_missing(
     arguments: Settings,
 ) -> None:
     """Run the trials that are not in the file yet."""
+
+    def trial(seed: int) -> list[dict[str, object]]:
+        task = make_task(target, seed)
+        return run_trial(task, learned, method in ACTIVE, seed, arguments.rounds)
+
+    last = arguments.first + arguments.trials
+    seeds = [(seed,) for seed in range(arguments.first, last)]
     path = path_of(method, target, arguments)
-    done = {int(row["seed"]) for row in read(path)}
-    for seed in range(arguments.first, arguments.first + arguments.trials):
-        if seed in done:
-            continue
-        start = time.process_time()
-        rows = run_trial(
-            make_task(target, seed),
-            learned,
-            method in ACTIVE,
-            seed,
-            arguments.rounds,
-        )
-        append(path, COLUMNS, rows)
-        spent = time.process_time() - start
-        values = " ".join(f"{row['log_prob_true']:.2f}" for row in rows)
-        print(f"{path.stem} {seed}: {values}, {spent:.0f} CPU s", flush=True)
+    resumed(path, ["seed"], seeds, trial, columns=COLUMNS)
 
 
 def main(arguments: Settings) -> None:
     """Run the trials that are not there yet, and print the table."""
-    torch.set_num_threads(1)
     is_coverage = arguments.table == "coverage"
     targets = [arguments.target] if arguments.target else ["1", "2"]
     targets = ["prior"] if is_coverage else targets

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy import stats
 
+from benchmarks.rows import column
 from sbi_active.display.table import Table
 
 __all__ = [
-    "column",
     "coverage_table",
     "label",
     "summarize",
@@ -27,11 +27,6 @@ PUBLISHED = {
 }
 Rows = Sequence[Mapping[str, str]]
 Cells = Mapping[tuple[str, str], Rows]  # by method and target
-
-
-def column(rows: Rows, key: str, number: int) -> np.ndarray:
-    """Return a column of one round."""
-    return np.array([float(r[key]) for r in rows if int(r["round"]) == number])
 
 
 def summarize(cells: Cells) -> str:

@@ -14,8 +14,6 @@ import json
 from dataclasses import asdict
 from pathlib import Path
 
-import torch
-
 from benchmarks.record.cases import cases, run
 from benchmarks.record.comparison import Kept, compared
 
@@ -56,7 +54,6 @@ def main(
         only: What the names of cases begin with.
         work: File of the lines of a run that goes on.
     """
-    torch.set_num_threads(1)
     if not summary:
         done = read(work)
         for number, (name, case) in enumerate(cases().items()):

@@ -28,7 +28,6 @@ import copy
 import io
 import sys
 import time
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,14 +39,13 @@ import torch
 
 from benchmarks.criticism.intervals import wilson
 from benchmarks.robots.machines import CONDITIONS, MACHINES, Machine, Set, recorded
-from benchmarks.rows import append
+from benchmarks.rows import resumed
 from sbi_active import GaussianNoise
 from sbi_active.criticism import close_loop
 from sbi_active.criticism.identification import identify
 from sbi_active.mujoco import from_sysid, mjcf_effects
 from sbi_active.mujoco.identification import identify_robot
 from sbi_active.mujoco.robot import Robot
-from sbi_active.threads import single_thread
 
 RESULTS = Path(__file__).parent / "results/coverage.csv"
 FIELDS: list[str] = [
@@ -108,44 +106,38 @@ def by_loop(own: Set, seed: int) -> tuple[Intervals, str, str]:
     return {name: every[name] for name in names}, report.verdict, words
 
 
-def rows_of(
-    machine: str, condition: str, seed: int, ways: list[str]
-) -> Iterator[dict[str, Any]]:
-    """Yield the rows of one set."""
-    for way in ways:
-        own = recorded(MACHINES[machine], condition, seed)
-        start = time.process_time()
-        if way == "sysid":
-            found, verdict, words = by_sysid(own)
-        elif way == "loop":
-            found, verdict, words = by_loop(own, seed)
-        else:
-            found, verdict, words = by_us(own, seed, bare=way == "bare")
-        spent = time.process_time() - start
-        for (name, (low, high)), truth in zip(found.items(), own.truth, strict=True):
-            values = (machine, condition, seed, way, name, truth, low, high)
-            values = (*values, round(spent, 3), verdict, words)
-            yield dict(zip(FIELDS, values, strict=True))
+def rows_of(machine: str, condition: str, seed: int, way: str) -> list[dict[str, Any]]:
+    """Return the rows of one set by one way, a parameter each."""
+    own = recorded(MACHINES[machine], condition, seed)
+    start = time.process_time()
+    if way == "sysid":
+        found, verdict, words = by_sysid(own)
+    elif way == "loop":
+        found, verdict, words = by_loop(own, seed)
+    else:
+        found, verdict, words = by_us(own, seed, bare=way == "bare")
+    spent = round(time.process_time() - start, 3)
+    return [
+        dict(
+            zip(
+                FIELDS,
+                (machine, condition, seed, way, name, truth, *ends, spent)
+                + (verdict, words),
+                strict=True,
+            )
+        )
+        for (name, ends), truth in zip(found.items(), own.truth, strict=True)
+    ]
 
 
-def run(
-    machine: str, conditions: Sequence[str], seeds: range, out: Path, *, loop: bool
-) -> None:
-    """Append the rows of sets that are not there yet."""
-    done: set[tuple[str, str, int, str]] = set()
-    if out.is_file():
-        table = pd.read_csv(out)
-        each = table[["machine", "condition", "seed", "way"]]
-        done = {*each.itertuples(index=False, name=None)}
-    out.parent.mkdir(exist_ok=True)
-    for seed in seeds:
-        for condition in conditions:
-            ways = ["sysid", "ours"]
-            if condition.startswith("friction"):
-                ways += ["bare", *(["loop"] if loop else [])]
-            ways = [w for w in ways if (machine, condition, seed, w) not in done]
-            append(out, FIELDS, [*rows_of(machine, condition, seed, ways)])
-        print(machine, "seed", seed, flush=True)
+def jobs_of(options: Settings) -> Iterator[tuple[str, str, int, str]]:
+    """Yield sets and ways; where there is friction, two more ways."""
+    for seed in range(*options.seeds):
+        for condition in options.conditions:
+            rough = ["bare", "loop"][: 1 + options.loop]
+            more = rough if condition.startswith("friction") else []
+            for way in ("sysid", "ours", *more):
+                yield options.machine, condition, seed, way
 
 
 def table(rows: Any) -> pd.DataFrame:
@@ -255,12 +247,4 @@ def main(options: Settings) -> None:
     if words := missing(options.machine):
         print(words, file=sys.stderr)
         return
-    warnings.simplefilter("ignore")
-    with single_thread():
-        run(
-            options.machine,
-            options.conditions,
-            range(*options.seeds),
-            options.out,
-            loop=options.loop,
-        )
+    resumed(options.out, FIELDS[:4], jobs_of(options), rows_of, columns=FIELDS)

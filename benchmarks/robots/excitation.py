@@ -28,11 +28,11 @@ cover. Seeds below 1000 tune, those from 2000 on judge. Resumable.
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -43,7 +43,7 @@ from torch import Tensor
 from benchmarks.robots.machines import go2_leg
 from benchmarks.robots.models import ARM
 from benchmarks.robots.signals import SHARE, Played, largest, plain
-from benchmarks.rows import append, read
+from benchmarks.rows import resumed
 from sbi_active import DiscreteActions, InformationGainDesigner, MixedActions
 from sbi_active.actions import SignalActions
 from sbi_active.criticism import Trials, identify
@@ -335,13 +335,9 @@ class Settings:
 
 def main(arguments: Settings) -> None:
     """Run the cases that are missing and print the table."""
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    done = {(row["machine"], int(row["case"])) for row in read(arguments.out)}
     machines = [arguments.machine] if arguments.machine else [*MACHINES]
-    for name in [] if arguments.summary else machines:
-        for case in range(arguments.first, arguments.first + arguments.cases):
-            if (name, case) not in done:
-                append(arguments.out, COLUMNS, score(name, case))
-                print(name, case, flush=True)
-    print(*summary(read(arguments.out)), sep="\n")
+    cases = range(arguments.first, arguments.first + arguments.cases)
+    jobs = [] if arguments.summary else product(machines, cases)
+    keys = ["machine", "case"]
+    rows = resumed(arguments.out, keys, jobs, score, columns=COLUMNS)
+    print(*summary(rows), sep="\n")

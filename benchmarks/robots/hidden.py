@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import json
 import time
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -42,12 +41,11 @@ from torch import Tensor
 from benchmarks.criticism.intervals import rate
 from benchmarks.criticism.scores import counted
 from benchmarks.robots.public import PUBLIC, Public
-from benchmarks.rows import append, read
+from benchmarks.rows import resumed
 from sbi_active.criticism import AugmentedSimulator, Criticism, Effect, Trials
 from sbi_active.criticism.effects.trial_conditions import conditions_of_trials
 from sbi_active.mujoco import from_mjcf, mjcf_effects
 from sbi_active.mujoco.robot import Robot
-from sbi_active.threads import single_thread
 
 Array = NDArray[Any]
 
@@ -296,25 +294,9 @@ class Settings:
 
 def main(options: Settings) -> None:
     """Run from a shell."""
-    if options.summary:
-        table: Any = pd.read_csv(options.out)
-        print(*summary(table[table.seed >= FIRST]), sep="\n")
-        return
-    warnings.simplefilter("ignore")
-    with single_thread():
-        for seed in range(*options.seeds):
-            for kind in options.kind:
-                for name in options.robots:
-                    rows = read(options.out)
-                    done = {(r["robot"], r["kind"], r["seed"]) for r in rows}
-                    if (name, kind, str(seed)) in done:
-                        continue
-                    row = run_case(name, kind, seed)
-                    append(options.out, FIELDS, [row])
-                    print(
-                        f"{name} {kind} {seed}: {row['effect']} "
-                        f"({row['excess']:.0f}) -> {row['verdict']}, "
-                        f"{row['simulated_trials']:,} trials, "
-                        f"{row['cpu_seconds']:.0f} CPU s",
-                        flush=True,
-                    )
+    seeds = () if options.summary else range(*options.seeds)
+    jobs = [(r, k, s) for s in seeds for k in options.kind for r in options.robots]
+    keys = ["robot", "kind", "seed"]
+    resumed(options.out, keys, jobs, run_case, columns=FIELDS)
+    table: Any = pd.read_csv(options.out)
+    print(*summary(table[table.seed >= FIRST]), sep="\n")

@@ -29,11 +29,11 @@ import numpy as np
 import torch
 
 from benchmarks.robots.models import ARM, CART_POLE, PENDULUM, SPRING_MASS
+from benchmarks.rows import keep
 from sbi_active import BoxActions
 from sbi_active.mujoco import from_mjcf
 from sbi_active.mujoco.effects.changes import PowerForce
 from sbi_active.mujoco.models.spec import mujoco_of
-from sbi_active.threads import single_thread
 
 RESULT = Path(__file__).with_suffix(".json")
 SECONDS, SHARED = 1.0, 8
@@ -155,8 +155,7 @@ def main(
     if go2 is not None:
         spec = mujoco.MjSpec.from_file(str(go2))
         models["quadruped, 12 joints"] = (spec, "FL_calf_joint", 0.0, 1.0)
-    with single_thread():
-        found = measured(models, rows, repeats)
+    found = measured(models, rows, repeats)
     record = {
         "date": date.today().isoformat(),
         "mujoco": mujoco.__version__,
@@ -164,4 +163,4 @@ def main(
         "repeats": repeats,
         "models": found,
     }
-    out.write_text(json.dumps(record, indent=1) + "\n")
+    keep(out, record)

@@ -26,6 +26,8 @@ from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 
+from benchmarks.rows import keep
+
 HERE = Path(__file__).parent
 USES_NPE = re.compile(r"\b(NPE_C|NPE|SNPE|SNPE_C)\b")
 
@@ -101,6 +103,6 @@ def main(arguments: Settings) -> None:
         "swapped": Counter(swapped.values()),
         "differ": differ,
     }
-    (HERE / "result.json").write_text(json.dumps(result, indent=2) + "\n")
+    keep(HERE / "result.json", result)
     print(json.dumps({k: v for k, v in result.items() if k != "files"}, indent=2))
     sys.exit(bool(differ))

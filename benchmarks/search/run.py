@@ -18,9 +18,7 @@ result.csv beside this file, and those that are there are not run again.
 
 from __future__ import annotations
 
-import csv
 import time
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +29,7 @@ from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal
 
 from benchmarks.information_gain.run import ExactBelief
+from benchmarks.rows import grouped, resumed
 from sbi_active import (
     BoxActions,
     DiscreteActions,
@@ -175,9 +174,7 @@ def run(case: Case, search: str) -> dict[str, Any]:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for row in rows:
-        groups.setdefault((row["case"], row["search"]), []).append(row)
+    groups = grouped(rows, "case", "search")
     lines = []
     for (case, search), group in groups.items():
         regret = torch.tensor([float(r["regret"]) for r in group])
@@ -225,31 +222,13 @@ def main(
         first: Number of the first case.
         summary: Whether to run nothing, and print the table of the rows.
     """
-    warnings.simplefilter("ignore")
-    torch.set_num_threads(1)
-    rows: list[dict[str, Any]] = []
-    if RESULT.exists():
-        with RESULT.open() as file:
-            rows = [*csv.DictReader(file)]
-    if summary:
-        print(table([r for r in rows if int(r["seed"]) >= first]))
-        return
-    done = {(r["case"], r["search"], int(r["seed"])) for r in rows}
-    with RESULT.open("a", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        if not rows:
-            writer.writeheader()
-        for name in cases:
-            make, num_seeds = CASES[name]
-            for case in make(num_seeds):
-                for search in searches:
-                    if case.seed < first:
-                        continue
-                    key = (case.name, search, case.seed)
-                    skipped = name == "mixed" and search == "exhaustive"
-                    if key in done or skipped:
-                        continue
-                    rows.append(run(case, search))
-                    writer.writerow(rows[-1])
-                    file.flush()
+    every = {
+        (case.name, search, case.seed): (case, search)
+        for name in cases
+        for make, num_seeds in [CASES[name]]
+        for case in ([] if summary else make(num_seeds))
+        for search in searches
+        if case.seed >= first and (name, search) != ("mixed", "exhaustive")
+    }
+    rows = resumed(RESULT, COLUMNS[:3], every, lambda *job: run(*every[job]))
     print(table([r for r in rows if int(r["seed"]) >= first]))

@@ -44,10 +44,21 @@ def legible(figure: Figure) -> Figure:
     Args:
         figure: A figure, changed in place.
     """
+    from matplotlib.axis import Axis
     from matplotlib.text import Text
+    from matplotlib.ticker import FuncFormatter
 
+    for axis in figure.findobj(Axis):
+        assert isinstance(axis, Axis)
+        given = axis.get_major_formatter()
+        if isinstance(given, FuncFormatter):  # names at ticks are set at each drawing
+            axis.set_major_formatter(lambda *at, given=given: _seen(given(*at)))
     for text in figure.findobj(Text):
         assert isinstance(text, Text)
         text.set_parse_math(False)
-        text.set_text(UNSEEN.sub("\ufffd", text.get_text()))
+        text.set_text(_seen(text.get_text()))
     return figure
+
+
+def _seen(text: str) -> str:
+    return UNSEEN.sub("\ufffd", text)

@@ -1,8 +1,5 @@
 """Sets with a truth, rows that are not run twice, and what the table makes of them."""
 
-import importlib.util
-
-import mujoco
 import pandas as pd
 import pytest
 
@@ -14,8 +11,6 @@ if not hasattr(sysid, "Parameter"):
     )
 
 from benchmarks.__main__ import main as run  # noqa: E402
-from benchmarks.robots.coverage import missing  # noqa: E402
-from benchmarks.robots.machines import MACHINES  # noqa: E402
 
 
 def test_rows_are_run_once_and_told(tmp_path, capsys):
@@ -41,18 +36,3 @@ def test_rows_are_run_once_and_told(tmp_path, capsys):
     assert "| ours  | 1      | 1.00 (0.34 to 1.00)" in capsys.readouterr().out
     run(["robots.coverage", "--summary", "--out", str(out)])
     assert "| friction 1  | 0.00    | 1.00   | 1.00" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("name", [*MACHINES])
-def test_machines_are_made_or_say_what_they_need(name):
-    if words := missing(name):
-        assert name in ("Go2 leg", "swimmer")
-        assert importlib.util.find_spec("gymnasium") is None or name == "Go2 leg"
-        assert "cannot be made here" in words
-        return
-    machine = MACHINES[name]
-    model = machine.spec().compile()
-    assert isinstance(model, mujoco.MjModel)
-    assert model.nu == len(machine.drive)
-    assert model.nsensordata == len(machine.noise)
-    assert model.nq == len(machine.start)

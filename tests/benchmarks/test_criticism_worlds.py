@@ -10,7 +10,6 @@ from benchmarks.criticism.cases import (
 from benchmarks.criticism.worlds import get_world
 from benchmarks.criticism.worlds.block import EDGE, GRAVITY, slide
 from benchmarks.criticism.worlds.sliding_block import NOISE_SD, TIMES
-from sbi_active.criticism import AugmentedSimulator
 
 
 def exact_position(near: float, far: float, speed: float, time: float) -> float:
@@ -34,30 +33,6 @@ def test_the_block_follows_the_closed_form():
         for t, v in zip(theta, speed, strict=True)
     ]
     assert (x - torch.tensor(exact)).abs().max() < 0.15 * NOISE_SD
-
-
-@pytest.mark.parametrize("name", ["A", "B", "C"])
-def test_effects_vanish_at_their_nulls(name):
-    world = get_world(name)
-    theta, action = world.prior.sample((16,)), world.actions.sample((16,))
-    model = AugmentedSimulator(world.model, [*world.effects, *world.outside])
-    index = torch.arange(16.0)
-    bare = world.model.mean(theta, action)
-    for effect in model.effects:
-        phi = {effect.name: effect.null_phi(16).to(theta.dtype)}
-        x = model.evaluate(theta, phi, action, index=index)
-        assert torch.allclose(x, bare, atol=1e-5 * float(bare.abs().max())), effect.name
-
-
-def test_a_case_is_its_number():
-    world = get_world("B")
-    first, again = draw_case(world, "library", 3), draw_case(world, "library", 3)
-    assert torch.equal(first.problem.trials.x, again.problem.trials.x)
-    longer = draw_case(world, "library", 3, num_trials=12)
-    assert torch.equal(longer.problem.trials.x[:8], first.problem.trials.x[:8])
-    other = draw_case(world, "library", 4)
-    assert not torch.equal(other.truth.theta, first.truth.theta)
-    assert len(first.problem.trials.held_out_positions) == 8
 
 
 def test_non_centrality_is_weighted_least_squares_where_the_model_is_linear():

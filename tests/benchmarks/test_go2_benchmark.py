@@ -2,12 +2,10 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
-from benchmarks.__main__ import main as run
-from benchmarks.measured.go2_leg import FITTED, read_leg, usual_parameters
+from benchmarks.measured.go2_leg import read_leg, usual_parameters
 from sbi_active.mujoco import mjcf_effects
 
 DATA = Path(__file__).parents[2] / "../shared/data/go2_in_air"
@@ -24,20 +22,6 @@ def leg():
 
 
 @needs_data
-def test_a_leg_is_alone_and_its_trials_are_the_slow_triangles(leg):
-    model = leg.spec().compile()
-    assert (model.nq, model.nu) == (3, 3)
-    robot = leg.robot(usual_parameters(leg), leg.triangles())
-    assert len(robot.trials) == FITTED
-    x = robot.trials.x.numpy()
-    read = np.isfinite(x).all(2)
-    assert read.sum() == pytest.approx(leg.split / 5, abs=FITTED)
-    knee = x[read][:, 2]
-    assert (knee > -2.5).all()
-    assert (knee < -1.2).all()
-
-
-@needs_data
 def test_friction_by_position_follows_the_knee_where_a_constant_one_does_not(leg):
     parameters = usual_parameters(leg)
     robot = leg.robot(parameters, leg.triangles())
@@ -51,8 +35,3 @@ def test_friction_by_position_follows_the_knee_where_a_constant_one_does_not(leg
     assert before["fitted"][2] > 7e-3
     assert after["fitted"][2] < 3e-3
     assert after["held out"][2] < 5e-3
-
-
-def test_a_folder_without_files_is_said(tmp_path):
-    with pytest.raises(SystemExit, match="--data DIR"):
-        run(["measured.go2", "--data", str(tmp_path)])

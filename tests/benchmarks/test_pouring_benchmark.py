@@ -6,17 +6,7 @@ from benchmarks.pouring.bank import LIKELY, ROWS_A_FILE, draw
 from benchmarks.pouring.likelihood import (
     repeated,
 )
-from benchmarks.pouring.power import cross_validated
 from sbi_active.tasks import get_task  # pyright: ignore
-
-
-def test_outcomes_without_information_have_no_gain():
-    rng = np.random.default_rng(1)
-    theta = rng.random((60, 3))
-    noise = rng.standard_normal((60, 8))
-    likelihood = cross_validated(theta, noise, np.zeros(60, dtype=bool))
-    gain = likelihood.gain(rng.random((200, 3)), 100, rng)
-    assert abs(gain.mean()) < 0.3
 
 
 def test_a_repeat_tells_less_than_a_first_pour():

@@ -2,18 +2,12 @@
 
 import json
 
-import pytest
 import torch
 from torch.distributions import HalfNormal, Independent, Normal
 
-from benchmarks.__main__ import main as run
-from benchmarks.measured.ball_and_hoop import free_run, run_pieces
 from benchmarks.measured.record_stages import Bench, aliases, run_stages, table
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials
-from sbi_active.tasks import ball_and_hoop as hoop  # pyright: ignore
-from sbi_active.tasks.records import cut  # pyright: ignore
-from tests.tasks.test_records import record
 
 PLACES = torch.linspace(-1, 1, 12, dtype=torch.float64)[:, None]
 
@@ -87,21 +81,3 @@ def test_stages_name_what_is_there_and_are_run_once(tmp_path, capsys):
     assert "before, m: far" in text
     assert "| 1 replays of the bare model, seeds 2000 to 2000 | none (1) |" in text
     assert aliases(rows) == "Aliases named: 0 of 1 removals."
-
-
-@pytest.mark.parametrize("name", ["ball_and_hoop", "cascaded_tanks"])
-def test_without_the_records_it_says_where_they_should_be(name, tmp_path):
-    with pytest.raises(SystemExit, match=r"expected a record in .* --data DIR"):
-        run([f"measured.{name}", "--data", str(tmp_path)])
-
-
-def test_free_run_of_a_hoop_with_its_own_effects_has_no_error():
-    made = record(0.1, (-0.9, 0.9), 241)
-    whole = cut(made, 240)
-    effects = [e for e in hoop.make_effects() if e.name in ("Coulomb", "warm-up")]
-    z = torch.tensor([[7.0, 0.8, 0.01, 0.5, 0.1]], dtype=torch.float64)
-    x = run_pieces(z, whole, effects)
-    output = torch.cat([torch.from_numpy(whole.start), x[0, 0]]).numpy()
-    held = {"made": cut(type(made)("made", 0.1, made.voltage, output), 240)}
-    assert free_run(z, held, effects)["made"] == 0
-    assert free_run(z[:, :3], held)["made"] > 0.1

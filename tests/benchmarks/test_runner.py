@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Literal
@@ -58,43 +57,6 @@ def test_options_are_arguments():
             parse(wrong.split())
 
 
-def test_arguments_without_a_default_are_given_by_place_or_must_be_named():
-    def run(folder: Path, *, bank: int) -> None: ...
-
-    parse = parser_of(run, "some").parse_args
-    assert vars(parse(["a", "--bank", "3"])) == {"folder": Path("a"), "bank": 3}
-    with pytest.raises(SystemExit):
-        parse(["a"])
-
-
-@dataclass(frozen=True)
-class Base:
-    """What all share.
-
-    Args:
-        first: Number of the first,
-            on two lines.
-    """
-
-    first: int = 0
-
-
-@dataclass(frozen=True)
-class Settings(Base):
-    """What one has."""
-
-    first: int = 7
-    last: int = 9
-
-
-def test_settings_are_options():
-    def run(settings: Settings) -> None: ...
-
-    parser = parser_of(run, "some")
-    assert vars(parser.parse_args(["--last", "3"])) == {"first": 7, "last": 3}
-    assert "Number of the first, on two lines." in parser.format_help()
-
-
 @pytest.mark.parametrize("name", benchmarks())
 def test_every_benchmark_has_a_parser_and_describes_its_options(name):
     try:
@@ -103,11 +65,6 @@ def test_every_benchmark_has_a_parser_and_describes_its_options(name):
         pytest.skip(str(error))
     parser = parser_of(run, name)
     assert all(action.help for action in parser._actions)
-
-
-def test_an_unknown_name_is_an_error_with_those_alike(capsys):
-    assert main(["oracle"]) == 2
-    assert "got 'oracle'" in capsys.readouterr().err
 
 
 def test_all_are_listed(capsys):

@@ -10,15 +10,13 @@ from sbi.utils import BoxUniform
 from torch.distributions import Independent, Normal
 
 from sbi_active import (
-    BoxActions,
     Campaign,
-    CampaignOptions,
     DiscreteActions,
     GaussianNoise,
     SimulatorModel,
 )
 from sbi_active.campaign.options import CampaignDetails
-from tests.campaign.problem import ACTIONS, MODEL, OPTIONS, PRIOR, campaign, noisy
+from tests.campaign.problem import ACTIONS, OPTIONS, PRIOR, campaign, noisy
 
 
 def test_ask_tell_update():
@@ -81,12 +79,13 @@ def test_nsbi_draws_actions_at_random():
     assert len(chosen) == 3
 
 
-def run(mode, method, make_actions):
+def run(mode, method):
     """Return actions, scores and draws of a campaign, all of it made in a mode."""
     with mode():
         prior = BoxUniform(torch.zeros(1), torch.ones(1))
         model = SimulatorModel(lambda t, a: t * a, noise=GaussianNoise(0.1))
-        c = Campaign(model, prior, make_actions(), method=method, options=OPTIONS)
+        actions = DiscreteActions(torch.tensor([0.5, 1.0, 3.0]))
+        c = Campaign(model, prior, actions, method=method, options=OPTIONS)
         for _ in range(2):
             trial = c.ask()
             c.tell(torch.tensor([0.6]) * trial.action, trial=trial)
@@ -98,25 +97,10 @@ def run(mode, method, make_actions):
     return trial.action.tolist(), scores, c.belief.sample((20,)).tolist()
 
 
-def box_of_actions():
-    return BoxActions(torch.tensor([0.1]), torch.tensor([3.0]))
-
-
-def list_of_actions():
-    return DiscreteActions(torch.tensor([0.5, 1.0, 3.0]))
-
-
-@pytest.mark.parametrize(
-    ("method", "make_actions"),
-    [
-        ("asbi", list_of_actions),
-        ("alhi", list_of_actions),
-        pytest.param("asbi", box_of_actions, marks=pytest.mark.slow),
-    ],
-)
-def test_numbers_are_the_same_without_gradients(method, make_actions):
+@pytest.mark.parametrize("method", ["asbi", "alhi"])
+def test_numbers_are_the_same_without_gradients(method):
     modes = (contextlib.nullcontext, torch.inference_mode)
-    plain, other = (run(mode, method, make_actions) for mode in modes)
+    plain, other = (run(mode, method) for mode in modes)
     assert other == plain
 
 
@@ -185,21 +169,6 @@ def test_an_error_while_designing_loses_nothing():
     assert c.ask().status == "pending"
 
 
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ({"num_simulations": 10}, "expected num_simulations >= 100"),
-        ({"max_simulations": 10}, "expected max_simulations >= 100 or None"),
-        ({"planned_trials": 0}, "expected planned_trials >= 1"),
-        ({"check_every": 0}, "expected check_every >= 1 or None; got 0"),
-        ({"network": "never"}, "expected network 'each round' or 'on demand'"),
-    ],
-)
-def test_options_are_checked(options, text):
-    with pytest.raises(ValueError, match=text):
-        CampaignOptions(**options)
-
-
 def test_other_errors():
     valid = "'asbi', 'nsbi', 'alhi', 'nlhi', 'seqbed'; got 'nre'"
     with pytest.raises(ValueError, match=re.escape(valid)):
@@ -237,13 +206,11 @@ def box(low, high, dtype=torch.float32):
     ("prior", "text"),
     [
         (box([0.0, 1.0], [1.0, 1.0]), "got length within [1, 1]"),
-        (box([1.0, 0.0], [1.0 + 1e-9, 1.0], torch.float64), "got mass within [1, 1]"),
         (
             Independent(Normal(torch.full((2,), 5.0), torch.tensor([1.0, 1e-9])), 1),
             "got length within [5, 5]",
         ),
         (box([0.0, 1.0], [1.0, 0.0]), "expected a prior with draws in its support"),
-        (box([0.0, float("nan")], [1.0, 1.0]), "expected a prior with draws in its"),
     ],
 )
 def test_priors_without_width(prior, text):
@@ -263,7 +230,3 @@ def test_narrow_and_wide_priors_that_float32_holds(scale):
     c = Campaign(model, prior, ACTIONS, method="nsbi", options=OPTIONS)
     c.tell(1.8, action=[3.0])
     assert float(c.update().mean) / scale == pytest.approx(0.6, abs=0.05)
-
-
-def test_a_model_of_the_problem_is_deterministic_but_for_its_noise():
-    assert campaign("asbi", MODEL).ask().action.tolist() == [3.0]

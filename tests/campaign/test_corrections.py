@@ -7,7 +7,6 @@ import pytest
 import torch
 from torch.distributions import Independent, Normal
 
-from sbi_active.campaign.health import outlyingness
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.criticism import Effect
 from tests.campaign.problem import (  # noqa: F401 # others import them from here
@@ -38,10 +37,7 @@ def scores(c):
 
 @pytest.mark.parametrize(
     ("method", "bad"),
-    [
-        *[("nsbi", 1e15), ("nsbi", -1e30), ("alhi", 62.0)],
-        *[pytest.param(m, 62.0, marks=pytest.mark.slow) for m in ("asbi", "seqbed")],
-    ],
+    [("nsbi", 1e15), ("nsbi", -1e30), ("alhi", 62.0)],
 )
 def test_a_number_that_nothing_explains_is_named_and_left_out(method, bad):
     c = tell(campaign(method), x0=bad)
@@ -99,10 +95,9 @@ def test_a_measurement_where_the_simulator_hardly_gives_one(least):
     c.ask()
 
 
-@pytest.mark.parametrize("method", ["nsbi", "alhi"])
 @pytest.mark.filterwarnings("ignore:trial 0")
-def test_a_corrected_trial_is_as_if_told_at_once(method):
-    right, wrong = tell(campaign(method)), tell(campaign(method), x0=1e15)
+def test_a_corrected_trial_is_as_if_told_at_once():
+    right, wrong = tell(campaign()), tell(campaign(), x0=1e15)
     right.update(), wrong.update()
     assert (right.health, wrong.health) == ("ok", "alarm")
     assert [t.outlyingness for t in right.history] == [None] * 3
@@ -190,15 +185,10 @@ def test_a_correction_behind_an_adoption():
     ("told", "text"),
     [
         ({"x": "abc"}, "expected x of real numbers; got 'abc'"),
-        ({"x": [None]}, "expected x of real numbers; got [None]"),
         ({"x": 10**400}, "expected x of real numbers; got 1000"),
-        ({"x": 1 + 2j}, "expected x of real numbers; got torch.complex128"),
         ({"x": np.array([1e39])}, "expected x within +-3.4e38, the range of float32"),
         ({"x": []}, "expected x of shape (1,)"),
-        ({"x": [[1.0], [2.0]]}, "expected one outcome of shape (1,); got 2"),
         ({"x": 1.0, "action": [np.nan]}, "expected a finite action"),
-        ({"x": 1.0, "action": [1e39]}, "expected a finite action"),
-        ({"x": 1.0, "action": "abc"}, "expected the action"),
     ],
 )
 def test_what_is_refused_leaves_no_trace(told, text):
@@ -233,12 +223,3 @@ def test_a_robot_that_changes_its_action_changes_no_record():
 
     c.run(real_system, num_rounds=1)
     assert bool(ACTIONS.contains(c.history[0].action))
-
-
-def test_outlyingness_by_the_farthest_number():
-    drawn = torch.stack([torch.linspace(0, 1, 11), torch.zeros(11)], 1)
-    assert outlyingness(torch.tensor([0.5, 0.0]), drawn) == 0
-    assert outlyingness(torch.tensor([-2.0, 0.0]), drawn) == 2
-    assert outlyingness(torch.tensor([torch.nan, 4.0]), drawn[:, 1:].repeat(1, 2)) > 1e9
-    drawn[:, 1] = torch.nan
-    assert outlyingness(torch.tensor([0.5, 0.0]), drawn) == float("inf")

@@ -3,7 +3,6 @@
 import copy
 import logging
 import pickle
-import time
 
 import matplotlib
 import numpy as np
@@ -13,18 +12,15 @@ import torch
 from sbi.utils import BoxUniform
 
 from sbi_active import (
-    BoxActions,
     Campaign,
     CampaignOptions,
     DiscreteActions,
     GaussianNoise,
-    MixedActions,
     SimulatorModel,
     progress,
     to_inference_data,
 )
 from sbi_active.campaign.display.figures import predict
-from sbi_active.campaign.display.page import outcome_labels
 from sbi_active.campaign.health import health_after
 from sbi_active.campaign.state import CampaignState, ModelVersion, Trial
 
@@ -105,28 +101,6 @@ def test_table_draws_and_names_are_the_same_without_the_simulator(folder):
     figure = loaded.plot()
     surprise = figure.axes[-2].lines[0].get_ydata()[0]
     assert surprise == pytest.approx(campaign.history[0].surprise)
-
-
-def test_a_campaign_without_trials_is_an_empty_table():
-    frame = new(simulator=MODEL).to_dataframe()
-    assert len(frame) == 0
-    assert "speed [m/s]" in frame.columns
-
-
-def test_many_numbers_are_an_array_and_names_stay_apart():
-    x = torch.linspace(0, 1, 30)
-    model = SimulatorModel(lambda t, a: t[:, :1] * x, noise=GaussianNoise(0.1))
-    actions = MixedActions(
-        BoxActions(0.0, 1.0, names=["surprise"]), DiscreteActions([0, 1], names=["x"])
-    )
-    c = Campaign(model, PRIOR, actions, options=OPTIONS)
-    c.attach([0.5, 1.0], x)
-    frame = c.to_dataframe()
-    assert frame["action surprise"][0] == 0.5
-    assert frame["x"][0] == 1.0
-    np.testing.assert_array_equal(frame["outcome x"][0], x)
-    assert outcome_labels((1,)) == ["x"]
-    assert outcome_labels((2, 3))[:2] == ["x_1_1", "x_1_2"]
 
 
 def test_health_is_that_of_then():
@@ -281,18 +255,6 @@ def test_every_size_is_drawn_without_overlap(dim, num_trials, x):
         assert low < 0.1 < high
 
 
-def test_maps_stand_in_the_figure():
-    model = SimulatorModel(
-        lambda theta, action: theta * action[:, :1] + action[:, 1:],
-        noise=GaussianNoise(0.1),
-    )
-    actions = BoxActions([0.5, 0.0], [2.0, 1.0], names=["speed", "tilt"])
-    c = Campaign(model, PRIOR, actions, options=OPTIONS)
-    c.ask()
-    titles = [ax.get_title() for ax in c.plot().axes]
-    assert "information by action, trial 0" in titles
-
-
 @pytest.fixture
 def said(monkeypatch, caplog):
     """Call long what takes a twentieth of a second, and return the log's lines."""
@@ -301,41 +263,6 @@ def said(monkeypatch, caplog):
     monkeypatch.setattr(progress, "TICK", 0.01)
     caplog.set_level(logging.INFO, "sbi_active")
     return lambda: [r.getMessage() for r in caplog.records if r.name == "sbi_active"]
-
-
-def state_with(*seconds):
-    state = CampaignState("asbi", 0, OPTIONS)
-    for index, each in enumerate([*seconds, {}]):
-        state.trials.append(Trial(index, torch.empty(0), seconds=each))
-    return state
-
-
-def test_a_stage_says_how_long_it_takes(said):
-    with state_with().stage(0, "training"):
-        time.sleep(4 * SOON)
-    during, after = said()
-    assert during.startswith("trial 0: training, 0.1 s so far; it is the first")
-    assert after.startswith("trial 0: training took 0.2 s")
-    with state_with().stage(0, "training"):
-        pass
-    assert len(said()) == 2  # a short one has no line
-    state = state_with({"training": 12.0}, {"design": 0.5})
-    with state.stage(2, "training"):
-        assert said()[-1] == "trial 2: training, about 12 s, as in trial 0"
-    with state_with({"training": 0.01}).stage(1, "training"):
-        time.sleep(4 * SOON)
-    assert any("in trial 0 it took 0.0 s" in line for line in said())
-    with state_with().watched(1, "criticism"):  # work for no trial
-        time.sleep(4 * SOON)
-    assert said()[-1].startswith("criticism took")
-
-    def failing():
-        with state_with().stage(0, "training"):
-            time.sleep(4 * SOON)
-            raise ZeroDivisionError
-
-    pytest.raises(ZeroDivisionError, failing)
-    assert "ended with an error after" in said()[-1]
 
 
 def test_bars_show_stages_and_rounds_where_they_are_asked_for(said, capsys, tmp_path):

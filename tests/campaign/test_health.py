@@ -139,10 +139,3 @@ def test_a_lost_calibration_stops_and_is_judged_once(refine, monkeypatch):
     c.run(lambda action: 0.4 * action, num_rounds=3)
     assert len(c.history) == len(calls) == 2
     assert c.stop_reason == "calibration is lost: it excludes the truth"
-
-
-def test_a_right_belief_is_not_lost():
-    c = campaign(stop=StopRules(calibration_lost=True))
-    c.tell(0.4, action=[1.0])
-    c.update()
-    assert c.stop_reason is None

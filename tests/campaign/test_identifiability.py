@@ -40,17 +40,3 @@ def test_what_is_said_outlives_the_process(tmp_path):
     assert repr(loaded) == "Campaign(asbi, 1 trials)"  # nothing was read yet
     assert loaded.belief.diagnostics.combinations == said  # pyright: ignore
     assert repr(loaded) == f"Campaign(asbi, 1 trials; {said})"
-
-
-def test_the_report_says_it():
-    options = CampaignOptions(network="on demand")
-    campaign = Campaign(MODEL, PRIOR, ACTIONS, options=options)
-    for action, x in ((1.0, 0.352), (2.0, 0.693), (1.0, 0.343), (2.0, 0.708)):
-        campaign.attach([action], [x])
-    report = campaign.criticize(evaluate=False)
-    (known,) = report.combinations.known
-    assert known.text == "friction * mass"
-    assert known.low < 0.35 < known.high
-    text = " ".join(str(report).split())
-    assert "Of parameters together, known: friction * mass = " in text
-    assert "Of parameters together" in report.to_markdown()

@@ -5,7 +5,6 @@ import time
 import pytest
 import torch
 
-from sbi_active.campaign.learning.rounds import RoundModel
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.seeding import row_normals
 from tests.campaign.problem import campaign, draws
@@ -80,14 +79,6 @@ def test_on_demand_it_is_trained_for_what_needs_it(changes, asks):
     assert "training" in trial.cpu_seconds
 
 
-def test_a_design_by_the_simulations_of_the_training_costs_none():
-    details = CampaignDetails(design_on="training")
-    trained = campaign("asbi", num_simulations=2_000, details=details).ask()
-    assert trained.num_simulations == 2_000
-    assert trained.design.num_simulations == 0
-    assert trained.design.stopped == "simulations given"
-
-
 def test_on_demand_it_is_trained_where_no_other_estimator_may_be_used():
     c = campaign("asbi", heavy_tailed)
     start = time.process_time()
@@ -99,22 +90,3 @@ def test_on_demand_it_is_trained_where_no_other_estimator_may_be_used():
     eager = campaign("asbi", heavy_tailed, network="each round").ask()
     gain = eager.design.expected_information_gain
     assert torch.equal(trial.design.expected_information_gain, gain)
-
-
-def test_a_model_is_trained_by_the_first_question():
-    calls = []
-
-    class Model:
-        log_likelihood, belief = "density", "belief"
-
-    def train():
-        calls.append(1)
-        return Model()
-
-    model = RoundModel(train)
-    assert getattr(model, "belief", None) is None
-    assert not calls
-    assert not hasattr(model, "log_posterior")
-    assert not model.was_asked
-    assert model.log_likelihood == "density"
-    assert (model.was_asked, model.is_trained, calls) == (True, True, [1])

@@ -7,7 +7,7 @@ from sbi_active import Campaign, CampaignOptions, GaussianNoise, SimulatorModel
 from sbi_active.actions import SignalActions
 from sbi_active.actions.waveforms import step
 from sbi_active.campaign.options import CampaignDetails
-from sbi_active.criticism import Criticism, Trials, generic_effects
+from sbi_active.criticism import Criticism, Trials
 from tests.campaign.sizes import REFINEMENT
 
 GRID = torch.linspace(0, 1, 51)
@@ -73,21 +73,6 @@ def test_a_campaign_asks_for_signals_and_learns():
     assert bool(((mean - TRUTH[0]).abs() < 4 * sd + 0.01).all())
     assert bool((sd < torch.tensor([0.1, 0.02])).all())
     assert campaign.health == "ok"
-
-
-def test_a_dead_zone_of_the_motor_is_found():
-    action = SPACE.sample((8,), seed=1)
-    x = torch.stack([motor(a, k, dead=0.15) for k, a in enumerate(action)])
-    effects = generic_effects(MODEL, SPACE, prior=PRIOR)
-    names = {e.name for e in effects}
-    assert {"input offset", "input lag", "sensor delay"} <= names
-    assert not [e for e in effects if e.hook == "action"]
-    rivals = [e for e in effects if e.name in ("input offset", "input lag", "bias")]
-    loop = Criticism(MODEL, PRIOR, Trials(action, x), effects=rivals, actions=SPACE)
-    # Of one sign, a dead zone is an offset while the voltage is on, and none else.
-    assert loop.detect().alarm
-    chosen = loop.next_action()
-    assert chosen.action is None or bool(SPACE.contains(torch.tensor(chosen.action)))
 
 
 def test_recorded_inputs_take_the_place_of_the_signals():

@@ -11,7 +11,7 @@ from sbi_active import (
     InformationGainDesigner,
     SimulatorModel,
 )
-from tests.linear_gaussian import PRIOR, ExactModel, simulator
+from tests.linear_gaussian import PRIOR
 
 ANGLES = DiscreteActions([0.0, 0.25, 1.0], names=["angle"])
 
@@ -137,21 +137,3 @@ def test_a_batch_in_a_continuous_space():
     grid = torch.linspace(0, 1, 101).tolist()
     assert joint(0.0) - joint(first) < 0.1
     assert max(joint(first, b) for b in grid) - joint(first, second) < 0.1
-
-
-def test_errors():
-    posterior = InformationGainDesigner(ANGLES, num_samples=100, estimator="posterior")
-    with pytest.raises(ValueError, match="expected an estimator of the joint inform"):
-        posterior.select(ExactModel(), simulator, num_actions=2, seed=0)
-    with pytest.raises(ValueError, match="got PosteriorGain on ExactModel"):
-        posterior.select(ExactModel(), simulator, pending=torch.zeros(1, 1), seed=0)
-    with pytest.raises(ValueError, match=r"expected pending of shape \(t, 1\); got"):
-        select(pending=torch.zeros(1, 2))
-    with pytest.raises(ValueError, match="expected num_actions >= 1; got 0"):
-        select(num_actions=0)
-
-    class Both(ExactModel, Likelihood):
-        """A posterior and a likelihood of single outcomes."""
-
-    with pytest.raises(AttributeError, match="got one that asks for log_posterior"):
-        posterior.select(Both(), simulator, num_actions=2, seed=0)

@@ -15,7 +15,7 @@ from sbi_active.design import GradientSearch, Search
 from sbi_active.design.search import ExhaustiveSearch
 from sbi_active.tasks.numerical.task import NumericalTask
 from tests.design.test_designer import Exact
-from tests.linear_gaussian import PRIOR, ExactModel, information, simulator
+from tests.linear_gaussian import PRIOR, ExactModel, simulator
 
 BOX = BoxActions(-5.0, 5.0, names=["xi"])
 
@@ -61,22 +61,6 @@ def test_the_best_category_and_place_of_a_known_function():
         )
         assert float(design.action[1]) == 7.0
         assert 2.1 - float(bumps(design.action[None])) < 0.05
-
-
-def test_a_learned_posterior_in_a_box():
-    box = BoxActions(0.0, 2.0)
-    designer = InformationGainDesigner(box, num_samples=400, estimator="posterior")
-    design = designer.select(ExactModel(), simulator, seed=0)
-    assert (
-        float(information(torch.tensor([[2.0]])) - information(design.action[None]))
-        < 0.05
-    )
-    assert (design.bound, design.estimator) == ("lower", "PosteriorGain")
-    again = designer.select(ExactModel(), simulator, seed=0)
-    assert torch.equal(design.candidates, again.candidates)
-    assert torch.equal(
-        design.expected_information_gain, again.expected_information_gain
-    )
 
 
 def test_which_search():

@@ -155,29 +155,6 @@ def test_given_simulations_in_a_box():
     assert float(design.action[0]) > 1.6
 
 
-def test_errors_of_given_simulations():
-    designer = InformationGainDesigner(ACTIONS)
-    given = rows(400, ACTIONS)
-    with pytest.raises(ValueError, match="expected a model with simulations="):
-        designer.select(None, belief=PRIOR, simulations=given)
-    with pytest.raises(
-        ValueError, match="expected one action and none pending with si"
-    ):
-        designer.select(ExactModel(), simulations=given, num_actions=2)
-    with pytest.raises(ValueError, match="at least 16 rows of a candidate; got fewer"):
-        designer.select(ExactModel(), simulations=rows(400, BOX))
-    entropy = InformationGainDesigner(BOX, estimator="entropy")
-    with pytest.raises(ValueError, match="scores rows one by one with simulations="):
-        entropy.select(None, belief=PRIOR, simulations=rows(400, BOX))
-    wrong = Simulations(given.theta, given.action.repeat(1, 2), given.x)
-    with pytest.raises(TypeError, match=r"expected Simulations\(theta, action, x\)"):
-        designer.select(ExactModel(), simulations=(given.theta, given.action, given.x))
-    with pytest.raises(ValueError, match=r"of actions \(n, 1\); got \(400, 2\)"):
-        designer.select(ExactModel(), simulations=wrong)
-    with pytest.raises(ValueError, match="target='model'; got given simulations"):
-        designer.select([], simulations=given, target="model")
-
-
 def test_random_choices_of_any_space():
     mixed = MixedActions(BOX, DiscreteActions([0.0, 1.0]))
     drawn = torch.stack(

@@ -95,15 +95,6 @@ def test_each_category_has_a_panel(own):
     assert seen == len(made.candidates)
 
 
-def test_of_many_categories_the_best_and_the_chosen_have_panels():
-    many = DiscreteActions(torch.arange(30.0), names=["place"])
-    actions = MixedActions(BoxActions(0.0, 1.0, names=["speed"]), many)
-    rows = torch.cat([torch.rand(60, 1), torch.arange(60.0)[:, None] % 30], 1)
-    ax = design(actions, candidates=rows, index=2).plot()
-    titles = [panel.get_title() for panel in ax.child_axes if panel.get_title()]
-    assert titles == ["place = 2", *[f"place = {k}" for k in range(19, 30)]]
-
-
 @pytest.mark.parametrize("dim", [3, 7])
 def test_more_entries_are_bars_in_order_with_the_chosen_one(dim):
     actions = BoxActions([0.0] * dim, [1.0] * dim)
@@ -116,17 +107,6 @@ def test_more_entries_are_bars_in_order_with_the_chosen_one(dim):
     assert widths[-1] == pytest.approx(float(made.expected_information_gain.max()))
     assert widths[0] == pytest.approx(float(made.expected_information_gain.min()))
     assert ax.get_title() == "red: chosen; 15 further candidates"
-
-
-def test_a_random_choice_has_places_and_no_colors():
-    unknown = torch.full((30,), torch.nan)
-    made = design(BOX, expected_information_gain=unknown, standard_error=unknown)
-    ax = made.plot()
-    assert not ax.collections
-    np.testing.assert_allclose(ax.lines[0].get_xydata(), made.candidates)
-    three = BoxActions([0.0] * 3, [1.0] * 3)
-    ax = design(three, expected_information_gain=unknown, standard_error=unknown).plot()
-    assert ax.get_title().startswith("chosen at random")
 
 
 def test_it_is_drawn_where_it_is_told_to():

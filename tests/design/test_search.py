@@ -2,10 +2,9 @@ import pytest
 import torch
 
 from sbi_active import BoxActions, DiscreteActions, MixedActions
-from sbi_active.actions import ActionSpace
 from sbi_active.design import GradientSearch
-from sbi_active.design.coordinates import Coordinates, cells
-from sbi_active.design.search import ExhaustiveSearch, ascend
+from sbi_active.design.coordinates import Coordinates
+from sbi_active.design.search import ascend
 from tests.design.known import BEST, SPACE, Counted, objective, utility
 
 PLANE = Coordinates(
@@ -78,38 +77,6 @@ def test_given_evaluations_are_enough():
     assert loss(found) < 0.05
 
 
-def test_coordinates_go_there_and_back():
-    coordinates = Coordinates(SPACE)
-    action = SPACE.sample((50,), seed=0)
-    assert torch.allclose(coordinates.actions(coordinates.points(action)), action)
-    point = coordinates.spread(30, 0)
-    assert torch.bincount(point[:, 1].long()).tolist() == [10, 10, 10]
-    assert (point[:, 0].sort().values.diff() < 0.1).all()
-
-
-def test_errors():
-    with pytest.raises(TypeError, match="expected DiscreteActions; got BoxActions"):
-        ExhaustiveSearch().size(BoxActions(0.0, 1.0))
-    with pytest.raises(TypeError, match="expected BoxActions or MixedActions"):
-        GradientSearch().size(DiscreteActions([0.0, 1.0]))
-    with pytest.raises(ValueError, match=r"num_starts >= 1; got \(6, 0, 64\)"):
-        GradientSearch(num_finalists=0)
-    with pytest.raises(ValueError, match="expected a budget >= 1600"):
-        GradientSearch().num_evaluations(1_000, 100)
-
-    class Ball(ActionSpace):
-        action_dim = 1
-
-        def sample(self, sample_shape, *, seed=None):
-            return torch.zeros(*sample_shape, 1)
-
-        def contains(self, action):
-            return torch.ones(action.shape[:-1]).bool()
-
-    with pytest.raises(TypeError, match="expected boxes and lists of actions; got Bal"):
-        Coordinates(Ball())
-
-
 def test_each_is_the_best_of_those_that_are_far_from_better_ones():
     generator = torch.Generator().manual_seed(0)
     category = torch.randint(2, (60, 1), generator=generator).double()
@@ -143,17 +110,3 @@ def test_influence_is_the_error_of_the_mean():
     spread = torch.tensor(means).std()
     ratio = float(torch.tensor(said).mean() / spread)
     assert 0.5 < ratio < 1.5  # 4 standard errors of a standard deviation of 30, .5
-
-
-def test_cells_hold_neighbors_of_one_category():
-    generator = torch.Generator().manual_seed(0)
-    point = torch.rand(1_000, 3, generator=generator, dtype=torch.float64)
-    point[:, 2] = (point[:, 2] * 3).floor()
-    groups = cells(point, 50, num_continuous=2)
-    assert torch.cat(groups).sort().values.tolist() == [*range(1_000)]
-    assert 40 <= len(groups) <= 100
-    for group in groups:
-        inside = point[group]
-        assert len(inside[:, 2].unique()) == 1
-        width = inside[:, :2].amax(0) - inside[:, :2].amin(0)
-        assert float(width.max()) < 0.6

@@ -15,7 +15,6 @@ from sbi_active import (
     SimulatorModel,
 )
 from sbi_active.diagnostics import check_belief, check_calibration
-from sbi_active.diagnostics.verdict import clopper_pearson, ks_distance
 from sbi_active.inference import ActionPosterior
 from sbi_active.seeding import forked_generators
 
@@ -127,26 +126,6 @@ def test_a_result_says_itself_and_leaves_the_generators_alone(trained):
     assert len(found.plot().axes) == 4
     assert found.label.max() == 2
     assert found.verdict != "trust" or found.overall.lost < 0.4
-
-
-def test_bad_input_is_an_error(trained):
-    with pytest.raises(ValueError, match="expected a simulator and actions"):
-        check_calibration(trained, MODEL)
-    with pytest.raises(ValueError, match="at least 100"):
-        check_calibration(trained, MODEL, actions=ACTIONS, num_simulations=50)
-    with pytest.raises(TypeError, match="got str"):
-        check_calibration("network", MODEL, actions=ACTIONS)
-
-    def noisy(theta, action):
-        return theta * action + torch.randn_like(theta)
-
-    with pytest.raises(ValueError, match="declares its noise"):
-        check_calibration(trained, noisy, actions=ACTIONS, gap="likelihood")
-
-
-def test_intervals():
-    assert clopper_pearson(0, 10, 0.05) == pytest.approx((0, 0.3085), abs=1e-3)
-    assert ks_distance(torch.linspace(0.05, 0.95, 10).numpy()) == pytest.approx(0.05)
 
 
 class Normal(torch.distributions.MultivariateNormal):

@@ -11,11 +11,9 @@ from sbi_active import (
     BoxActions,
     Campaign,
     DiscreteActions,
-    InformationGainDesigner,
     RandomDesigner,
     SimulatorModel,
 )
-from sbi_active.campaign import Trial
 from sbi_active.display.notebook import badge, card, facts, items, table
 from sbi_active.display.table import Table
 from sbi_active.inference.beliefs.belief import UnchangedBelief
@@ -93,12 +91,6 @@ def test_a_campaign_has_its_health_belief_and_trials(campaign):
     assert mean in page.texts
 
 
-def test_a_campaign_without_trials_has_no_table_of_them():
-    c = Campaign(MODEL, PRIOR, BoxActions([0.5], [2.0]), options=OPTIONS)
-    assert "the belief is the prior" in page_of(c).text
-    assert "surprise" not in page_of(c).text
-
-
 def test_a_long_campaign_is_small(campaign):
     c = Campaign(MODEL, PRIOR, campaign.actions, options=OPTIONS)
     for _ in range(40):
@@ -106,20 +98,6 @@ def test_a_long_campaign_is_small(campaign):
     page = page_of(c)
     assert "and 28 before" in page.texts
     assert "39" in page.texts
-
-
-def test_a_trial_says_what_was_asked_and_told(campaign):
-    told, pending = campaign.state.trials
-    page = page_of(told)
-    assert "Trial 0: ok" in page.texts
-    assert f"speed {EVIL} [m/s] {float(told.action):.4g}" in page.texts
-    assert f"{told.information_gained:.3g} nats" in page.texts
-    assert f"{float(told.x[0]):.4g}" in page.text
-    assert "Trial 1: pending" in page_of(pending).texts
-    assert "outcome" not in page_of(pending).texts
-    x = torch.tensor([0.125])
-    away = page_of(Trial(3, torch.ones(1), x=x, status="withdrawn", reason=EVIL))
-    assert {EVIL, "0.125"} <= {*away.texts}
 
 
 def test_a_belief_has_each_parameter_and_what_speaks_against_it():
@@ -136,14 +114,6 @@ def test_looking_at_a_belief_draws_nothing_from_the_global_generator(campaign):
     assert torch.equal(torch.get_rng_state(), before)
 
 
-def test_diagnostics_have_figures_in_words():
-    page = page_of(
-        Diagnostics(trustworthy=True, num_simulations=4_000, error_nats=0.01)
-    )
-    assert {"trustworthy", "4000"} <= {*page.texts}
-    assert "not checked" in page_of(Diagnostics()).texts
-
-
 def test_a_design_has_the_chosen_and_the_best_candidates(campaign):
     design = campaign.pending.design
     page = page_of(design)
@@ -152,12 +122,6 @@ def test_a_design_has_the_chosen_and_the_best_candidates(campaign):
     pairs = DiscreteActions([[0.0, 1.0], [1.0, 2.0]], names=["a", "b"])
     page = page_of(RandomDesigner(pairs).select(seed=0))
     assert {"a", "b", "chosen"} <= {*page.texts}
-
-
-def test_a_batch_has_a_page():
-    designer = InformationGainDesigner(DiscreteActions([0.5, 1.0]), num_samples=40)
-    designs = designer.select(None, MODEL, belief=PRIOR, num_actions=2, seed=0)
-    assert "2 actions" in page_of(designs).text
 
 
 def test_a_report_has_its_verdict():
@@ -178,9 +142,3 @@ def test_pieces_are_escaped():
     ]
     for piece in pieces:
         assert EVIL in Page(piece).texts
-
-
-def test_many_parameters_are_cut():
-    names = [f"p{i}" for i in range(40)]
-    page = Page(table(Table.of_parameters(names, torch.randn(50, 40))))
-    assert "and 10 more" in page.texts

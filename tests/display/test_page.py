@@ -7,7 +7,7 @@ from sbi_active.campaign.display.page import page as campaign_page
 from sbi_active.display import Page, Section, Table, svg
 from tests.campaign.storage.campaigns import MODEL, go_on, new
 from tests.criticism.report.reports import report
-from tests.display.browser import assert_reads_well, look
+from tests.display.browser import CHROMIUM, assert_reads_well, look
 
 TABLE = Table(
     ("name", "value"),
@@ -55,10 +55,12 @@ def test_the_browser_sees_what_is_wrong(tmp_path):
     assert any("broken" in line for line in console)
 
 
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
 def test_a_criticism_reads_well_in_a_browser(tmp_path):
     assert_reads_well(report().to_html(), tmp_path)
 
 
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
 @pytest.mark.filterwarnings("ignore")
 def test_a_campaign_reads_well_in_a_browser(tmp_path):
     campaign = go_on(new(simulator=MODEL), 2)

@@ -39,7 +39,3 @@ def test_parameters_have_mean_deviation_and_interval():
     ((name, mean, sd, interval),) = Table.of_parameters(["mass"], draws).rows
     assert (name, float(mean), float(sd)) == ("mass", 0.5, 0.29)
     assert interval == "0.05 to 0.95"
-
-
-def test_a_table_without_rows_is_its_header():
-    assert Table(("a", "b"), []).text() == "a  b\n-  -"

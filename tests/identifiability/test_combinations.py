@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sbi_active.identifiability.formula import Combination, Term, linked
+from sbi_active.identifiability.formula import Combination, Term
 from sbi_active.identifiability.search import KNOWN, search
 
 NAMES = [*"abcdef"]
@@ -86,9 +86,3 @@ def test_all_that_is_known_of_two_is_found():
         is_there = best < 0.8 * KNOWN * np.sqrt(covariance.diagonal().min())
         assert len(found) == 1 or not is_there
         assert all(own < 1.1 * best for _, own in found)
-
-
-def test_combinations_that_share_parameters_go_together():
-    first, last = Combination((Term(0), Term(1))), Combination((Term(1), Term(2)))
-    other = Combination((Term(3), Term(4)))
-    assert linked([last, other, first]) == [[first, last], [other]]

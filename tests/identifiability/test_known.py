@@ -1,18 +1,13 @@
 """What beliefs know of parameters together, from exact posteriors."""
 
-import json
-import pickle
-
 import pytest
 import torch
 from sbi.utils import BoxUniform
 from torch.distributions import Distribution, MultivariateNormal
 
 from sbi_active.identifiability.known import (
-    Combinations,
     combinations_of,
 )
-from sbi_active.inference.beliefs.diagnostics import Diagnostics
 
 POSITIVE, CENTERED = (0.2, 1.0), (-1.0, 1.0)
 
@@ -153,30 +148,8 @@ def test_what_is_said_after_few_trials_is_true(num, share):
                 assert float(deviation[i]) > 0.4
 
 
-def test_one_parameter_and_few_draws_say_nothing():
-    one = box(POSITIVE)
-    assert not combinations_of(one, one)
-    prior = box(POSITIVE, POSITIVE)
-    few = Draws(posterior(lambda a, b: a * b, prior, [0.5, 0.7]).draws[:15])
-    assert not combinations_of(few, prior)
-
-
 def test_a_little_of_the_prior_in_a_belief_does_not_hide_it():
     prior = box(POSITIVE, POSITIVE)
     own = posterior(lambda a, b: a * b, prior, [0.5, 0.7]).draws
     mixed = Draws(torch.cat([own, prior.sample((len(own) // 200,))]))
     assert combinations_of(mixed, prior).known[0].text == "theta_1 * theta_2"
-
-
-def test_as_part_of_diagnostics():
-    prior = box(POSITIVE, POSITIVE)
-    belief = posterior(lambda a, b: a * b, prior, [0.5, 0.7])
-    found = combinations_of(belief, prior, ["friction", "mass"])
-    diagnostics = Diagnostics(trustworthy=True).extended(combinations=found)
-    assert str(diagnostics).splitlines()[1].startswith("known: friction * mass = ")
-    plain = diagnostics.to_dict()
-    assert json.loads(json.dumps(plain)) == plain
-    assert plain["combinations"]["unknown"][0]["text"] == "friction / mass"
-    assert pickle.loads(pickle.dumps(diagnostics)) == diagnostics
-    assert "combinations" not in Diagnostics().to_dict()
-    assert str(Combinations()) == ""

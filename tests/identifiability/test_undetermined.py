@@ -6,8 +6,6 @@ from sbi.utils import BoxUniform
 
 from sbi_active import BoxActions, DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.actions import ActionSpace
-from sbi_active.cli import main
-from sbi_active.identifiability.undetermined import find_undetermined
 from sbi_active.simulation import check_simulator
 
 SPEEDS = DiscreteActions([0.5, 1.0, 2.0, 3.0], names=["speed"])
@@ -185,42 +183,3 @@ def test_the_noise_does_not_matter(sd):
     )
     (group,) = check_simulator(model, box(POSITIVE, POSITIVE), SPEEDS).undetermined
     assert group.known == ("friction * (mass + 0.5)",)
-
-
-def test_few_rows_and_many_numbers_say_nothing():
-    def simulate(theta, action, key):
-        return theta[:, :1] * theta[:, 1:]
-
-    prior, actions = box(POSITIVE, POSITIVE), torch.ones(4, 1)
-    names = ["a", "b"]
-    assert find_undetermined(simulate, prior, actions, names, num_rows=8) == ()
-    assert find_undetermined(simulate, prior, actions, names, num_numbers=10**9) == ()
-    assert find_undetermined(simulate, prior, actions, names)
-
-
-def test_a_slow_simulator_is_run_less():
-    calls = []
-
-    def simulator(theta, action):
-        calls.append(len(theta))
-        return theta[:, :1] * theta[:, 1:] + 0.01 * torch.randn(len(theta), 1)
-
-    report = check_simulator(simulator, box(POSITIVE, POSITIVE), SPEEDS, num_rows=16)
-    assert max(calls) == 16
-    assert report.undetermined[0].known == ("theta_1 * theta_2",)
-
-
-def test_the_command_says_it(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("sbi_active.cli.simulators.time_round", lambda *_: 1.0)
-    file = tmp_path / "my_checked_body.py"
-    file.write_text(
-        "import torch\n"
-        "def simulator(theta, action):\n"
-        "    x = action * theta[:, :1] / theta[:, 1:]\n"
-        "    return x + 0.01 * torch.randn_like(x)\n"
-    )
-    space = ["--theta-low=0.2,0.2", "--theta-high=1,1", "--actions", "1:3:3"]
-    assert main(["check", f"{file}:simulator", *space]) == 0
-    printed = capsys.readouterr().out
-    assert "warning: no permitted action tells theta_1 and theta_2 apart" in printed
-    assert "theta_1 / theta_2 alone" in printed

@@ -23,7 +23,7 @@ from tests.campaign.test_corrections import OPTIONS, RATIOS
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
 MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise(0.1))
 SETTINGS = RefinementOptions(num_histories=300, num_effective=25)
-SIZES = (1e15, 1e30, -3e38)
+SIZES = (1e15, -3e38)
 
 
 JUMPS = SimulatorModel(
@@ -52,11 +52,6 @@ def trained(make):
     [
         *[(make, None) for make in (ASBI, ALHI, SeqBED, SeqBED_LFIRE)],
         (ASBI, MODEL),
-        *[
-            pytest.param(m, MODEL, marks=pytest.mark.slow)
-            for m in (SeqBED, SeqBED_LFIRE)
-        ],
-        pytest.param(ALHI, MODEL, marks=pytest.mark.slow),
     ],
 )
 def test_updates_give_a_belief_to_go_on_from(make, simulator, x):

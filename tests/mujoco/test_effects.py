@@ -1,6 +1,5 @@
 """Effects enumerated from a model: names, nulls, and what they do."""
 
-import mujoco
 import numpy as np
 import pytest
 import torch
@@ -72,16 +71,6 @@ def test_parameters_and_what_changes_nothing_are_left_out(effects):
     assert not [name for name in effects if "contact" in name]
 
 
-def test_every_effect_has_a_name_a_unit_a_null_and_a_family(effects):
-    assert all(e.describe and e.family for e in effects.values())
-    assert effects["hinge friction loss"].units == "N m"
-    assert effects["hinge series elasticity"].units == "rad/N m"
-    assert effects["bob payload"].units == "kg"
-    # A fifth of the generalized force, which gravity's share m g l / sqrt(2) dominates.
-    sd = effects["hinge friction loss"].declared_draws().square().mean().sqrt()
-    assert 0.2 * 1.0 < sd < 0.2 * 4.0
-
-
 def test_every_effect_vanishes_at_its_null_and_moves_the_robot(robot, effects):
     theta = robot.prior.sample((4,)).double()
     action = robot.actions.sample((4,)).double()
@@ -117,33 +106,6 @@ def test_fields_are_those_of_the_mjcf(robot, effects):
     ):
         x = run(robot, effects[name], [0.07])
         assert x == pytest.approx(native(**{attribute: 0.07}).numpy(), abs=1e-12)
-
-
-@pytest.mark.parametrize(("what", "power"), [("damping", 2), ("stiffness", 3)])
-def test_a_force_of_the_caller_does_what_a_field_does(robot, effects, what, power):
-    if not hasattr(robot.simulator.fn.model, "dof_dampingpoly"):
-        pytest.skip("this MuJoCo has no polynomial springs and dampers")
-    word = {2: "quadratic", 3: "cubic"}[power]
-    native = run(robot, effects[f"hinge {word} {what}"], [0.05, 0.2])
-    force = under("force", PowerForce(((0, 0, 0.0),), what, power))
-    # MuJoCo takes a part of its own at the end of a step, and a force at its begin.
-    assert run(robot, force, [0.05, 0.2]) == pytest.approx(native, abs=0.03)
-    bare = robot.simulator.mean(
-        torch.full((1, 1), 0.03, dtype=torch.float64),
-        torch.ones(1, 1, dtype=torch.float64),
-    )
-    assert run(robot, force, [0.0]) == pytest.approx(bare.numpy(), abs=0)
-    assert np.abs(native - bare.numpy()).max() > 0.1
-
-
-def test_play_lets_a_load_fall_by_its_width(robot, effects):
-    hold = pendulum(
-        parameters={"hinge.damping": (0.0, 0.1)},
-        start={"hinge": 0.0},
-        actions=BoxActions([-1.5], [1.5], names=["hinge velocity"]),
-    )
-    x = run(hold, effects["hinge backlash"], [0.0, 0.1], angle=0.0)
-    assert np.abs(x).max() < 0.06
 
 
 def test_a_compliant_servo_hangs_lower_behind_its_encoder():
@@ -187,11 +149,6 @@ def test_patterns_choose_and_unknown_ones_are_said(robot):
     assert not [n for n in mjcf_effects(robot, exclude=["hinge*"]) if "hinge" in n.name]
     with pytest.raises(ValueError, match="did you mean 'hinge friction loss'"):
         mjcf_effects(robot, include=["hinge frictionloss"])
-
-
-def test_a_spec_alone_has_effects_too():
-    names = {e.name for e in mjcf_effects(mujoco.MjSpec.from_string(ARM))}
-    assert {"elbow friction loss", "shoulder servo gain", "lower payload"} <= names
 
 
 @pytest.mark.parametrize("what", ["backlash", "series elasticity"])

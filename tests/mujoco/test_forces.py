@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sbi_active import BoxActions
-from sbi_active.criticism import AugmentedSimulator, Criticism, Trials
+from sbi_active.criticism import AugmentedSimulator, Trials
 from sbi_active.criticism.forces.trajectories import trajectories
 from sbi_active.mujoco import force_effects, from_mjcf
 
@@ -44,11 +43,6 @@ def test_forms_are_on_the_joints_of_the_model_in_their_units(cart):
     assert applied[0] == pytest.approx([0.0, force.size])
 
 
-def test_a_robot_without_recordings_asks_for_trials(cart):
-    with pytest.raises(ValueError, match="expected a prior and trials; got None"):
-        force_effects(cart[0])
-
-
 def test_the_force_of_nominal_motion_is_inertia_times_acceleration(cart):
     """The cart with its pole, where the pole's inertia is the smaller part."""
     robot, trials = cart
@@ -70,33 +64,3 @@ def test_a_force_moves_the_robot_and_none_does_not(cart):
     bare = robot.simulator.mean(theta, action)
     assert torch.allclose(x[0], bare[0], atol=1e-9)
     assert (x[1] - bare[1]).abs().max() > 1e-3
-
-
-@pytest.mark.slow
-def test_a_hidden_force_is_found_with_few_simulations():
-    robot = from_mjcf(
-        CART.replace('timestep=".002"', 'timestep=".01"'),
-        {"rail.damping": (0.1, 1.0), "pole.mass": (0.2, 0.8)},
-        sensors=["rail", "hinge"],
-        actions=BoxActions([-1.2], [1.2], names=["hinge"]),
-        times=np.linspace(0.1, 2.0, 20),
-        noise=1e-3,
-    )
-    action = torch.tensor([0.9, -0.4, 0.6, -1.1, 0.2, 1.2])[:, None]
-    theta = torch.tensor([[0.5, 0.4]]).expand(6, -1)
-    times = robot.simulator.sample_times
-    blank = Trials(action, torch.zeros(6, 20, 2), sample_times=times)
-    effects = force_effects(robot, trials=blank, seed=1)
-    hidden = next(e for e in effects if e.name == "v|v| of hinge")
-    model = AugmentedSimulator(robot.simulator, [hidden])
-    x = model.evaluate(theta, {hidden.name: torch.full((6, 1), -0.3)}, action)
-    generator = torch.Generator().manual_seed(1)
-    x = x + 1e-3 * torch.randn(x.shape, generator=generator)
-    trials = Trials(action, x, sample_times=times)
-    loop = Criticism(robot.simulator, robot.prior, trials, effects=effects)
-    tracing = loop.trace()
-    families = {e.name: e.family for e in effects}
-    assert len(effects) > 60
-    assert families[tracing.verdict] == "force in v of hinge"
-    assert hidden.name in tracing.credible_set
-    assert loop.rivals.simulator.num_simulations < 15_000

@@ -1,12 +1,10 @@
 """Dry friction that follows the state of its joint."""
 
-import mujoco
 import numpy as np
 import pytest
 import torch
 
-from benchmarks.robots.models import PENDULUM
-from sbi_active.criticism import AugmentedSimulator, close_loop
+from sbi_active.criticism import AugmentedSimulator
 from sbi_active.mujoco import from_mjcf, mjcf_effects
 from sbi_active.mujoco.effects.changes import FrictionChange
 from tests.mujoco.test_effects import under
@@ -37,20 +35,6 @@ def run(robot, phi, angles, effects, damping=0.0):
     return model.evaluate(theta, given, action).numpy()
 
 
-def test_they_are_offered_with_their_units_and_say_on_what_they_depend(effects):
-    assert {*effects} == {
-        "hinge friction loss",
-        "hinge friction loss by position",
-        "hinge friction loss by load",
-        "hinge static friction",
-    } - {"hinge friction loss by load"}  # nothing drives this pendulum
-    for name, what in (("friction loss by position", "position"), ("static", "speed")):
-        (effect,) = (e for n, e in effects.items() if name in n and "hinge" in n)
-        assert f"depends on its {what}" in effect.describe
-        assert (effect.units, effect.family) == ("N m", "friction")
-        assert (effect.declared_draws() >= 0).all()
-
-
 def test_a_friction_that_follows_nothing_is_that_of_the_field(robot, effects):
     loss = effects["hinge friction loss"]
     same = FrictionChange(("hinge",), "speed", speed=1e12)  # of any speed
@@ -60,14 +44,6 @@ def test_a_friction_that_follows_nothing_is_that_of_the_field(robot, effects):
     # Two frictions of one joint add up.
     both = run(robot, [[0.15], [0.05]], [1.0, -0.6], [follows, loss])
     assert both == pytest.approx(field, abs=1e-9)
-
-
-def test_friction_by_position_is_largest_at_the_ends():
-    change = FrictionChange(("hinge",), "position", (-1.0,), (3.0,))
-    q = np.array([[-2.0], [-1.0], [1.0], [3.0], [9.0]])
-    phi = np.tile([0.4, 0.8], (5, 1))
-    found = change.values(q, 0 * q, 0 * q, phi)[:, 0]
-    assert found == pytest.approx([0.4, 0.4, 0.3, 0.8, 0.8])
 
 
 def test_a_joint_is_held_where_friction_is_large_and_slides_where_it_is_not(
@@ -123,41 +99,3 @@ def test_friction_by_load_grows_with_the_force_of_the_motor():
 
 def by_position(effects):
     return effects["hinge friction loss by position"]
-
-
-@pytest.mark.slow
-def test_the_loop_names_friction_that_depends_on_the_position():
-    rng = np.random.default_rng(3)
-
-    def log(start):
-        model = mujoco.MjModel.from_xml_string(PENDULUM)
-        model.dof_damping[0] = 0.03
-        data, angles = mujoco.MjData(model), []
-        data.qpos[0] = start
-        for _ in range(150):
-            angles.append(data.qpos[0] + 0.002 * rng.standard_normal())
-            model.dof_frictionloss[0] = 0.15 * max(1 + data.qpos[0], 0.0)
-            mujoco.mj_step(model, data)
-        time = 0.01 * np.arange(150)
-        return {
-            "time": time[10::10],
-            "hinge": angles[10::10],
-            "start hinge": np.full(14, start),
-        }
-
-    logs = [log(start) for start in (0.3, -1.4, 1.0, -0.7, 1.4, -0.4, 0.7)]
-    robot = from_mjcf(PENDULUM, THETA, sensors=["hinge"], recordings=logs, noise=0.002)
-    effects = mjcf_effects(
-        robot,
-        include=[
-            *("hinge friction loss*", "hinge static friction", "hinge stiffness"),
-            *("hinge quadratic damping", "hinge zero offset", "gravity tilt y"),
-        ],
-    )
-    assert robot.trials is not None
-    report = close_loop(*robot[:2], robot.trials, effects=effects, evaluate=False)
-    # A constant friction loss beside it makes up for the part that it has everywhere.
-    named = report.tracing.misfit.named
-    assert "hinge friction loss by position" in named
-    assert {*named} <= {"hinge friction loss", "hinge friction loss by position"}
-    assert "depends on its position" in str(report)

@@ -46,9 +46,3 @@ def test_without_anything_beside_it_is_wide_and_says_so():
     low, high = belief.interval()["hinge.damping"]
     assert low < TRUTH < high
     assert "disagree about hinge.damping" in belief.diagnostics.warnings[0]
-
-
-def test_it_needs_recordings():
-    bare = from_mjcf(PENDULUM, {"hinge.damping": (0.0, 0.3)}, times=[0.1, 0.2])
-    with pytest.raises(ValueError, match="a robot with recordings; got none"):
-        identify_robot(bare)

@@ -113,8 +113,9 @@ def test_dates_are_seconds_since_the_first():
             )
 
 
+@pytest.mark.filterwarnings("error")
 def test_a_log_of_milliseconds_is_said_before_anything_runs():
-    with pytest.warns(UserWarning, match="10,000 time steps of 0.002 s.*in ms"):
+    with pytest.raises(UserWarning, match="10,000 time steps of 0.002 s.*in ms"):
         read_logs(encoder_log(time=1_000 * encoder_log()["time"]))
 
 

@@ -76,13 +76,6 @@ def test_rows_do_not_depend_on_batches_workers_or_threads():
     assert (one == again[:9]).all()
 
 
-def test_a_simulator_can_be_pickled():
-    robot = pendulum()
-    theta, action = robot.prior.sample((3,)), RELEASE.sample((3,))
-    other = pickle.loads(pickle.dumps(robot.simulator))
-    assert (other.mean(theta, action) == robot.simulator.mean(theta, action)).all()
-
-
 @pytest.mark.parametrize("given", ["text", "path", "spec"])
 def test_a_model_comes_as_text_path_or_spec(given, tmp_path):
     file = tmp_path / "pendulum.xml"
@@ -195,48 +188,18 @@ def test_a_state_that_diverges_is_invalid_and_counted():
     ("change", "message"),
     [
         ({"parameters": {"hinge.dampin": (0, 1)}}, "did you mean 'hinge.damping'"),
-        ({"parameters": {"hing.damping": (0, 1)}}, "did you mean 'hinge.damping'"),
         ({"parameters": {"hinge.damping": (1, 0)}}, "low < high"),
-        ({"parameters": {"hinge.damping": 3}}, "as .low, high"),
-        ({"parameters": {}}, "at least one parameter"),
         ({"parameters": {"bob.mass": (0, 1)}}, "inertia; got none of 'hinge'"),
         ({"parameters": {"bob.mass": (-1, 1)}}, "'bob.mass' from 0 on; got -1 to 1"),
         ({"times": [0.1, np.nan]}, "times that increase from 0 s on"),
-        ({"times": [-0.1, 0.1]}, "times that increase from 0 s on"),
-        ({"times": [0.2, 0.1]}, "times that increase from 0 s on"),
         ({"times": [1.7e9, 1.7e9 + 1]}, "subtract the time at which the trial starts"),
-        ({"threads": 0}, "at least one thread; got threads=0"),
-        ({"threads": 1.5}, "at least one thread; got threads=1.5"),
         ({"sensors": ["hinges"]}, "did you mean 'hinge'"),
-        ({"actions": BoxActions([0], [1], names=["hingo"])}, "did you mean 'hinge'"),
         ({"start": {"hinge_": 1.0}}, "did you mean 'hinge'"),
-        ({"noise": {"hing": 1.0}}, "did you mean 'hinge'"),
     ],
 )
 def test_what_does_not_fit_is_said(change, message):
     with pytest.raises(ValueError, match=message):
         pendulum(**change)
-
-
-def test_a_model_that_does_not_compile_is_said():
-    with pytest.raises(ValueError, match="expected an MJCF that compiles"):
-        from_mjcf(PENDULUM.replace("capsule", "no shape"), {"hinge.damping": (0, 1)})
-    with pytest.raises(FileNotFoundError, match="no such file"):
-        from_mjcf("no/such.xml", {"hinge.damping": (0, 1)})
-
-
-def test_signals_out_of_range_and_unknown_actuators_are_said():
-    grid = np.arange(0, 1, 0.02)
-    loud = SignalActions(
-        step("push", length=1.0), [-9.0, 0.1], [9.0, 0.5], input_times=grid
-    )
-    with pytest.raises(ValueError, match="within its ctrlrange"):
-        from_mjcf(SPRING_MASS, {"cart.mass": (0.5, 2)}, inputs=loud)
-    other = SignalActions(
-        step("pull", length=1.0), [-1.0, 0.1], [1.0, 0.5], input_times=grid
-    )
-    with pytest.raises(ValueError, match="name of an actuator|did you mean 'push'"):
-        from_mjcf(CART_POLE, {"cart.mass": (0.5, 2)}, inputs=other)
 
 
 def test_a_parameter_that_changes_nothing_is_said_at_once():

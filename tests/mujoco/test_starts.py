@@ -79,24 +79,6 @@ def test_a_keyframe_gives_controls_and_mocap_poses_too():
     assert held("servo", start=start) == pytest.approx(x, abs=1e-12)
 
 
-def test_a_keyframe_holds_beside_forces_that_are_stepped():
-    robot = from_mjcf(
-        held_arm("servo"),
-        {"hinge.damping": (0.0, 1.0)},
-        **{"times": [0.0, 0.5], "noise": 0.01, "start": "home"},
-    )
-
-    def push(q, v, t, phi):
-        return phi
-
-    x = robot.simulator.mean(
-        torch.tensor([[0.1]]).double(),
-        torch.zeros(1, 1).double(),
-        force={push: torch.zeros(1, 1).double()},
-    )
-    assert x[0].tolist() == pytest.approx(by_hand(key=True), abs=1e-9)
-
-
 def test_tendons_and_activations_move_as_in_a_bare_loop():
     robot = from_mjcf(
         TENDON,

@@ -13,11 +13,9 @@ from sbi.utils import BoxUniform
 
 from benchmarks.robots.models import SPRING_MASS
 from sbi_active import GaussianNoise
-from sbi_active.criticism import close_loop
 from sbi_active.mujoco import (
     belief_to_parameters,
     from_sysid,
-    mjcf_effects,
     randomization,
 )
 from sbi_active.simulation import check_simulator, simulate
@@ -146,16 +144,6 @@ def test_a_transform_acts_on_what_is_predicted():
         assert own == pytest.approx(residual, abs=1e-6)
 
 
-def test_states_are_signals_too():
-    group = sequences()
-    for k, series in enumerate(group.sensordata):
-        group.sensordata[k] = sysid.TimeSeries.from_names(
-            series.times, series.data, group.gt_model, ["slide_qpos", "slide_qvel"]
-        )
-    robot = from_sysid(group, parameters(), noise=0.01)
-    assert robot.simulator.channel_names == ["slide_qpos", "slide_qvel"]
-
-
 def test_any_residual_is_a_deterministic_simulator():
     group = sequences()
     params = parameters()
@@ -201,17 +189,6 @@ def test_what_no_trial_determines_is_named_and_the_payload_does():
         loaded.simulator, loaded.prior, loaded.actions, num_rows=64
     )
     assert not report.undetermined
-
-
-def test_errors_of_unknown_size_are_the_default():
-    robot = from_sysid(sequences(), parameters())
-    assert robot.simulator.noise.parameter_names[-1] == "correlation_time"
-
-
-def test_effects_of_a_sysid_robot():
-    robot = from_sysid(sequences(), parameters(), noise=0.01)
-    names = {e.name for e in mjcf_effects(robot, include=["slide*", "push*"])}
-    assert {"slide friction loss", "push gain", "push delay"} <= names
 
 
 def test_a_belief_comes_back_as_parameters(tmp_path):
@@ -271,36 +248,3 @@ def test_bad_logs_and_parameters_are_said():
         from_sysid(other, parameters())
     with pytest.raises(TypeError, match="expected ModelSequences"):
         from_sysid([SPRING_MASS], parameters())
-
-
-@pytest.mark.slow
-def test_a_friction_hidden_from_sysid_is_named():
-    """Two specs, recorded from ones with .15 N of dry friction, which theta lacks."""
-    rng = np.random.default_rng(0)
-    sd = np.array([0.002, 0.01])
-    groups = []
-    for text, name in ((SPRING_MASS, "bare"), (payload(SPRING_MASS), "payload")):
-        bare = sequences(text, name)
-        rubs = text.replace('damping="0.5"', 'damping="0.5" frictionloss="0.15"')
-        read = [
-            sysid.TimeSeries(
-                series.times,
-                series.data + sd * rng.standard_normal(series.data.shape),
-                series.signal_mapping,
-            )
-            for series in sequences(rubs, name).sensordata
-        ]
-        groups.append(
-            sysid.ModelSequences(
-                name, bare.spec, bare.sequence_name, bare.initial_state, bare.control,
-                read,
-            )
-        )  # fmt: skip
-    robot = from_sysid(groups, parameters(), noise=GaussianNoise(torch.tensor(sd)))
-    effects = mjcf_effects(
-        robot, include=["slide friction loss", "push *", "slide quad*", "*sensor delay"]
-    )
-    report = close_loop(
-        *robot[:2], robot.trials, effects=effects, evaluate=False, plan=False
-    )
-    assert report.verdict == "slide friction loss"

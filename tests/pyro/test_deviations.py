@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from sbi_active.pyro import SpikeAndSlab
-from sbi_active.pyro.denoising import denoise
 from sbi_active.pyro.deviations import SHARE, Coordinates, _normalized
 from sbi_active.pyro.predictive import Predictive
 
@@ -60,27 +59,3 @@ def test_coordinates_are_monotone_and_their_seed_decides():
     assert (one(y).diff(dim=0) >= 0).all()
     assert torch.equal(one(y), same(y))
     assert not torch.equal(one(y), other(y))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("num", [6, 20, 50])
-def test_many_channels_mix(num):
-    """Before, in coordinates of the channels alone, r_hat was 1.1, 1.2 and 3.0."""
-    generator = torch.Generator().manual_seed(num)
-    way = torch.randn(3, num, generator=generator)
-
-    def rows(n):
-        theta = torch.randn(n, 3, generator=generator)
-        return theta @ way + 0.1 * torch.randn(n, num, generator=generator)
-
-    predictive, clean = rows(1_000), rows(1)[0]
-    off = clean.clone()
-    off[1] += 30
-    off[num // 2] -= 8
-    found = denoise(off, predictive, MODEL, seed=0)
-    wrong = found.probability > 0.5
-    assert wrong.nonzero()[:, 0].tolist() == [1, num // 2]
-    assert found.r_hat < 1.1
-    assert found.effective_sample_size > 50
-    error = (found.x.mean(0) - clean).abs() / predictive.std(0)
-    assert float(error.max()) < 0.3

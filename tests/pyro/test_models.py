@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sbi_active import Campaign, CampaignOptions, DiscreteActions, MixtureDensity
+from sbi_active import MixtureDensity
 from sbi_active.inference import refine
 from sbi_active.pyro import RobustASBI, from_pyro
 from sbi_active.seeding import forked_generators
@@ -66,67 +66,6 @@ def test_other_likelihoods():
     assert float(x.mean()) == pytest.approx(20 / (1 + math.exp(-2)), abs=0.4)
 
 
-# After three of Pyro's own examples: inclined_plane.py, the tutorial on adaptive
-# experiments (working memory) and contrib/oed/ab_test.py, written anew with an action.
-def plane(action: Tensor) -> Tensor:
-    """Return the time in which a box slides 2 m down a plane, by its angle in rad."""
-    friction = pyro.sample("friction", dist.Uniform(0.0, 1.0))
-    pull = 9.8 * (action.sin() - friction * action.cos())
-    time = (2 * 2.0 / pull.clamp_min(0.04)).sqrt()  # the watch is stopped at 10 s
-    return pyro.sample("x", dist.Normal(time, 0.02).to_event(1))
-
-
-def memory(action: Tensor) -> Tensor:
-    """Return whether a list of so many digits is remembered."""
-    span = pyro.sample("span", dist.Normal(7.0, 2.0))
-    return pyro.sample("x", dist.Bernoulli(logits=5 * (span - action)).to_event(1))
-
-
-def groups(action: Tensor) -> Tensor:
-    """Return the means of two groups of 100 people, so many of them in the first."""
-    w = pyro.sample("w", dist.Normal(torch.zeros(2), torch.tensor([10.0, 2.5])))
-    sizes = torch.cat([action, 100 - action])
-    return pyro.sample("x", dist.Normal(w, sizes.rsqrt()).to_event(1))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("model", "levels", "truth", "rounds"),
-    [
-        (plane, torch.tensor([0.3, 0.6, 0.9, 1.2]), [0.12], 2),
-        (memory, torch.arange(1.0, 15.0, 2.0), [5.2], 2),
-        (groups, torch.tensor([5.0, 20.0, 50.0, 80.0, 95.0]), [4.0, -1.0], 1),
-    ],
-)
-def test_campaigns_on_pyros_own_examples(model, levels, truth, rounds):
-    problem = from_pyro(model, levels[:1])
-    truth = torch.tensor([truth])
-    campaign = Campaign(
-        problem.simulator,
-        problem.prior,
-        DiscreteActions(levels),
-        seed=0,
-        options=CampaignOptions(
-            network="on demand", max_simulations=300 * rounds, planned_trials=rounds
-        ),
-    )
-    before, chosen = problem.prior.sample((2_000,)).std(0), []
-    with forked_generators(0):
-        for _ in range(rounds):
-            trial = campaign.ask()
-            chosen.append(float(trial.action))
-            campaign.tell(problem.simulator(truth, trial.action[None])[0])
-            campaign.update()
-    draws = campaign.belief.sample((2_000,))
-    assert bool(problem.prior.support.check(draws).all())
-    assert bool(((draws.mean(0) - truth[0]).abs() < 3 * draws.std(0)).all())
-    assert bool((draws.std(0) < before / 2).all())
-    if model is memory:  # the median of the prior halves what is possible
-        assert chosen[0] == 7.0
-    if model is groups:
-        assert chosen == [50.0]
-
-
 def test_a_belief_is_the_prior_of_the_next_model():
     problem = from_pyro(growth, torch.ones(1))
     action, x = torch.tensor([[1.0], [4.0]]), torch.tensor([[0.6], [1.5]])
@@ -160,12 +99,6 @@ def test_models_that_cannot_be_used():
         from_pyro(counted, torch.ones(1))
     with pytest.raises(ValueError, match="name the outcome"):
         from_pyro(growth, torch.ones(1), outcome="y")
-
-
-def test_a_robust_update_needs_a_simulator():
-    problem = from_pyro(growth, torch.ones(1))
-    with pytest.raises(ValueError, match="pass the simulator alone"):
-        RobustASBI(problem.prior).update(torch.zeros(1), action=torch.ones(1))
 
 
 @pytest.mark.slow

@@ -1,15 +1,13 @@
 """The command on small modules in files, one for each defect, and a clean one."""
 
 import sys
-import time
 
 import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import CampaignOptions, DiscreteActions, SimulatorModel
+from sbi_active import DiscreteActions
 from sbi_active.cli import main
-from sbi_active.cli.simulators import time_round
 from sbi_active.simulation import check_simulator
 
 HEAD = "import numpy as np\nimport torch\nfrom sbi_active import *\n"
@@ -185,12 +183,6 @@ def test_lost_rows_are_told_by_action(check):
     assert "action 1:" not in printed
 
 
-def test_tasks_are_ready(capsys, monkeypatch):
-    monkeypatch.setattr("sbi_active.cli.simulators.time_round", lambda *_: 1.0)
-    assert main(["check", "--task", "numerical", "--rows", "32"]) == 0
-    assert "x: shape (n, 1)" in capsys.readouterr().out
-
-
 def test_files_named_like_other_modules_are_refused(tmp_path, capsys):
     (tmp_path / "json.py").write_text(HEAD + CLEAN)
     assert main(["check", f"{tmp_path}/json.py:simulator", *SPACE]) == 2
@@ -222,42 +214,3 @@ def test_every_entry_of_a_large_grid_is_varied():
     grid = DiscreteActions(torch.cartesian_prod(axis, axis))
     report = check_simulator(simulator, prior, grid, num_rows=32)
     assert report.idle_actions == ("action_2",)
-
-
-def test_actions_of_several_entries(check):
-    text = """
-def simulator(theta, action):
-    return theta * action[:, 1:] + torch.randn_like(theta)
-"""
-    status, printed = check(text, "--actions", "0:1:2", "1,2,4")
-    assert status == 0
-    assert "changing action_1 leaves x as it is" in printed
-    assert "at most 68,000 simulations" not in printed
-    assert "at most 86,000 simulations" in printed  # 4 (5000 + 6 x 1500) + 30,000
-
-
-def test_a_campaign_costs_what_its_rounds_cost(check, monkeypatch):
-    shown = check(CLEAN, "--rounds", "3")[1]
-    assert "about 3 seconds on 1 worker\n" in shown
-    monkeypatch.setattr("sbi_active.cli.simulators.LONG", -1.0)
-    shown = check(CLEAN, "--rounds", "3")[1]
-    assert "on 1 worker for them, and some to learn\n" in shown
-
-
-def test_the_round_that_is_timed_is_one_of_a_campaign():
-    def simulator(theta, action):
-        return theta * action
-
-    prior = BoxUniform(torch.zeros(1), torch.ones(1))
-    model, actions = SimulatorModel(simulator, noise=0.1), DiscreteActions([1.0, 2.0])
-    start = time.perf_counter()
-    seconds = time_round(model, prior, actions, CampaignOptions(), 0)
-    assert 0.1 < seconds <= time.perf_counter() - start
-
-
-def test_noise_is_an_option(check):
-    status, shown = check(DETERMINISTIC)
-    assert status == 1
-    assert "expected a simulator with noise" in shown
-    assert check(DETERMINISTIC, "--noise", "0.1")[0] == 0
-    assert check(DETERMINISTIC, "--noise", "0")[0] == 2

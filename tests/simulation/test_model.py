@@ -9,7 +9,6 @@ from sbi_active import (
     AutocorrelatedNoise,
     GaussianNoise,
     SimulatorModel,
-    estimate_noise,
 )
 from sbi_active.seeding import row_normals, row_seeds
 from sbi_active.simulation.model import takes_seeds
@@ -72,15 +71,6 @@ def test_effects_are_numbers_or_one_a_row(model):
         model(THETA, ACTION, SEEDS, friction=1.0)
     with pytest.raises(ValueError, match=r"expected drag as a number or one a row, s"):
         model.mean(THETA, ACTION, drag=torch.ones(2))
-
-
-def test_functions_without_effects_and_with_any():
-    with pytest.raises(TypeError, match="keyword arguments of fn, none; got 'drag'"):
-        SimulatorModel(noisy)(THETA, ACTION, SEEDS, drag=1.0)
-    anything = SimulatorModel(lambda t, a, **effects: t + effects.get("push", 0))
-    assert torch.equal(anything(THETA, ACTION, push=1), THETA + 1)
-    assert SimulatorModel(torch.add).effect_names == ()
-    assert torch.equal(SimulatorModel(torch.add)(THETA, ACTION), THETA + ACTION)
 
 
 @pytest.mark.parametrize(
@@ -191,29 +181,6 @@ def test_setup_runs_once_a_process():
     assert torch.equal(again(THETA, ACTION), here)
     other = SimulatorModel(with_context, batched=False, setup=setup)
     assert other(THETA, ACTION)[0, 1] != here[0, 1]
-
-
-def test_setup_without_context_is_an_error():
-    with pytest.raises(ValueError, match="expected fn to take what setup returns"):
-        SimulatorModel(line, setup=setup)
-
-
-def test_models_with_estimated_noise_are_picklable():
-    noise = estimate_noise(torch.randn(4, 1))
-    model = pickle.loads(pickle.dumps(SimulatorModel(line, noise=noise)))
-    x = torch.randn(3, 1)
-    assert torch.equal(
-        model.log_prob(x, THETA, ACTION),
-        SimulatorModel(line, noise=noise).log_prob(x, THETA, ACTION),
-    )
-
-
-def test_exceptions_of_a_row_pass():
-    def fails(theta, action, rng):
-        raise FloatingPointError("unstable")
-
-    with pytest.raises(FloatingPointError, match="unstable"):
-        SimulatorModel(fails, batched=False)(THETA, ACTION)
 
 
 @pytest.mark.parametrize("sd", [0.0, 1.0])

@@ -8,7 +8,6 @@ from sbi.utils import BoxUniform
 from sbi_active import (
     Campaign,
     DiscreteActions,
-    GaussianNoise,
     SimulatorModel,
     simulate,
 )
@@ -16,7 +15,6 @@ from sbi_active.campaign.telling import outcome_told
 from sbi_active.inference.rounds.condition import outcome_rows
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning, SimulationError, check_simulator
-from sbi_active.simulation.simulator import outcome_tensor
 
 THETA = torch.arange(4.0)[:, None]
 ONE = torch.Size([1])
@@ -29,21 +27,13 @@ def x_of(function, **options):
 @pytest.mark.parametrize(
     "function",
     [
-        lambda t: t.numpy()[::-1][::-1],  # a view, strides > 0
         lambda t: t.flip(0).numpy()[::-1],
         lambda t: t.numpy().astype(">f8"),
-        lambda t: t.numpy().astype(np.longdouble),
         lambda t: t.numpy().astype(np.uint32),
         lambda t: t.numpy().astype(object),
-        lambda t: t.numpy().astype(np.float16),
-        lambda t: t.bfloat16(),
-        lambda t: t.long(),
         lambda t: t.tolist(),
-        lambda t: list(t),
-        lambda t: tuple(t.numpy()),
         lambda t: t[:, 0],
-        lambda t: np.broadcast_to(t.numpy(), t.shape),  # not writable
-        lambda t: np.asfortranarray(t.numpy()),
+        lambda t: np.broadcast_to(t.numpy(), t.shape),
     ],
 )
 def test_forms_of_x_that_are_taken(function, recwarn):
@@ -98,23 +88,6 @@ def test_numbers_that_would_be_lost_are_refused(functions, text):
             simulate(model_of(function), THETA, THETA, seed=0)
 
 
-@pytest.mark.parametrize("row", [1j, np.array([1j]), torch.tensor([1j])])
-def test_complex_rows_are_refused(row):
-    model = SimulatorModel(
-        lambda theta, action, rng: row, batched=False, noise=GaussianNoise(1.0)
-    )
-    with pytest.raises(ValueError, match="expected x of real numbers"):
-        model.mean(THETA, THETA)
-    with pytest.raises(ValueError, match="expected x of real numbers"):
-        simulate(model, THETA, THETA, seed=0)
-
-
-def test_rows_of_no_numbers_are_refused():
-    model = SimulatorModel(lambda theta, action, rng: [], batched=False)
-    with pytest.raises(ValueError, match="expected at least one number a row"):
-        simulate(model, THETA, THETA, seed=0)
-
-
 def test_a_row_without_an_outcome_is_missing():
     def row(theta, action, rng):
         return None if theta[0] == 2 else theta
@@ -137,11 +110,6 @@ def test_infinite_numbers_stay_no_measurement():
         seed=0,
     )
     assert rows.counts == {"ok": 3, "invalid": 1, "missing": 0}
-
-
-def test_the_largest_number_is_kept():
-    largest = torch.finfo(torch.float32).max
-    assert (x_of(lambda t: t.double() * 0 + largest) == largest).all()
 
 
 @pytest.mark.parametrize(
@@ -183,11 +151,6 @@ def test_the_check_of_rows_without_a_measurement(lost, mixes):
     assert report.counts["invalid"] > 0
     assert report.rows_are_independent is not mixes
     assert not report.is_deterministic
-
-
-def test_a_number_a_row_is_a_column():
-    assert outcome_tensor([1.0, 2.0], 2).shape == (2, 1)
-    assert outcome_tensor(np.zeros((2, 3)), 2).dtype == torch.float64
 
 
 def pairs(theta, action):

@@ -9,7 +9,6 @@ from torch.distributions import Independent, LogNormal
 from sbi_active import (
     Campaign,
     CampaignOptions,
-    DiscreteActions,
     GaussianNoise,
     InformationGainDesigner,
     RandomDesigner,
@@ -52,12 +51,6 @@ def test_what_is_no_list_of_actions_is_refused(actions):
         Campaign(MODEL, PRIOR, actions)
 
 
-@pytest.mark.parametrize("make", [DiscreteActions, RandomDesigner])
-def test_actions_of_several_lengths_are_refused(make):
-    with pytest.raises(ValueError, match="expected actions of .* rows of one length"):
-        make([[1.0], [2.0, 3.0]])
-
-
 def test_options_are_taken_from_a_dict():
     campaign = Campaign(MODEL, PRIOR, ACTIONS, options={"num_simulations": 300})
     assert campaign.state.options == CampaignOptions(num_simulations=300)
@@ -97,21 +90,3 @@ def test_a_function_of_one_row_may_leave_out_the_generator():
     assert model.effect_names == ("push",)
     drag = SimulatorModel(lambda t, a, drag=0.0: t * a - drag, batched=False, noise=0.1)
     assert torch.equal(drag.mean(*ROWS, drag=1.0), exact - 1)
-
-
-def test_random_numbers_of_a_row_without_a_generator_follow_the_seed():
-    model = SimulatorModel(lambda theta, action: theta + np.random.normal(), batched=0)
-    assert not model.fn_takes_seeds
-    x, same, other = (simulate(model, *ROWS, seed=s).x for s in (0, 0, 1))
-    assert torch.equal(x, same)
-    assert not torch.equal(x, other)
-
-
-def test_a_campaign_adopts_reports_alone():
-    with pytest.raises(TypeError, match="pass what criticize"):
-        Campaign(MODEL, PRIOR, ACTIONS).adopt(None)
-
-
-def test_a_role_may_have_an_underscore():
-    trials = Trials([1.0, 2.0], [0.5, 1.0], role=["fit", "held_out"])
-    assert trials.held_out_positions == [1]

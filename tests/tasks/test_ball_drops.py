@@ -1,22 +1,16 @@
 """Falling balls: the fall, what it may lack, and the measured drops."""
 
-import math
-
 import numpy as np
 import pytest
 import torch
 
-from benchmarks.__main__ import main as run
 from benchmarks.measured.ball_forecast import forecast_error, second_drop_error
 from sbi_active.criticism import AugmentedSimulator
 from sbi_active.tasks import get_task  # pyright: ignore
 from sbi_active.tasks.ball_drops import (  # pyright: ignore
     Drop,
     fall,
-    read_drops,
-    trials_of,
 )
-from sbi_active.tasks.product import Product  # pyright: ignore
 
 G, TIMES = 9.81, torch.linspace(0, 4, 61).double()
 LEVEL = torch.zeros(1, 2).double()
@@ -59,34 +53,6 @@ def test_every_effect_vanishes_at_its_null_and_moves_x_elsewhere():
         phi = effect.sample(16).to(theta.dtype)
         change = (model.evaluate(theta, {effect.name: phi}, action) - bare).abs()
         assert float(change.max()) > 0.01, effect.name
-
-
-def test_a_product_has_the_density_of_its_parts():
-    parts = [
-        torch.distributions.HalfNormal(torch.tensor([3.0])),
-        torch.distributions.Uniform(torch.tensor([0.5]), torch.tensor([2.5])),
-    ]
-    both = Product(parts)
-    draws = both.sample((500,))
-    assert bool(both.support.check(draws).all())
-    expected = parts[0].log_prob(draws[:, 0]) + math.log(0.5)
-    torch.testing.assert_close(both.log_prob(draws), expected)
-    assert not bool(both.support.check(torch.tensor([1.0, 3.0])))
-
-
-def test_a_cut_drop_is_masked_from_there_on():
-    pair = [drop(1.0), drop(1.0, number=2)]
-    trials = trials_of(pair, until={1: 0.8})
-    assert trials.x.shape == (2, 52)
-    assert trials.mask.sum(1).tolist() == [52, 13]
-    assert trials.action.tolist() == [[0.1], [0.1]]
-
-
-def test_data_that_are_not_there():
-    with pytest.raises(FileNotFoundError, match="got no drops.csv there; give"):
-        read_drops("nowhere")
-    with pytest.raises(SystemExit, match=r"measured drops in nowhere.*--data DIR"):
-        run(["measured.ball_drops", "--data", "nowhere"])
 
 
 @pytest.mark.parametrize("kind", ["linear drag", "quadratic drag"])

@@ -21,17 +21,6 @@ def rows(num, seed=0):
     return theta, action
 
 
-def test_is_the_paper_s(task):
-    assert task.actions.values[:, 0].tolist() == [0.5 * i for i in range(41)]
-    assert task.parameter_names == ["table_friction", "cube_friction", "cube_density"]
-    assert task.num_rounds == 6
-    assert task.simulator.noise.sd == 0.005
-    assert task.theta_true.tolist() == pytest.approx([0.8] * 3)
-    low = get_task("box_collision", target=2)
-    assert low.theta_true.tolist() == pytest.approx([0.2] * 3)
-    assert bool(task.prior.support.check(task.prior.sample((9,))).all())
-
-
 def test_momentum_passes_to_the_cube(task):
     """A light, slippery cube leaves faster than the pusher, never twice as fast."""
     from sbi_active.tasks.box_collision.scene import Scene  # pyright: ignore
@@ -123,21 +112,6 @@ def test_reproduction_error_counts_the_code_of_a_fall():
     distance = float((x + 1).norm())
     error = task.reproduction_error(stays, 5.0, num_samples=2)
     assert error == pytest.approx(distance)
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ({"target": 3}, "expected target among 1, 2; got 3"),
-        ({"variant": "round"}, "expected variant among 'centered', 'off_center'"),
-        ({"left_table": "zero"}, "expected left_table among 'invalid', 'paper'"),
-        ({"theta_true": (0.2, 0.2, 1.2)}, "expected theta_true of three numbers"),
-        ({"noise": -1.0}, "expected a standard deviation >= 0"),
-    ],
-)
-def test_bad_options(options, text):
-    with pytest.raises(ValueError, match=text):
-        get_task("box_collision", **options)
 
 
 def test_theta_outside_the_box_is_refused(task):

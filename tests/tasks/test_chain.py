@@ -40,17 +40,11 @@ def test_the_closed_form_solves_the_equations(parameters, moving):
     assert (found[moving:] == 0).all()
 
 
-@pytest.mark.parametrize("parameters", [3, 21, 4.5])
-def test_impossible_numbers_of_parameters(parameters):
-    with pytest.raises(ValueError, match="from 4 to 20"):
-        get_task("chain", parameters=parameters)
-
-
 def test_the_reference_s_evidence_agrees_between_seeds():
     task = get_task("chain", parameters=4)
     action = torch.tensor([[10.0, 2.0]])
     x = task.real_system(action[0], seed=0)[None]
-    one, other = (task.reference(action, x, seed=s, num_particles=300) for s in (0, 1))
+    one, other = (task.reference(action, x, seed=s, num_particles=150) for s in (0, 1))
     error = np.hypot(one.standard_error, other.standard_error)
     assert abs(one.log_evidence - other.log_evidence) < 5 * error
     theta = one.sample(200, seed=0).float()

@@ -41,26 +41,3 @@ def test_log_likelihood_is_a_normal_s():
     torch.testing.assert_close(task.log_likelihood(x, theta, action), expected)
     torch.testing.assert_close(task.simulator.log_prob(x, theta, action), expected)
     assert task.exact_likelihood
-
-
-def test_real_system_is_the_model_at_the_truth():
-    task = get_task("location_finding")
-    action = torch.tensor([0.3, -0.2])
-    x = torch.stack([task.real_system(action, seed=s) for s in range(200)])
-    expected = mean(task.theta_true[None], action[None])
-    assert abs(float(x.mean() - expected)) < 4 * NOISE_SD / 200**0.5
-    # The standard error of a standard deviation is sd / sqrt(2 n).
-    assert float(x.std()) == pytest.approx(NOISE_SD, abs=4 * NOISE_SD / 400**0.5)
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ({"num_sources": 0}, "expected num_sources >= 1; got 0"),
-        ({"theta_true": [1.0, 2.0]}, "expected theta_true of 4 finite numbers"),
-        ({"theta_true": [1.0, 2.0, 3.0, math.nan]}, "expected theta_true of 4 finite"),
-    ],
-)
-def test_bad_options(options, text):
-    with pytest.raises(ValueError, match=text):
-        get_task("location_finding", **options)

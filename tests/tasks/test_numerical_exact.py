@@ -82,15 +82,6 @@ def cell_masses(posterior: ExactPosterior) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 @each_variant
-@each_history
-def test_density_integrates_to_one(history: str, variant: str) -> None:
-    mass = cell_masses(posterior_of(history, variant))[2]
-    both_signs = 2 if variant == "square" else 1
-    # the midpoint rule; its error is largest where the box cuts the density
-    assert both_signs * mass.sum() == pytest.approx(1, abs=3e-4)
-
-
-@each_variant
 @pytest.mark.parametrize("action", [[3.0], [2.0, 5.0], [4.0, 2.5, 3.5]])
 def test_evidence_against_prior_samples(action: list[float], variant: str) -> None:
     x = [0.4, -1.0, 2.0][: len(action)]
@@ -195,32 +186,6 @@ def test_greedy_campaigns_at_the_reference_values() -> None:
 
 
 # Errors
-
-
-@pytest.mark.parametrize(
-    ("action", "x", "variant", "message"),
-    [
-        (
-            [1.0, 2.0],
-            [1.0],
-            "linear",
-            "expected one x an action; got 2 actions and 1 x",
-        ),
-        (torch.zeros(2, 2), [1.0, 1.0], "linear", r"expected action of shape \(n,\)"),
-        (
-            [1.0],
-            torch.zeros(1, 1, 1),
-            "linear",
-            r"expected x of shape .*got \(1, 1, 1\)",
-        ),
-        ([5.5], [1.0], "linear", r"expected actions in \[-5, 5\]; got 5.5"),
-        ([1.0], [float("nan")], "linear", "expected finite x"),
-        ([1.0], [1.0], "cubic", "linear, sinh, square; got 'cubic'"),
-    ],
-)
-def test_bad_trials(action, x, variant: str, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        ExactPosterior(action, x, variant=variant)
 
 
 def test_gain_of_a_gaussian_posterior() -> None:

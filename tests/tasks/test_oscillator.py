@@ -87,9 +87,9 @@ def test_mean_solves_the_equation_of_motion():
 def evidence_by_prior(
     action: Tensor, x: Tensor, noise_sd: float = NOISE_SD
 ) -> tuple[float, float]:
-    """Log evidence and standard error from a million draws of the prior."""
+    """Log evidence and standard error from half a million draws of the prior."""
     log_likelihood = []
-    for block in range(10):
+    for block in range(5):
         theta = uniform(100_000, PRIOR_LOW, PRIOR_HIGH, 50 + block)
         total = torch.zeros(len(theta), dtype=torch.float64)
         for xi, row in zip(action, x, strict=True):
@@ -148,20 +148,6 @@ def test_no_trials_give_the_prior():
     assert prior.log_evidence == 0
 
 
-@pytest.mark.parametrize(
-    ("action", "x", "message"),
-    [
-        ([[1.0]], [[0.0] * 6], r"action of shape \(n, 2\); got \(1, 1\)"),
-        ([[1.0, 2.0]], [[0.0] * 5], r"x of shape \(n, 6\); got \(1, 5\)"),
-        ([[1.0, 2.0]] * 2, [[0.0] * 6], "one x per action; got 2 actions and 1 x"),
-        ([[1.0, 2.0]], [[math.nan] * 6], "finite x"),
-    ],
-)
-def test_reference_rejects_wrong_trials(action, x, message):
-    with pytest.raises(ValueError, match=message):
-        OscillatorReference(action, x)
-
-
 # ------------------------------------------------------- the information gain
 
 
@@ -207,7 +193,7 @@ def test_gain_lies_between_contrastive_bounds():
     action = ACTIONS[[2, 9, 16]].double()
     prior = OscillatorReference([], [])
     gain, error = prior.expected_information_gain(action)
-    n, m = 400, 20_000
+    n, m = 400, 6_000
     contrast = uniform(m, PRIOR_LOW, PRIOR_HIGH, 20)
     truth = uniform(n, PRIOR_LOW, PRIOR_HIGH, 21)
     noise = torch.randn(

@@ -77,23 +77,6 @@ def test_coverage_counts_areas():
     assert float(empty.abs().max()) == 0.0
 
 
-def test_holes_are_masked():
-    x, _ = images(30)
-    x = 5 * x
-    holes = x.clone()
-    holes[:, ::97] = float("nan")
-    before = holes.clone()
-    assert float((mesh_coverage(holes) - mesh_coverage(x)).abs().max()) < 0.03
-    pca = ImagePCA(x, 3)
-    assert pca(holes).isfinite().all()
-    assert float((pca(holes) - pca(x)).abs().max()) < 0.1
-    assert ImagePCA(holes, 3)(holes).isfinite().all()
-    assert torch.equal(holes.nan_to_num(-1), before.nan_to_num(-1))
-    nothing = torch.full((2, 22_500), float("nan"))
-    assert mesh_coverage(nothing).isfinite().all()
-    assert pca(nothing).isfinite().all()
-
-
 def test_principal_components_tell_what_varies():
     x, weight = images(80)
     pca = ImagePCA(x)
@@ -105,11 +88,3 @@ def test_principal_components_tell_what_varies():
     z = torch.cat([pca(fresh), torch.ones(40, 1)], 1)
     fit = z @ torch.linalg.lstsq(z, weight).solution
     assert float((fit - weight).abs().max()) < 1e-3
-
-
-@pytest.mark.parametrize("shape", [(2, 22_499), (22_500,), (2, 150, 150)])
-def test_an_image_of_another_size_is_refused(shape):
-    with pytest.raises(ValueError, match="expected depth images of 150 x 150 pixels"):
-        mesh_coverage(torch.zeros(shape))
-    with pytest.raises(ValueError, match="expected depth images of 150 x 150 pixels"):
-        ImagePCA(torch.zeros(shape))

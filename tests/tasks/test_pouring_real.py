@@ -6,38 +6,11 @@ from sbi_active.tasks import get_task  # pyright: ignore
 
 pytest.importorskip("pybullet")
 from sbi_active.tasks.pouring import intersection_volume  # noqa: E402
-from sbi_active.tasks.pouring.real import COMPARED_AT, DENSITIES  # noqa: E402
 
 
 @pytest.fixture(scope="module", params=["beads", "gravel"])
 def task(request):
     return get_task("pouring_real", material=request.param, cubes=8)
-
-
-def test_is_the_paper_s(task):
-    assert task.num_rounds == 4
-    assert len(task.actions.values) == 27
-    values = task.actions.values
-    assert [sorted(set(values[:, k].tolist())) for k in range(3)] == [
-        [15.0, 35.0, 55.0],
-        [-30.0, 0.0, 30.0],
-        pytest.approx([0.2, 0.9, 1.6]),
-    ]
-    compared = torch.tensor(COMPARED_AT)
-    assert bool(torch.isclose(values, compared).all(1).any())
-    assert task.parameter_names == [
-        "ground_friction",
-        "ground_dynamic_friction",
-        "ground_restitution",
-        "friction",
-        "rolling_friction",
-        "restitution",
-        "linear_damping",
-        "angular_damping",
-    ]
-    assert task.pours.particles.density == DENSITIES[task.material]
-    assert len(task.real_pours.particles) == len(task.pours.particles) == 8
-    assert task.theta_true.isnan().all()
 
 
 def test_materials_are_not_the_model():
@@ -61,17 +34,3 @@ def test_intersection_volume_is_what_two_heaps_share():
     simulated[0, 5:15] = 6.0
     assert intersection_volume(real, simulated).tolist() == [20.0, 0.0]
     assert float(intersection_volume(real, real[None])) == 40.0
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ({"material": "sand"}, "expected material among 'beads', 'gravel'; got 'sand'"),
-        ({"size": 0.0}, "expected size > 0; got 0.0"),
-        ({"size": 20.0}, "expected particles that fit a bucket"),
-        ({"cubes": 0}, "expected 1 to 1000 particles; got 0"),
-    ],
-)
-def test_bad_options(options, text):
-    with pytest.raises(ValueError, match=text):
-        get_task("pouring_real", **options)

@@ -5,7 +5,6 @@ import pandas as pd
 import pytest
 import torch
 
-from sbi_active.seeding import forked_generators
 from sbi_active.tasks import ball_and_hoop, cascaded_tanks  # pyright: ignore
 from sbi_active.tasks.ball_and_hoop import spin  # pyright: ignore
 from sbi_active.tasks.cascaded_tanks import levels, start_levels  # pyright: ignore
@@ -51,26 +50,6 @@ def test_pieces_meet_at_their_ends():
     assert pieces.rows(2)["inputs"]["voltage"].shape == (6, 80)
 
 
-def test_a_piece_knows_its_first_slope():
-    made = record(0.1, (-1, 1), 241)
-    line = Record("line", 0.1, made.voltage, 3 + 0.5 * 0.1 * np.arange(241))
-    pieces = cut(line, 80, every=8, slope=5)
-    assert pieces.slope == pytest.approx(0.5)
-    assert pieces.action.shape == (3, 3)
-    assert cut(line, 80).action.shape == (3, 2)
-
-
-def test_a_piece_runs_before_its_readings_count():
-    made = record(0.1, (-1, 1), 241)
-    pieces = cut(made, 60, every=6, lead=50)
-    assert pieces.voltage.shape == (3, 110)
-    assert pieces.times[[0, -1]].tolist() == pytest.approx([5.6, 11.0])
-    assert (
-        pieces.output[1].tolist() == made.output[60 + 50 + np.arange(6, 61, 6)].tolist()
-    )
-    assert pieces.start[1] == made.output[60]
-
-
 def write(path, **columns):
     pd.DataFrame(columns).to_csv(path, index=False)
     return path
@@ -108,20 +87,6 @@ def test_effects_vanish_at_zero_and_have_a_slope_there(name):
         assert sizes[0] == 0, effect.name
         assert sizes[2] > 0, effect.name
         assert sizes[1] == pytest.approx(sizes[2] / 100, rel=0.3), effect.name
-
-
-@pytest.mark.parametrize("name", [*MACHINES])
-def test_rows_are_apart_and_of_the_prior(name):
-    fn, _, _, step, bounds = MACHINES[name]
-    module = {"hoop": ball_and_hoop, "tanks": cascaded_tanks}[name]
-    with forked_generators(0):
-        theta = module.make_prior().sample((6,)).double()
-    pieces = cut(record(step, bounds), 120, every=4, slope=6 * (name == "tanks"))
-    x = fn(theta.repeat_interleave(2, 0), **pieces.rows(6))
-    assert x.isfinite().all()
-    alone = fn(theta[2:3].repeat_interleave(2, 0), **pieces.rows(1))
-    torch.testing.assert_close(x[4:6], alone)
-    assert module.make_prior().log_prob(theta).isfinite().all()
 
 
 def test_the_hoop_follows_the_linear_equation():

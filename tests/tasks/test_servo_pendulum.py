@@ -5,8 +5,6 @@ import pandas as pd
 import pytest
 import torch
 
-from sbi_active.criticism import Criticism
-from sbi_active.simulation import AutocorrelatedNoise
 from sbi_active.tasks import get_task  # pyright: ignore
 from sbi_active.tasks.servo_pendulum import (  # pyright: ignore
     Recordings,
@@ -102,11 +100,6 @@ def test_effects_vanish_at_zero(task):
         assert np.abs(every_trial(task, **{keyword: 0.05}) - bare).max() > 0.01
 
 
-def test_an_action_that_was_not_recorded(task):
-    with pytest.raises(ValueError, match=r"expected the action of a recorded.*300"):
-        task.angles(THETA, torch.tensor([[300.0, 0.0]]))
-
-
 def test_the_real_system_replays(task):
     assert torch.equal(task.real_system(task.actions.values[1]), torch.zeros(30))
     other = task.with_truth([0.45, 5.0, 0.0045, 0.0015, -0.02])
@@ -160,6 +153,22 @@ def test_reading_interpolates_and_finds_when_the_motor_is_off(folder):
     ]
 
 
+# The closed loop
+
+
+def test_viscous_friction_is_back_emf_until_the_motor_is_off(task):
+    kt, resistance = THETA[0, 0], THETA[0, 1]
+    b = 0.01
+    more = kt + b * resistance / kt  # the same torque a volt, more back-EMF
+    other = THETA.clone()
+    other[0, 0], other[0, 1] = more, resistance * more / kt
+    viscous, electric = every_trial(task, viscous=b), every_trial(task, other)
+    off = task.recordings.motor_off
+    assert off.tolist() == [False, True, False, True]
+    assert np.abs(viscous - electric)[~off].max() < 1e-9
+    assert np.abs(viscous - electric)[off].max() > 0.1
+
+
 def edited(folder, name, change):
     table = pd.read_csv(folder / name)
     change(table).to_csv(folder / name, index=False)
@@ -184,58 +193,3 @@ def edited(folder, name, change):
 def test_recordings_that_do_not_fit(folder, name, change, message):
     with pytest.raises(ValueError, match=message):
         read_recordings(edited(folder, name, change))
-
-
-# The closed loop
-
-
-def judged(friction, *, seed):
-    """The verdict on simulated trials with errors of .03 rad, correlated over .3 s."""
-    trials = [
-        (kp, name, 0.0)
-        for kp in (100.0, 800.0)
-        for name in ("sin_time_square", "lift_and_drop")
-    ]
-    quiet = ServoPendulumTask(data=recordings(*trials))
-    r = quiet.recordings
-    mean = torch.from_numpy(every_trial(quiet, **friction))
-    noise = AutocorrelatedNoise(0.03, 0.3)
-    seeds = torch.arange(len(r)) + 100 * seed
-    x = noise.sample(mean, seeds, times=torch.from_numpy(r.times))
-    found = Recordings(
-        r.kp, r.trajectory, r.goal, r.enabled, r.start, r.times, x.numpy()
-    )
-    real = ServoPendulumTask(data=found)
-    return Criticism(
-        real.simulator,
-        real.prior,
-        real.trials(range(len(r))),
-        effects=real.effects(),
-        actions=real.actions,
-    ).trace()
-
-
-@pytest.mark.slow
-def test_a_servo_without_friction_lacks_nothing():
-    assert judged({}, seed=0).verdict == "none"
-
-
-@pytest.mark.slow
-def test_coulomb_friction_is_found():
-    tracing = judged({"coulomb": 0.06}, seed=0)
-    assert tracing.verdict == "Coulomb"
-    mean, sd = tracing.estimates[0].mean[0], tracing.estimates[0].sd[0]
-    assert abs(mean - 0.06) < 4 * sd
-
-
-def test_viscous_friction_is_back_emf_until_the_motor_is_off(task):
-    kt, resistance = THETA[0, 0], THETA[0, 1]
-    b = 0.01
-    more = kt + b * resistance / kt  # the same torque a volt, more back-EMF
-    other = THETA.clone()
-    other[0, 0], other[0, 1] = more, resistance * more / kt
-    viscous, electric = every_trial(task, viscous=b), every_trial(task, other)
-    off = task.recordings.motor_off
-    assert off.tolist() == [False, True, False, True]
-    assert np.abs(viscous - electric)[~off].max() < 1e-9
-    assert np.abs(viscous - electric)[off].max() > 0.1

@@ -45,27 +45,3 @@ def test_real_system_is_the_simulator_at_the_truth():
     truth = -3 * torch.tensor(3.0).exp()
     assert abs(float(x.mean() - truth)) < 4 / 400**0.5
     assert torch.equal(task.real_system(torch.zeros(1), seed=1), x[1])
-
-
-def test_reproduction_error_of_a_point_and_of_the_exact_posterior():
-    task = get_task("numerical")
-
-    class Point:
-        def sample(self, shape):
-            return torch.tensor([-2.0, 1.0]).expand(*shape, 2)
-
-    error = task.reproduction_error(Point(), 0.0, num_samples=3)
-    assert error == pytest.approx(float(torch.tensor(3.0).exp()))
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ({"variant": "cubic"}, "expected variant among 'linear', 'sinh', 'square'"),
-        ({"theta_true": [6.0, 0.0]}, "expected theta_true of two numbers within"),
-        ({"theta_true": [0.0]}, "expected theta_true of two numbers within"),
-    ],
-)
-def test_bad_options(options, text):
-    with pytest.raises(ValueError, match=text):
-        get_task("numerical", **options)

@@ -126,6 +126,5 @@ def main(
         case: Number of the case.
         action: Number of the action, of the world's.
     """
-    torch.set_num_threads(1)
     figure = residual_figure(bank, kind, case, action)
     save(figure, str(folder / f"residual_{kind}.png"))

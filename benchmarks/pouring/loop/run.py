@@ -19,7 +19,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,7 +31,7 @@ from benchmarks.pouring.bank import read as read_bank
 from benchmarks.pouring.loop.emulator import Emulator, pictures_numbers, side_of
 from benchmarks.pouring.loop.summary import summarize
 from benchmarks.pouring.loop.worlds import World, get_world
-from benchmarks.rows import append, read
+from benchmarks.rows import read, resumed
 from sbi_active import DiscreteActions
 from sbi_active.criticism import Context, Criticism, Report, Trials
 from sbi_active.seeding import derive_seed, forked_generators
@@ -237,19 +237,13 @@ class Settings:
 
 def main(arguments: Settings) -> None:
     """Run what is asked for and is not there yet, and print the table."""
-    torch.set_num_threads(1)
     path = arguments.results / "loop.csv"
     if not arguments.summary:
         if arguments.bank is None:
             raise SystemExit(
                 "expected --bank FOLDER; got none; make one, see worlds.py"
             )
-        done = {(row["kind"], row["case"]) for row in read(path)}
-        for kind in arguments.kind:
-            for case in range(CASES[kind]):
-                if (kind, str(case)) in done:
-                    continue
-                row = row_of(arguments.bank, kind, case)
-                append(path, COLUMNS, [row])
-                print(kind, case, row["truth"], "->", row["verdict"], flush=True)
+        jobs = [(kind, case) for kind in arguments.kind for case in range(CASES[kind])]
+        own = partial(row_of, arguments.bank)
+        resumed(path, COLUMNS[:2], jobs, own, columns=COLUMNS)
     print(summarize(read(path)))

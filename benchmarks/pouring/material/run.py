@@ -20,7 +20,7 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,7 @@ from benchmarks.pouring.material.learned import (
 )
 from benchmarks.pouring.material.summary import checks_table, summarize
 from benchmarks.pouring.run import TEMPERED
-from benchmarks.rows import append, read, short
+from benchmarks.rows import read, resumed
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import intersection_volume
@@ -145,41 +145,42 @@ class Settings:
 
 def run_missing(bank: Path, learned: ByPlace, arguments: Settings) -> None:
     """Run the trials, or the checks, that are not in the files yet."""
-    trials = arguments.results / "intervol.csv"
-    checks = arguments.results / "intervol_poured.csv"
-    path = checks if arguments.check else trials
-    done = {(r["seed"], r["material"], r["method"]) for r in read(path)}
+    last = arguments.first + arguments.trials
     for material in MATERIALS:
         task: Any = get_task("pouring_real", material=material)
         overlap = compared_pours(bank, compared_images(material))
         print(
             f"{material}: {overlap.explained:.2f} of the variance, {overlap.num} pours"
         )
-        for seed in range(arguments.first, arguments.first + arguments.trials):
-            for method in METHODS:
-                if (str(seed), material, method) in done:
-                    continue
-                rows, belief = run_trial(task, learned, overlap, method, seed)
-                if not arguments.check:
-                    append(trials, COLUMNS, rows)
-                    values = " ".join(f"{row['intervol']:.0f}" for row in rows)
-                    print(material, method, seed, values, flush=True)
-                    continue
-                volume = poured(belief, material, arguments.check, seed)
-                row = {
-                    **{k: rows[0][k] for k in ("seed", "material", "method")},
-                    "num": arguments.check,
-                    "poured": float(volume.mean()),
-                    "poured_se": float(volume.std(ddof=1) / np.sqrt(len(volume))),
-                    "learned": rows[-1]["intervol"],
-                }
-                append(checks, CHECKED, [row])
-                print(material, method, seed, short(row["poured"]), flush=True)
+        trial = partial(run_trial, task, learned, overlap)
+
+        def rows(
+            seed: int, _: str, method: str, trial: Any = trial
+        ) -> list[dict[str, object]]:
+            return trial(method, seed)[0]
+
+        def check(
+            seed: int, material: str, method: str, trial: Any = trial
+        ) -> dict[str, object]:
+            made, belief = trial(method, seed)
+            volume = poured(belief, material, arguments.check, seed)
+            error = volume.std(ddof=1) / np.sqrt(len(volume))
+            told = seed, material, method, len(volume), volume.mean(), error
+            learned = made[-1]["intervol"]
+            return dict(zip(CHECKED, (*told, learned), strict=True))
+
+        jobs = [(s, material, m) for s in range(arguments.first, last) for m in METHODS]
+        name, make, columns = (
+            ("intervol_poured", check, CHECKED)
+            if arguments.check
+            else ("intervol", rows, COLUMNS)
+        )
+        path = arguments.results / f"{name}.csv"
+        resumed(path, CHECKED[:3], jobs, make, columns=columns)
 
 
 def main(arguments: Settings) -> None:
     """Run what is asked for and is not there yet, and print the table."""
-    torch.set_num_threads(1)
     if not arguments.summary:
         if arguments.bank is None:
             raise SystemExit("expected --bank FOLDER; got none; make one, see bank.py")

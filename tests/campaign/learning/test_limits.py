@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sbi_active import BoxActions, Campaign, DiscreteActions, SimulatorModel
+from sbi_active import Campaign, DiscreteActions, SimulatorModel
 from sbi_active.campaign.options import CampaignDetails
 from tests.campaign import problem
 from tests.campaign.learning import test_revision as revised
@@ -43,12 +43,6 @@ def test_a_constraint_is_kept_by_designed_and_random_actions(method):
     assert all(float(t.action) <= 1.5 for t in c.history)
     if method == "asbi":
         assert float(c.history[0].action) == 1.0
-
-
-def test_a_constraint_is_kept_in_a_box():
-    box = BoxActions([0.0], [3.0])
-    c = campaign(actions=box, limits={"constraint": below(1.5)})
-    assert 1.2 < float(c.ask().action) <= 1.5
 
 
 @pytest.mark.parametrize(("constraint", "side"), [(None, -1), (above(0.5), 1)])

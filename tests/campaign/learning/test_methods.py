@@ -79,7 +79,7 @@ def test_each_method_has_its_authors_utility(method):
 def test_faithful_seqbed_is_lfire():
     sizes = {"num_simulations": 900, "refine": False, "estimator": "ratio"}
     c = small("seqbed", density_estimator=LFIRE(), **sizes)
-    c.run(measured, num_rounds=2)
+    c.run(measured, num_rounds=1)
     assert c.belief.label == "weighted particles"
     assert c.history[0].design.estimator == "RatioGain"
     assert c.history[0].action.tolist() == [3.0]

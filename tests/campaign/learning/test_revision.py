@@ -131,23 +131,6 @@ def test_a_report_of_another_model_is_refused(adopted):
 
 
 @pytest.mark.slow
-def test_a_drift_is_inferred_at_the_index_of_each_trial():
-    c = campaign()
-    tell(c, shift=0.0, per_trial=0.4, actions=(1.0, -2.0, 2.0, -1.0, 2.0, -2.0))
-    c.update()
-    report = c.criticize(LIBRARY, evaluate=False)
-    assert report.verdict == "drift"
-    c.adopt(report)
-    # Slope and drift, from six measurements of noise .1.
-    assert c.belief.mean.tolist() == pytest.approx([0.5, 0.4], abs=0.1)
-    trial = c.ask()
-    c.tell(0.5 * trial.action + 0.4 * trial.index)
-    c.update()
-    assert c.history[-1].surprise > 0.05
-    assert c.belief.mean.tolist() == pytest.approx([0.5, 0.4], abs=0.1)
-
-
-@pytest.mark.slow
 def test_a_failed_adoption_changes_nothing(monkeypatch):
     c = campaign()
     tell(c)

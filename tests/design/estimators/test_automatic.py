@@ -6,7 +6,6 @@ import pytest
 import torch
 from torch.distributions import Distribution
 
-from sbi_active import DiscreteActions, InformationGainDesigner
 from sbi_active.design import LikelihoodGain, PosteriorGain, RatioGain
 from sbi_active.design.estimators.automatic import (
     choose_estimator,
@@ -62,46 +61,6 @@ def test_a_ratio_beyond_the_reach_of_info_nce_is_averaged():
     assert type(chosen) is RatioGain
     assert "not used: InfoNCEGain is near its largest value, log K = 4.9" in notes[-1]
     assert "at 1 of 2 actions" in notes[-1]
-
-
-@pytest.mark.parametrize("model", [ExactLikelihood(), ExactRatio()])
-def test_the_designer_without_a_posterior_or_usable_noise(model):
-    def simulator(theta, action):
-        noise = torch.distributions.StudentT(3.0).sample(theta.shape)
-        return action * theta + noise
-
-    designer = InformationGainDesigner(
-        DiscreteActions([0.0, 0.5, 2.0]), num_samples=600
-    )
-    design = designer.select(model, simulator, seed=0)
-    assert design.action.tolist() == [2.0]
-    assert design.estimator in ("LikelihoodGain", "InfoNCEGain")
-    assert any("noise is not Gaussian" in note for note in design.notes)
-    assert float(design.expected_information_gain[0]) == pytest.approx(0, abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("name", "bound"),
-    [
-        ("likelihood", "upper"),
-        ("contrastive", "lower"),
-        ("info_nce", "lower"),
-        ("ratio", "none"),
-    ],
-)
-def test_the_designer_takes_them_by_name(name, bound):
-    class Model(ExactLikelihoodAndPosterior, ExactRatio):
-        offset, power = 0.0, 1.0
-
-    actions = DiscreteActions([0.0, 0.5, 1.0])
-    designer = InformationGainDesigner(actions, num_samples=2_000, estimator=name)
-    design = designer.select(Model(), lambda t, a: a * t + torch.randn_like(t), seed=0)
-    assert design.action.tolist() == [1.0]
-    assert design.bound == bound
-    exact = information(actions.values)
-    error = (design.expected_information_gain - exact).abs()
-    assert (error <= 3 * design.standard_error + 0.02).all()
-    assert design.notes == ()
 
 
 @pytest.mark.parametrize(

@@ -118,15 +118,6 @@ def test_outcomes_at_the_same_parameters_are_averaged(name, rows):
     assert torch.allclose(pairs, (first + second) / 2, atol=tolerance)
 
 
-@pytest.mark.parametrize("name", FROM_MODELS)
-def test_batches_do_not_matter(name, rows):
-    options = dict(vars(ESTIMATORS[name])) | {"batch_size": 70}
-    gain = type(ESTIMATORS[name])(**options)(Everything(), rows, PRIOR).mean(1)
-    whole = ESTIMATORS[name](Everything(), rows, PRIOR).mean(1)
-    tolerance = 0.1 if name in DRAWING else 1e-5
-    assert torch.allclose(gain, whole, atol=tolerance)
-
-
 @pytest.mark.parametrize("name", sorted(set(FROM_MODELS) - {"posterior"}))
 def test_a_model_that_cannot_say_is_an_error(name, rows):
     """A loss that the model does not know is refused, not dropped."""
@@ -153,22 +144,3 @@ def test_a_table_of_all_pairs_is_used(rows):
     gain = estimator(Table(), rows, PRIOR)
     assert Table.calls == 3
     assert torch.allclose(gain, estimator(Everything(), rows, PRIOR))
-
-
-def test_draws_of_the_belief_differ_by_simulations(rows):
-    """The halves that choose and report share none, candidates share all."""
-    estimator = LikelihoodGain(num_contrastive=5)
-    first = estimator._draw(PRIOR, rows)
-    assert torch.equal(
-        estimator._draw(PRIOR, rows.candidates(torch.tensor([1]))), first
-    )
-    other = rows.samples(slice(64))
-    assert not torch.equal(estimator._draw(PRIOR, other), first)
-    assert not torch.equal(LikelihoodGain(seed=1)._draw(PRIOR, rows)[:5], first)
-
-
-def test_without_a_belief(rows):
-    with pytest.raises(
-        ValueError, match="expected a belief for LikelihoodGain to draw"
-    ):
-        LikelihoodGain()(Everything(), rows, None)

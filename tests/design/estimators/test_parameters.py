@@ -13,7 +13,7 @@ from torch.distributions import MultivariateNormal
 
 from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.design.estimators.densities import cross_fit, patterns_of_numbers
-from sbi_active.design.estimators.posterior import NormalScores, ParameterGain
+from sbi_active.design.estimators.posterior import ParameterGain
 
 COVARIANCE = torch.tensor([[1.0, 0.6, 0.0], [0.6, 1.0, 0.0], [0.0, 0.0, 1.0]])
 BELIEF = MultivariateNormal(torch.zeros(3), COVARIANCE)
@@ -22,7 +22,7 @@ ACTIONS = torch.tensor([[0.0], [0.5], [2.0], [20.0]])
 SLACK = 0.15
 
 
-def simulations(n=600, seed=0):
+def simulations(n=400, seed=0):
     torch.manual_seed(seed)
     theta = BELIEF.sample((n,))
     x = ACTIONS[:, None] * (theta @ MIX.T) + torch.randn(len(ACTIONS), n, 2)
@@ -48,9 +48,7 @@ def assert_lower_bound(gain, exact, slack=SLACK):
     assert (gain.mean(1) > exact - slack - 3 * error).all()
 
 
-@pytest.mark.parametrize(
-    "index", [[0], [2], [0, 1], pytest.param([1, 2], marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("index", [[0], [0, 1]])
 def test_the_closed_form(index):
     gain = ParameterGain(index)(None, simulations(), BELIEF)
     exact = information(index)
@@ -99,19 +97,6 @@ def test_invalid_outcomes_count():
     assert exact - SLACK < float(known.mean()) < exact + 3 * error
 
 
-def test_normal_scores():
-    uniform = torch.rand(20_000, generator=torch.Generator().manual_seed(0)).double()
-    scores = NormalScores(uniform)
-    u = scores(uniform)
-    assert float(u.mean()) == pytest.approx(0.0, abs=4 / 20_000**0.5)
-    assert float(u.std()) == pytest.approx(1.0, abs=0.02)
-    assert (scores(torch.tensor([0.1, 0.5, 0.9]).double()).diff() > 0).all()
-    outside = scores(torch.tensor([-5.0, 5.0]).double())
-    assert outside.isfinite().all()
-    normal = torch.special.ndtri(uniform.clamp(1e-6, 1 - 1e-6))
-    assert NormalScores(normal).curve is None  # left as it is
-
-
 def test_rows_are_scored_without_themselves():
     """A member that memorizes its training rows gains nothing."""
 
@@ -127,9 +112,3 @@ def test_rows_are_scored_without_themselves():
     )  # fmt: skip
     found = sorted((r.tolist(), c.tolist()) for r, c in groups)
     assert found == [([0, 1, 2], [0]), ([3, 4, 5], [0, 1]), ([6], [])]
-
-
-def test_errors():
-    for index in ([], [1, 1]):
-        with pytest.raises(ValueError, match="expected one or more different"):
-            ParameterGain(index)

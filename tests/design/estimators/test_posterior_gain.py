@@ -1,4 +1,3 @@
-import pytest
 import torch
 
 from sbi_active.design import PosteriorGain
@@ -31,10 +30,3 @@ def test_a_model_of_the_wrong_spread_loses_what_the_divergence_says():
     error = gain.std(1) / gain.shape[1] ** 0.5
     distance = (gain.mean(1) - (information(rows.action) - loss)).abs()
     assert (distance < 4 * error).all()
-
-
-def test_wrong_shape():
-    rows = simulations(n=5)
-    wrong = CandidateSimulations(rows.theta[:4], rows.action, rows.x)
-    with pytest.raises(ValueError, match=r"expected x of shape \(3, 4, \*x_shape\)"):
-        PosteriorGain()(ExactModel(), wrong, PRIOR)

@@ -3,7 +3,6 @@
 import copy
 import json
 import pickle
-from dataclasses import FrozenInstanceError
 
 import pytest
 
@@ -19,31 +18,11 @@ KNOWN = Diagnostics(
 ).extended(bandwidth=0.1, num_missing=2)
 
 
-def test_who_adds_makes_another():
-    more = KNOWN.extended(num_simulations=500, num_regions=3)
-    assert (more.num_simulations, more.num_regions, more.bandwidth) == (500, 3, 0.1)
-    assert KNOWN.num_simulations == 300
-    assert "num_regions" not in KNOWN.figures
-    with pytest.raises(FrozenInstanceError):
-        KNOWN.trustworthy = False  # pyright: ignore
-
-
 def test_a_warning_takes_the_trust():
     assert KNOWN.warned() is KNOWN
     warned = KNOWN.warned("one").warned("two")
     assert not warned.trustworthy
     assert warned.warnings == ("one", "two")
-
-
-def test_in_words():
-    text = str(KNOWN.warned("the belief is too wide; raise num_histories"))
-    assert text.splitlines()[:2] == [
-        "not trustworthy",
-        "- the belief is too wide; raise num_histories",
-    ]
-    assert "settled" in text
-    assert "300 simulations" in text
-    assert str(Diagnostics()) == "not checked"
 
 
 def test_as_plain_data():
@@ -67,10 +46,3 @@ def test_entries_by_name_go_in_the_next_version():
         assert KNOWN.get("bandwidth") == 0.1
     with pytest.warns(DeprecationWarning, match="deprecated"):
         assert "width" not in KNOWN
-
-
-def test_an_empty_list_is_no_unknown_name():
-    with pytest.warns(DeprecationWarning, match="deprecated"):
-        assert Diagnostics()["warnings"] == []
-    with pytest.warns(DeprecationWarning, match="deprecated"), pytest.raises(KeyError):
-        Diagnostics()["warning"]

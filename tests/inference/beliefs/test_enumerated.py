@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 from sbi.utils import BoxUniform, MultipleIndependent
-from torch.distributions import Bernoulli, Categorical, Independent, Normal, Poisson
+from torch.distributions import Bernoulli, Categorical, Normal
 
 from sbi_active import BoxActions, Campaign, GaussianNoise, SimulatorModel
 from sbi_active.inference import refine
-from sbi_active.inference.beliefs.enumerated import EnumeratedBelief, Enumeration
+from sbi_active.inference.beliefs.enumerated import EnumeratedBelief
 
 SD = 0.3
 ACTION, X = torch.tensor([[1.0], [2.0]]), torch.tensor([[1.2], [1.9]])
@@ -96,26 +96,6 @@ def test_noise_is_not_inflated_for_a_value_that_trials_rule_out():
     # Off, they miss by ten deviations each: e^-200, whatever the prior.
     assert belief.probability.tolist() == pytest.approx([0.0, 1.0], abs=1e-9)
     assert belief.diagnostics.trustworthy
-
-
-def test_the_parts_are_told_apart():
-    found = Enumeration.of(PRIOR)
-    assert found is not None
-    assert found.places.tolist() == [0, 2]
-    assert found.others.tolist() == [1]
-    full = found.filled(3, torch.tensor([[0.7]]))
-    assert full.tolist() == [[1.0, pytest.approx(0.7), 1.0]]
-    assert found.combination(full).tolist() == [3]
-    assert found.combination(torch.tensor([[1.0, 0.7, 0.4]])).tolist() == [-1]
-    box = BoxUniform(torch.zeros(1), torch.ones(1))
-    assert Enumeration.of(box) is None
-    endless = MultipleIndependent([box, Poisson(torch.ones(1))], validate_args=False)
-    assert Enumeration.of(endless) is None
-    for num, is_few in ((6, True), (7, False)):
-        switches = Independent(Bernoulli(0.5 * torch.ones(num)), 1)
-        many = Enumeration.of(MultipleIndependent([box, switches]))
-        assert (many is not None) == is_few
-        assert many is None or many.values.shape == (64, 6)
 
 
 def test_a_campaign_designs_and_comes_back(tmp_path):

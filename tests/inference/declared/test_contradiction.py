@@ -92,13 +92,12 @@ def test_trials_that_agree_leave_the_noise_as_it_is(simulator):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("method", ["nlhi"])
 @pytest.mark.xfail(
     reason="beliefs of learned likelihoods are not checked against the trials: "
     "one engine for all potentials",
     strict=True,
 )
-def test_products_of_learned_likelihoods_do_not_collapse(method):
+def test_products_of_learned_likelihoods_do_not_collapse():
     trials = [(1.0, -1.0), (1.0, 2.0), (3.0, 1.6)]
-    c = after(trials, method=method)
+    c = after(trials, method="nlhi")
     assert moments(c)[1] > 0.1 or c.belief.diagnostics.trustworthy is False

@@ -13,15 +13,10 @@ from torch import Tensor
 
 from sbi_active.inference import RefinementOptions, refine
 from sbi_active.inference.declared.simulated_belief import SimulatedBelief
-from sbi_active.inference.engine import Settings, SimulatedPotential, infer, search
 from sbi_active.inference.engine.potential import (
     MeanTable,
     SimulatedLikelihood,
     declares_noise,
-)
-from sbi_active.inference.sampling.coordinates import (
-    NormalCoordinates,
-    PriorCoordinates,
 )
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, MissingRowsWarning, SimulatorModel
@@ -73,56 +68,6 @@ def grid_evidence(model: SimulatorModel, action: Tensor, x: Tensor) -> float:
         shape = len(theta), 1
         log_likelihood += model.log_prob(each.expand(shape), theta, a.expand(shape))
     return float(log_likelihood.logsumexp(0)) - math.log(len(theta))
-
-
-def sampled(model: SimulatorModel, x: Tensor, count: int, seed: int = 0, past=None):
-    rng = np.random.default_rng(seed)
-    if past is None:
-        base = PriorCoordinates(BOX, np.random.default_rng(0))
-        coordinates = NormalCoordinates(base, np.random.default_rng(0))
-        table = MeanTable(model, IN_PROCESS)
-    else:
-        table, coordinates = past[0].likelihood.table, past[0].coordinates
-    likelihood = SimulatedLikelihood(table, ACTION[:count], x[:count])
-    potential = SimulatedPotential(likelihood, coordinates)
-    settings = Settings(num_simulations=9_000)
-    if past is None:
-        found = search(potential, rng)
-        return potential, infer(potential, rng, found=found, settings=settings)
-    pool = past[1].pool.with_trials(potential, settings)
-    fit = infer(potential, rng, past=pool, settings=settings)
-    return potential, fit
-
-
-def test_the_likelihood_is_the_noise_around_the_mean(model: SimulatorModel):
-    x = observe(model, 0)
-    likelihood = SimulatedLikelihood(MeanTable(model, IN_PROCESS), ACTION, x)
-    theta = BOX.sample((50,))
-    exact = torch.zeros(50).double()
-    for k in range(3):
-        exact += model.log_prob(x[k].expand(50, 1), theta, ACTION[k].expand(50, 1))
-    value = likelihood(theta)
-    # Means come as float32, of size 1 with a relative error of 6e-8 and noise .02.
-    assert value == pytest.approx(exact.numpy(), rel=1e-3, abs=1e-3)
-    count = likelihood.table.num_simulations
-    assert count == 150
-    floor = float(np.median(value))
-    reaches = np.isfinite(likelihood(theta, floor=floor - 1e-6))
-    assert (reaches == (value >= floor - 1e-6)).all()
-    assert likelihood.table.num_simulations == count
-
-
-@pytest.mark.parametrize("seed", [1])
-def test_the_evidence_is_that_of_a_fine_grid(model: SimulatorModel, seed: int):
-    x = observe(model, seed)
-    last = None
-    for count in (1, 3):
-        exact = grid_evidence(model, ACTION[:count], x[:count])
-        scratch = sampled(model, x, count, seed)
-        last = sampled(model, x, count, seed, past=last)
-        for _, fit in (scratch, last):
-            assert fit.effective_sample_size > 20
-            assert fit.log_evidence == pytest.approx(exact, abs=4 * fit.standard_error)
 
 
 def test_a_further_trial_goes_on_from_the_draws(model: SimulatorModel):

@@ -8,7 +8,6 @@ from scipy.stats import norm
 from sbi_active.inference.engine import infer, search
 from sbi_active.inference.engine.importance import (
     _largest_power,
-    along_ridges,
 )
 from sbi_active.inference.engine.settings import Settings
 from sbi_active.inference.sampling.weights import effective_sample_size
@@ -31,17 +30,6 @@ def evidence():
         return norm.pdf(gain) * norm.pdf(X / scale) / scale
 
     return np.log(quad(density, -8, 8)[0])
-
-
-def test_places_stay_on_the_ridge_and_spread_along_it():
-    own, rng = product(), np.random.default_rng(0)
-    found = search(own, rng)
-    mixture = along_ridges(own, found, found.modes, rng, SETTINGS)
-    u = mixture.means
-    assert u[:, 0] * np.exp(SLOPE * u[:, 1]) == pytest.approx(X, abs=0.02)
-    assert np.ptp(u[:, 1]) > 2  # deviations of the prior
-    # None is as wide as the prior.
-    assert np.linalg.svd(mixture.factors, compute_uv=False).max() < 1
 
 
 def test_a_thin_ridge_has_the_right_evidence():

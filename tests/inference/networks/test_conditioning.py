@@ -5,8 +5,6 @@ import torch
 
 from sbi_active.inference import MixtureDensity
 from sbi_active.inference.networks.baseline import Baseline, local, precision_factor
-from sbi_active.inference.networks.conditioning import Conditioning
-from sbi_active.inference.networks.mixture_network import PreparedLoss
 from sbi_active.tasks.numerical import NumericalTask
 from tests import linear_gaussian
 
@@ -26,12 +24,6 @@ def numerical(variant="linear", n=2_000, seed=0):
     return theta, x, action
 
 
-def gaussian_world(n=2_000, seed=0):
-    torch.manual_seed(seed)
-    theta, action = torch.randn(n, 2), 4 * torch.rand(n, 1) - 2
-    return theta, linear_gaussian.simulator(theta, action), action
-
-
 def shaken(net):
     """Far from the start, so that nothing is trivial."""
     for parameter in net.parameters():
@@ -49,6 +41,12 @@ def built(variant="linear", shake=True, n=2_000, **settings):
 
 
 # The baseline
+
+
+def gaussian_world(n=2_000, seed=0):
+    torch.manual_seed(seed)
+    theta, action = torch.randn(n, 2), 4 * torch.rand(n, 1) - 2
+    return theta, linear_gaussian.simulator(theta, action), action
 
 
 def test_the_linear_baseline_is_the_exact_posterior_of_a_linear_world():
@@ -84,16 +82,6 @@ def test_held_out_rows_choose_the_baseline(variant, kind):
     assert pure.num_frames == 1
 
 
-def test_two_modes_have_a_frame_each():
-    net, _, _ = built("square", shake=False, n=4_000)
-    theta = torch.tensor([[3.0, 1.0]])
-    action = torch.tensor([[-2.0]])
-    x = SIMULATOR["square"].mean(theta, action)
-    _, frames = net.conditioning(torch.cat([x, action], 1))
-    modes = net.conditioning.unwhiten(frames.mean)[0, :2, 0]
-    assert sorted(modes.tolist()) == pytest.approx([-3.0, 3.0], abs=0.05)
-
-
 # In the network
 
 
@@ -124,21 +112,6 @@ def gaussian_around(place, draws):
         near = near[z.square().sum(0).argsort()[: len(near) // 2]]
     covariance = 0.5 * torch.cov(near.T)
     return torch.distributions.MultivariateNormal(near.mean(0), covariance)
-
-
-@pytest.mark.parametrize("variant", ["square"])
-def test_density_integrates_to_one(variant):
-    torch.manual_seed(0)
-    theta, x, action = numerical(variant, 2_000)
-    condition = torch.cat([x, action], 1)
-    net = MixtureDensity(hidden_features=(16,)).build(theta[:, :1], condition, 1)
-    net = shaken(net)
-    grid = torch.linspace(-60, 60, 400_001)[:, None, None]
-    for row in condition[action[:, 0] > 0][:3]:
-        with torch.no_grad():
-            density = net.log_prob(grid, row[None])[:, 0].exp()
-        total = float(torch.trapezoid(density, grid[:, 0, 0]))
-        assert total == pytest.approx(1.0, abs=5e-3)
 
 
 @pytest.mark.parametrize("variant", ["linear", "sinh"])
@@ -183,22 +156,16 @@ def test_outcomes_without_a_measurement():
     [
         (torch.randn(100, 2), torch.full((100, 1), 3.0), torch.rand(100, 1)),
         (torch.randn(100, 2), torch.randn(100, 1), torch.full((100, 1), 2.0)),
-        (torch.randn(100, 3), torch.randn(100, 5), torch.rand(100, 2)),
-        (torch.randn(12, 2), torch.randn(12, 1), torch.rand(12, 1)),
         (torch.randn(1, 2), torch.randn(1, 1), torch.rand(1, 1)),
         (torch.ones(100, 2), torch.randn(100, 1), torch.rand(100, 1)),
         (torch.randn(200, 2), torch.full((200, 1), torch.nan), torch.rand(200, 1)),
-        (torch.randn(200, 2), torch.randn(200, 50), torch.rand(200, 1)),
     ],
     ids=[
         "constant x",
         "constant action",
-        "many numbers",
-        "few rows",
         "one row",
         "constant theta",
         "no measurement",
-        "large x",
     ],
 )
 def test_degenerate_rows(theta, x, action):
@@ -208,22 +175,6 @@ def test_degenerate_rows(theta, x, action):
         net = settings.build(theta, condition, action.shape[1])
         assert net.log_prob(theta, condition).isfinite().all()
         assert net.sample(torch.Size([2]), condition).isfinite().all()
-
-
-def test_prepared_rows_have_the_same_loss():
-    for variant in ("linear", "square"):
-        net, theta, condition = built(variant)
-        loss = PreparedLoss(net).loss(*net.prepare(theta, condition))
-        assert torch.allclose(loss, net.loss(theta, condition), rtol=1e-5, atol=1e-4)
-
-
-def test_whitening_removes_all_correlation():
-    torch.manual_seed(0)
-    theta = torch.randn(1_000, 2) @ torch.tensor([[1.0, 0.999], [0.0, 1e-3]]) + 50
-    conditioning = Conditioning(theta, torch.randn(1_000, 2), 1, **FULL)
-    u = conditioning.whiten(theta)
-    assert torch.allclose(torch.cov(u.T), torch.eye(2).double(), atol=2e-3)
-    assert torch.allclose(conditioning.unwhiten(u), theta.double(), atol=1e-9)
 
 
 def test_factor_survives_rounding():

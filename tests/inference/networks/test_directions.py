@@ -3,7 +3,7 @@
 import torch
 from torch.distributions import MultivariateNormal
 
-from sbi_active.inference.networks.conditioning import Conditioning, Directions
+from sbi_active.inference.networks.conditioning import Conditioning
 from sbi_active.inference.networks.mixture_density import (
     MixtureDensity,
     TrainingBudget,
@@ -54,12 +54,6 @@ def test_a_network_of_many_numbers_comes_near_the_exact_posterior():
     assert exact(theta, condition) - score < 0.15
 
 
-def test_few_numbers_stay_as_they_are():
-    theta, condition = rows(200, 0)
-    few = condition[:, -6:]
-    assert Conditioning(theta, few, 1, **ALL_ROWS).directions is None
-
-
 def test_an_outcome_that_lacks_a_number_is_seen_by_the_others():
     theta, condition = rows(300, 0)
     whole = condition.clone()
@@ -76,13 +70,3 @@ def test_an_outcome_that_lacks_a_number_is_seen_by_the_others():
     # No frame is trusted where a number lacks.
     for row in (5, 9):
         assert bool((frames.mean[row] == 0).all())
-
-
-def test_directions_are_orthonormal_and_hold_what_parameters_move():
-    theta, condition = rows(1_000, 0)
-    x, action = condition.split([NUM, 1], 1)
-    own = Directions(theta.double(), x, action, num=8)
-    torch.testing.assert_close(own.rows @ own.rows.T, torch.eye(8).double())
-    signal = BASIS.double() / own.scale
-    kept = signal @ own.rows.T
-    assert float(kept.square().sum() / signal.square().sum()) > 0.95

@@ -72,21 +72,6 @@ def test_missing_outcomes_are_something_to_condition_on():
     assert (draws < 0).float().mean() > 0.85
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"num_components": 0},
-        {"hidden_features": (0,)},
-        {"learning_rate": 0.0},
-        {"scaling": "local"},
-        {"baseline": "cubic"},
-    ],
-)
-def test_settings_validate_themselves(settings):
-    with pytest.raises(ValueError, match=f"expected {next(iter(settings))}"):
-        MixtureDensity(**settings)
-
-
 def test_faithful_settings_condition_on_nothing_but_z_scores():
     """The paper's setting: the same network whether or not the action is known."""
     theta, condition = torch.randn(200, 2), torch.randn(200, 3)

@@ -5,11 +5,7 @@ import math
 import pytest
 import torch
 
-from sbi_active.inference.networks.action_scaling import (
-    ActionScaling,
-    Polynomials,
-    exponents_of,
-)
+from sbi_active.inference.networks.action_scaling import ActionScaling
 from sbi_active.inference.networks.baseline import Baseline, precision_factor
 from sbi_active.inference.networks.response import Response
 
@@ -34,34 +30,6 @@ def test_location_and_scale_over_four_decades(shift):
     z = scaling(x, action)
     assert abs(float(z.mean())) < 5 / math.sqrt(n)
     assert float(z.std()) == pytest.approx(1.0, abs=0.1)
-
-
-@pytest.mark.parametrize(
-    ("x", "action"),
-    [
-        (torch.full((100, 1), 7.0), torch.rand(100, 1)),
-        (torch.randn(100, 1), torch.full((100, 1), 3.0)),
-        (torch.full((100, 2), 7.0), torch.full((100, 2), 3.0)),
-        (torch.randn(8, 1), torch.rand(8, 1)),
-    ],
-    ids=["constant x", "constant action", "both", "few rows"],
-)
-def test_degenerate_rows_are_scaled_to_finite_numbers(x, action):
-    z = ActionScaling(x, action)(x, action)
-    assert z.isfinite().all()
-    assert z.abs().max() < 10
-
-
-def test_derivatives_of_polynomials():
-    rows = torch.rand(50, 3, dtype=torch.float64)
-    exponents, sizes = exponents_of(rows, max_degree=4, max_terms=100)
-    assert sizes == [1, 4, 10, 20, 35]
-    polynomials = Polynomials(rows, exponents)
-    inside = (0.2 + 0.6 * rows[:5]).requires_grad_()
-    values, slopes = polynomials.with_jacobian(inside)
-    for j in range(35):
-        (slope,) = torch.autograd.grad(values[:, j].sum(), inside, retain_graph=True)
-        assert torch.allclose(slope, slopes[:, j])
 
 
 @pytest.mark.parametrize("seed", [1])

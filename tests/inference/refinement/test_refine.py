@@ -50,65 +50,17 @@ def linear() -> tuple[LearnedBelief, Tensor, Tensor]:
     return belief, action, x
 
 
-def test_linear_gaussian_closed_form():
-    # x = A(xi) theta + e, theta ~ N(0, I): a Gaussian posterior, x of shape (2, 2).
-    weight = torch.tensor([[1.0, 0.5, 0.0], [0.0, 1.0, 0.5], [0.3, 0, 1], [1, -1, 0.2]])
-    sd = 0.3
-
-    def simulator(theta: Tensor, action: Tensor) -> Tensor:
-        x = action[:, :1] * (theta @ weight.T) + sd * torch.randn(len(theta), 4)
-        return x.reshape(-1, 2, 2)
-
-    prior = MultivariateNormal(torch.zeros(3), torch.eye(3))
-    action = torch.tensor([[0.5], [1.0], [2.0]])
-    truth = torch.tensor([[0.5, -1.0, 0.3]])
-    with forked_generators(1):
-        x = simulator(truth.expand(3, -1), action)
-    belief = refine(simulator, prior, action, x, seed=1)
-
-    design = torch.cat([a * weight for a in action[:, 0]]).double()
-    precision = torch.eye(3).double() + design.T @ design / sd**2
-    covariance = torch.linalg.inv(precision)
-    mean = covariance @ design.T @ x.reshape(-1).double() / sd**2
-    exact = MultivariateNormal(mean, covariance)
-    sample = draws(belief, 20_000).double()
-    # The last regression rests on at least 400 histories with 4 coefficients: the mean
-    # is off by about sqrt(4 / 400) = .1 deviations, and 1 % of draws are the prior's.
-    error = (sample.median(0).values - mean) / covariance.diagonal().sqrt()
-    assert error.abs().max() < 4 * 0.1
-    kept = sample[exact.log_prob(sample) > exact.log_prob(mean[None]) - 12]
-    ratio = torch.cov(kept.T).diagonal() / covariance.diagonal()
-    assert (ratio.log().abs() < 4 * math.sqrt(2 / 400)).all()
-    theta = exact.sample(torch.Size([2_000]))
-    log_ratio = exact.log_prob(theta) - belief.log_prob(theta).double()
-    assert abs(float(log_ratio.mean())) < 0.1
-    assert belief.diagnostics.trustworthy, belief.diagnostics.warnings
-
-
-@pytest.mark.parametrize("num_histories", [500])
 @pytest.mark.parametrize("variant", ["sinh", "square"])
-def test_close_to_the_exact_posterior(variant: str, num_histories: int):
-    runs = [
-        scored(variant, [-5.0, 5.0, -5.0, 5.0], num_histories, seed)
-        for seed in range(2)
-    ]
+def test_close_to_the_exact_posterior(variant: str):
+    runs = [scored(variant, [-5.0, 5.0, -5.0, 5.0], 500, seed) for seed in range(2)]
     divergence = torch.tensor([run[1] for run in runs])
-    # Medians of 20 trials: .02-.03 with 3,000 histories, .03-.05 with 500.
-    assert divergence.median() < (0.1 if num_histories == 3_000 else 0.15)
+    # Medians of 20 trials: .03-.05.
+    assert divergence.median() < 0.15
     assert divergence.max() < 0.4
     if variant == "square":
         for _, _, belief in runs:
             left = float((draws(belief, 4_000)[:, 0] < 0).float().mean())
             assert 0.25 < left < 0.75
-
-
-@pytest.mark.parametrize("action", [-5.0, 3.0])
-@pytest.mark.parametrize("variant", ["square"])
-def test_a_single_trial_leaves_a_ridge_across_the_box(variant: str, action: float):
-    gap, divergence, belief = scored(variant, [action], 3_000, seed=2)
-    assert abs(gap) < 1.0
-    assert -0.02 < divergence < 0.1
-    assert belief.diagnostics.trustworthy
 
 
 def test_density_is_normalized(linear):
@@ -136,14 +88,6 @@ def test_draws_follow_the_density(linear):
     assert len(sample.unique(dim=0)) > 2_000  # as many as are effective
 
 
-def test_defensive_share_of_the_prior(linear):
-    belief, _, _ = linear
-    far = torch.tensor([[4.0, -4.0]])
-    expected = math.log(RefinementOptions().defensive) + float(BOX.log_prob(far))
-    assert float(belief.log_prob(far)) == pytest.approx(expected, abs=1e-4)
-    assert float(belief.log_prob(torch.tensor([[6.0, 0.0]]))) == -math.inf
-
-
 def test_same_seed_same_belief(linear):
     belief, action, x = linear
     torch.rand(7)  # the global state must not matter
@@ -152,20 +96,6 @@ def test_same_seed_same_belief(linear):
     assert torch.equal(belief.log_prob(theta), again.log_prob(theta))
     assert torch.equal(theta, draws(again, 200))
     assert belief.diagnostics == again.diagnostics
-
-
-def test_global_generator_is_left_alone():
-    action, x = torch.tensor([[1.0]]), torch.tensor([[2.0]])
-    state = torch.get_rng_state()
-    refine(
-        numerical(),
-        BOX,
-        action,
-        x,
-        settings=RefinementOptions(num_histories=200),
-        seed=0,
-    )
-    assert torch.equal(state, torch.get_rng_state())
 
 
 def test_pickles_without_the_simulator(linear):
@@ -178,9 +108,8 @@ def test_pickles_without_the_simulator(linear):
     assert torch.equal(draws(copy, 100), theta)
 
 
-@pytest.mark.parametrize("num_histories", [200, 1_111])
-def test_budget_is_respected(num_histories: int):
-    rows = 0
+def test_budget_is_respected():
+    num_histories, rows = 1_111, 0
 
     def simulator(theta: Tensor, action: Tensor) -> Tensor:
         nonlocal rows
@@ -195,14 +124,12 @@ def test_budget_is_respected(num_histories: int):
     assert belief.diagnostics.num_simulations == rows
 
 
-@pytest.mark.parametrize("num_histories", [500, 1_000])
-@pytest.mark.parametrize("num_seeds", [2])
 @pytest.mark.parametrize("noise", ["gaussian", "uniform"])
-def test_hard_edged_noise_is_flagged(noise: str, num_seeds: int, num_histories: int):
+def test_hard_edged_noise_is_flagged(noise: str):
     action = torch.tensor([[-5.0], [5.0], [-5.0], [5.0]])
-    settings = RefinementOptions(num_histories=num_histories)
+    settings = RefinementOptions(num_histories=500)
     simulator = numerical(noise=noise)
-    for seed in range(num_seeds):
+    for seed in range(2):
         x = observe(simulator, torch.tensor([[1.0, 2.0]]), action, seed)
         belief = refine(simulator, BOX, action, x, settings=settings, seed=seed)
         holds = belief.diagnostics.assumptions["gaussian_noise"].holds
@@ -211,30 +138,27 @@ def test_hard_edged_noise_is_flagged(noise: str, num_seeds: int, num_histories: 
             assert not belief.diagnostics.trustworthy
 
 
-@pytest.mark.parametrize("num_histories", [500, 3_000])
-@pytest.mark.parametrize("num_seeds", [1])
-def test_four_sharp_modes_are_flagged(num_seeds: int, num_histories: int):
+def test_four_sharp_modes_are_flagged():
     action = torch.tensor([[-5.0], [5.0], [-5.0], [5.0]])
     simulator = numerical("sine")
-    settings = RefinementOptions(num_histories=num_histories)
-    for seed in range(num_seeds):
-        with forked_generators(seed, "truth"):
-            theta = BOX.sample((1,))
-        x = observe(simulator, theta, action, seed)
-        belief = refine(simulator, BOX, action, x, settings=settings, seed=seed)
-        assert not belief.diagnostics.trustworthy
-        assert not belief.diagnostics.assumptions["smooth_response"].holds
+    with forked_generators(0, "truth"):
+        theta = BOX.sample((1,))
+    x = observe(simulator, theta, action, 0)
+    settings = RefinementOptions(num_histories=500)
+    diagnostics = refine(
+        simulator, BOX, action, x, settings=settings, seed=0
+    ).diagnostics
+    assert not diagnostics.trustworthy
+    assert not diagnostics.assumptions["smooth_response"].holds
 
 
 def test_impossible_observation_is_flagged(linear):
     assert 0.01 < linear[0].diagnostics.tail_probability <= 1
     action = torch.tensor([[0.0], [0.0], [5.0]])
     x = torch.tensor([[50.0], [-50.0], [200.0]])  # the same action, 100 sigma apart
-    for seed in range(1):
-        diagnostics = refine(numerical(), BOX, action, x, seed=seed).diagnostics
-        assert diagnostics.tail_probability < 1e-3
-        warnings = " ".join(diagnostics.warnings)
-        assert "unlike anything simulated" in warnings
+    diagnostics = refine(numerical(), BOX, action, x, seed=0).diagnostics
+    assert diagnostics.tail_probability < 1e-3
+    assert "unlike anything simulated" in " ".join(diagnostics.warnings)
 
 
 def test_diagnostics_are_plain(linear):

@@ -16,8 +16,7 @@ from torch.distributions import (
     Uniform,
 )
 
-from sbi_active.inference import RefinementOptions, refine
-from sbi_active.inference.regression.histories import HistoryRecord
+from sbi_active.inference import refine
 from sbi_active.seeding import forked_generators
 from sbi_active.tasks import get_task
 from sbi_active.tasks.numerical.exact import ExactPosterior
@@ -102,20 +101,6 @@ def test_deterministic_simulator_is_refused():
         )
 
 
-@pytest.mark.parametrize(
-    "option",
-    [
-        {"num_histories": 50},
-        {"num_effective": 5},
-        {"num_draws": 1},
-        {"defensive": 0.0},
-    ],
-)
-def test_settings_validate_themselves(option: dict):
-    with pytest.raises(ValueError, match=f"expected {next(iter(option))} in"):
-        RefinementOptions(**option)
-
-
 def counted(simulator):
     """Return a simulator that counts its rows, and the count."""
     count = [0]
@@ -150,26 +135,6 @@ def test_past_histories_are_used_first():
         divergences.append(float(difference.mean()))
     assert rows[0] < 0.6 * rows[1]
     assert max(divergences) < 0.08
-
-
-def test_the_record_keeps_outcomes_and_pairs():
-    task = get_task("numerical")
-    action, x = torch.tensor([[0.0]]), torch.tensor([[-60.0]])
-    # Called by its method, it declares no noise.
-    past = refine(task.simulator.__call__, task.prior, action, x, seed=0).histories
-    assert isinstance(past, HistoryRecord)
-    assert past.x.shape == (len(past.theta), 1, 1)
-    mean = task.simulator.mean(past.theta, action.expand(len(past.theta), 1))
-    residual = torch.from_numpy(past.x[:, :, 0]) - mean
-    assert abs(float(residual.std()) - 1) < 4 / (2 * len(residual)) ** 0.5
-    kinds = past.theta.unique(dim=0, return_inverse=True)[1]
-    second = residual[(kinds[:, None] == kinds).sum(1) > 1]
-    assert abs(float(second.std()) - 1) < 4 / (2 * len(second)) ** 0.5
-    assert 0 < past.is_overview.sum() < len(past.theta)
-    # other first trials: nothing is taken over
-    other = torch.tensor([[1.0], [0.0]])
-    assert not past.precedes(other)
-    assert past.precedes(torch.tensor([[0.0], [1.0]]))
 
 
 def test_a_lack_of_memory_is_said(monkeypatch):

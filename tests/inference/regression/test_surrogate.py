@@ -52,14 +52,6 @@ def test_cubic_is_smooth_and_a_wave_is_not():
     assert regress(lambda z: np.sin(8 * z))[0].roughness > 0.5
 
 
-def test_too_few_rows_give_nothing():
-    rng = np.random.default_rng(0)
-    z, x = rng.standard_normal((15, 2)), rng.standard_normal((15, 1))
-    noise = estimate_noise(x[:5], x[5:10], np.ones(1))
-    fit = LocalRegression.fit(whole_space(2), z, x, noise=noise, num_trials=1)
-    assert fit is None
-
-
 def test_powers_alone_serve_many_parameters():
     rng = np.random.default_rng(0)
     z = rng.uniform(-1, 1, (NUM, 12))  # too few rows for 455 cubics

@@ -8,11 +8,8 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import (
     Beta,
-    Distribution,
     Exponential,
     Independent,
-    LogNormal,
-    MultivariateNormal,
     Normal,
     Uniform,
     constraints,
@@ -21,11 +18,6 @@ from torch.distributions import (
 from sbi_active.support import support_bounds
 
 ONES = torch.ones(2)
-PRIORS: dict[str, Distribution] = {
-    "box": BoxUniform(-ONES, 3 * ONES),
-    "normal": MultivariateNormal(ONES, 4 * torch.eye(2)),
-    "log-normal": Independent(LogNormal(ONES, 0.5 * ONES), 1),
-}
 
 
 @pytest.mark.parametrize(

@@ -37,14 +37,6 @@ def test_what_is_no_trend_is_interpolated_with_its_error():
     assert float(np.sqrt(far[1][0, 0])) > 0.5
 
 
-def test_learned_noise_is_that_of_the_outputs():
-    rng = np.random.default_rng(2)
-    u = rng.uniform(-1, 1, (200, 2))
-    y = 3 * u[:, :1] + 0.2 * rng.standard_normal((200, 1))
-    process = GaussianProcess.fit(u, y, noise="learned")
-    assert float(process.noise_sd[0]) == pytest.approx(0.2, rel=0.2)
-
-
 def test_a_trend_of_fewer_features_misses_left_out_rows_by_less():
     rng = np.random.default_rng(3)
     u = rng.uniform(-1, 1, (150, 10))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform, MultipleIndependent
-from torch.distributions import Beta, Independent, LogNormal, Normal
+from torch.distributions import Independent, LogNormal, Normal
 
 from sbi_active.inference.sampling.coordinates import (
     NormalCoordinates,
@@ -56,10 +56,3 @@ def test_draws_have_unit_variance_and_go_to_parameters_and_back(options):
     assert u.std(0) == pytest.approx(1, abs=0.1)
     again = c.from_z(c.base.to_z(c.to_theta(u)))
     assert again == pytest.approx(u, abs=1e-3)
-
-
-def test_a_number_that_is_narrow_between_its_bounds_has_a_normal_beside_them():
-    narrow = Independent(Beta(torch.tensor([30.0]), torch.tensor([30.0])), 1)
-    c = coordinates(narrow)
-    assert 0.9 < c.precision[0] < 1
-    assert c.high[0] > 5

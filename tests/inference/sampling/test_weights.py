@@ -4,22 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.special import logsumexp
 
 from sbi_active.inference.sampling.weights import (
     effective_sample_size,
-    log_sum_exp,
     normalized,
     systematic,
 )
-
-
-@pytest.mark.parametrize("axis", [None, 0, 1])
-def test_the_log_of_a_sum_is_scipy_s(axis):
-    values = np.random.default_rng(0).normal(size=(5, 7)) * 50 - 2_000
-    values[2] = -np.inf
-    expected = logsumexp(values, axis=axis)
-    assert log_sum_exp(values, axis) == pytest.approx(expected, abs=1e-10)
 
 
 def test_the_effective_sample_size_is_kish_s():

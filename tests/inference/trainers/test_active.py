@@ -6,17 +6,16 @@ import pickle
 import subprocess
 import sys
 import warnings
-from dataclasses import replace
 
 import pytest
 import torch
 from sbi.inference import NLE_A, NPE_C, NRE_B, NRE_C
 from sbi.inference.trainers._contracts import StartIndexContext, TrainConfig
 from sbi.inference.trainers.npe.npe_base import PosteriorEstimatorTrainer
-from sbi.neural_nets import classifier_nn, likelihood_nn, posterior_nn
+from sbi.neural_nets import posterior_nn
 from sbi.utils import BoxUniform, RestrictedPrior
 
-from sbi_active import ALHI, ASBI, CampaignOptions, SeqBED, SeqBED_B
+from sbi_active import ALHI, ASBI, SeqBED, SeqBED_B
 from sbi_active.inference import ActiveInference, SeqBED_LFIRE
 from sbi_active.inference.trainers.action_rounds import SilentTracker
 
@@ -51,12 +50,6 @@ def test_every_trainer_takes_what_a_campaign_passes(trainer):
             assert given[parameter.name].default == parameter.default
         others = [p for n, p in given.items() if n not in wanted]
         assert all(p.default is not p.empty for p in others), name
-
-
-@pytest.mark.parametrize("trainer", TRAINERS)
-def test_a_belief_of_no_trials_is_an_error(trainer):
-    with pytest.raises(ValueError, match="expected at least one trial; got none"):
-        trainer(PRIOR).update_all([], simulator=torch.add)
 
 
 def simulator(theta, action):
@@ -120,22 +113,6 @@ def test_a_trainer_on_a_builder_of_sbi_is_loaded_by_another_process(tmp_path):
     belief = whole.update(torch.tensor([0.3]), action=torch.ones(1), seed=0)
     expected = belief.log_prob(torch.tensor([[-0.5], [0.5]])).tolist()
     assert json.loads(loaded.stdout) == pytest.approx(expected, abs=1e-4)
-
-
-@pytest.mark.filterwarnings("ignore:When the inference object is pickled")
-@pytest.mark.parametrize(
-    ("trainer", "builder"),
-    [
-        *[(ASBI, posterior_nn("maf")), (ALHI, likelihood_nn("maf"))],
-        *[(SeqBED_B, classifier_nn("mlp")), (SeqBED, classifier_nn("resnet"))],
-    ],
-)
-def test_builders_of_sbi_pickle(trainer, builder):
-    copy = pickle.loads(pickle.dumps(trainer(PRIOR, builder)))
-    assert callable(copy._action_estimator)
-    options = pickle.loads(pickle.dumps(CampaignOptions(density_estimator=builder)))
-    assert callable(options.density_estimator)
-    assert replace(options, density_estimator=None) == CampaignOptions()
 
 
 PARENTS = {ASBI: NPE_C, ALHI: NLE_A, SeqBED_B: NRE_B, SeqBED: NRE_C}

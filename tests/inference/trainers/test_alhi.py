@@ -10,7 +10,6 @@ from sbi.inference.potentials import likelihood_estimator_based_potential
 from sbi.utils import BoxUniform
 
 from sbi_active import ALHI, MixtureDensity, RefinementOptions
-from sbi_active.inference.beliefs.kernel_belief import KernelBelief
 from sbi_active.inference.models.product import Product
 from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
@@ -133,17 +132,6 @@ def test_a_belief_is_a_normalized_distribution_that_pickles(posterior):
     assert torch.equal(again.log_prob(grid), belief.log_prob(grid))
 
 
-def test_kernels_have_the_stated_bandwidth():
-    torch.manual_seed(0)
-    draws = PRIOR.sample((1_000,))
-    belief = KernelBelief(PRIOR, draws)
-    assert belief.diagnostics.bandwidth == pytest.approx(1_000 ** (-1 / 6))
-    few = PRIOR.sample((30,))
-    widened = KernelBelief(PRIOR, few).sample((4_000,))
-    # 1 + h^2 times the variance of the draws, but for what is cut off.
-    assert 1 < float(widened.var() / few.var()) < 1.32 * 1.05
-
-
 def falls(theta, action):
     """No measurement where theta exceeds a half."""
     x = theta + 0.1 * torch.randn_like(theta)
@@ -174,24 +162,6 @@ def test_no_measurement_is_information():
 
 def raises(text, error=ValueError):
     return pytest.raises(error, match=re.escape(text))
-
-
-def test_errors():
-    inference = ALHI(PRIOR, SETTINGS, show_progress_bars=False)
-    with raises("expected a network trained under the current belief", RuntimeError):
-        inference.update(torch.zeros(2), action=torch.ones(1))
-    theta, x, action = rows(200)
-    inference.append_simulations(theta, x, action=action)
-    with raises("call train() first", RuntimeError):
-        inference.build_posterior()
-    with raises("expected action=, since earlier rounds of this trainer have actions"):
-        inference.append_simulations(theta, x)
-    with raises("expected posterior among 'importance', 'kde'"):
-        ALHI(PRIOR, posterior="nuts")
-    inference = ALHI(PRIOR, "mdn", show_progress_bars=False)
-    inference.append_simulations(theta, x)
-    with raises("start a new ALHI(prior) for rounds with actions"):
-        inference.append_simulations(theta, x, action=action)
 
 
 def test_a_failed_update_leaves_the_trainer_as_it_was():

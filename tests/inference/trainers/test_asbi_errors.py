@@ -5,7 +5,6 @@ import re
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import Distribution
 
 from sbi_active import ASBI, MixtureDensity
 
@@ -28,19 +27,7 @@ def raises(text, error=ValueError):
     return pytest.raises(error, match=re.escape(text))
 
 
-class NoSupport(Distribution):
-    def __init__(self):
-        super().__init__(event_shape=torch.Size([2]), validate_args=False)
-
-    def sample(self, sample_shape=()):
-        return PRIOR.sample(sample_shape)
-
-    def log_prob(self, value):
-        return PRIOR.log_prob(value)
-
-
 OUTSIDE = torch.tensor([[0.0, 3.0]]).expand(50, -1)
-FRESH = {"no support": NoSupport(), "no prior": None}
 
 
 @pytest.mark.parametrize(
@@ -62,16 +49,6 @@ def test_rows_that_do_not_fit(text, changes):
     given = {"theta": theta, "x": x, "action": action} | changes
     with raises(text):
         with_round().append_simulations(**given)
-
-
-@pytest.mark.parametrize("name", FRESH)
-def test_priors_that_no_belief_begins_from(name):
-    theta, x, action = rows()
-    text = (
-        "with a support, which" if name == "no support" else "expected a prior, since"
-    )
-    with raises(text):
-        ASBI(FRESH[name]).append_simulations(theta, x, action=action)
 
 
 def test_rounds_with_and_without_action_do_not_mix():
@@ -104,11 +81,3 @@ def test_what_a_trained_round_refuses():
     inference.update(torch.zeros(2), action=torch.zeros(1))
     with raises("append simulations of the belief with action=", RuntimeError):
         inference.update(torch.zeros(2), action=torch.zeros(1))
-
-
-@pytest.mark.parametrize("name", ["discard_prior_samples", "use_combined_loss"])
-def test_arguments_without_meaning(name):
-    with raises(f"expected {name} to be left out in a round with actions"):
-        with_round().train(**{name: True})
-    with raises("No simulations found", RuntimeError):
-        ASBI(PRIOR).train()

@@ -7,10 +7,8 @@ import torch
 from torch.distributions import MultivariateNormal
 
 from sbi_active import ASBI, MixtureDensity, RefinementOptions
-from sbi_active.inference import refine
-from sbi_active.inference.beliefs.belief import ChainedBelief, compare
+from sbi_active.inference.beliefs.belief import compare
 from sbi_active.inference.rounds.rows import Observation
-from sbi_active.inference.trainers import asbi
 from tests.linear_gaussian import PRIOR, simulator
 
 TRIALS = [
@@ -91,32 +89,6 @@ def test_an_invalid_trial_no_simulation_explains_changes_nothing():
     assert belief.diagnostics.probability_of_outcome == [1, 1, 1, 0]
     texts = " ".join(belief.diagnostics.warnings)
     assert "the simulator lacks a way to fail" in texts
-
-
-def test_a_lost_network_does_not_lose_the_posterior_of_earlier_trials():
-    """The belief before a trial is looked at first, however wrong the network is."""
-    inference = ASBI(PRIOR, MixtureDensity(hidden_features=(16,), num_iterations=50))
-    inference.update_all(TRIALS[:2], simulator, refinement=SETTINGS, seed=0)
-    starts = []
-    previous = inference.belief
-
-    def spy(*args, **kwargs):
-        starts.extend(kwargs["start"])
-        return refine(*args, **kwargs)
-
-    wrong = MultivariateNormal(torch.tensor([2.0, 2.0]), 0.01 * torch.eye(2))
-    theta, action = wrong.sample((500,)), 3 * torch.rand(500, 1)
-    x = simulator(theta, action)
-    inference.append_simulations(theta, x, action=action, belief=previous).train()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(asbi, "refine", spy)
-        belief = inference.update(
-            TRIALS[2].x, action=TRIALS[2].action, simulator=simulator,
-            refinement=SETTINGS, seed=0,
-        )  # fmt: skip
-    assert starts[-1] is previous
-    assert isinstance(starts[0], ChainedBelief)
-    assert divergence(belief, exact(TRIALS)) < COST
 
 
 class _Network:

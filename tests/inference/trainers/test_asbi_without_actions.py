@@ -38,13 +38,7 @@ def two_rounds(trainer_class, density_estimator, **train):
 
 
 @pytest.mark.filterwarnings("ignore:.*Maximum number of epochs")
-@pytest.mark.parametrize(
-    "density_estimator",
-    [
-        *["mdn", "maf"],
-        *[pytest.param(name, marks=pytest.mark.slow) for name in ("nsf", "made")],
-    ],
-)
+@pytest.mark.parametrize("density_estimator", ["mdn", "maf"])
 def test_two_rounds_are_numerically_npe_c(density_estimator):
     ours, our_trainer = two_rounds(ASBI, density_estimator)
     theirs, their_trainer = two_rounds(NPE_C, density_estimator)

@@ -169,30 +169,3 @@ def test_what_had_the_name_still_works_and_a_warning_says_the_new_one():
 
 def raises(text, error=ValueError):
     return pytest.raises(error, match=re.escape(text))
-
-
-def test_errors():
-    inference = SeqBED_LFIRE(NORMAL)
-    with raises("expected at least 6 simulations of each particle at each action"):
-        inference.arrange(NORMAL.sample((50,)), torch.rand(50, 1))
-    with raises("expected simulations of this round", RuntimeError):
-        inference.train()
-    with raises("call train() first", RuntimeError):
-        inference.update(torch.zeros(1), action=torch.ones(1))
-    theta, x, action = drawn(inference, 800, NORMAL)
-    with raises("expected action=, since ratios belong to an action"):
-        inference.append_simulations(theta, x)
-    model = inference.append_simulations(theta, x, action=action).train()
-    with raises("expected theta among the 20 particles of this round; got [9.0]"):
-        model.log_ratio(torch.tensor([[9.0]]), x[:1], action[:1])
-    with pytest.warns(UserWarning, match=r"the ratios are those at \[2.0\]"):
-        inference.update(torch.zeros(1), action=torch.tensor([1.8]))
-    inference = SeqBED_LFIRE(NORMAL)
-    theta = NORMAL.sample((100,))
-    inference.append_simulations(theta, theta, action=torch.ones(1))
-    with raises("simulate each parameter set several times"):
-        inference.train()
-    with raises("expected num_iterations >= 1; got 0"):
-        RatioClassifier(num_iterations=0)
-    with raises("expected num_folds >= 2; got 1"):
-        LFIRE(num_folds=1)

