@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi, chi2
 
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.gaussian_mixture import GaussianMixture
+from sbi_active.inference.sampling.gaussian_mixture import fitted_normals
 
 Array = NDArray[Any]
 
@@ -117,15 +117,16 @@ def cover(
     """
     d = points.shape[1]
     counts = [k for k in (1, 2, 3, 4, 6, 8) if k <= max_regions]
-    best = GaussianMixture.fit(points, counts[0], rng)
-    for count in counts[1:]:
-        other = GaussianMixture.fit(points, count, rng)
-        if other.log_likelihood > best.log_likelihood + worth * d:
-            best = other
-    label = best.assign(points)
+    best, likelihood = fitted_normals(points, counts[0], rng), -np.inf
+    for count in counts:
+        other = fitted_normals(points, count, rng)
+        found = float(other.log_prob(points).mean())
+        if found > likelihood + worth * d:
+            best, likelihood = other, found
+    label = best.log_parts(points).argmax(0)
     full = chi2.ppf(COVERED, d) ** 0.5
     regions = []
-    for k in range(len(best.log_weight)):
+    for k in range(len(best.means)):
         members = points[label == k]
         if len(np.unique(members, axis=0)) < d + 3:
             continue
