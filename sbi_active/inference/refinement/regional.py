@@ -128,6 +128,7 @@ class Regions(Stages):
             self.rng,
             max_regions=min(self.own.max_regions, limit),
             generous=stage.excess < 3,
+            wide=stage.excess <= MISFIT,
         )
 
     def simulate(self, size: int) -> None:
