@@ -203,11 +203,11 @@ def sample_product(
         )
     belief = LearnedBelief(prior, fit, defensive=defensive)
     belief.label = "product over trials"
-    effective = fit.fit.effective_sample_size
+    effective = fit.effective_sample_size
     belief.diagnostics = Diagnostics().extended(
         effective_sample_size=effective,
         likelihood="learned",
-        log_normalizer=fit.fit.log_evidence,
+        log_normalizer=fit.log_evidence,
     )
     if effective < ENOUGH:
         belief.diagnostics = belief.diagnostics.warned(
