@@ -3,9 +3,10 @@
 A belief is bad where its mean is off by more than .3 standard deviations, or where the
 KL divergence of normal fits is above .1: the flag is to say so. Resumable: a problem
 that stands in ``rows.csv`` is not run again. Thresholds were chosen on seeds below 110,
-proposals of drawn noise on 500 to 508; these rows are of seeds 400 to 403. The
-reference is that of the oracles, tempered importance sampling. The share of the prior
-in a belief is the least, of which one draw in 5,000 would decide the moments.
+proposals of drawn noise on 500 to 508; these rows are of drawn noise, seeds 400 to 403
+at three and four parameters. The reference is that of the oracles, tempered importance
+sampling. The share of the prior in a belief is the least, of which one draw in 5,000
+would decide the moments.
 """
 
 from __future__ import annotations
