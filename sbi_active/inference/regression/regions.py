@@ -22,7 +22,7 @@ COVERED = 0.9997
 SPREAD = 2.2
 #: Radius of a wide region in that of the ellipsoid within. At 1 the noise of slopes
 #: moves a mean by .12 deviations of four parameters at 3,000 histories, which grows
-#: with the numbers in an outcome; at 2 by .06.
+#: with the numbers in an outcome; at 2 by .08.
 WIDE = 2.0
 #: Spread of a region at least: parameters are simulated in single precision, and draws
 #: of a finer one would lie beside it.
