@@ -9,7 +9,7 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from sbi_active.inference.sampling.gaussian_mixture import GaussianMixture
+from sbi_active.inference.sampling.gaussian_mixture import fitted_normals
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,10 @@ class Predictive:
     def fit(x: Tensor, seed: int, *, num: int = 4) -> Predictive:
         """Return a fit to rows (n, q)."""
         rng = np.random.default_rng(seed)
-        found = GaussianMixture.fit(x.numpy(), num, rng)
-        factor = torch.from_numpy(found.factor)
-        mean, log_weight = map(torch.from_numpy, (found.mean, found.log_weight))
-        return Predictive(log_weight, mean, factor @ factor.mT)
+        found = fitted_normals(x.numpy(), num, rng)
+        parts = found.weights, found.means, found.factors
+        weight, mean, factor = map(torch.from_numpy, parts)
+        return Predictive(weight.log(), mean, factor @ factor.mT)
 
     def marginal(self, seen: Tensor) -> Predictive:
         """Return the predictive of some channels, a boolean of shape (q,)."""

@@ -12,7 +12,7 @@ from sbi_active.inference.sampling.coordinates import (
     PriorCoordinates,
 )
 from sbi_active.inference.sampling.smc import bridge
-from sbi_active.inference.sampling.student_mixture import NormalMixture
+from sbi_active.inference.sampling.student_mixture import StudentMixture
 from sbi_active.inference.sampling.weights import (
     effective_sample_size,
     log_sum_exp,
@@ -70,7 +70,7 @@ class ChainReference:
         found = bridge(
             u.log_prior,
             lambda v: self.log_likelihood(u.to_theta(v)).numpy(),
-            NormalMixture(np.ones(1), np.zeros((1, u.dim)), eye[None]),
+            StudentMixture(np.zeros((1, u.dim)), eye[None], freedom=np.inf),
             rng,
             num_particles=num_particles,
             max_moves=MAX_MOVES,
@@ -84,7 +84,7 @@ class ChainReference:
         self.log_evidence = found.log_evidence
         self.standard_error = found.standard_error
         factor = np.linalg.cholesky(WIDER * np.cov(found.u.T))
-        normal = NormalMixture(np.ones(1), found.u.mean(0)[None], factor[None])
+        normal = StudentMixture(found.u.mean(0)[None], factor[None], freedom=np.inf)
         v = normal.sample(NUM_WEIGHTED, rng)
         theta = u.to_theta(v)
         log_w = self.log_likelihood(theta).numpy() + u.log_prior(v)

@@ -26,7 +26,7 @@ from sbi_active.design.estimators.densities import (
 )
 from sbi_active.design.estimators.emulator import NUM_CHOOSING, kernel, linear
 from sbi_active.design.estimators.entropy import nearest_neighbor_entropy
-from sbi_active.inference.sampling.gaussian_mixture import GaussianMixture
+from sbi_active.inference.sampling.gaussian_mixture import fitted_normals
 from sbi_active.seeding import forked_generators
 
 
@@ -388,8 +388,8 @@ def _mixture(
 ) -> Density:
     """Return the conditional density of a mixture of so many Gaussians of (z, u)."""
     q, rows = z.shape[1], torch.cat([z, u], 1).numpy()
-    joint = GaussianMixture.fit(rows, most, np.random.default_rng(0), num_iterations=40)
-    given = replace(joint, mean=joint.mean[:, :q], factor=joint.factor[:, :q, :q])
+    joint = fitted_normals(rows, most, np.random.default_rng(0), num_iterations=40)
+    given = replace(joint, means=joint.means[:, :q], factors=joint.factors[:, :q, :q])
 
     def log_density(u: Tensor, x: Tensor) -> Tensor:
         rows = torch.cat([reduce(x), u], 1).numpy()

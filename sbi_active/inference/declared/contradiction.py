@@ -82,7 +82,7 @@ def find_contradiction(
     likelihood: SimulatedLikelihood,
     theta: Tensor,
     residual: Array,
-    jacobian: Array,
+    jacobian: Array | None = None,
     *,
     level: float = LEVEL,
     rng: np.random.Generator,
@@ -95,7 +95,8 @@ def find_contradiction(
         theta: Best fit, then parameters around it, shape (n, d).
         residual: Whitened residuals at the best fit, shape (N,), 0 where not observed.
         jacobian: Derivatives of the residuals in coordinates of a standard normal
-            prior, (N, d).
+            prior, (N, d); None counts every parameter, and infers no inflation from
+            their spread.
         level: Tail probability below which trials contradict.
         rng: Source of the draws of the noise.
         informed_above: Derivative below which no trial informs a parameter.
@@ -103,7 +104,9 @@ def find_contradiction(
     t = len(likelihood)
     seen = likelihood.x.isfinite().flatten(1).numpy()
     squares = (residual.reshape(t, -1) ** 2).sum(1)
-    informed = int((np.abs(jacobian).max(0) > informed_above).sum())
+    informed = theta.shape[1]
+    if jacobian is not None:
+        informed = int((np.abs(jacobian).max(0) > informed_above).sum())
     found = compared(
         likelihood.action,
         likelihood.x,
@@ -114,7 +117,7 @@ def find_contradiction(
     )
     if found is None or not _beyond_noise(likelihood, theta, rng):
         return None
-    if t == 1:
+    if t == 1 or jacobian is None:
         return found
     d = jacobian.shape[1]
     precision = jacobian.T @ jacobian + np.eye(d)
@@ -124,31 +127,6 @@ def find_contradiction(
     spread = np.linalg.eigvals(np.linalg.solve(precision, gradient.T @ gradient))
     by_trial = t / (t - 1) * float(spread.real.max())
     return replace(found, inflation=max(found.inflation, by_trial**0.5))
-
-
-def contradiction_at(
-    likelihood: SimulatedLikelihood,
-    theta: Tensor,
-    *,
-    level: float = LEVEL,
-    rng: np.random.Generator,
-) -> Contradiction | None:
-    """Return the contradiction at parameters that are about the best, shape (1, d)."""
-    squares = []
-    for action, x in zip(likelihood.action, likelihood.x, strict=True):
-        gap = x - torch.from_numpy(likelihood.table.mean(theta, action)[0])
-        squares.append(
-            float(whitened(likelihood.noise, gap).nan_to_num().square().sum())
-        )
-    found = compared(
-        likelihood.action,
-        likelihood.x,
-        lambda gap: whitened(likelihood.noise, gap),
-        np.array(squares),
-        num_fitted=theta.shape[1],
-        level=level,
-    )
-    return found if found and _beyond_noise(likelihood, theta, rng) else None
 
 
 def compared(

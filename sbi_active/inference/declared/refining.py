@@ -15,7 +15,6 @@ from torch.distributions import Distribution
 from sbi_active.inference.declared.contradiction import (
     MAX_INFLATIONS,
     Contradiction,
-    contradiction_at,
     find_contradiction,
 )
 from sbi_active.inference.declared.diagnosing import diagnose_fit
@@ -185,8 +184,13 @@ def _gone_on(
         return None
     if fit.tail_shape > own.largest_shape:
         return None
-    best = potential.coordinates.to_theta(fit.u[[fit.log_likelihood.argmax()]])
-    contradicted = contradiction_at(potential.likelihood, best, rng=rng)
+    best = fit.u[[fit.log_likelihood.argmax()]]
+    contradicted = find_contradiction(
+        potential.likelihood,
+        potential.coordinates.to_theta(best),
+        potential.residual(best)[0][0],
+        rng=rng,
+    )
     return fit if contradicted is None else None
 
 

@@ -16,8 +16,7 @@ from sbi_active.inference.engine import Fit, SimulatedPotential
 from sbi_active.inference.engine.pool import Pool
 from sbi_active.inference.engine.potential import MeanTable
 from sbi_active.inference.sampling.coordinates import NormalCoordinates
-from sbi_active.inference.sampling.gaussian_mixture import GaussianMixture
-from sbi_active.inference.sampling.student_mixture import NormalMixture
+from sbi_active.inference.sampling.gaussian_mixture import fitted_normals
 from sbi_active.inference.sampling.weights import systematic
 
 Array = NDArray[Any]
@@ -92,10 +91,7 @@ class SimulatedBelief(WeightedBelief):
         self._normal = NormalCoordinates(coordinates.base, rng, keeps_edges=False)
         self.free = fit.free
         u = self._normal.from_z(self._z[systematic(self._weight, num_fitted, 0.5)])
-        mixture = GaussianMixture.fit(u, 4, rng)
-        self._fitted = NormalMixture(
-            np.exp(mixture.log_weight), mixture.mean, mixture.factor
-        )
+        self._fitted = fitted_normals(u, 4, rng)
 
     def _drawn(self, num: int, rng: np.random.Generator) -> Array:
         # Resampled: a further likelihood would cost a simulation a trial.

@@ -34,7 +34,7 @@ from sbi_active.inference.engine.pool import Pool
 from sbi_active.inference.engine.potential import Density, Potential
 from sbi_active.inference.engine.search import Found
 from sbi_active.inference.engine.settings import Settings
-from sbi_active.inference.sampling.gaussian_mixture import GaussianMixture
+from sbi_active.inference.sampling.gaussian_mixture import fitted_normals
 from sbi_active.inference.sampling.least_squares import descend, floored
 from sbi_active.inference.sampling.student_mixture import (
     Defended,
@@ -294,12 +294,11 @@ def fitted(
     num_components = int(np.clip(4 * effective / (dim * (dim + 3)), 1, num_components))
     some = u[systematic(weight, num, rng.random())]
     some = some + settings.jitter * some.std(0) * rng.standard_normal(some.shape)
-    fit = GaussianMixture.fit(some, num_components, rng)
-    return StudentMixture(
-        fit.mean,
-        wider(settings.wider, dim) * fit.factor,
-        np.exp(fit.log_weight),
-        max(settings.freedom, float(dim)),
+    fit = fitted_normals(some, num_components, rng)
+    return replace(
+        fit,
+        factors=wider(settings.wider, dim) * fit.factors,
+        freedom=max(settings.freedom, float(dim)),
     )
 
 

@@ -31,7 +31,7 @@ from sbi_active.inference.engine.settings import Settings
 from sbi_active.inference.sampling.student_mixture import (
     Defended,
     Proposal,
-    SplitStudentMixture,
+    StudentMixture,
 )
 from sbi_active.inference.sampling.weights import log_sum_exp, normalized
 
@@ -210,9 +210,7 @@ def _go_on(
     pool.add(first, first.sample(settings.num_draws, rng), potential)
 
 
-def _around(
-    found: Found, potential: Potential, settings: Settings
-) -> SplitStudentMixture:
+def _around(found: Found, potential: Potential, settings: Settings) -> StudentMixture:
     r"""Return a mixture around the modes, as wide on each side as the density is.
 
     Along each axis of a mode's normal approximation, of unit length there, within
@@ -254,4 +252,4 @@ def _around(
     width = np.concatenate([width, others], 1)
     left, right = wider(settings.laplace_wider, d) * width
     freedom = max(settings.freedom, float(d))
-    return SplitStudentMixture(guess.means, axes, left, right, guess.weights, freedom)
+    return StudentMixture(guess.means, axes, guess.weights, freedom, left, right)

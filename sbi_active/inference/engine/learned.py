@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.inference.engine.infer import infer
-from sbi_active.inference.engine.pool import Fit
 from sbi_active.inference.engine.settings import Settings
 from sbi_active.inference.sampling.coordinates import (
     NormalCoordinates,
@@ -88,20 +87,26 @@ class LearnedPotential:
 
 
 @dataclass(frozen=True)
-class FreshDraws:
-    """Draws of a posterior that were in no fit: none is there as often as it weighs.
+class LearnedFit:
+    """The posterior of a learned likelihood, by the proposal that was last fitted.
+
+    Its draws were in no fit: none is there as often as it weighs.
 
     Attributes:
         potential: Prior times learned likelihood.
-        proposal: Proposal that the posterior was last fitted by.
+        proposal: Proposal that draws are from.
         efficiency: Share of its draws that are effective.
+        effective_sample_size: Number of effective draws behind the evidence.
+        log_evidence: Log of the integral of prior times likelihood, nats.
     """
 
     potential: LearnedPotential
     proposal: Proposal
     efficiency: float
+    effective_sample_size: float
+    log_evidence: float
 
-    def __call__(
+    def draws(
         self,
         num: int,
         rng: np.random.Generator,
@@ -131,34 +136,6 @@ class FreshDraws:
         return self.potential.coordinates.to_z(np.concatenate(parts))
 
 
-@dataclass(frozen=True)
-class LearnedFit:
-    """The posterior of a learned likelihood.
-
-    Attributes:
-        potential: Prior times learned likelihood.
-        fit: Weighted draws, in the potential's coordinates, and the evidence.
-    """
-
-    potential: LearnedPotential
-    fit: Fit
-
-    @property
-    def efficiency(self) -> float:
-        """Share of the draws of the last proposal that are effective."""
-        return self.fit.effective_sample_size / max(self.fit.pool.num_final, 1)
-
-    @property
-    def fresh(self) -> FreshDraws:
-        """Source of draws that are not those of the fit."""
-        proposal = self.fit.pool.proposals[-1][1]
-        return FreshDraws(self.potential, proposal, self.efficiency)
-
-    def draws(self, num: int, rng: np.random.Generator) -> Array:
-        """Return the prior's coordinates of equally weighted draws, (num, d)."""
-        return self.potential.coordinates.to_z(self.fit.draws(num, rng))
-
-
 def learned_fit(
     learned: LearnedLikelihood,
     rng: np.random.Generator,
@@ -181,4 +158,11 @@ def learned_fit(
     fit = infer(potential, rng, near=places, settings=own)
     if not np.isfinite(fit.log_evidence):
         return None
-    return LearnedFit(potential, fit)
+    effective = fit.effective_sample_size
+    return LearnedFit(
+        potential,
+        fit.pool.proposals[-1][1],
+        efficiency=effective / max(fit.pool.num_final, 1),
+        effective_sample_size=effective,
+        log_evidence=fit.log_evidence,
+    )

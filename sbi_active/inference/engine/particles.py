@@ -19,7 +19,7 @@ from sbi_active.inference.engine.potential import Potential
 from sbi_active.inference.engine.search import WIDER, Found
 from sbi_active.inference.engine.settings import Settings
 from sbi_active.inference.sampling.smc import Bridged, bridge
-from sbi_active.inference.sampling.student_mixture import NormalMixture
+from sbi_active.inference.sampling.student_mixture import StudentMixture
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
@@ -73,10 +73,11 @@ def led_particles(
     cov = guess.factors @ np.swapaxes(guess.factors, 1, 2)
     factors = np.linalg.cholesky(cov[:, axes[:, None], axes])
     # Tails that bend away from the normal of a mode are out of its own reach.
-    own = NormalMixture(
-        np.concatenate([guess.weights * weight for _, weight in widths]),
+    own = StudentMixture(
         np.concatenate([guess.means[:, axes]] * len(widths)),
         np.concatenate([factors * width for width, _ in widths]),
+        np.concatenate([guess.weights * weight for _, weight in widths]),
+        np.inf,
     )
     rest = np.zeros((1, potential.dim))
 

@@ -19,7 +19,7 @@ from scipy.stats import chi2
 
 from sbi_active.inference.engine.potential import Potential
 from sbi_active.inference.sampling.least_squares import Whitener, descend, floored
-from sbi_active.inference.sampling.student_mixture import NormalMixture, lower_factors
+from sbi_active.inference.sampling.student_mixture import StudentMixture, lower_factors
 
 Array = NDArray[Any]
 
@@ -83,7 +83,7 @@ class Found:
         screened: Draws of the prior that were looked at, shape (n, d).
     """
 
-    guess: NormalMixture
+    guess: StudentMixture
     modes: Array
     informed: NDArray[np.bool_]
     num_found: int
@@ -161,7 +161,7 @@ def search(
     mass = np.append(len(modes) * mass, np.ones(num_other)) / (len(modes) + num_other)
     factors = WIDER * lower_factors(np.linalg.inv(np.concatenate(precisions)))
     return Found(
-        NormalMixture(mass, np.concatenate(means), factors),
+        StudentMixture(np.concatenate(means), factors, mass, np.inf),
         u[modes],
         np.abs(jac).max((0, 1)) > own.faint,
         int((cost - cost.min() < own.same).sum()),

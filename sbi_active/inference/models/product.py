@@ -17,7 +17,8 @@ from sbi_active.inference.engine.learned import learned_fit
 from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.gaussian_mixture import GaussianMixture
+from sbi_active.inference.sampling.gaussian_mixture import fitted_normals
+from sbi_active.inference.sampling.student_mixture import StudentMixture
 from sbi_active.threads import single_thread
 
 Array = NDArray[Any]
@@ -64,7 +65,7 @@ class TrainedRegion:
         floor: Log density of the mixture at the edge.
     """
 
-    mixture: GaussianMixture
+    mixture: StudentMixture
     floor: float
 
     @staticmethod
@@ -73,7 +74,7 @@ class TrainedRegion:
     ) -> TrainedRegion:
         """Return the region of rows, coordinates of shape (n, d)."""
         some = rng.permutation(z)[: own.num_fitted]
-        mixture = GaussianMixture.fit(some, own.num_components, rng)
+        mixture = fitted_normals(some, own.num_components, rng)
         floor = np.quantile(mixture.log_prob(z), own.lost) - own.margin
         return TrainedRegion(mixture, float(floor))
 
@@ -95,8 +96,8 @@ def widened(
     parameters of any distribution. Each component of a Gaussian mixture of z, shape (n,
     d), is doubled, so that modes stay apart.
     """
-    mixture = GaussianMixture.fit(z[: own.num_fitted], own.num_components, rng)
-    factor = mixture.factor[mixture.assign(z)]
+    mixture = fitted_normals(z[: own.num_fitted], own.num_components, rng)
+    factor = mixture.factors[mixture.log_parts(z).argmax(0)]
     kept, missing = [], num_samples
     while missing > 0:
         i = rng.integers(len(z), size=2 * num_samples)
@@ -202,11 +203,11 @@ def sample_product(
         )
     belief = LearnedBelief(prior, fit, defensive=defensive)
     belief.label = "product over trials"
-    effective = fit.fit.effective_sample_size
+    effective = fit.effective_sample_size
     belief.diagnostics = Diagnostics().extended(
         effective_sample_size=effective,
         likelihood="learned",
-        log_normalizer=fit.fit.log_evidence,
+        log_normalizer=fit.log_evidence,
     )
     if effective < ENOUGH:
         belief.diagnostics = belief.diagnostics.warned(

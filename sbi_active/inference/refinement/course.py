@@ -128,7 +128,7 @@ class Stage:
         log_prior = self.surrogate.coordinates.log_prior(z)
         log_likelihood = self.surrogate.log_likelihood(z)
         return log_prior + np.logaddexp(
-            np.log1p(-self.defensive) + log_likelihood - self.fit.fit.log_evidence,
+            np.log1p(-self.defensive) + log_likelihood - self.fit.log_evidence,
             np.log(self.defensive),
         )
 

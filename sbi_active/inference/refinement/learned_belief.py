@@ -29,16 +29,12 @@ class LearnedBelief(WeightedBelief):
     def __init__(
         self, prior: Distribution, fit: LearnedFit, *, defensive: float
     ) -> None:
-        self._learned, self._fresh = fit.potential.learned, fit.fresh
-        super().__init__(
-            prior,
-            self._learned.coordinates,
-            fit.fit.log_evidence,
-            defensive=defensive,
-        )
+        self._fit, self._learned = fit, fit.potential.learned
+        coordinates = self._learned.coordinates
+        super().__init__(prior, coordinates, fit.log_evidence, defensive=defensive)
 
     def _drawn(self, num: int, rng: np.random.Generator) -> Array:
-        return self._fresh(num, rng)
+        return self._fit.draws(num, rng)
 
     def log_likelihood(self, z: Array) -> Array:
         """Return the learned log likelihood at the prior's coordinates (n, d), (n,)."""

@@ -128,6 +128,7 @@ class Regions(Stages):
             self.rng,
             max_regions=min(self.own.max_regions, limit),
             generous=stage.excess < 3,
+            wide=stage.excess <= MISFIT,
         )
 
     def simulate(self, size: int) -> None:
@@ -144,12 +145,7 @@ class Regions(Stages):
             # The first stage's first region is the whole space, seen from the prior.
             is_overview = is_first and k == 0
             share = max(own.replicate_share, 12 / size)
-            count -= histories.reuse(
-                regions[k],
-                int(count),
-                num_repeated=int(share * count),
-                is_overview=is_overview,
-            )
+            count -= histories.reuse(regions[k], int(count), is_overview=is_overview)
             if count <= 0:
                 continue
             num_repeated = int(share * count)
@@ -218,7 +214,7 @@ class Regions(Stages):
         """Return tail probabilities, by fresh simulations at draws of the belief."""
         c, own = self.coordinates, self.own
         num = max(own.least_checked, int(own.checked_share * self.budget))
-        theta = c.to_theta(stage.fit.fresh(num, self.rng))
+        theta = c.to_theta(stage.fit.draws(num, self.rng))
         x, lost = self.histories.fresh(theta)
         z, num_trials = c.to_z(theta), len(self.action)
         self.fresh = compared_with_fresh(

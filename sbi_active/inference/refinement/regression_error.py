@@ -18,7 +18,6 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -101,10 +100,7 @@ def widened(
         wider.insert(0, ([one], reach * np.array([1.0, *reaches])))
     for regions, factors in wider:
         for factor in factors if best is surrogate else ():
-            fits = [
-                histories.regress(replace(region, radius=factor * region.radius))
-                for region in regions
-            ]
+            fits = [histories.regress(region.wider(factor)) for region in regions]
             wide = [fit for fit in fits if fit is not None and fit.excess <= MISFIT]
             if len(wide) < len(fits):
                 break

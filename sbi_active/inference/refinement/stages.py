@@ -181,7 +181,7 @@ class Stages(ABC):
             tails,
             edge_mass,
             num_simulations=self.spent()[1],
-            effective_sample_size=float(last.fit.fit.effective_sample_size),
+            effective_sample_size=float(last.fit.effective_sample_size),
             error_nats=last.error,
             error_nats_if_explained=last.error,
             figures={

@@ -129,19 +129,12 @@ class Histories:
             require_noise(torch.from_numpy(x[:num_replicates]), again)
         self._append(theta, x, present, is_overview=is_overview)
 
-    def reuse(
-        self,
-        region: Region,
-        count: int,
-        *,
-        num_repeated: int = 0,
-        is_overview: bool = False,
-    ) -> int:
+    def reuse(self, region: Region, count: int, *, is_overview: bool = False) -> int:
         """Take past histories in a region, simulated at the further actions only.
 
-        At most ``count``, of which ``num_repeated`` repeat others: these tell the
-        noise. For an overview those drawn from the whole prior instead, so that a first
-        stage keeps its distribution. Returns how many were added.
+        At most ``count``, each followed by those that repeat it, which tell the noise.
+        For an overview those drawn from the whole prior instead, so that a first stage
+        keeps its distribution. Returns how many were added.
         """
         past = self._past
         if past is None or count <= 0:
@@ -153,12 +146,8 @@ class Histories:
             past.theta.numpy(), axis=0, return_index=True, return_inverse=True
         )
         first = first[of.reshape(-1)]  # the row that each row repeats, or itself
-        eligible = eligible & self._unused
-        own = first == np.arange(len(first))
-        rows = np.flatnonzero(eligible & own)[:count]
-        again = np.isin(first, rows[: max(count - num_repeated, 0)])
-        again = np.flatnonzero(eligible & ~own & again)[:num_repeated]
-        rows = np.concatenate([rows[: count - len(again)], again])
+        rows = np.flatnonzero(eligible & self._unused)
+        rows = rows[np.argsort(first[rows], kind="stable")][:count]
         if len(rows) == 0:
             return 0
         self._unused[rows] = False

@@ -42,7 +42,8 @@ from scipy.linalg import get_lapack_funcs
 from scipy.optimize import minimize_scalar
 from scipy.special import ndtr, ndtri
 
-from sbi_active.inference.sampling.gaussian_mixture import GaussianMixture
+from sbi_active.inference.sampling.gaussian_mixture import fitted_normals
+from sbi_active.inference.sampling.student_mixture import StudentMixture
 
 Array = NDArray[Any]
 
@@ -164,7 +165,7 @@ class NoiseShape:
     power: float
     floor: Array
     scale: Array
-    mixture: GaussianMixture
+    mixture: StudentMixture
     covariance: ResidualCovariance
     shift: Array
     coefficient: Array
@@ -253,16 +254,13 @@ class NoiseShape:
         return marginal - 0.5 * (white**2).sum(1) - self.covariance.log_volume
 
 
-def _mixture(e: Array, own: ShapeSettings, rng: np.random.Generator) -> GaussianMixture:
+def _mixture(e: Array, own: ShapeSettings, rng: np.random.Generator) -> StudentMixture:
     some = rng.permutation(e)[: own.most_fitted, None]
-    return GaussianMixture.fit(some, own.num_components, rng, num_iterations=100)
+    return fitted_normals(some, own.num_components, rng, num_iterations=100)
 
 
-def _normal_scores(mixture: GaussianMixture, e: Array) -> Array:
+def _normal_scores(mixture: StudentMixture, e: Array) -> Array:
     """Return normal scores of residuals, of their shape."""
-    weight, mean = np.exp(mixture.log_weight), mixture.mean[:, 0]
-    width = np.abs(mixture.factor[:, 0, 0])
-    level = sum(
-        w * ndtr((e - m) / s) for w, m, s in zip(weight, mean, width, strict=True)
-    )
+    parts = zip(mixture.weights, mixture.means, mixture.factors, strict=True)
+    level = sum(w * ndtr((e - m[0]) / s[0, 0]) for w, m, s in parts)
     return ndtri(np.clip(level, 1e-12, 1 - 1e-12))

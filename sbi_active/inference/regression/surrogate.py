@@ -20,7 +20,7 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -154,7 +154,13 @@ class LocalRegression:
         scale = np.sqrt(noise.variance)
         best: tuple[float, Basis, Array, Array, Array] | None = None
         roughness = 0.0
+        is_inner = np.linalg.norm(u, axis=1) <= region.inner
+        # Both intercepts are to be known.
+        is_split = region.inner < 1
+        is_split &= min(is_inner.sum(), (~is_inner).sum()) >= 2 * FREEDOM
         for basis in _candidates(u.shape[1], n):
+            if is_split:
+                basis = replace(basis, inner=region.inner)
             is_wave = basis.phase.size > 0
             if is_wave and best is not None and _misfit(best[3], noise, best[2]) < 3:
                 break  # a cubic will do, or another stage makes it do

@@ -1,8 +1,8 @@
-"""Student-t densities, mixtures of them, and mixtures that defend themselves."""
+"""Mixtures of t and of normal distributions, and mixtures that defend themselves."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -45,8 +45,10 @@ def log_student(
         square: :math:`\|L^{-1} (z - m)\|^2`, any shape.
         log_volume: :math:`\log |L|`, a shape that broadcasts with it.
         dim: d.
-        freedom: Degrees of freedom, :math:`\nu`.
+        freedom: Degrees of freedom, :math:`\nu`; infinite is a normal distribution.
     """
+    if np.isinf(freedom):
+        return -0.5 * (square + dim * np.log(2 * np.pi)) - log_volume
     constant = (
         gammaln(0.5 * (freedom + dim))
         - gammaln(0.5 * freedom)
@@ -57,55 +59,8 @@ def log_student(
 
 
 @dataclass(frozen=True)
-class StudentMixture:
-    """Mixture of multivariate t distributions.
-
-    Attributes:
-        means: Means of the components, shape (k, dim).
-        factors: Lower Cholesky factors of the scale matrices, shape (k, dim, dim).
-        weights: Sum to 1, shape (k,); None has equal ones.
-        freedom: Degrees of freedom.
-    """
-
-    means: Array
-    factors: Array
-    weights: Array | None = None
-    freedom: float = FREEDOM
-
-    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
-        """Return draws, shape (n, dim), each component's share of them fixed."""
-        normal = rng.normal(size=(num_samples, self.means.shape[1]))
-        square = rng.chisquare(self.freedom, size=(num_samples, 1)) / self.freedom
-        return self.moved(self.components(num_samples), normal / np.sqrt(square))
-
-    def components(self, num: int) -> NDArray[np.int64]:
-        """Return the component of each draw, in proportion to the weights, (num,)."""
-        if self.weights is None:
-            return np.arange(num) % len(self.means)
-        return systematic(self.weights, num, 0.5)
-
-    def moved(self, which: NDArray[np.int64], steps: Array) -> Array:
-        """Return steps of unit scale, shape (n, dim), from the components (n,)."""
-        return self.means[which] + np.einsum("nij,nj->ni", self.factors[which], steps)
-
-    def log_prob(self, z: Array) -> Array:
-        """Return log densities, shape (n,)."""
-        return log_sum_exp(self.log_parts(z), axis=0)
-
-    def log_parts(self, z: Array) -> Array:
-        """Return log of weight times density of each component, shape (k, n)."""
-        k = len(self.means)
-        weights = np.full(k, 1 / k) if self.weights is None else self.weights
-        apart = (z - self.means[:, None]).transpose(0, 2, 1)
-        square = ((np.linalg.inv(self.factors) @ apart) ** 2).sum(1)
-        log_volume = np.log(np.diagonal(self.factors, axis1=1, axis2=2)).sum(1)
-        log_volume = (log_volume - np.log(weights))[:, None]
-        return log_student(square, log_volume, z.shape[1], self.freedom)
-
-
-@dataclass(frozen=True)
-class SplitStudentMixture(Proposal):
-    r"""Mixture of t distributions whose widths differ from side to side.
+class StudentMixture(Proposal):
+    r"""Mixture of t or normal distributions, whose widths may differ by side.
 
     With e of a t distribution of unit scale,
 
@@ -118,73 +73,62 @@ class SplitStudentMixture(Proposal):
 
     Attributes:
         means: m, shape (k, d).
-        axes: A, whose columns are axes of unit scale, shape (k, d, d).
-        left: l, shape (k, d).
-        right: r, shape (k, d).
-        weights: Sum to 1, shape (k,).
-        freedom: Degrees of freedom.
+        factors: A, shape (k, d, d): lower Cholesky factors of the scale matrices, or
+            axes of unit scale.
+        weights: Sum to 1, shape (k,); none are equal ones.
+        freedom: Degrees of freedom; infinite has normal components.
+        left: l, shape (k, d); None is 1.
+        right: r, likewise.
 
     References:
         Geweke, Econometrica 57 (1989).
     """
 
     means: Array
-    axes: Array
-    left: Array
-    right: Array
-    weights: Array
-    freedom: float = FREEDOM
-
-    def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
-        """Return draws, shape (n, d)."""
-        which = systematic(self.weights, num_samples, rng.random())
-        normal = rng.standard_normal((num_samples, self.means.shape[1]))
-        square = rng.chisquare(self.freedom, (num_samples, 1)) / self.freedom
-        e = normal / np.sqrt(square)
-        step = e * np.where(e > 0, self.right[which], self.left[which])
-        return self.means[which] + np.einsum("nij,nj->ni", self.axes[which], step)
-
-    def log_prob(self, z: Array) -> Array:
-        """Return log densities, shape (n,)."""
-        apart = (z - self.means[:, None]).transpose(0, 2, 1)
-        step = np.linalg.inv(self.axes) @ apart  # (k, d, n)
-        scale = np.where(step > 0, self.right[..., None], self.left[..., None])
-        volume = np.linalg.slogdet(self.axes)[1][:, None] + np.log(scale).sum(1)
-        volume = volume - np.log(self.weights)[:, None]
-        square = ((step / scale) ** 2).sum(1)
-        parts = log_student(square, volume, z.shape[1], self.freedom)
-        return log_sum_exp(parts, axis=0)
-
-
-@dataclass(frozen=True)
-class NormalMixture(Proposal):
-    """Normal components.
-
-    Attributes:
-        weights: Sum to 1, shape (k,).
-        means: Means of the components, shape (k, d).
-        factors: Lower Cholesky factors, shape (k, d, d).
-    """
-
-    weights: Array
-    means: Array
     factors: Array
+    weights: Array = field(default_factory=lambda: np.zeros(0))
+    freedom: float = FREEDOM
+    left: Array | None = None
+    right: Array | None = None
 
+    def __post_init__(self) -> None:
+        if not len(self.weights):
+            k = len(self.means)
+            object.__setattr__(self, "weights", np.full(k, 1 / k))
+
+    @override
     def sample(self, num_samples: int, rng: np.random.Generator) -> Array:
-        """Return draws, shape (n, d)."""
-        which = systematic(self.weights, num_samples, rng.random())
-        step = rng.standard_normal((num_samples, self.means.shape[1]))
-        return self.means[which] + np.einsum("nij,nj->ni", self.factors[which], step)
+        steps = rng.standard_normal((num_samples, self.means.shape[1]))
+        if np.isfinite(self.freedom):
+            square = rng.chisquare(self.freedom, (num_samples, 1)) / self.freedom
+            steps /= np.sqrt(square)
+        return self.moved(self.components(num_samples, rng), steps)
 
+    def components(self, num: int, rng: np.random.Generator) -> NDArray[np.int64]:
+        """Return the component of each draw, in proportion to the weights, (num,)."""
+        return systematic(self.weights, num, rng.random())
+
+    def moved(self, which: NDArray[np.int64], steps: Array) -> Array:
+        """Return steps of unit scale, shape (n, d), from the components (n,)."""
+        if self.left is not None and self.right is not None:
+            steps = steps * np.where(steps > 0, self.right[which], self.left[which])
+        return self.means[which] + np.einsum("nij,nj->ni", self.factors[which], steps)
+
+    @override
     def log_prob(self, z: Array) -> Array:
-        """Return log densities, shape (n,)."""
-        parts = [
-            np.log(w) + log_normal(z, mean, factor)
-            for w, mean, factor in zip(
-                self.weights, self.means, self.factors, strict=True
-            )
-        ]
-        return log_sum_exp(np.stack(parts), axis=0)
+        return log_sum_exp(self.log_parts(z), axis=0)
+
+    def log_parts(self, z: Array) -> Array:
+        """Return log of weight times density of each component, shape (k, n)."""
+        apart = (z - self.means[:, None]).transpose(0, 2, 1)
+        step = np.linalg.inv(self.factors) @ apart  # (k, d, n)
+        log_volume = np.linalg.slogdet(self.factors)[1] - np.log(self.weights)
+        log_volume = log_volume[:, None]
+        if self.left is not None and self.right is not None:
+            scale = np.where(step > 0, self.right[..., None], self.left[..., None])
+            step, log_volume = step / scale, log_volume + np.log(scale).sum(1)
+        square = (step**2).sum(1)
+        return log_student(square, log_volume, z.shape[1], self.freedom)
 
 
 @dataclass(frozen=True)

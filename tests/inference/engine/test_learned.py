@@ -48,16 +48,56 @@ def test_finds_narrow_peaks(centers: list, sd: list):
     place, width = np.array(centers), np.array(sd)
     found = learned_fit(likelihood_of(2, peaks(place, width)), rng)
     assert found is not None
-    effective = found.fit.effective_sample_size
+    effective = found.effective_sample_size
     assert effective > 2_900
     assert found.efficiency > 0.2
     error = 1 / effective**0.5
     exact = np.log(len(place)) - 2 * np.log(2)
-    assert found.fit.log_evidence == pytest.approx(exact, abs=4 * error)
+    assert found.log_evidence == pytest.approx(exact, abs=4 * error)
     draws = found.draws(4_000, rng)
     nearest = ((draws[:, None] - place) ** 2).sum(-1).argmin(1)
     share = np.bincount(nearest, minlength=len(place)) / 4_000
     assert abs(share - 1 / len(place)).max() < 4 * error
+
+
+@pytest.mark.parametrize("dim", [12])
+def test_a_density_cut_at_many_edges(dim: int):
+    # A normal density about a corner of the box, 1 in 2^d of which is within.
+    def log_density(z: np.ndarray) -> np.ndarray:
+        log_prob = -0.5 * (((z - 1) / 0.2) ** 2).sum(1) - dim * np.log(0.2)
+        return log_prob - 0.5 * dim * np.log(np.pi / 2)
+
+    own = likelihood_of(dim, log_density)
+    found = learned_fit(own, np.random.default_rng(0), num_effective=1_000)
+    assert found is not None
+    effective = found.effective_sample_size
+    assert effective > 990
+    exact = -dim * np.log(2)
+    assert found.log_evidence == pytest.approx(exact, abs=4 / effective**0.5)
+
+
+@pytest.mark.parametrize("width", [1e-1, 1e-3])
+def test_a_slanted_normal_density_of_six_parameters(width: float):
+    dim, center = 6, np.full(6, 0.2)
+    rng = np.random.default_rng(5)
+    root = width * np.linalg.qr(rng.standard_normal((dim, dim)))[0]
+    root = root * np.linspace(0.2, 1.0, dim)
+    log_volume = np.linalg.slogdet(root)[1] + 0.5 * dim * np.log(2 * np.pi)
+
+    def log_density(z: np.ndarray) -> np.ndarray:
+        step = np.linalg.solve(root, (z - center).T)
+        return -0.5 * (step**2).sum(0) - log_volume
+
+    found = learned_fit(likelihood_of(dim, log_density), rng)
+    assert found is not None
+    # An efficiency of a hundredth would say that a tempered proposal was kept.
+    assert found.efficiency > 0.2
+    error = 4 / found.effective_sample_size**0.5
+    assert found.log_evidence == pytest.approx(-dim * np.log(2), abs=error)
+    draws = found.draws(3_000, rng)
+    scaled = np.linalg.solve(root, (draws - center).T)
+    assert abs(scaled.mean(1)).max() < 0.15
+    assert abs(scaled.std(1) - 1).max() < 0.1
 
 
 PLATEAU = -20.0  # log likelihood where nothing is known
@@ -81,7 +121,7 @@ def test_a_peak_on_a_plateau_is_not_lost(is_known: bool, width: float):
     near = known if is_known else own.coordinates.sample_prior(400, rng)
     found = learned_fit(own, rng, near=near)
     assert found is not None
-    assert found.fit.log_evidence == pytest.approx(-DIM * np.log(2), abs=0.1)
+    assert found.log_evidence == pytest.approx(-DIM * np.log(2), abs=0.1)
     draws = found.draws(500, rng)
     assert draws.mean(0) == pytest.approx(center, abs=0.3 * width)
 

@@ -160,11 +160,10 @@ def test_an_edge_that_the_regression_cannot_follow_is_flagged():
 
 
 def test_lost_rows_cost_their_histories_and_nothing_else():
-    world, calls = WORLDS["edge"], [0]
+    world = WORLDS["edge"]
 
     def faulty(theta: Tensor, action: Tensor) -> Tensor:
-        calls[0] += len(theta)
-        if calls[0] % 20 == 0:
+        if bool((theta[:, 0] * 1e4 % 20 < 1).any()):
             raise RuntimeError("licence server")
         return world(theta, action)
 

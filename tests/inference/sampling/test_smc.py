@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import multivariate_normal, norm
 
 from sbi_active.inference.sampling.smc import bridge
-from sbi_active.inference.sampling.student_mixture import NormalMixture
+from sbi_active.inference.sampling.student_mixture import StudentMixture
 
 
 def standard(u):
@@ -15,7 +15,7 @@ def standard(u):
 def mixture(*means, sd=1.0):
     means = np.array(means, dtype=float)
     factors = np.stack([sd * np.eye(means.shape[1])] * len(means))
-    return NormalMixture(np.full(len(means), 1 / len(means)), means, factors)
+    return StudentMixture(means, factors, freedom=np.inf)
 
 
 @pytest.mark.parametrize("dim", [1, 20])

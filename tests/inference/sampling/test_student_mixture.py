@@ -9,7 +9,6 @@ from scipy.stats import multivariate_t
 from benchmarks.location_finding.kernels import KernelMixture
 from sbi_active.inference.sampling.student_mixture import (
     Defended,
-    SplitStudentMixture,
     StudentMixture,
     lower_factors,
 )
@@ -59,7 +58,7 @@ def test_a_split_mixture_is_normalized_and_matches_its_draws():
     rng = np.random.default_rng(0)
     axes = FACTORS @ np.array([[0.8, -0.6], [0.6, 0.8]])
     left, right = np.array([[1.0, 1.0], [2.0, 1.0]]), np.array([[3.0, 1.0], [1.0, 0.5]])
-    split = SplitStudentMixture(MEANS, axes, left, right, WEIGHTS, 7.0)
+    split = StudentMixture(MEANS, axes, WEIGHTS, 7.0, left, right)
     wide = StudentMixture(MEANS, 4 * FACTORS, WEIGHTS)
     z = wide.sample(200_000, rng)
     ratio = np.exp(split.log_prob(z) - wide.log_prob(z))
@@ -73,7 +72,7 @@ def test_a_split_mixture_is_normalized_and_matches_its_draws():
 
 def test_a_split_mixture_of_equal_sides_is_a_student_mixture():
     ones = np.ones((2, 2))
-    split = SplitStudentMixture(MEANS, FACTORS, ones, ones, WEIGHTS)
+    split = StudentMixture(MEANS, FACTORS, WEIGHTS, left=ones, right=ones)
     mixture = StudentMixture(MEANS, FACTORS, WEIGHTS)
     assert split.log_prob(Z) == pytest.approx(mixture.log_prob(Z))
 
