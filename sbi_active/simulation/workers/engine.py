@@ -139,7 +139,7 @@ def simulate(
             few = slice(0, 16)
             spend(len(theta[few]))
             other = schedule(theta[few], action[few], seed=derive_seed(seed, "again"))
-            other.run(pool)
+            _ = [*other.run(pool)]
             if whole.x is not None and other.x is not None:
                 require_noise(whole.x[few], other.x)
     rows = _simulations(whole)
@@ -178,14 +178,12 @@ def _run(
         total=len(theta), initial=num_restored, unit="row", disable=not show_progress
     )
 
-    def on_rows(index: Tensor, x: Tensor, status: Tensor) -> None:
-        bar.update(len(index))
-        if recorder is not None:
-            recorder.add(index, x, status)
-
     spend(len(theta) - num_restored)
     try:
-        schedule.run(pool, on_rows)
+        for rows in schedule.run(pool):
+            bar.update(len(rows[0]))
+            if recorder is not None:
+                recorder.add(*rows)
     except KeyboardInterrupt:
         if schedule.x is None:
             raise

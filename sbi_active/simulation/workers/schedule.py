@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -21,7 +21,6 @@ _UNFINISHED = -1  # no status of a row that is one
 
 #: Finished rows: index (k,), x (k, *x_shape), status (k,).
 Rows = tuple[Tensor, Tensor, Tensor]
-OnRows = Callable[[Tensor, Tensor, Tensor], None]
 
 
 class Schedule:
@@ -109,13 +108,11 @@ class Schedule:
             self._has_succeeded = True
         return len(index)
 
-    def run(self, pool: Pool, on_rows: OnRows | None = None) -> None:
-        """Simulate what is not finished.
+    def run(self, pool: Pool) -> Iterator[Rows]:
+        """Simulate what is not finished, and yield rows as they are.
 
         Args:
             pool: Pool that runs the calls.
-            on_rows: Function that is told about finished rows: index (k,),
-                x (k, *x_shape), status (k,).
 
         Raises:
             SimulationError: If no row can be simulated.
@@ -139,8 +136,8 @@ class Schedule:
             call, reply = pool.collect()
             num_running -= 1
             rows = self._receive(call, reply)
-            if rows is not None and on_rows is not None:
-                on_rows(*rows)
+            if rows is not None:
+                yield rows
 
     def _next_call(self, num_slots: int) -> Call | None:
         while self._urgent:
