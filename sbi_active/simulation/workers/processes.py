@@ -85,7 +85,8 @@ class Worker:
             time_limit: Seconds after which the process is killed, from the time when
                 it has loaded the simulator; None waits for ever.
         """
-        has_started = self._end.atexit = False
+        has_started = False
+        self._end.atexit = False  # a thread waits, which would see it end
         try:
             self._connection.send_bytes(pickle.dumps(call, protocol=5))
             reply = pickle.loads(self._connection.recv_bytes())
@@ -98,9 +99,8 @@ class Worker:
                 reply = pickle.loads(self._connection.recv_bytes())
         except (EOFError, OSError):
             code = self._end() or 0
-            how = f"was ended by signal {-code}"
-            if code >= 0:
-                how = f"ended with code {code}"
+            how = f"was ended by signal {-code}" if code < 0 else None
+            how = how or f"ended with code {code}"
             if has_started:
                 text = f"worker died: its process {how} during the call, without an"
                 return Reply(fault="worker died", traceback=f"{text} exception")
@@ -108,7 +108,8 @@ class Worker:
                 return None
             text = f"the process {how} while it loaded the simulator"
             return Reply(fault="not loaded", traceback=text)
-        self._has_answered = self._end.atexit = True
+        self._has_answered = True
+        self._end.atexit = True
         return reply
 
     def kill(self) -> None:
