@@ -116,10 +116,9 @@ def _copy_campaign(folder: Path, made: Path) -> int:
         state = {**ADDED, **decode(saved, known={})}
         state.pop("digest", None)
         with store.writing():
-            if state["belief"]:
-                belief = _content(folder / state["belief"]) or b""
-                state["belief"] = hashlib.sha256(belief).hexdigest()
-                store.put(BELIEF, 0, belief)
+            if state["belief"] is not None:  # "" where it could not be stored
+                path = folder / (state["belief"] or "none")
+                store.put(BELIEF, 0, _content(path) or b"")
             store.put(STATE, 0, encode(state, known={}))
     store.close()
     return len(entries)

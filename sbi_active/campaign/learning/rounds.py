@@ -21,8 +21,8 @@ from sbi_active.simulation.bank.bank import Bank
 from sbi_active.simulation.bank.reweighting import FEW, reuse
 from sbi_active.simulation.outcomes import Simulations
 from sbi_active.simulation.workers.engine import simulate
+from sbi_active.simulation.workers.meter import find_store
 from sbi_active.simulation.workers.settings import Workers
-from sbi_active.simulation.workers.store import find_store
 
 LOGGER = logging.getLogger("sbi_active")
 DENSITIES = ("log_posterior", "log_likelihood", "log_ratio")

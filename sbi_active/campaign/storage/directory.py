@@ -8,7 +8,6 @@ simulator's. ``campaign.toml`` says what the campaign is, for people alone.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -84,7 +83,7 @@ class CampaignDirectory:
         if self._saved is not None:
             with sensible(self.store.path):
                 self._require_whole(self._saved, repair=repair)
-        self._belief_written: tuple[Any, str | None] = (None, None)
+        self._written: Any = None  # the belief that is on the disk
         for entry in self._changes:
             self.manifest["simulator"] = entry["simulator"]
 
@@ -139,29 +138,25 @@ class CampaignDirectory:
             belief: Belief after ``state.processed``; None if that is the prior.
             known: Objects that the reader has too, see :func:`.encode`.
         """
-        content, name = None, None
-        if belief is not None:
-            kept, name = self._belief_written
-            if kept is not belief:
-                name = ""  # it has to be computed again, unless it can be stored
-                with suppress(NotStorableError):
-                    content = encode(belief, known=known)
-                    name = hashlib.sha256(content).hexdigest()
+        content = None
+        if belief is not None and belief is not self._written:
+            content = b""  # it has to be computed again, unless it can be stored
+            with suppress(NotStorableError):
+                content = encode(belief, known=known)
         saved = {
             "lines": len(self._entries),
             **{name: getattr(state, name) for name in SAVED},
             "num_simulated": state.meter.spent,
-            "belief": name,
+            "belief": belief is not None,
         }
         encoded = encode(saved, known={})
         with self._writing():
             self.store.put(STATE, 0, encoded)
             if content is not None:
                 self.store.put(BELIEF, 0, content)
-        if belief is not None:
-            self._belief_written = belief, name
+        self._written = belief
 
-    def restore(self, state: CampaignState) -> str | None:
+    def restore(self, state: CampaignState) -> bytes | None:
         """Bring a new state to where the log ends.
 
         Args:
@@ -169,7 +164,7 @@ class CampaignDirectory:
                 computed again.
 
         Returns:
-            The name of the belief; None if it is the prior, or to be computed.
+            The belief, encoded; None if it is the prior, or to be computed.
         """
         saved, self._saved = self._saved, None
         with sensible(self.store.path):
@@ -179,28 +174,18 @@ class CampaignDirectory:
                 state.meter.spent = saved["num_simulated"]
             for entry in self._entries[saved["lines"] if saved else 0 :]:
                 apply(state, entry)
-        name = saved["belief"] if saved else None
-        if name == "" and state.processed or saved is None and len(state.versions) > 1:
+        if saved is None:
+            state.is_stale |= len(state.versions) > 1
+        if saved is None or saved["belief"] in (None, False):
+            return None
+        belief = None
+        try:
+            belief = self.store.get(BELIEF) if saved["belief"] else None
+        except CorruptSegmentError as error:
+            self.notes.append(f"SA601 the belief is computed again: {error}")
+        if not belief and state.processed:
             state.is_stale = True
-        return name or None
-
-    def belief(self, name: str, known: Mapping[str, Any]) -> Any:
-        """Return a belief by its name.
-
-        Raises:
-            ValueError: If it is damaged, another release wrote it, or it is not there
-                any more.
-        """
-        content = b""
-        with suppress(CorruptSegmentError):
-            content = self.store.get(BELIEF) or content
-        if hashlib.sha256(content).hexdigest() != name:
-            raise ValueError(
-                f"expected the belief {name:.8} in {self.store.path}; got another or a "
-                "damaged one, as after another process went on with the campaign; load "
-                "it again"
-            )
-        return decode(content, known=known)
+        return belief or None
 
     def close(self) -> None:
         """Let others write."""

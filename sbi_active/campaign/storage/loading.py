@@ -18,7 +18,7 @@ from sbi_active.campaign.learning.pooled import make_learner
 from sbi_active.campaign.learning.revision import rebuilt
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.state import CampaignState
-from sbi_active.campaign.storage.codec import Absent
+from sbi_active.campaign.storage.codec import Absent, decode
 from sbi_active.campaign.storage.directory import CampaignDirectory, apply
 from sbi_active.campaign.storage.drawn import DrawnPrior
 from sbi_active.messages import warn
@@ -154,12 +154,12 @@ def load(
             num_earlier=manifest["num_earlier"],
         )
         shape = torch.Size(manifest["x_shape"])
-    name = disk.restore(state)
+    belief = disk.restore(state)
     for note in disk.notes:
         warn(note, stacklevel=3)
     if simulator is None:
         without = {"simulator": Absent(), "prior": first_prior}
-        saved = None if name is None else lambda: disk.belief(name, without)
+        saved = None if belief is None else lambda: decode(belief, known=without)
         reader = StoredLearner(
             first_prior, shape, state, saved, manifest["parameter_names"]
         )
@@ -189,18 +189,16 @@ def load(
             )
     model, joint = rebuilt(state, simulator, first_prior, space, effects)
     learner = make_learner(model, joint, space, state, x_shape=shape)
-    if name is not None and not state.is_stale:
+    if belief is not None and not state.is_stale:
         known = {"simulator": model, "prior": first_prior}
-        learner.resume(lambda: _belief(disk, name, known, learner))
+        learner.resume(lambda: _belief(belief, known, learner))
     return Loaded(disk, state, space, learner, first_prior)
 
 
-def _belief(
-    disk: CampaignDirectory, name: str, known: dict[str, Any], learner: Learner
-) -> Distribution:
+def _belief(content: bytes, known: dict[str, Any], learner: Learner) -> Distribution:
     """Return the belief, or the prior where all has to be computed again."""
     try:
-        return disk.belief(name, known)
+        return decode(content, known=known)
     except ValueError as error:
         warn(f"SA601 the belief is computed again: {error}", stacklevel=4)
         learner.forget()

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,7 +20,6 @@ from sbi_active.simulation.bank.sqlite import NAME
 from sbi_active.simulation.bank.store import Store
 from sbi_active.simulation.model import SimulatorModel
 from sbi_active.simulation.workers.meter import metering
-from sbi_active.simulation.workers.store import storing
 
 OWN = "drawn"  # rows of the simulator itself
 Method = TypeVar("Method", bound=Callable[..., Any])
@@ -38,10 +36,8 @@ def stored(method: Method) -> Method:
     @functools.wraps(method)
     def kept(campaign: Any, *arguments: Any, **options: Any) -> Any:
         learner, version = campaign._learner, campaign.state.version.number
-        with (
-            metering(campaign.state.meter),
-            campaign._storage.working(learner.simulator, version),
-        ):
+        find = campaign._storage.working(learner.simulator, version)
+        with metering(campaign.state.meter, find):
             return apart(campaign, *arguments, **options)
 
     return kept  # type: ignore[return-value]
@@ -90,11 +86,10 @@ class Storage:
         """The folder of the campaign."""
         return None if self.disk is None else self.disk.path
 
-    @contextmanager
     def working(
         self, simulator: Callable[..., Any] | None, version: int
-    ) -> Iterator[None]:
-        """Hold the right to write, and keep simulations of the current simulator.
+    ) -> Callable[[Callable[..., Any]], Bank | None]:
+        """Hold the right to write; return what finds the bank of a simulator.
 
         Args:
             simulator: The current one.
@@ -104,14 +99,14 @@ class Storage:
             self.disk.acquire()
 
         def find(other: Callable[..., Any]) -> Bank | None:
-            form = _form(other, simulator)
+            form = None
+            if self._place is not None and simulator is not None:
+                form = _form(other, simulator)
             return form and self._bank(
                 other, form + f"-model-{version}" * (version > 0)
             )
 
-        keeps = self._place is not None and simulator is not None
-        with storing(find) if keeps else nullcontext():
-            yield
+        return find
 
     def _bank(self, simulator: Callable[..., Any], name: str) -> Bank:
         """Return a bank of a form of the current simulator, open for writing."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,10 +26,7 @@ from sbi_active.simulation.bank.rows import (
 from sbi_active.simulation.bank.sqlite import CorruptSegmentError, sensible
 from sbi_active.simulation.bank.store import Store
 from sbi_active.simulation.outcomes import Outcome, Simulations
-from sbi_active.simulation.workers.store import StoredRows, run_digest
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
+from sbi_active.simulation.workers.store import run_digest
 
 
 class Bank:
@@ -230,14 +227,14 @@ class Bank:
         x = np.concatenate([self._rows.x(segment) for segment in own])
         return torch.from_numpy(index), torch.from_numpy(x), torch.from_numpy(status)
 
-    def save(self, run: str, **rows: Unpack[StoredRows]) -> None:
+    def save(self, run: str, **rows: Any) -> None:
         """Store rows of a run; they are on the disk when this returns.
 
         A row whose index is stored already is left as it is.
 
         Args:
             run: Name of the run: the same one for the same theta, action and seed.
-            **rows: The rows, as keywords of :class:`.StoredRows`.
+            **rows: The rows, as keywords of :meth:`.RowStore.save`.
 
         Raises:
             ValueError: If the rows do not fit the bank, or it was opened to read.

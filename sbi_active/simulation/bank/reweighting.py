@@ -74,9 +74,7 @@ def reuse(
     bank: Bank,
     target: Distribution,
     *,
-    action: Tensor | None = None,
     proposals: Mapping[str, Distribution] | None = None,
-    same_actions: bool = False,
 ) -> ReusedRows:
     r"""Weight the rows of a bank so that their theta is distributed as a target.
 
@@ -96,9 +94,9 @@ def reuse(
     variance. Neither can tell whether the proposals cover the target.
 
     Weights are for the law of theta *given an action*, as a posterior estimator of
-    q(theta | x, action) needs it. Proposals may have met with different actions, so by
-    default the mixture is taken anew among the rows of each action. Where every action
-    is another one, that amounts to the second formula: set ``same_actions``.
+    q(theta | x, action) needs it. Proposals may have met with different actions, so the
+    mixture is taken anew among the rows of each action. Where every action is another
+    one, that amounts to the second formula.
 
     Invalid rows are part of the result, missing ones are not, nor are rows whose
     proposal is not known.
@@ -106,9 +104,7 @@ def reuse(
     Args:
         bank: The rows.
         target: A prior or belief, anything with ``log_prob``.
-        action: Action of the rows that are taken, shape (action_dim,); None takes all.
         proposals: Proposals by label, all of those in the bank that have one.
-        same_actions: Whether all proposals drew actions from one law, whatever theta.
 
     Returns:
         The weighted rows; a warning is given where they amount to less than 100.
@@ -124,15 +120,11 @@ def reuse(
     """
     column = bank.columns("theta", "action", "status", "label", "log_proposal")
     usable = (column["status"] != Outcome.MISSING) & column["log_proposal"].isfinite()
-    if action is not None:
-        wanted = torch.as_tensor(action, dtype=torch.float32).reshape(1, -1)
-        usable &= torch.isclose(column["action"], wanted, rtol=1e-5, atol=1e-7).all(-1)
     rows = usable.nonzero()[:, 0]
     if not len(rows):
         raise ValueError(
-            f"expected rows of a known proposal in {bank}; got none"
-            f"{'' if action is None else f' at action {action.tolist()}'}; simulate "
-            "with store=bank.drawn_from(prior, label='prior')"
+            f"expected rows of a known proposal in {bank}; got none; simulate with "
+            "store=bank.drawn_from(prior, label='prior')"
         )
     theta, label = column["theta"][rows], column["label"][rows]
     log_own = column["log_proposal"][rows]
@@ -140,9 +132,7 @@ def reuse(
     if proposals is None:
         log_denominator = log_own
     else:
-        strata = torch.zeros(len(rows), dtype=torch.int64)
-        if action is None and not same_actions:
-            strata = torch.unique(column["action"][rows], dim=0, return_inverse=True)[1]
+        strata = torch.unique(column["action"][rows], dim=0, return_inverse=True)[1]
         log_denominator = _log_mixture(bank, proposals, theta, label, log_own, strata)
     log_weight = log_target - log_denominator
     if not bool((log_weight > -torch.inf).any()):

@@ -17,7 +17,6 @@ from sbi_active.arrays import own_tensor
 from sbi_active.messages import warn
 from sbi_active.simulation.bank.sqlite import require, sensible
 from sbi_active.simulation.bank.store import Store
-from sbi_active.simulation.workers.store import StoredRows
 from sbi_active.support import log_density
 
 #: Bytes of a segment: what reading one row may cost in memory. With 16 MiB, ten rows of
@@ -212,7 +211,7 @@ def row_type(shapes: Mapping[str, Sequence[int]]) -> np.dtype:
 
 
 def columns_of(
-    rows: StoredRows, proposal: Distribution | None, label: str
+    rows: Mapping[str, Any], proposal: Distribution | None, label: str
 ) -> dict[str, Tensor]:
     """Return the columns of rows that are to be written.
 

@@ -5,7 +5,6 @@ means.
 """
 
 from sbi_active.simulation.workers.cluster import DaskPool
-from sbi_active.simulation.workers.idle import IDLE
 from sbi_active.simulation.workers.pace import Pace, pace_of
 from sbi_active.simulation.workers.pickling import pickled
 from sbi_active.simulation.workers.schedule import Schedule
@@ -13,7 +12,6 @@ from sbi_active.simulation.workers.store import Recorder, RowStore, run_digest
 
 __all__ = [
     "DaskPool",
-    "IDLE",
     "Pace",
     "Recorder",
     "RowStore",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -21,6 +21,9 @@ from sbi_active.simulation.simulator import outcome_tensor
 #: Rows that share one seed of the global generators. Part of the definition of x for a
 #: simulator that takes no seeds, so it is never a setting.
 BLOCK = 256
+
+#: Source of the random numbers of a call, see :class:`Call`.
+Draws = Literal["seeds", "blocks", "alone"]
 
 Fault = Literal["raised", "timed out", "worker died", "misused", "not loaded"]
 
@@ -48,7 +51,6 @@ class Call:
             "blocks" forks the global generators for each block of 256 rows, and the
             rows are whole blocks; "alone" forks them for the single row.
         is_probe: Whether it only asks if the simulator works, its x being dropped.
-        is_second: Whether it is tried again after its worker died.
     """
 
     rows: np.ndarray
@@ -56,28 +58,20 @@ class Call:
     action: Tensor
     seeds: Tensor
     seed: int
-    draws: Literal["seeds", "blocks", "alone"]
+    draws: Draws
     is_probe: bool = False
-    is_second: bool = False
 
     def __len__(self) -> int:
         return len(self.rows)
 
-    def part(self, rows: slice, **changes: Any) -> Call:
-        """Return the call for some of the rows."""
-        return replace(
-            self,
-            rows=self.rows[rows],
-            theta=self.theta[rows],
-            action=self.action[rows],
-            seeds=self.seeds[rows],
-            **changes,
-        )
-
-    def blocks(self) -> Iterator[slice]:
-        """Yield the whole blocks that it is made of."""
-        for start in range(0, len(self), BLOCK):
-            yield slice(start, start + BLOCK)
+    def parts(self, size: int, **changes: Any) -> list[Call]:
+        """Return calls of so many of the rows each."""
+        rows = [slice(i, i + size) for i in range(0, len(self), size)]
+        names = "rows", "theta", "action", "seeds"
+        return [
+            replace(self, **{n: getattr(self, n)[part] for n in names}, **changes)
+            for part in rows
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,9 +92,9 @@ class Reply:
     traceback: str = ""
     error: BaseException | None = field(default=None, repr=False)
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __getstate__(self) -> dict[str, Any]:
         # An exception may be impossible to pickle; its text has been taken.
-        return Reply, (self.x, self.seconds, self.fault, self.traceback)
+        return {**vars(self), "error": None}
 
 
 def answer(
@@ -131,22 +125,20 @@ def _draw(simulator: Callable[..., Any], call: Call) -> Tensor:
     # A simulator may change its arguments in place; those of the call are tried again.
     theta, action, seeds = call.theta.clone(), call.action.clone(), call.seeds.clone()
     if call.draws == "seeds":
-        return _own_outcome(simulator(theta, action, seeds=seeds), theta)
-    parts = []
+        x = simulator(theta, action, seeds=seeds)
+        return outcome_tensor(x, len(theta), dtype=torch.float32)
     kind = "block" if call.draws == "blocks" else "row"
-    has_seeds = isinstance(simulator, SimulatorModel)
-    for rows in call.blocks():
-        own = {"seeds": seeds[rows]} if has_seeds else {}
-        part = theta[rows], action[rows]
-        first = int(call.rows[rows.start])
-        with _GENERATORS, forked_generators(call.seed, kind, first):
-            parts.append(_own_outcome(simulator(*part, **own), part[0]))
-    return parts[0] if len(parts) == 1 else torch.cat(parts)
-
-
-def _own_outcome(x: Any, theta: Tensor) -> Tensor:
-    """Return x as it is now, before the simulator fills its buffer again."""
-    return outcome_tensor(x, len(theta), dtype=torch.float32)
+    x = []
+    for start in range(0, len(call), BLOCK):
+        rows = slice(start, start + BLOCK)
+        given = theta[rows], action[rows]
+        if isinstance(simulator, SimulatorModel):
+            given = *given, seeds[rows]
+        with _GENERATORS, forked_generators(call.seed, kind, int(call.rows[start])):
+            part = simulator(*given)
+            # Copied before the simulator fills its buffer again.
+            x.append(outcome_tensor(part, len(theta[rows]), dtype=torch.float32))
+    return x[0] if len(x) == 1 else torch.cat(x)
 
 
 def _is_of_the_interface(error: BaseException) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import closing
+from functools import partial
 from typing import Any
 
 import torch
@@ -24,17 +25,13 @@ from sbi_active.simulation.outcomes import (
 )
 from sbi_active.simulation.simulator import require_noise, require_rows
 from sbi_active.simulation.workers.cluster import DaskPool, configured_client
-from sbi_active.simulation.workers.meter import spend
+from sbi_active.simulation.workers.meter import find_store, spend
 from sbi_active.simulation.workers.pace import pace_of
+from sbi_active.simulation.workers.pickling import pickled
 from sbi_active.simulation.workers.pools import InProcess, Pool, WorkerPool
 from sbi_active.simulation.workers.schedule import Schedule
 from sbi_active.simulation.workers.settings import Workers
-from sbi_active.simulation.workers.store import (
-    Recorder,
-    RowStore,
-    find_store,
-    run_digest,
-)
+from sbi_active.simulation.workers.store import Recorder, RowStore
 
 
 @takes_loose(workers=Workers)
@@ -73,7 +70,7 @@ def simulate(
         with joblib.parallel_config(backend="dask"):
             simulate(simulator, theta, action, seed=0, workers=64)
 
-    A lost Dask worker loses no rows. Time limits need the processes of this machine.
+    A lost Dask worker loses no rows.
 
     Args:
         simulator: ``simulator(theta, action)``, see
@@ -128,25 +125,34 @@ def simulate(
         theta, action = theta.detach().cpu(), action.detach().cpu()
     elif batch_size is None and not show_progress and store is None:
         pace = pace_of(simulator)  # nobody looks on
-    options = {
-        "has_seeds": takes_seeds(simulator),
-        "workers": workers,
-        "batch_size": batch_size,
-        "pace": pace,
-    }
-    schedule = Schedule(theta, action, seed=seed, **options)
+    schedule = partial(
+        Schedule,
+        has_seeds=takes_seeds(simulator),
+        workers=workers,
+        batch_size=batch_size,
+        pace=pace,
+    )
     with closing(pool):
-        _run(schedule, pool, store, show_progress)
-        rows = _simulations(schedule)
+        whole = schedule(theta, action, seed=seed)
+        _run(whole, pool, store, show_progress)
         if check_noise:
             few = slice(0, 16)
-            again = derive_seed(seed, "again")
             spend(len(theta[few]))
-            other = Schedule(theta[few], action[few], seed=again, **options)
-            other.run(pool)
-            if other.x is not None:
-                require_noise(rows.x[few], other.x)
-    _warn(schedule)
+            other = schedule(theta[few], action[few], seed=derive_seed(seed, "again"))
+            _ = [*other.run(pool)]
+            if whole.x is not None and other.x is not None:
+                require_noise(whole.x[few], other.x)
+    rows = _simulations(whole)
+    if whole.faults:
+        counts = ", ".join(f"{k} {fault}" for fault, k in whole.faults.items())
+        row, text = next(iter(rows.tracebacks.items()))
+        warn(
+            f"SA301 {whole.faults.total()} of {len(theta)} rows are missing: {counts}; "
+            f"the first is row {row}: {text.strip().splitlines()[-1]}. All tracebacks "
+            "are in Simulations.tracebacks",
+            MissingRowsWarning,
+            stacklevel=2,
+        )
     return rows
 
 
@@ -154,42 +160,30 @@ def _pool(simulator: Callable[..., Any], workers: Workers) -> Pool:
     if workers.num_workers == 1 and workers.time_limit is None:
         return InProcess(simulator)
     client = configured_client()
-    if client is None:
-        return WorkerPool(simulator, effective_n_jobs(workers.num_workers))
-    if workers.time_limit is not None:
-        raise ValueError(
-            "expected the processes of this machine for time_limit; got Dask from "
-            "joblib.parallel_config, whose workers cannot be killed here; simulate "
-            "outside that block, or limit the time in the simulator"
-        )
-    return DaskPool(simulator, workers.num_workers, client)
+    if client is not None:
+        return DaskPool(pickled(simulator), workers.num_workers, client)
+    return WorkerPool(pickled(simulator), effective_n_jobs(workers.num_workers))
 
 
 def _run(
     schedule: Schedule, pool: Pool, store: RowStore | None, show_progress: bool
 ) -> None:
-    theta, action, seed = schedule.theta, schedule.action, schedule.seed
-    recorder = None
-    num_restored = 0
+    theta, num_restored, recorder = schedule.theta, 0, None
     if store is not None:
-        run = run_digest(seed, theta, action)
-        recorder = Recorder(store, run, theta, action, seed)
-        stored = store.load(run)
+        recorder = Recorder(store, theta, schedule.action, schedule.seed)
+        stored = recorder.load()
         if stored is not None:
             num_restored = schedule.restore(*map(torch.as_tensor, stored))
     bar = tqdm(
         total=len(theta), initial=num_restored, unit="row", disable=not show_progress
     )
 
-    def on_rows(index: Tensor, x: Tensor, status: Tensor) -> None:
-        bar.update(len(index))
-        if recorder is not None:
-            recorder.add(index, x, status)
-
-    schedule.on_rows = on_rows
     spend(len(theta) - num_restored)
     try:
-        schedule.run(pool)
+        for rows in schedule.run(pool):
+            bar.update(len(rows[0]))
+            if recorder is not None:
+                recorder.add(*rows)
     except KeyboardInterrupt:
         if schedule.x is None:
             raise
@@ -204,19 +198,6 @@ def _simulations(schedule: Schedule) -> Simulations:
     assert schedule.x is not None
     status = schedule.status.clone()
     status[status < 0] = Outcome.MISSING  # interrupted
-    tracebacks = dict(sorted(schedule.tracebacks.items()))
+    lost = [k for k in sorted(schedule.tracebacks) if status[k] == Outcome.MISSING]
+    tracebacks = {row: schedule.tracebacks[row] for row in lost}
     return Simulations(schedule.theta, schedule.action, schedule.x, status, tracebacks)
-
-
-def _warn(schedule: Schedule) -> None:
-    if schedule.faults:
-        counts = ", ".join(f"{k} {fault}" for fault, k in schedule.faults.items())
-        row, text = min(schedule.tracebacks.items())
-        last = text.strip().splitlines()[-1]
-        warn(
-            f"SA301 {schedule.faults.total()} of {len(schedule.theta)} rows are "
-            f"missing: {counts}; the first is row {row}: {last}. All tracebacks are "
-            "in Simulations.tracebacks",
-            MissingRowsWarning,
-            stacklevel=3,
-        )

@@ -1,14 +1,19 @@
-"""Numbers of rows that were simulated, and that may be."""
+"""Simulations of a campaign: how many there may be, and where their rows are kept."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from typing import Any
 
 from sbi_active.messages import Explained
+from sbi_active.simulation.workers.store import RowStore
+
+#: Takes a simulator and returns the store of its rows, or None.
+FindStore = Callable[[Callable[..., Any]], RowStore | None]
 
 
 class SimulationBudgetError(Explained, RuntimeError):
@@ -50,13 +55,18 @@ class Meter:
         self.spent += num_rows
 
 
-_METER: ContextVar[Meter | None] = ContextVar("meter", default=None)
+_METER: ContextVar[tuple[Meter, FindStore]] = ContextVar("meter")
 
 
 @contextmanager
-def metering(meter: Meter) -> Iterator[None]:
-    """Count all simulations in the block."""
-    token = _METER.set(meter)
+def metering(meter: Meter, find: FindStore = lambda simulator: None) -> Iterator[None]:
+    """Count all simulations in the block, and keep those without a store of their own.
+
+    Args:
+        meter: Counter of the rows.
+        find: Function that returns the store of a simulator's rows.
+    """
+    token = _METER.set((meter, find))
     try:
         yield
     finally:
@@ -65,6 +75,11 @@ def metering(meter: Meter) -> Iterator[None]:
 
 def spend(num_rows: int) -> None:
     """Count rows by the meter of the block that this is called in, if any."""
-    meter = _METER.get()
-    if meter is not None and num_rows:
-        meter.spend(num_rows)
+    if num_rows:
+        _METER.get((Meter(), None))[0].spend(num_rows)
+
+
+def find_store(simulator: Callable[..., Any]) -> RowStore | None:
+    """Return the store of a simulator's rows, if the caller is in :func:`metering`."""
+    _, find = _METER.get((None, lambda simulator: None))
+    return find(simulator)

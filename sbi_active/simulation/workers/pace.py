@@ -43,56 +43,49 @@ class Pace:
     WARM = 0.8
 
     def __init__(self) -> None:
-        self._small: tuple[int, float] | None = None  # rows and seconds of a call
-        self._last: tuple[int, float] | None = None
+        self._few = self._many = 0, 0.0  # rows and seconds of two calls
 
     def observe(self, num_rows: int, seconds: float) -> None:
         """Take the time of a call."""
-        call = num_rows, seconds
-        small, last = self._small, self._last
-        if last is None:
-            self._last = call
-        elif num_rows >= 2 * last[0]:
-            is_warm = seconds >= self.WARM * last[1]
-            self._small, self._last = (last if is_warm else None), call
-        elif 2 * num_rows < last[0] or (small is not None and num_rows <= small[0]):
-            self._small = call
+        few, many = self._few[0], self._many[0]
+        if num_rows >= 2 * many:
+            is_warm = seconds >= self.WARM * self._many[1]
+            self._few = self._many if is_warm else (0, 0.0)
+            self._many = num_rows, seconds
+        elif 2 * num_rows < many or num_rows <= few:
+            self._few = num_rows, seconds
         else:
-            self._last = call
+            self._many = num_rows, seconds
 
     def is_short(self, num_rows: int) -> bool:
         """Return whether rows take too little time to be cut."""
-        if self._last is None:
+        rows, seconds = self._many
+        if not rows:
             return num_rows <= self.FEWEST
-        rows, seconds = self._last
         return seconds * max(num_rows / rows, 1.0) <= self.SLACK * self.SECONDS
 
     def size(self, num_left: int) -> int:
         """Return the rows of the next call, of those that are left."""
         if self.is_short(num_left):
             return num_left
-        wanted = 0.0 if self._last is None else self._wanted(*self._last)
-        size = max(int(min(wanted, num_left)), self.FEWEST)
+        size = max(int(min(self._wanted(), num_left)), self.FEWEST)
         return size if num_left - size >= self.FEWEST else num_left
 
-    def _wanted(self, rows: int, seconds: float) -> float:
-        """Return the rows of a part, given those of the last one and its time."""
+    def _wanted(self) -> float:
+        """Return rows that take a second, or that make little of the fixed time."""
+        (few, least), (rows, seconds) = self._few, self._many
+        if not rows:
+            return 0.0
         timely = self.SECONDS * rows / seconds  # or less, where some time is fixed
-        if self._small is None:
+        if not few:
             return max(timely, (2 if seconds > self.SECONDS / 2 else 4) * rows)
-        wanted = max(timely, self._efficient(*self._small, rows, seconds))
-        # What compiles for each shape is better off with one.
-        return rows if wanted / 2 <= rows <= 2 * wanted else wanted
-
-    def _efficient(self, few: int, least: float, rows: int, seconds: float) -> float:
-        """Return the rows that a part needs, given a small call and a larger one."""
-        ratio = rows / few
         a_row = max((seconds - least) / (rows - few), 1e-12)
         fixed = max(seconds - a_row * rows, 0.0)
-        if fixed < least / ratio:  # it may be chance
-            return 0.0
-        growth = 256 if seconds < 1.1 * least else min(2 * ratio, 16)
-        return min(fixed / self.SHARE / a_row, growth * rows)
+        if fixed >= least * few / rows:  # less may be chance
+            growth = 256 if seconds < 1.1 * least else min(2 * rows / few, 16)
+            timely = max(timely, min(fixed / self.SHARE / a_row, growth * rows))
+        # What compiles for each shape is better off with one.
+        return rows if timely / 2 <= rows <= 2 * timely else timely
 
 
 # By the simulator, or by the object and the name of its method. What is known is kept

@@ -2,135 +2,141 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-import pickle
 import sys
-import time
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from math import inf
-from multiprocessing.connection import wait
+from functools import lru_cache
+from queue import SimpleQueue
 from typing import Any
 
 from typing_extensions import override
 
 from sbi_active.simulation.workers.calls import Call, Reply, answer
-from sbi_active.simulation.workers.idle import IDLE
-from sbi_active.simulation.workers.pickling import pickled
 from sbi_active.simulation.workers.processes import Worker
 
 
 class Pool(ABC):
     """Runs calls, some at a time, and hands back what came of them in any order.
 
-    Attributes:
-        num_slots: Calls that it takes at once.
-        knows_guilty: Whether a call whose worker died was the only one there.
+    Each call is asked for in a thread of its own, which waits for the reply.
+
+    Args:
+        num_slots: Number of calls at a time.
     """
 
-    num_slots: int
-    knows_guilty: bool = True
-
-    @property
-    @abstractmethod
-    def num_free(self) -> int:
-        """Calls that it would take now."""
+    def __init__(self, num_slots: int) -> None:
+        self.num_slots = num_slots
+        self._done: SimpleQueue[tuple[Call, Reply | BaseException]] = SimpleQueue()
 
     @abstractmethod
-    def submit(self, call: Call, time_limit: float | None) -> None:
-        """Take a call.
+    def ask(self, call: Call, time_limit: float | None) -> Reply:
+        """Return the reply to a call; threads may ask at the same time.
 
         Args:
             call: The rows.
             time_limit: Seconds after which it is given up; None waits for ever.
         """
 
-    @abstractmethod
-    def collect(self) -> list[tuple[Call, Reply]]:
-        """Wait until a call has ended, and return those that have."""
+    def submit(self, call: Call, time_limit: float | None) -> None:
+        """Take a call, with arguments as for :meth:`ask`."""
+        thread = threading.Thread(target=self._put, args=(call, time_limit))
+        thread.daemon = True
+        thread.start()
+
+    def _put(self, call: Call, time_limit: float | None) -> None:
+        try:
+            reply = self.ask(call, time_limit)
+        except BaseException as error:  # collect() raises it
+            reply = error
+        self._done.put((call, reply))
+
+    def collect(self) -> tuple[Call, Reply]:
+        """Wait until a call has ended, and return it with its reply."""
+        call, reply = self._done.get()
+        if isinstance(reply, BaseException):
+            raise reply
+        return call, reply
 
     def close(self) -> None:  # noqa: B027  # most have nothing to close
         """Give up what still runs."""
 
 
 class InProcess(Pool):
-    """Runs each call here, at once."""
+    """Runs each call here, at once.
 
-    num_slots = 1
+    Args:
+        simulator: Simulator of the calls.
+    """
 
     def __init__(self, simulator: Callable[..., Any]) -> None:
+        super().__init__(1)
         self._simulator = simulator
-        self._done: list[tuple[Call, Reply]] = []
 
-    @property
     @override
-    def num_free(self) -> int:
-        return 1 - len(self._done)
+    def ask(self, call: Call, time_limit: float | None) -> Reply:
+        return answer(self._simulator, call)
 
     @override
     def submit(self, call: Call, time_limit: float | None) -> None:
-        self._done.append((call, answer(self._simulator, call)))
-
-    @override
-    def collect(self) -> list[tuple[Call, Reply]]:
-        done, self._done = self._done, []
-        return done
+        self._done.put((call, self.ask(call, time_limit)))
 
 
 class WorkerPool(Pool):
-    """Runs calls in processes of its own, each of which has one call at a time.
+    """Runs calls in processes, each of which has one call at a time.
 
     A worker that dies or is killed at its time limit therefore loses no other call, and
-    the guilty call is known. Workers that have answered are kept for the next pool of
-    the same simulator, folder, path and environment.
+    the guilty call is known. Workers that have answered wait for the next pool of the
+    same simulator, folder, path and environment.
 
     Args:
-        simulator: Simulator, sent once to each worker.
+        simulator: Simulator, pickled; it is sent once to each worker.
         num_workers: Number of processes.
     """
 
-    def __init__(self, simulator: Callable[..., Any], num_workers: int) -> None:
-        self.num_slots = num_workers
-        self._simulator = pickled(simulator)
-        surroundings = os.getcwd(), sys.path, dict(os.environ)
-        key = pickle.dumps((self._simulator, surroundings))
-        self._key = hashlib.sha256(key).hexdigest()
-        self._idle = IDLE.take(self._key)
-        self._busy: list[Worker] = []
-
-    @property
-    @override
-    def num_free(self) -> int:
-        return self.num_slots - len(self._busy)
+    def __init__(self, simulator: bytes, num_workers: int) -> None:
+        super().__init__(num_workers)
+        self._simulator = simulator
+        environment = tuple(sorted(os.environ.items()))
+        self._waiting = waiting_workers(
+            simulator, os.getpid(), os.getcwd(), tuple(sys.path), environment
+        )
+        self._busy: set[Worker] = set()
+        self._is_closed = False
 
     @override
-    def submit(self, call: Call, time_limit: float | None) -> None:
-        worker = self._idle.pop() if self._idle else Worker(self._simulator)
-        self._busy.append(worker)
-        worker.start(call, time_limit)
-
-    @override
-    def collect(self) -> list[tuple[Call, Reply]]:
-        done: list[tuple[Call, Reply]] = []
-        while self._busy and not done:
-            first = min(w.deadline for w in self._busy)
-            timeout = None if first == inf else max(first - time.monotonic(), 0.0)
-            wait([w.connection for w in self._busy], timeout=timeout)
-            for worker in [*self._busy]:
-                reply = worker.reply()
-                if reply is not None:
-                    self._busy.remove(worker)
-                    done.append((worker.call, reply))
-                    if reply.fault in ("timed out", "worker died", "not loaded"):
-                        worker.end()
-                    else:
-                        self._idle.append(worker)
-        return done
+    def ask(self, call: Call, time_limit: float | None) -> Reply:
+        reply = None
+        while reply is None:
+            try:
+                worker = self._waiting.pop()
+            except IndexError:
+                worker = Worker(self._simulator)
+            self._busy.add(worker)
+            if self._is_closed:
+                worker.kill()
+            reply = worker.ask(call, time_limit)
+            self._busy.discard(worker)
+        if reply.fault not in ("timed out", "worker died", "not loaded"):
+            self._waiting.append(worker)
+        return reply
 
     @override
     def close(self) -> None:
-        for worker in self._busy:
-            worker.end()
-        IDLE.give(self._key, self._idle, at_most=self.num_slots)
-        self._idle, self._busy = [], []
+        self._is_closed = True
+        for worker in [*self._busy]:
+            worker.kill()
+
+
+@lru_cache(maxsize=1)
+def waiting_workers(simulator: bytes, *surroundings: Any) -> list[Worker]:
+    """Return the workers that wait for calls of a simulator.
+
+    Those of another simulator end, since nobody holds them any more.
+
+    Args:
+        simulator: Simulator, pickled.
+        *surroundings: Process, folder, path and environment that they belong to.
+    """
+    return []

@@ -14,18 +14,18 @@ import pickle
 import signal
 import sys
 import threading
-import time
 import traceback
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from importlib import import_module
 from importlib.machinery import ModuleSpec
-from math import inf
-from multiprocessing import get_context, parent_process, process
+from multiprocessing import get_context, parent_process, process, util
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
 import cloudpickle
+import torch
+from threadpoolctl import threadpool_limits
 
 from sbi_active.simulation.model import SimulatorModel
 from sbi_active.simulation.workers.calls import Call, Reply, answer
@@ -33,8 +33,6 @@ from sbi_active.simulation.workers.calls import Call, Reply, answer
 _FORKS = sys.platform.startswith("linux")
 
 _CONTEXT: Any = get_context("forkserver" if _FORKS else "spawn")
-
-_ONE_THREAD = f"{__package__}.one_thread"
 
 _PR_SET_PDEATHSIG = 1  # <sys/prctl.h>
 
@@ -48,92 +46,94 @@ _ENVIRONMENT = {
 class Worker:
     """A process that has been sent a simulator and answers calls, one at a time.
 
-    It has the folder, path and environment of this process at its start.
+    It has the folder, path and environment of this process at its start, and ends
+    when nobody holds this object any more.
 
     Args:
-        simulator: Pickled.
-
-    Attributes:
-        connection: Connection that gives None at the start of a call and then its
-            reply, both pickled; and an end of file where the process died.
-        call: Call that it was given last.
-        deadline: Time when that is given up, which is known once it has been started.
+        simulator: Simulator, pickled.
     """
 
-    call: Call
-    deadline: float
+    #: Seconds without a call after which it ends.
+    PATIENCE = 60.0
 
     def __init__(self, simulator: bytes) -> None:
-        self._simulator = simulator
         self._has_answered = False
-        self.connection, theirs = _CONTEXT.Pipe()
+        self._connection, theirs = _CONTEXT.Pipe()
         environment = {**os.environ, **_ENVIRONMENT}
-        self._process = _CONTEXT.Process(target=_work, args=(theirs, environment))
+        self._process = _CONTEXT.Process(
+            target=_work, args=(theirs, environment, self.PATIENCE)
+        )
         with _main_module_left_alone():
             if _FORKS:  # of no effect once the server runs
-                _CONTEXT.set_forkserver_preload([__name__, _ONE_THREAD])
+                _CONTEXT.set_forkserver_preload([__name__])
             self._process.start()
         # Its end is ours to see to, not that of the interpreter, which would wait.
         process._children.discard(self._process)  # pyright: ignore
         theirs.close()
+        # Called at the latest when nobody holds this object, or this process ends.
+        self._end = weakref.finalize(
+            self, _end, self._connection, self._process, os.getpid()
+        )
         with suppress(OSError):
-            self.connection.send_bytes(simulator)
+            self._connection.send_bytes(simulator)
 
-    def start(self, call: Call, time_limit: float | None) -> None:
-        """Send a call."""
-        self.call, self.deadline = call, inf
-        self._time_limit = time_limit
-        self._has_started = False
-        with suppress(OSError):  # it has died, as reply() will find
-            self.connection.send_bytes(pickle.dumps(call, protocol=5))
+    def ask(self, call: Call, time_limit: float | None) -> Reply | None:
+        """Return the reply to a call; None if the process had died before it.
 
-    def reply(self) -> Reply | None:
-        """Return the reply of the call; None while it runs."""
+        Args:
+            call: The rows.
+            time_limit: Seconds after which the process is killed, from the time when
+                it has loaded the simulator; None waits for ever.
+        """
+        has_started = False
+        self._end.atexit = False  # a thread waits, which would see it end
         try:
-            while self.connection.poll():
-                reply = pickle.loads(self.connection.recv_bytes())
-                if reply is not None:
-                    self._has_answered = True
-                    return reply
-                self._has_started = True
-                if self._time_limit is not None:
-                    self.deadline = time.monotonic() + self._time_limit
+            self._connection.send_bytes(pickle.dumps(call, protocol=5))
+            reply = pickle.loads(self._connection.recv_bytes())
+            has_started = reply is None
+            if has_started:
+                if not self._connection.poll(time_limit):
+                    self._end()
+                    text = f"timed out: no answer within {time_limit:g} s"
+                    return Reply(fault="timed out", traceback=text)
+                reply = pickle.loads(self._connection.recv_bytes())
         except (EOFError, OSError):
-            return self._last_words()
-        if time.monotonic() < self.deadline:
-            return None
-        text = f"timed out: no answer within {self._time_limit:g} s"
-        return Reply(fault="timed out", traceback=text)
-
-    def _last_words(self) -> Reply | None:
-        code = self.end()
-        how = f"was ended by signal {-code}" if code < 0 else f"ended with code {code}"
-        if self._has_started:
-            text = f"worker died: its process {how} during the call, without an"
-            return Reply(fault="worker died", traceback=f"{text} exception")
-        if not self._has_answered:
+            code = self._end() or 0
+            how = f"was ended by signal {-code}" if code < 0 else None
+            how = how or f"ended with code {code}"
+            if has_started:
+                text = f"worker died: its process {how} during the call, without an"
+                return Reply(fault="worker died", traceback=f"{text} exception")
+            if self._has_answered:  # it died while it waited, which costs no row
+                return None
             text = f"the process {how} while it loaded the simulator"
             return Reply(fault="not loaded", traceback=text)
-        self.__init__(self._simulator)  # it died while it waited, which costs no row
-        self.start(self.call, self._time_limit)
-        return None
+        self._has_answered = True
+        self._end.atexit = True
+        return reply
 
-    def end(self) -> int:
-        """Kill the process and what it started; return its exit code.
+    def kill(self) -> None:
+        """Kill the process and what it started; whoever asks it is told."""
+        _kill(self._process)
 
-        The code of a killed process is its negative signal.
-        """
-        if self.connection.closed:
-            return self._process.exitcode or 0
-        self.connection.close()
-        # One that died by itself is given a moment to be seen dead, for its own code.
-        self._process.join(0.02)
-        if _FORKS:
-            with suppress(ProcessLookupError, PermissionError):
-                os.killpg(self._process.pid, signal.SIGKILL)
-        self._process.kill()
-        self._process.join()
-        return self._process.exitcode or 0
+
+def _kill(process: Any) -> None:
+    if _FORKS:
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+    process.kill()
+
+
+def _end(connection: Connection, process: Any, owner: int) -> int:
+    """End a process; return its exit code, the negative signal if it was killed."""
+    if os.getpid() != owner:  # it belongs to the parent of this forked child
+        return 0
+    connection.close()
+    # One that ends by itself is given a moment, for its own code and its finalizers.
+    process.join(0.02)
+    _kill(process)
+    process.join()
+    return process.exitcode or 0
 
 
 _START = threading.Lock()
@@ -171,12 +171,13 @@ if _FORKS:
     os.register_at_fork(after_in_child=_forget)
 
 
-def _work(connection: Connection, environment: dict[str, str]) -> None:
+def _work(connection: Connection, environment: dict[str, str], patience: float) -> None:
     """Load a simulator and answer calls, until there are no more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     if _FORKS:
         _end_with_parent()
-    import_module(_ONE_THREAD)
+    torch.set_num_threads(1)
+    threadpool_limits(1)
     try:
         os.environ.clear()
         os.environ.update(environment)
@@ -188,7 +189,7 @@ def _work(connection: Connection, environment: dict[str, str]) -> None:
         connection.send_bytes(pickle.dumps(reply))
         return
     with suppress(EOFError, OSError):  # nobody waits for it any more
-        while True:
+        while connection.poll(patience):
             call = pickle.loads(connection.recv_bytes())
             connection.send_bytes(pickle.dumps(None))
             reply = answer(simulator, call, catches=BaseException)
@@ -200,6 +201,7 @@ def _work(connection: Connection, environment: dict[str, str]) -> None:
 def _end_with_parent() -> None:
     """End with whoever asked for this process, and with the server that forked it."""
     os.setpgid(0, 0)  # so that what a simulator starts ends with it
+    util.Finalize(None, os.killpg, (0, signal.SIGKILL), exitpriority=0)
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     threading.Thread(target=_outlive_nobody, daemon=True).start()
 

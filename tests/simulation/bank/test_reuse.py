@@ -51,9 +51,8 @@ def z_score(values, weights, exact):
 
 
 @pytest.mark.parametrize("proposals", [PROPOSALS, None])
-@pytest.mark.parametrize("same_actions", [True, False])
-def test_weighted_rows_have_the_law_of_the_target(bank, proposals, same_actions):
-    reused = reuse(bank, TARGET, proposals=proposals, same_actions=same_actions)
+def test_weighted_rows_have_the_law_of_the_target(bank, proposals):
+    reused = reuse(bank, TARGET, proposals=proposals)
     rows = reused.simulations()
     theta, weights = rows.theta[:, 0].double(), reused.weights
     assert float(weights.sum()) == pytest.approx(1)
@@ -85,8 +84,10 @@ def test_errors_have_the_size_that_is_stated(proposals, tmp_path):
     assert low < total < high
 
 
-def test_effective_sample_size_is_that_of_kish(bank):
-    reused = reuse(bank, TARGET, proposals=PROPOSALS, same_actions=True)
+def test_effective_sample_size_is_that_of_kish(tmp_path):
+    with Bank(tmp_path / "bank", simulator=simulator) as bank:
+        fill(bank, actions=((0.0,), (0.0,)))
+    reused = reuse(bank, TARGET, proposals=PROPOSALS)
     theta = reused.simulations().theta
     mixture = 0.5 * (PRIOR.log_prob(theta).exp() + ROUND.log_prob(theta).exp())
     weights = (TARGET.log_prob(theta).exp() / mixture).double()
@@ -102,18 +103,16 @@ def test_proposals_may_have_met_with_other_actions(tmp_path):
     with Bank(tmp_path / "bank", simulator=simulator) as bank:
         uneven = ((0.0, 0.0, 0.0, 1.0), (0.0, 1.0, 1.0, 1.0))
         fill(bank, num_rows=10_000, actions=uneven)
-    scores = {}
-    for same in (False, True):
-        reused = reuse(bank, TARGET, proposals=PROPOSALS, same_actions=same)
-        rows = reused.simulations()
-        some = rows.action[:, 0] == 0
-        w = reused.weights[some] / reused.weights[some].sum()
-        scores[same] = z_score(rows.theta[some, 0].double(), w, 1.0)
-    assert abs(scores[False]) < 4
-    assert abs(scores[True]) > 6  # negative control: the assumption is wrong here
-    at = reuse(bank, TARGET, proposals=PROPOSALS, action=torch.zeros(1))
-    assert (at.simulations().action == 0).all()
-    assert abs(z_score(at.simulations().theta[:, 0].double(), at.weights, 1.0)) < 4
+    reused = reuse(bank, TARGET, proposals=PROPOSALS)
+    theta, own = bank.read().theta, reused.simulations().action[:, 0] == 0
+    mixture = 0.5 * (PRIOR.log_prob(theta).exp() + ROUND.log_prob(theta).exp())
+    mixed = (TARGET.log_prob(theta).exp() / mixture).double()
+    scores = []
+    for weights in (reused.weights, mixed):
+        w = weights[own] / weights[own].sum()
+        scores.append(z_score(theta[own, 0].double(), w, 1.0))
+    assert abs(scores[0]) < 4
+    assert abs(scores[1]) > 6  # negative control: one mixture for all actions
 
 
 def test_resampled_rows_have_equal_weight(bank):
@@ -171,7 +170,6 @@ def test_a_box_that_validates_its_arguments(bank):
             {"proposals": {"prior": ROUND, "round 1": ROUND}},
             r"expected proposals\['prior'\] to be what its rows were drawn from",
         ),
-        ({"action": torch.tensor([0.5])}, r"got none at action \[0.5\]; simulate"),
     ],
 )
 def test_bad_arguments(bank, options, text):

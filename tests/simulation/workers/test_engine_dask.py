@@ -18,7 +18,7 @@ from sbi_active import simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning
 from sbi_active.simulation.workers import DaskPool, Schedule, pickled
-from sbi_active.simulation.workers.cluster import _answer_apart
+from sbi_active.simulation.workers.cluster import _ask_child
 from sbi_active.simulation.workers.settings import Workers
 
 dask = pytest.importorskip("dask")
@@ -114,12 +114,23 @@ def test_a_worker_killed_in_the_middle_loses_nothing(
     assert killed[0] not in client.run(os.getpid).values()
 
 
-def test_time_limits_need_the_processes_of_this_machine(client, rows):
+def test_a_row_that_hangs_costs_itself_on_a_cluster(client, rows):
+    def simulator(theta, action, seeds):
+        if bool((action == 3).any()):
+            time.sleep(60)
+        return seeded(theta, action, seeds)
+
+    theta, action = (r[:8].clone() for r in rows)
+    action[5] = 3
+    limited = Workers(2, time_limit=1.0)
     with (
         joblib.parallel_config(backend="dask"),
-        pytest.raises(ValueError, match="expected the processes of this machine"),
+        pytest.warns(MissingRowsWarning, match="1 of 8 rows are missing: 1 timed out"),
     ):
-        simulate(seeded, *rows, seed=0, workers=Workers(2, time_limit=1.0))
+        result = simulate(simulator, theta, action, seed=0, workers=limited)
+    clean = simulate(seeded, theta, action, seed=0).x
+    assert result.tracebacks.keys() == {5}
+    assert torch.equal(result.x[result.valid], clean[result.valid])
 
 
 @pytest.mark.slow
@@ -228,7 +239,7 @@ def test_rows_at_risk_run_in_a_child():
     schedule = Schedule(theta, action, seed=0, has_seeds=False)
     calls = [schedule._call(np.array([i]), "alone") for i in range(3)]
     good, falls_back, deadly = (
-        _answer_apart(pickled(simulator), call) for call in calls
+        _ask_child(pickled(simulator), call, None) for call in calls
     )
     for i, reply in enumerate((good, falls_back)):
         assert reply.x is not None

@@ -14,7 +14,8 @@ import torch
 
 from sbi_active import simulate
 from sbi_active.simulation import MissingRowsWarning, Workers
-from sbi_active.simulation.workers import IDLE
+from sbi_active.simulation.workers.pools import waiting_workers
+from sbi_active.simulation.workers.processes import Worker
 
 # A worker cannot import a test module.
 cloudpickle.register_pickle_by_value(sys.modules[__name__])
@@ -57,9 +58,9 @@ def are_gone(pids, seconds=5.0):
 
 @pytest.fixture(autouse=True)
 def none_before():
-    IDLE.end()
+    waiting_workers.cache_clear()
     yield
-    IDLE.end()
+    waiting_workers.cache_clear()
 
 
 def test_workers_are_kept_for_the_same_simulator(monkeypatch):
@@ -78,7 +79,7 @@ def test_workers_are_kept_for_the_same_simulator(monkeypatch):
 
 
 def test_workers_that_wait_too_long_end(monkeypatch):
-    monkeypatch.setattr(IDLE, "SECONDS", 0.3)
+    monkeypatch.setattr(Worker, "PATIENCE", 0.3)
     pids = workers_of(pids_of_rows)
     assert any(map(is_alive, pids))
     assert are_gone(pids)
@@ -105,7 +106,7 @@ def test_a_forked_child_leaves_them_alone():
     pids = workers_of(pids_of_rows)
     child = os.fork()
     if child == 0:
-        IDLE.end()
+        waiting_workers.cache_clear()
         os._exit(0)
     assert os.waitpid(child, 0)[1] == 0
     assert workers_of(pids_of_rows) == pids
@@ -128,7 +129,7 @@ def test_what_a_worker_started_ends_with_it(tmp_path):
 
     assert are_gone(pids_of(1))
     assert all(map(is_alive, pids_of(2)))  # the next simulation may need them
-    IDLE.end()
+    waiting_workers.cache_clear()
     assert are_gone(pids_of(0) | pids_of(2))
     assert len(pids_of(0) | pids_of(1) | pids_of(2)) == 5  # two workers
 
