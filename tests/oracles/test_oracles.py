@@ -37,6 +37,9 @@ QUICK = {
     ),
     "identify": ("decay", "missing"),
 }
+#: Posteriors of several modes or with a curved ridge, whose normal fits vary by the
+#: seed by a tenth of a nat: the median of so many seeds is judged.
+VARIED, NUM_SEEDS = ("eight_modes", "banana"), 5
 #: What is wrong today, each with the reason; strict, so that a cure shows.
 KNOWN: dict[tuple[str, str], str] = {}
 
@@ -45,13 +48,13 @@ def rng_of(name: str) -> np.random.Generator:
     return np.random.default_rng(zlib.crc32(name.encode()))
 
 
-def run(problem: str, way: str) -> tuple[Judged, bool | None]:
+def run(problem: str, way: str, seed: int = 0) -> tuple[Judged, bool | None]:
     own = PROBLEMS[problem]()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        torch.manual_seed(0)
+        torch.manual_seed(seed)
         simulator = own.simulator(is_declared=WAYS[way].is_declared)
-        found = WAYS[way].run(own, simulator, 0)
+        found = WAYS[way].run(own, simulator, seed)
     return judged(own, answers()[problem], found), found.trustworthy
 
 
@@ -103,7 +106,9 @@ def test_a_wrong_noise_a_lost_mode_and_a_wrong_evidence_are_seen(name):
     ],
 )
 def test_the_way_gives_the_answer(problem, way):
-    result, says = run(problem, way)
+    seeds = range(NUM_SEEDS if problem in VARIED else 1)
+    results = [run(problem, way, seed) for seed in seeds]
+    result, says = sorted(results, key=lambda r: r[0].kl)[len(results) // 2]
     assert not result.faults(), (result, says)
 
 
