@@ -28,6 +28,8 @@ COVERAGE = 0.9
 SURPRISING = 0.05
 #: Distance, in widths of the permitted actions, below which two are the same.
 SAME = 1e-6
+#: Mean squared error, in sensor variances, that counts as none.
+TINY = 1e-9
 #: Draws of a registered prediction: its 90 % limit has a standard error of 1 %.
 NUM_DRAWS = 400
 
@@ -226,7 +228,7 @@ def _by_left_out(
         Barber et al., Annals of Statistics 49 (2021), on intervals by left-out errors.
     """
     own, m = misfit.of(name), rivals.measurements
-    size = 0.5 * np.log(own.parts)
+    size = 0.5 * np.log(np.maximum(own.parts, TINY))
     num, spread = len(size), float(size.std(ddof=1))
     channel = np.zeros(int(np.prod(m.shape[1:])), dtype=np.int64)
     channel[m.position % len(channel)] = m.channel
