@@ -75,8 +75,8 @@ def varying_parameters(
         trials: Measured trials. Entries of the action that do not differ, and actions
             that are labels, vary nothing; nor does an order that is unknown.
         scale: Prior standard deviation of phi: the change of a parameter, in its own
-            prior deviations, from the middle to an end of the range. Half or twice
-            changes odds little.
+            prior deviations, from the middle to an end of the range. A third
+            and three times are tried as well, so that half or twice says little else.
 
     Returns:
         Effects for ``close_loop(effects=...)``, up to (action_dim + 1) a parameter.

@@ -17,7 +17,7 @@ from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.next_trial.candidates import following
 from sbi_active.criticism.report.predicted import Registered, TestedTrial
 from sbi_active.criticism.report.report import Report
-from sbi_active.criticism.results import NONE, UNEXPLAINED, Array
+from sbi_active.criticism.results import NONE, UNEXPLAINED, Array, ModelKey
 from sbi_active.criticism.steps.predictive import Prediction, predict
 from sbi_active.criticism.under_misfit import Misfit
 from sbi_active.seeding import derive_seed
@@ -182,7 +182,9 @@ def register(
     seed = derive_seed(rivals.seed, "registered", len(rivals.trials))
     options = {"num_draws": NUM_DRAWS, "seed": seed, "scored": False}
     prediction = predict(rivals, trial, key=report.tracing.key, **options)
-    bare = predict(rivals, trial, **options)
+    bare = prediction
+    if report.tracing.key != ModelKey():
+        bare = predict(rivals, trial, **options)
     mean, sd = prediction.moments()
     distance = np.sqrt((((prediction.x - mean) / sd) ** 2).mean(1))
     limit = float(np.quantile(distance, COVERAGE))
@@ -228,11 +230,12 @@ def _by_left_out(
         Barber et al., Annals of Statistics 49 (2021), on intervals by left-out errors.
     """
     own, m = misfit.of(name), rivals.measurements
-    size = 0.5 * np.log(np.maximum(own.parts, TINY))
+    square = np.maximum(own.parts, TINY)
+    size = 0.5 * np.log(square)
     num, spread = len(size), float(size.std(ddof=1))
     channel = np.zeros(int(np.prod(m.shape[1:])), dtype=np.int64)
     channel[m.position % len(channel)] = m.channel
-    typical = np.exp(size.mean()) / np.sqrt(np.mean(own.parts))
+    typical = np.exp(size.mean()) / np.sqrt(square.mean())
     sd = typical * own.left_out[channel[prediction.position]]
     limit = stats.t.ppf(COVERAGE, num - 1) * spread * np.sqrt(1 + 1 / num)
     return np.sqrt(sd**2 + prediction.mean.var(0)), float(np.exp(limit))

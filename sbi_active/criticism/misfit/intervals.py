@@ -42,16 +42,18 @@ QUANTILE = 0.95
 THINNED = 2
 
 
-def covariance(
+def covariances(
     model: LinearModel,
     posterior: Posterior,
     left: LeftOut,
     errors: Errors,
     action: Array,
-    *,
-    between: Array | float = 0.0,
-) -> Array:
-    """Return the covariance of a model's coordinates about its best fit, (d, d).
+    between: Array,
+) -> tuple[Array, Array]:
+    """Return covariances of a model's coordinates about its best fit, (d, d).
+
+    The first is without what coordinates differ by from model to model, the second with
+    it.
 
     Args:
         model: Linear model.
@@ -66,13 +68,18 @@ def covariance(
     mean = np.clip(mean, model.low, model.high)
     jackknife, apart = left.jackknife(), model.u - mean
     within = np.maximum(np.diag(cov), np.diag(jackknife)) + apart**2
-    between = np.broadcast_to(between, apart.shape)
-    variance = _few(left.num_parts) ** 2 * within + between
+    variance = _few(left.num_parts) ** 2 * within
+
+    def scaled(total: Array, variance: Array) -> Array:
+        widest = model.widened(WIDTHS[-1])  # of the prior
+        sd = np.minimum(np.sqrt(variance), widest)
+        scale = sd / np.sqrt(np.maximum(np.diag(total), 1e-300))
+        return total * np.outer(scale, scale)
+
     # Parameters move together as in any of the three, whose sum is hardly wider.
-    total = cov + jackknife + np.outer(apart, apart) + np.diag(between)
-    sd = np.minimum(np.sqrt(variance), model.widened(WIDTHS[-1]))  # that of the prior
-    scale = sd / np.sqrt(np.maximum(np.diag(total), 1e-300))
-    return total * np.outer(scale, scale)
+    total = cov + jackknife + np.outer(apart, apart)
+    both = total + np.diag(between), variance + between
+    return scaled(total, variance), scaled(*both)
 
 
 def _few(parts: int) -> float:

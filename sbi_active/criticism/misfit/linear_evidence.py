@@ -56,7 +56,7 @@ def is_linear(search: Search) -> bool:
 
     They follow no jumps, and without a time axis not which trials have an outcome.
     Samples of trajectories of a large library would take too long. Where models bend,
-    evidence about their best fits is that of samples to some tenths of a nat.
+    evidence about their best fits decides as that of samples does.
     """
     rivals = search.rivals
     jumps = not rivals.is_smooth or bool(rivals.roughness.any())
@@ -288,8 +288,10 @@ class LinearEvidence:
         """
         own, model = self._mixture(key), self.search.model(self._predicting(key))
         if key not in self.rivals.fits and self._is_sampled(key):
-            found = self.rivals.fit(key).evidence
-            return replace(found, log_evidence=own.log_evidence)
+            fit = self.rivals.fit(key)
+            found = replace(fit.evidence, log_evidence=own.log_evidence)
+            self.rivals.fits[key] = replace(fit, evidence=found)
+            return found
         given = self.rivals, key, model, own.mean, own.cov, own.log_evidence
         if not self._louder(key):
             return keep_draws(*given, unit=self.search.unit)

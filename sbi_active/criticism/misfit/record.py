@@ -139,7 +139,7 @@ def with_intervals(tracing: Tracing, misfit: Misfit) -> Tracing:
         if key not in misfit.search.found:
             continue
         model = misfit.model(key)
-        u = _drawn(misfit.rivals, model, model.u, misfit.covariance(key))
+        u = _drawn(misfit.rivals, model, model.u, misfit.covariances(key)[1])
         draws = misfit.rivals.rival(key).coordinates.to_z(u)[:, : model.own]
         found[name] = replace(own, draws=draws, narrow=own.draws)
     return replace(tracing, evidences=found)
@@ -148,13 +148,13 @@ def with_intervals(tracing: Tracing, misfit: Misfit) -> Tracing:
 def _record(misfit: Misfit, key: ModelKey) -> Evidence:
     """Return a model's record, and keep its draws as its posterior sample."""
     model, log_z = misfit.model(key), misfit.search.found[key].posterior.log_process
+    own, shown = misfit.covariances(key)
     # Draws as wide as misfit asks leave the valleys of what bends: left-out trials are
     # predicted from the best fit, and so are others.
     return keep_draws(
-        *(misfit.rivals, key, model, model.u),
-        *(misfit.covariance(key, between=False), log_z),
+        *(misfit.rivals, key, model, model.u, own, log_z),
         best=model.u,
-        shown=misfit.covariance(key),
+        shown=shown,
     )
 
 

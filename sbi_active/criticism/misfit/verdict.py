@@ -22,7 +22,7 @@ from sbi_active.criticism.linear.left_out import Candidate, leave_out
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.guesses import gained_by_guesses
-from sbi_active.criticism.misfit.intervals import covariance
+from sbi_active.criticism.misfit.intervals import covariances
 from sbi_active.criticism.misfit.rule import Choice, Rule, Scored
 from sbi_active.criticism.misfit.weights import weights_by_error
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, ModelKey
@@ -78,24 +78,22 @@ class Misfit:
         found = self.search.found[key]
         return self.search.errors.posterior(found.model, found.grams, use)
 
-    def covariance(self, key: ModelKey, *, between: bool = True) -> Array:
-        """Return the covariance of a model's coordinates about its best fit, (d, d).
+    def covariances(self, key: ModelKey) -> tuple[Array, Array]:
+        """Return covariances of a model's coordinates about its best fit, (d, d).
 
-        Args:
-            key: Key of the model.
-            between: Whether to add by what coordinates differ from model to model:
-                intervals have that, and predictions of one model do not.
+        The first is that of the model, which predictions have. Intervals have the
+        second, with what coordinates differ by from model to model besides.
         """
         found = self.search.found[key]
         action = self.rivals.trials.action.numpy()
         action = action[np.unique(self.rivals.measurements.trial)]
-        return covariance(
+        return covariances(
             found.model,
             found.posterior,
             found.left,
             self.search.errors,
             action,
-            between=self._between(key) if between else 0.0,
+            between=self._between(key),
         )
 
     def replaces(self, verdict: str) -> bool:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.criticism.results import NONE
 from sbi_active.display.page import Section
 from sbi_active.display.table import Table
 
@@ -108,7 +107,7 @@ class TestedTrial:
     def _beside_bare(self) -> str:
         """Return by how much the bare model missed, where the verdict is another."""
         own = self.registered
-        if own.verdict == NONE or not self.is_measured:
+        if np.array_equal(own.mean, own.bare) or not self.is_measured:
             return ""
         return f" (bare model: {self._off(own.bare):.3g} off)"
 

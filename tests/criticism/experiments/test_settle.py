@@ -167,7 +167,7 @@ def test_predictions_where_every_model_misses_are_as_wide_as_left_out_errors():
         held.append(trial.held)
         sizes.append(trial.registered.limit * trial.registered.sd.mean())
     # The process has a root mean square of .07; t of 8 trials widens its 90 % limit.
-    assert sum(held) >= 5
+    assert sum(held) >= 5  # fewer of 8 at .9 have a probability of .005
     assert 0.07 < sum(sizes) / len(sizes) < 0.2
 
 

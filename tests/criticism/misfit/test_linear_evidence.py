@@ -178,13 +178,16 @@ def test_likely_models_that_bend_have_samples_of_their_posterior():
     error = torch.as_tensor(np.random.default_rng(4).standard_normal((8, 1)))
     trials = Trials(action, 4 * action + 2 + 0.5 * error)
     prior = BoxUniform(torch.zeros(2), 5 * torch.ones(2))
-    tracing = Criticism(model, prior, trials, effects=[BIAS], seed=0).trace()
+    loop = Criticism(model, prior, trials, effects=[BIAS], seed=0)
+    tracing = loop.trace()
     assert tracing.verdict == "bias"
     assert tracing.evidences["scatter"].engine == "linear"
     own = tracing.evidences["bias"]
     assert own.engine in ("importance", "smc")
     assert own.draws[:, :2].std(0).min() > 0.5
+    # Seven standard errors of the slope beside a bias, .135, for all 400 draws.
     assert own.draws[:, 0] * own.draws[:, 1] == pytest.approx(4.0, abs=1.0)
+    assert loop._found.record(ModelKey(("bias",))).log_evidence == own.log_evidence
 
 
 def scattered(size, *effects):
