@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from numpy.typing import NDArray
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
@@ -27,16 +28,15 @@ from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summari
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit.evaluation import chooses_again, evaluate_linear
-from sbi_active.criticism.misfit.linear_evidence import LinearEvidence, is_linear
-from sbi_active.criticism.misfit.record import detected, traced
+from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.misfit.rule import Rule
-from sbi_active.criticism.misfit.second_look import beside_misfit
 from sbi_active.criticism.misfit.stand_ins import judged
-from sbi_active.criticism.misfit.verdict import Misfit, find_misfit, without
+from sbi_active.criticism.misfit.verdict import Verdict, is_linear, judge, without
 from sbi_active.criticism.next_trial.next_action import choose_action
 from sbi_active.criticism.results import (
     Detection,
     Evaluation,
+    ModelKey,
     NextAction,
     Residuals,
     Tracing,
@@ -44,6 +44,7 @@ from sbi_active.criticism.results import (
 from sbi_active.criticism.rivals.further_trials import with_known_inputs
 from sbi_active.criticism.steps.equivalence import equivalent_effects, is_large
 from sbi_active.criticism.steps.evaluation import evaluate_held_out, evaluate_left_out
+from sbi_active.criticism.steps.refuted import widened
 from sbi_active.criticism.steps.residuals import find_residuals
 from sbi_active.criticism.steps.sampled import Sampled
 from sbi_active.criticism.steps.tracing import trace
@@ -55,6 +56,8 @@ from sbi_active.simulation import SimulatorModel
 
 if TYPE_CHECKING:
     from sbi_active.criticism.report.report import Report
+
+Array = NDArray[Any]
 
 FEWEST_TRIALS = 4  # to leave one out
 #: Posterior draws that predict held-out trials, of models by linear evidence.
@@ -173,8 +176,7 @@ class Criticism:
         self._residuals: Residuals | None = None
         self._detection: Detection | None = None
         self._tracing: Tracing | None = None
-        self._misfit: Misfit | None = None
-        self._is_searched = False
+        self._verdict: Verdict | Sampled | None = None
 
     def _look(self) -> None:
         """Make the models of the trials that are there."""
@@ -191,34 +193,38 @@ class Criticism:
         # Each model's held-out errors would take as much as the verdict.
         self._scored = None if self._is_large else trials.held_out
 
-    def misfit(self) -> Misfit | None:
-        """Return the models where none explains the trials to the sensor's error.
-
-        None if one does, or where the size of that error is not declared, x has no
-        time axis, or the simulator is random or jumps.
-        """
-        if not self._is_searched:
-            groups = self.equivalent()
-            self._misfit = find_misfit(self._linear, groups, rule=self.rule)
-            if self._misfit is not None and not self.set_aside:
-                self.set_aside = found = self._misfit.outlying()
+    def _judge(self) -> Verdict | Sampled:
+        """Return what decides: linear models, or samples where none has the error."""
+        if self._verdict is None:
+            search, groups = self._linear, self.equivalent()
+            if search is None or not is_linear(self.rivals):
+                self._verdict = Sampled(self.rivals, groups)
+                return self._verdict
+            with self._fitting("models fitted"):
+                self._verdict = judge(search, groups, self.rule)
+            if self._verdict.is_missed and not self.set_aside:
+                self.set_aside = found = self._verdict.outlying()
                 if found:  # they are not to decide what the others say
                     model, trials, effects = self._parts
                     self._parts = model, without(trials, found), effects
                     self.trials, self._equivalent = without(self.trials, found), None
                     self._look()
-                    return self.misfit()
-            self._found = Sampled(self.rivals, groups)
-            search = self._linear if self._misfit is None else None
-            if search is not None and is_linear(search):
-                self._found = LinearEvidence(search, self.rivals, groups)
-            self._is_searched = True
-        return self._misfit
+                    self._verdict = None
+                    return self._judge()
+        return self._verdict
+
+    def misfit(self) -> Verdict | None:
+        """Return the models where none explains the trials to the sensor's error.
+
+        None if one does, or where the size of that error is not declared, or no linear
+        model has it: the simulator is random, or jumps without a time axis.
+        """
+        found = self._judge()
+        return found if isinstance(found, Verdict) and found.is_missed else None
 
     def residuals(self) -> Residuals:
         """Return the residuals of the bare model."""
-        if self.misfit() is not None:
-            self.trace()  # by which models have their posteriors
+        self.trace()  # by which models have their posteriors
         if self._residuals is None:
             self._residuals = find_residuals(self.rivals)
         return self._residuals
@@ -239,34 +245,37 @@ class Criticism:
     def detect(self) -> Detection:
         """Return whether the bare model misses the data."""
         if self._detection is None:
-            misfit = self.misfit()
-            with self._fitting("models fitted", len(self.rivals.effects) + NUM_OTHERS):
-                own = self._found.detected() if misfit is None else detected(misfit)
-            self._detection = own
+            found = self._judge()
+            if isinstance(found, Verdict):
+                self._detection = found.detection
+            else:
+                num = len(self.rivals.effects) + NUM_OTHERS
+                with self._fitting("models fitted", num):
+                    self._detection = found.detected()
         return self._detection
 
     def trace(self) -> Tracing:
         """Return the tracing: the effect that the data point to."""
-        misfit = self.misfit()
-        if self._tracing is not None:
-            return self._tracing
-        if misfit is not None:
-            tracing = traced(misfit, self._scored)
-        else:
-            detection, groups = self.detect(), self.equivalent()
-            with self._fitting("verdict, sets of effects fitted"):
-                tracing = trace(
-                    *(self._found, detection),
-                    # What separates its effects, the next action looks for.
-                    actions=None if self._is_large else self.actions,
-                    near=not self._is_large,
-                )
-            given = self.rivals, groups, self._scored, self._linear, self.rule
-            tracing, self._misfit = beside_misfit(tracing, detection, *given)
-            if self._misfit is not None:
-                self._residuals = None
-        self._tracing = replace(tracing, set_aside=self.set_aside)
+        if self._tracing is None:
+            tracing = self._traced()
+            if tracing.misfit is None:
+                tracing = widened(tracing, self.rivals.seed, self._within)
+            self._tracing = replace(tracing, set_aside=self.set_aside)
         return self._tracing
+
+    def _traced(self, *, compare: bool = True) -> Tracing:
+        found, detection = self._judge(), self.detect()
+        # What separates effects of a large library, the next action looks for.
+        actions = None if self._is_large else self.actions
+        options = {"actions": actions, "compare": compare, "near": not self._is_large}
+        with self._fitting("verdict, sets of effects fitted"):
+            if isinstance(found, Verdict):
+                return traced(found, self._scored, **options)
+            return trace(found, detection, **options)
+
+    def _within(self, key: ModelKey, z: Array) -> Array:
+        """Return draws of a model, moved into the bounds of its prior."""
+        return self.rivals.rival(key).coordinates.within(z)
 
     def add(
         self, effects: Sequence[str] | None = None
@@ -327,7 +336,7 @@ class Criticism:
             return evaluate_held_out(self.rivals, tracing, held_out, **self._fewer)
         if int(self.trials.valid.sum()) < FEWEST_TRIALS:
             return None
-        found = self._found if tracing.misfit is None else self._misfit
+        found = self._judge()
         if chooses_again(found, tracing.key):
             return evaluate_linear(found, trials.fit)
         return evaluate_left_out(
@@ -362,8 +371,7 @@ class Criticism:
         parts = model, self.prior, trials
         part = Criticism(*parts, effects=effects, summaries=0, thin=False, **kept)
         part._equivalent = self.equivalent()
-        detection = part.detect()
-        return part.rivals, trace(part._found, detection, compare=False)
+        return part.rivals, part._traced(compare=False)
 
     def report(
         self,

@@ -46,7 +46,8 @@ Array = NDArray[Any]
 WIDTHS = (1 / 3, 1.0, 3.0)
 #: Sizes of the process in sensor deviations, a factor apart.
 SMALLEST, LARGEST, FACTOR = 0.3, 40.0, 1.63
-#: Every so many of the sizes is one of what differs from trial to trial.
+#: Every so many of the sizes is one of what differs from trial to trial, and every so
+#: many of sizes and time scales one of a gross error.
 THINNED = 2
 #: Trajectories below which parts are left out in their place, and how many parts.
 FEWEST, NUM_FOLDS = 6, 8
@@ -268,47 +269,58 @@ class Errors:
         log_det = grams.log_det[:, use].sum(1)
         return -0.5 * (log_det + grams.count[use].sum() * LOG_2PI)
 
-    def scaled(self, rows: Array, factors: Array) -> tuple[Array, Array]:
-        """Return Gram matrices of all rows under other sizes of the sensor's error.
+    def scaled(
+        self, rows: Array, factors: Array, use: NDArray[np.bool_]
+    ) -> tuple[Array, Array]:
+        """Return Gram matrices of rows under other sizes of the sensor's error.
 
         Args:
             rows: Rows, shape (N, k).
-            factors: Factors on the size, one a number, shape (s, N), or (s, 1).
+            factors: Factors on the size of each number's error, shape (s, N).
+            use: Parts of the trials that count, shape (f,).
 
         Returns:
             Gram matrices, shape (c j s, k, k), and log weights, shape (c j s,).
         """
-        factors = np.broadcast_to(factors, (len(factors), len(rows)))
-        grams, log_weight = [], []
+        grams, log_weight, own = [], [], use[self.fold]
         each = product(self.cells, self.scales)
         for (cell, size), log_p in zip(each, self.log_sensor, strict=True):
-            white = cell.whiten(rows.T / (size * factors[:, None]))  # (s, k, N)
+            white = cell.whiten(rows.T / (size * factors[:, None]))[..., own]
             grams.append(white @ np.swapaxes(white, 1, 2))
-            log_det = cell.log_scale + np.log(size * factors).sum(1)
-            log_weight.append(log_p - log_det - 0.5 * len(rows) * LOG_2PI)
+            scale = np.log(cell.sd * size * factors) + 0.5 * np.log1p(-(cell.rho**2))
+            log_det = scale[:, own].sum(1)
+            log_weight.append(log_p - log_det - 0.5 * own.sum() * LOG_2PI)
         return np.concatenate(grams), np.concatenate(log_weight)
 
-    def one_trial(self, model: LinearModel, grams: Grams) -> tuple[Array, Array]:
+    def one_trial(
+        self, model: LinearModel, grams: Grams, use: NDArray[np.bool_]
+    ) -> tuple[Array, Array]:
         """Return Gram matrices with a process in one trial, whichever it is.
 
-        The sensor's error elsewhere is the most probable one by the other trials.
+        The sensor's error elsewhere is the most probable one by the other trials. A
+        gross error needs no fine grid: of the processes some count.
 
         Args:
             model: Linear model.
             grams: Gram matrices of its rows.
+            use: Parts of the trials that count, shape (f,).
 
         Returns:
             Gram matrices, shape (t h, k, k), trial by trial, and log weights, (t h,).
         """
         n, found, weights = len(self.log_sensor), [], []
-        some = slice(n, n + self.num_processes)
-        for at in self.trials:
-            others = grams.gram[:n, ~at].sum(1)
-            log_p = self.log_sensor + self.constants(grams, ~at)[:n]
-            own = int(np.argmax(summed(others, log_p, model).share))
-            log_det = grams.log_det[own, ~at].sum() + grams.log_det[some][:, at].sum(1)
-            found.append(others[own] + grams.gram[some][:, at].sum(1))
-            weights.append(-0.5 * (log_det + grams.count.sum() * LOG_2PI))
+        shape = len(self.kernels), len(self.times), len(self.sizes)
+        places = n + np.arange(self.num_processes).reshape(shape)
+        some = places[:, ::THINNED, ::THINNED].ravel()
+        for trial in self.trials:
+            at, others = trial & use, ~trial & use
+            gram = grams.gram[:n, others].sum(1)
+            log_p = self.log_sensor + self.constants(grams, others)[:n]
+            own = int(np.argmax(summed(gram, log_p, model).share))
+            log_det = grams.log_det[own, others].sum()
+            log_det = log_det + grams.log_det[some][:, at].sum(1)
+            found.append(gram[own] + grams.gram[some][:, at].sum(1))
+            weights.append(-0.5 * (log_det + grams.count[use].sum() * LOG_2PI))
         weight = np.concatenate(weights)
         return np.concatenate(found), weight - np.log(len(weight))
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from sbi_active.criticism.evidence.predicted_before import NUM_DRAWS
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
-from sbi_active.criticism.linear.errors import Errors, Mixture, summed
+from sbi_active.criticism.linear.errors import Errors
 from sbi_active.criticism.linear.fits import (
     FitSettings,
     along_secants,
@@ -198,18 +198,21 @@ class Search:
             self.keep(self._fit(key, known or [ModelKey()]))
         return self.found[key]
 
-    def beside_smooth(self, key: ModelKey) -> Mixture:
-        """Return a model's posterior beside a smooth function of the action.
+    def smooth(self, model: LinearModel) -> tuple[Array, Array]:
+        """Return Gram matrices of a model beside a smooth function of the action.
 
         It stands for what was not declared where x has no time axis.
+
+        Args:
+            model: Linear model.
+
+        Returns:
+            Gram matrices, shape (h, k, k), and log weights, shape (h,).
         """
-        model = self.found[key].model
-        rows = self.unit[:, None] * model.rows
         if self._process is None:
             self._process = self.rivals.residual_process(self.sensor.noise)
-        grams, log_weight = self._process.grams(rows)
-        units = np.log(self.unit).sum()  # densities are of sensor deviations
-        return summed(grams, log_weight + units, model)
+        grams, log_weight = self._process.grams(self.unit[:, None] * model.rows)
+        return grams, log_weight + np.log(self.unit).sum()  # of sensor deviations
 
     @property
     def explains(self) -> bool:

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.linear.errors import Posterior
-from sbi_active.criticism.misfit.linear_evidence import LinearEvidence
-from sbi_active.criticism.misfit.verdict import Misfit
+from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.results import UNEXPLAINED, Evaluation, ModelKey
 from sbi_active.criticism.rivals.error_models import LOG_2PI
 from sbi_active.criticism.steps.equivalence import is_large
@@ -22,28 +21,24 @@ from sbi_active.seeding import derive_seed
 Array = NDArray[Any]
 
 
-def chooses_again(found: object, key: ModelKey) -> TypeGuard[LinearEvidence | Misfit]:
+def chooses_again(found: object, key: ModelKey) -> TypeGuard[Verdict]:
     """Return whether a choice among linear models stands for one among all models.
 
-    By the sensor's error they know of no larger noise and no gross error, which the
-    verdict of numbers without a time axis most often has to exclude: one without each
-    trial can choose these too.
+    Without a time axis a model may bend, and trials are few enough to fit all again.
 
     Args:
-        found: Evidence of the models, or the models of which every one misses.
+        found: Verdict of linear models, or evidence of others.
         key: Key of the model that all trials point to.
     """
-    if not isinstance(found, LinearEvidence):
-        return isinstance(found, Misfit)
+    if not isinstance(found, Verdict) or found.is_missed:
+        return isinstance(found, Verdict)
     search, rivals = found.search, found.rivals
     if not (search.sensor.is_known and rivals.measurements.is_sequence):
         return False
     return key in search.found or is_large(rivals.library)  # which takes long
 
 
-def evaluate_linear(
-    misfit: LinearEvidence | Misfit, trials: Trials
-) -> Evaluation | None:
+def evaluate_linear(misfit: Verdict, trials: Trials) -> Evaluation | None:
     """Return the error on each trial of models chosen and fitted without it.
 
     The linearizations are those of all trials; evidence, left-out errors, the choice
@@ -63,17 +58,15 @@ def evaluate_linear(
         key = misfit.selected_without(fold)
         for kept, model in ((before, ModelKey()), (after, key)):
             kept.append(scores(_prediction(misfit, model, fold, int(place)), one))
-        fits = key.effects or isinstance(misfit, LinearEvidence)
-        selected.append(str(key) if fits else UNEXPLAINED)
+        is_missed = misfit.is_missed and not key.effects
+        selected.append(UNEXPLAINED if is_missed else str(key))
     names = tuple(trials.names[int(i)] for i in places)
     return summary(
         "leave one out", places, joined(before), joined(after), (*selected,), names
     )
 
 
-def _prediction(
-    misfit: LinearEvidence | Misfit, key: ModelKey, fold: int, place: int
-) -> Prediction:
+def _prediction(misfit: Verdict, key: ModelKey, fold: int, place: int) -> Prediction:
     """Return the prediction of a trial by a model that was fitted without it."""
     search, m = misfit.search, misfit.rivals.measurements
     candidate, errors = search.found[key], search.errors

@@ -22,6 +22,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sbi_active.criticism.linear.errors import summed
 from sbi_active.criticism.linear.left_out import leave_out
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
@@ -95,7 +96,7 @@ def _guess_of_numbers(search: Search) -> tuple[tuple[str, float], ...]:
     The simplest of those that it does not beat by the margin comes before it.
     """
     bare, errors, gains = search.found[ModelKey()].model, search.errors, {}
-    least = search.beside_smooth(ModelKey()).log_evidence
+    least = summed(*search.smooth(bare), bare).log_evidence
     for name, term in _terms(search, of_all=True):
         model = _with_term(bare, term / search.unit)
         gains[name] = errors.posterior(model, errors.grams(model.rows)).log_sensor

@@ -8,25 +8,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.rival_set import NUM_DRAWS, RivalSet
-from sbi_active.criticism.linear.left_out import Candidate
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.guesses import guess_residual
-from sbi_active.criticism.misfit.verdict import Misfit
+from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.results import (
+    OUTLIER,
     UNEXPLAINED,
-    Detection,
     Estimate,
     Evidence,
     ModelKey,
     Tracing,
 )
 from sbi_active.criticism.rivals.rival import Rival
-from sbi_active.criticism.steps.detection import LEVEL, THRESHOLD
+from sbi_active.criticism.steps.detection import THRESHOLD
+from sbi_active.criticism.steps.equivalence import equivalent_effects
+from sbi_active.criticism.steps.influence import is_left_to_chance, withdrawn
+from sbi_active.criticism.steps.near_aliases import near_aliases
 from sbi_active.criticism.steps.predictive import predict
 from sbi_active.criticism.steps.tracing import (
     credible_set,
@@ -52,42 +55,68 @@ COUNTS, MOST_COUNTED = 0.05, 6
 CLOSE = 1.0
 
 
-def detected(misfit: Misfit) -> Detection:
-    """Return the detection of the bare model's misfit, by the verdict's evidence."""
-    bare = misfit.search.found[ModelKey()]
-    return detection_of(bare, misfit.log_bayes_factor, LEVEL)
-
-
-def detection_of(bare: Candidate, log_b: float, level: float) -> Detection:
-    """Return the detection by a linear bare model.
-
-    Args:
-        bare: The model.
-        log_b: Log Bayes factor of everything else against it, nats.
-        level: Tail probability of its chi-square that is an alarm by itself.
-    """
-    square, freedom, p_value = bare.model.chi_square
-    return Detection(
-        log_bayes_factor=log_b,
-        standard_error=0.0,
-        lower=log_b,
-        threshold=THRESHOLD,
-        chi_square=square,
-        degrees_of_freedom=float(freedom),
-        p_value=p_value,
-        level=level,
-        null_log_evidence=bare.posterior.log_sensor,
-        null_cross_check=None,
-    )
-
-
-def traced(misfit: Misfit, held_out: Trials | None) -> Tracing:
+def traced(
+    found: Verdict,
+    held_out: Trials | None,
+    *,
+    actions: ActionSpace | None = None,
+    compare: bool = True,
+    near: bool = True,
+) -> Tracing:
     """Return the verdict, and record the models behind it with posterior draws.
 
     Args:
-        misfit: The models and what helps.
+        found: The models and what helps.
         held_out: Trials on which the recorded models are scored; None for none.
+        actions: The permitted ones, for what they hardly separate.
+        compare: Whether to look for effects that are nearly the same.
+        near: Whether to look for groups that these trials do not separate as well.
     """
+    rivals, key = found.rivals, found.key
+    if found.is_missed:
+        return _beside_misfit(found, held_out)
+    is_missed = key.error == UNEXPLAINED  # by an error whose size is not declared
+    chosen = () if is_missed else key.effects
+    keys = [*found.states.keys(ModelKey()), *found.choice.probabilities, key]
+    keys += [ModelKey((name,)) for name in rivals.effects]
+    keys = [k for k in dict.fromkeys(keys) if k.error is None or not k.effects]
+    probabilities = found.probabilities
+    evidences = {str(k): _record(found, k) for k in keys}
+    groups = equivalent_effects(rivals, None) if compare and near else ()
+    aliases: tuple[frozenset[str], ...] = ()
+    if compare and found.detection.alarm:
+        singles = {n: evidences[n].log_evidence for n in rivals.effects}
+        known = [*found.equivalent, *groups]
+        aliases = near_aliases(rivals, singles, actions, known)
+    effects = ModelKey(key.effects)
+    gain = found.states.log_evidence(ModelKey(found.choice.key.effects, UNEXPLAINED))
+    tracing = Tracing(
+        verdict=str(ModelKey(chosen) if chosen else ModelKey(error=key.error)),
+        chosen=chosen,
+        probabilities=probabilities,
+        inclusion=found.inclusion,
+        credible_set=credible_set(probabilities),
+        equivalent=(*found.equivalent,),
+        near=groups,
+        aliases=aliases,
+        estimates=_estimates(found, evidences),
+        evidences=evidences,
+        robust=found.is_robust(),
+        guesses=_guesses(found) if is_missed else (),
+        beside=key.effects if is_missed else (),
+        outliers=found.outliers,
+        needed=found.states.needed(effects, THRESHOLD) if chosen else (),
+        p_value=_tail(found, effects),
+        log_process=gain - found.states.log_evidence(found.choice.key),
+        trial_names=dict(
+            zip(rivals.trials.index.tolist(), rivals.trials.names, strict=True)
+        ),
+    )
+    return withdrawn(tracing) if is_left_to_chance(tracing) else tracing
+
+
+def _beside_misfit(misfit: Verdict, held_out: Trials | None) -> Tracing:
+    """Return the verdict where every model misses, or several effects fit."""
     rivals, search, choice = misfit.rivals, misfit.search, misfit.choice
     if getattr(rivals.model.noise, "measurement_sd", None) is None:
         rivals.widen(2 * search.found[ModelKey()].model.rms)
@@ -97,7 +126,7 @@ def traced(misfit: Misfit, held_out: Trials | None) -> Tracing:
     weights = _weights(misfit)
     evidences = {}
     for key in dict.fromkeys([*tabled, *singles, *weights]):
-        evidences[str(key)] = _record(misfit, key)
+        evidences[str(key)] = _record_misfit(misfit, key)
     models = [_scored(misfit, key, held_out) for key in tabled]
     found = _found(misfit, tuple(models), weights)
     named = found.named
@@ -106,11 +135,12 @@ def traced(misfit: Misfit, held_out: Trials | None) -> Tracing:
         n: choice.probabilities.get(ModelKey((n,)), 0.0) for n in search.names
     }
     ordered = dict(sorted(probabilities.items(), key=lambda item: -item[1]))
+    guess = not (choice.key.effects if rivals.measurements.is_sequence else named)
     return Tracing(
-        verdict=str(ModelKey(named)) if named else UNEXPLAINED,
+        verdict=str(ModelKey(named)) if named else misfit.key.error or UNEXPLAINED,
         chosen=choice.key.effects,
         probabilities=ordered,
-        inclusion={n: choice.inclusion.get(n, 0.0) for n in rivals.effects},
+        inclusion=misfit.inclusion,
         credible_set=credible_set(ordered),
         equivalent=(*misfit.equivalent,),
         near=(),
@@ -118,34 +148,87 @@ def traced(misfit: Misfit, held_out: Trials | None) -> Tracing:
         estimates=_estimates(misfit, evidences),
         evidences=evidences,
         robust=misfit.is_robust(),
-        guesses=() if choice.key.effects else guess_residual(search),
+        guesses=_guesses(misfit) if guess else (),
         beside=tuple(n for n in choice.key.effects if n not in named),
         misfit=found,
         p_value=misfit.model(choice.key).chi_square[2],
     )
 
 
-def with_intervals(tracing: Tracing, misfit: Misfit) -> Tracing:
-    """Return a verdict of other evidence with the intervals that hold under misfit.
+def _guesses(found: Verdict) -> tuple[tuple[str, float], ...]:
+    known = found.search.sensor.is_known
+    is_timed = found.rivals.measurements.is_sequence
+    return guess_residual(found.search) if known or not is_timed else ()
+
+
+def _tail(found: Verdict, key: ModelKey) -> float:
+    """Return the tail of a model's chi-square; NaN where the error has no size."""
+    known = found.search.sensor.is_known
+    return found.states.chi_square(key)[1] if known else float("nan")
+
+
+def bends(search: Search, key: ModelKey, *, num: int = 16, most: float = 0.5) -> bool:
+    """Return whether the simulator leaves a linear model where its posterior lies.
+
+    A normal posterior is then another one than the simulator's.
 
     Args:
-        tracing: Tracing of numbers without a time axis, of which no declared effect
-            predicts left-out trials better: larger noise or something undeclared.
-        misfit: The models.
+        search: Search that has fitted the model.
+        key: Key of the model.
+        num: Number of posterior draws that are simulated.
+        most: Standard deviation over the draws of the log density ratio of simulator
+            and linear model up to which a model counts as linear, nats. With half, more
+            models are sampled.
     """
-    found = dict(tracing.evidences)
-    for name, own in found.items():
-        key = ModelKey(own.key.effects)
-        if key not in misfit.search.found:
-            continue
-        model = misfit.model(key)
-        u = _drawn(misfit.rivals, model, model.u, misfit.covariances(key)[1])
-        draws = misfit.rivals.rival(key).coordinates.to_z(u)[:, : model.own]
-        found[name] = replace(own, draws=draws, narrow=own.draws)
-    return replace(tracing, evidences=found)
+    c = search.found[key]
+    m, rng = c.model, np.random.default_rng(derive_seed(search.rivals.seed, "bends"))
+    use = np.ones(search.errors.num_folds, bool)
+    own = search.errors.posterior(m, c.grams, use, process=False)
+    values, vectors = eigh(own.cov)
+    spread = vectors * np.sqrt(np.maximum(values, 0))
+    u = own.mean + rng.standard_normal((num, len(m.u))) @ spread.T
+    u = np.clip(u, m.low, m.high)
+    residual = search.rivals.rival(key).residual(u)[0]
+    linear = search.unit * (m.residual + (u - m.u) @ m.jacobian.T)
+    log_p = search.sensor.noise.log_likelihood
+    return not (log_p(residual) - log_p(linear)).std() < most  # NaN: not simulated
 
 
-def _record(misfit: Misfit, key: ModelKey) -> Evidence:
+def _record(found: Verdict, key: ModelKey) -> Evidence:
+    """Return the record of a model that may fit, and keep its draws.
+
+    The bare model and those that are likely have samples of the simulator's own
+    posterior where they bend. Beside a gross error, its trial tells little.
+    """
+    rivals, states, search = found.rivals, found.states, found.search
+    own, effects = states.mixture(key), states.predicting(key)
+    model = search.model(effects)
+    if key not in rivals.fits and _is_sampled(found, key):
+        fit = rivals.fit(key)
+        evidence = replace(fit.evidence, log_evidence=own.log_evidence)
+        rivals.fits[key] = replace(fit, evidence=evidence)
+        return evidence
+    at = own
+    if key.effects and found.key == ModelKey(key.effects, OUTLIER):
+        at = states.mixture(found.key)
+    given = rivals, key, model, at.mean, at.cov, own.log_evidence
+    if not states.louder(key):
+        return keep_draws(*given, unit=search.unit)
+    phi, square = states.louder_draws(key)[0], states.chi_square(key)[0]
+    return keep_draws(*given, louder=phi, chi_square=square)
+
+
+def _is_sampled(found: Verdict, key: ModelKey) -> bool:
+    states = found.states
+    if found.rivals.measurements.is_sequence or key not in found.search.found:
+        return False
+    likely = max(map(states.log_evidence, states.keys(found.choice.key)))
+    if key.effects and states.log_evidence(key) < likely - THRESHOLD:
+        return False
+    return bends(found.search, key)
+
+
+def _record_misfit(misfit: Verdict, key: ModelKey) -> Evidence:
     """Return a model's record, and keep its draws as its posterior sample."""
     model, log_z = misfit.model(key), misfit.search.found[key].posterior.log_process
     own, shown = misfit.covariances(key)
@@ -259,7 +342,7 @@ def _drawn(rivals: RivalSet, model: LinearModel, center: Array, cov: Array) -> A
     return np.clip(u, model.low, model.high)
 
 
-def _weights(misfit: Misfit) -> dict[ModelKey, float]:
+def _weights(misfit: Verdict) -> dict[ModelKey, float]:
     """Return the models that count, by their errors on left-out parts."""
     weights = misfit.weights
     kept = [key for key, weight in weights.items() if weight >= COUNTS]
@@ -267,7 +350,7 @@ def _weights(misfit: Misfit) -> dict[ModelKey, float]:
 
 
 def _found(
-    misfit: Misfit, models: tuple[ModelError, ...], weights: dict[ModelKey, float]
+    misfit: Verdict, models: tuple[ModelError, ...], weights: dict[ModelKey, float]
 ) -> Found:
     choice, search = misfit.choice, misfit.search
     m = search.rivals.measurements
@@ -288,7 +371,7 @@ def _found(
     )
 
 
-def _open_forms(misfit: Misfit) -> dict[str, str]:
+def _open_forms(misfit: Verdict) -> dict[str, str]:
     """Return the declared families of the effects that are named, if more is missing.
 
     Laws of friction, for example, imitate each other: while something undeclared is
@@ -301,7 +384,7 @@ def _open_forms(misfit: Misfit) -> dict[str, str]:
     return {e.name: str(e.family) for e in named if e.family != e.hook}
 
 
-def _scored(misfit: Misfit, key: ModelKey, held_out: Trials | None) -> ModelError:
+def _scored(misfit: Verdict, key: ModelKey, held_out: Trials | None) -> ModelError:
     """Return a model's errors on trials that it was not fitted to."""
     search, rivals = misfit.search, misfit.rivals
     left, bare = (search.found[k].left for k in (key, ModelKey()))
@@ -319,7 +402,7 @@ def _scored(misfit: Misfit, key: ModelKey, held_out: Trials | None) -> ModelErro
     )
 
 
-def _held_out(misfit: Misfit, key: ModelKey, held_out: Trials) -> Array:
+def _held_out(misfit: Verdict, key: ModelKey, held_out: Trials) -> Array:
     """Return the root mean square error on held-out trials by channel, (c,)."""
     prediction = predict(misfit.rivals, held_out, key=key)
     m = Measurements.of(held_out, is_sequence=True)
@@ -334,20 +417,21 @@ def _by_channel(square: Array, channel: NDArray[np.int64]) -> Array:
     return np.bincount(channel, square) / np.maximum(np.bincount(channel), 1)
 
 
-def _estimates(misfit: Misfit, evidences: dict[str, Evidence]) -> tuple[Estimate, ...]:
+def _estimates(found: Verdict, evidences: dict[str, Evidence]) -> tuple[Estimate, ...]:
     bare = evidences[str(ModelKey())].log_evidence
     return likeliest_first(
         estimate_of(
-            misfit.rivals.effects[name],
+            effect,
             evidences[name],
-            probability=misfit.choice.inclusion[name],
+            probability=found.inclusion[name],
             log_bayes_factor=evidences[name].log_evidence - bare,
         )
-        for name in misfit.search.names
+        for name, effect in found.rivals.effects.items()
+        if name in evidences
     )
 
 
-def _aliases(misfit: Misfit) -> tuple[frozenset[str], ...]:
+def _aliases(misfit: Verdict) -> tuple[frozenset[str], ...]:
     """Return pairs of effects that fit the trials nearly alike and about as well."""
     found = misfit.search.found
     return alike(

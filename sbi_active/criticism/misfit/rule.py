@@ -60,11 +60,14 @@ class Scored:
             of what is expected of it, (f,): trials to which a fit can but extrapolate
             tell little of a model.
         fitted: Mean squared residual of the fit, in sensor variances.
+        fits: Whether the sensor's error, or what a declared effect makes of it, is the
+            most probable state of the error beside the model.
     """
 
     log_p: float
     square: Array
     fitted: float
+    fits: bool = False
 
     @property
     def error(self) -> float:
@@ -200,8 +203,27 @@ class Rule:
                 guessed=-np.inf if guessed is None else guessed(key, n),
             )
         named = tuple(n for n, own in support.items() if self.is_cause(own))
+        if _explains(models, key):
+            named = key.effects
         instead = self.stand_ins(models, key, names)
         return Choice(key, probabilities, inclusion, named, support, instead)
+
+    def nothing(
+        self, models: Mapping[ModelKey, Scored], names: Sequence[str]
+    ) -> Choice:
+        """Return the choice where there is no alarm, with what is probable.
+
+        Args:
+            models: Fitted models.
+            names: Names of all effects.
+        """
+        log_p = np.array([m.log_p for m in models.values()])
+        p = dict(zip(models, np.exp(log_p - log_sum_exp(log_p)).tolist(), strict=True))
+        p = dict(sorted(p.items(), key=lambda item: -item[1]))
+        inclusion = {
+            n: sum((v for k, v in p.items() if n in k.effects), 0.0) for n in names
+        }
+        return Choice(ModelKey(), p, inclusion, (), {}, {})
 
     def is_cause(self, support: Support) -> bool:
         """Return whether an effect that helps is probably the cause."""
@@ -335,10 +357,20 @@ class Rule:
                 return True
             return timed and predicts_better(best.square, model.square) < self.sure
 
-        as_good = {key for key, m in models.items() if is_as_good(m)}
+        as_good = {
+            k for k, m in models.items() if is_as_good(m) or _explains(models, k)
+        }
         net = {key: m.log_p - self._cost(key, timed=timed) for key, m in models.items()}
         enough = max(net[key] for key in as_good) + self.ahead
         return [key for key in models if key in as_good or net[key] > enough]
+
+
+def _explains(models: Mapping[ModelKey, Scored], key: ModelKey) -> bool:
+    """Return whether a model leaves the sensor's error, and has too little to imitate.
+
+    Several effects fit much that was not declared.
+    """
+    return models[key].fits and len(key.effects) <= 1
 
 
 def _remains(models: Mapping[ModelKey, Scored], key: ModelKey, name: str) -> float:

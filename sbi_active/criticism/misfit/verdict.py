@@ -1,18 +1,20 @@
-"""Whether every model misses the trials by more than the sensor's error, and then what.
+"""The verdict of linear models: what the trials show, by one rule.
 
-If one fits to the sensor's error, evidence on the simulator itself decides, and this
-module is not needed.
+Every model has the same states of the error (:mod:`..linear.states`): with the one that
+fits to the sensor's error, and where every model misses, the rule is the same
+(:mod:`.rule`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from sbi_active.criticism.contradictions import OutlyingTrial
 from sbi_active.criticism.data.trials import Trials
@@ -21,49 +23,213 @@ from sbi_active.criticism.linear.errors import Posterior
 from sbi_active.criticism.linear.left_out import Candidate, leave_out
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
+from sbi_active.criticism.linear.states import States
 from sbi_active.criticism.misfit.guesses import gained_by_guesses
 from sbi_active.criticism.misfit.intervals import covariances
 from sbi_active.criticism.misfit.rule import Choice, Rule, Scored
 from sbi_active.criticism.misfit.weights import weights_by_error
-from sbi_active.criticism.results import SCATTER, UNEXPLAINED, ModelKey
-from sbi_active.criticism.steps.detection import THRESHOLD
-from sbi_active.criticism.steps.equivalence import is_large
+from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Detection, ModelKey
+from sbi_active.criticism.steps.detection import LEVEL, THRESHOLD
 from sbi_active.criticism.steps.missed_trials import outlying_trials
-from sbi_active.criticism.steps.tracing import RESCALED
-from sbi_active.inference.sampling.weights import log_sum_exp
+from sbi_active.criticism.steps.tracing import RESCALED, log_bayes_factor
 from sbi_active.seeding import derive_seed
 
 Array = NDArray[Any]
 
-#: Trials with the largest error, each of which alone may be what no model fits.
-NUM_SUSPECTS = 3
-#: Trials below which none can be told to be the one that errs.
-FEWEST_TRIALS = 3
+
+def is_linear(rivals: RivalSet) -> bool:
+    """Return whether linear models tell the simulator's apart, or have to.
+
+    Along a trajectory they do wherever the sensor's error is known. Without a time axis
+    they follow no jumps, and not which trials have an outcome.
+
+    Args:
+        rivals: The models, of which linear ones have the error.
+    """
+    jumps = not rivals.is_smooth or bool(rivals.roughness.any())
+    return rivals.measurements.is_sequence or not (rivals.can_fail or jumps)
+
+
+def judge(
+    search: Search,
+    equivalent: Sequence[frozenset[str]] = (),
+    rule: Rule = Rule(),  # noqa: B008  (frozen)
+) -> Verdict:
+    """Return the verdict of linear models.
+
+    Before an alarm, the bare model is searched again from many starts: a mode that the
+    first search missed would be a false one.
+
+    Args:
+        search: Search that fits the models.
+        equivalent: Groups of effects that no permitted action separates.
+        rule: Rule of what helps and what is named.
+    """
+    search.fit_singles()
+    found = Verdict(search, equivalent, rule)
+    if found.detection.alarm and search.look_again():
+        found = Verdict(search, equivalent, rule)
+    return found
 
 
 @dataclass
-class Misfit:
-    """The models of trials that none of them explains to the sensor's error.
+class Verdict:
+    """The models of some trials, and what the rule says of them.
 
     Attributes:
         search: Search with its models.
-        rivals: Rivals that the models are made of.
         equivalent: Groups of effects that nothing separates.
-        choice: Choice of what helps.
-        standard: Function that returns a model's squared errors on left-out parts, as
-            the rule takes them.
-        log_bayes_factor: Log Bayes factor of anything with a residual process against
-            the bare model with the sensor's error alone, nats.
         rule: Rule that decides which effects help.
     """
 
     search: Search
-    rivals: RivalSet
     equivalent: Sequence[frozenset[str]]
-    choice: Choice
-    standard: Callable[[Candidate], Array]
-    log_bayes_factor: float
     rule: Rule
+
+    def __post_init__(self) -> None:
+        self.rivals, self.states = self.search.rivals, States(self.search)
+
+    @cached_property
+    def detection(self) -> Detection:
+        """Whether the bare model misses the trials."""
+        states, rivals = self.states, self.rivals
+        bare = self.search.found[ModelKey()]
+        log_b = self._log_bayes_factor()
+        square, p = states.chi_square(ModelKey())
+        _, freedom, _ = bare.model.chi_square
+        found = Detection(
+            log_bayes_factor=log_b,
+            standard_error=0.0,
+            lower=log_b,
+            threshold=THRESHOLD,
+            chi_square=square,
+            degrees_of_freedom=float(freedom),
+            p_value=p,
+            level=LEVEL if rivals.has_known_noise else 0.0,
+            null_log_evidence=states.log_evidence(ModelKey()),
+            null_cross_check=None,
+        )
+        noise, spare = rivals.model.noise, len(bare.model.residual) - len(bare.model.u)
+        is_declared = noise is not None and noise.posterior is None and spare > 0
+        if not is_declared or rivals.roughness.any():
+            return found
+        lower = float(chi2.cdf(square, spare))
+        return replace(found, least_chi_square=square, lower_p_value=lower)
+
+    def _log_bayes_factor(self, use: NDArray[np.bool_] | None = None) -> float:
+        """Return the log Bayes factor of everything else against the bare model."""
+        names = (UNEXPLAINED, SCATTER, *self.rivals.effects)
+        keys = [ModelKey(), *map(ModelKey.of, names)]
+        log_z = {key: self.states.mixture(key, use).log_evidence for key in keys}
+        return log_bayes_factor(log_z, self.rivals.library, self.equivalent)
+
+    @cached_property
+    def standard(self) -> Callable[[Candidate], Array]:
+        """Function from a model to its squared errors on left-out parts, (f,)."""
+        return standard_errors(self.search)
+
+    @cached_property
+    def choice(self) -> Choice:
+        """What helps, and what is named; without an alarm nothing."""
+        if not self.detection.alarm:
+            names = self.search.names
+            scored = {k: self._scored(c) for k, c in self.search.found.items()}
+            return self.rule.nothing(scored, names)
+        self.search.fit_larger()
+        timed = self.rivals.measurements.is_sequence
+        guessed = None if timed else partial(gained_by_guesses, self.search)
+        return self._settled(self._scored, guessed)
+
+    def _scored(
+        self,
+        c: Candidate,
+        use: NDArray[np.bool_] | None = None,
+        factor: float = 1.0,
+        standard: Callable[[Candidate], Array] | None = None,
+    ) -> Scored:
+        """Return what the rule needs of a model."""
+        key, log_p = c.model.key, self.states.log_p(c, use, factor)
+        fits = self._is_explained(self.states.share(key))
+        return Scored(log_p, (standard or self.standard)(c), c.model.rms**2, fits)
+
+    def _is_explained(self, share: dict[ModelKey, float]) -> bool:
+        return max(share, key=share.__getitem__).error is None
+
+    def _settled(
+        self,
+        score: Callable[[Candidate], Scored],
+        guessed: Callable[[ModelKey, str], float] | None = None,
+    ) -> Choice:
+        """Return the choice, once every part of the top models is fitted.
+
+        Args:
+            score: Function that returns what the rule needs of a model.
+            guessed: Function that returns the nats that guesses in the place of an
+                effect gain over it; None asks none.
+        """
+        search, scored = self.search, dict[ModelKey, Scored]()
+        timed = self.rivals.measurements.is_sequence
+        while True:
+            for key, candidate in search.found.items():
+                if key not in scored:
+                    scored[key] = score(candidate)
+            tops = self.rule.starts(scored, search.names, timed=timed)
+            missing = [key for top in tops for key in _missing(search, top)]
+            if not missing:
+                given = scored, search.names, self.equivalent
+                return self.rule.choose(*given, timed=timed, guessed=guessed)
+            for key in missing:
+                search.fit_set(key)
+
+    @cached_property
+    def key(self) -> ModelKey:
+        """Effects that help, with the most probable state of the error."""
+        if not self.detection.alarm:
+            return ModelKey()
+        share = self.states.share(self.choice.key)
+        return max(share, key=share.__getitem__)
+
+    @property
+    def is_missed(self) -> bool:
+        """Whether every model misses the trials by more than the sensor's error.
+
+        Several effects that fit prove little, so many imitate what was not declared:
+        they are shown as if they missed.
+        """
+        own = self.key
+        scatters = own.error == SCATTER and bool(own.effects)
+        several = len(self.choice.key.effects) > 1
+        is_missed = scatters or several or own.error == UNEXPLAINED
+        return self.search.sensor.is_known and is_missed
+
+    @cached_property
+    def probabilities(self) -> dict[str, float]:
+        """Probabilities of the admitted models, the states of a bare one apart."""
+        found: dict[str, float] = {}
+        for key, p in self.choice.probabilities.items():
+            for own, share in self.states.share(key).items():
+                # What an effect on the noise makes of the error is an effect as well.
+                name = str(own if own.error is None or not key.effects else key)
+                found[name] = found.get(name, 0.0) + p * share
+        every = dict.fromkeys(self.rivals.effects, 0.0) | found
+        return dict(sorted(every.items(), key=lambda item: -item[1]))
+
+    @cached_property
+    def inclusion(self) -> dict[str, float]:
+        """Probability of each effect among the admitted models."""
+        found = {
+            name: self.choice.inclusion.get(name, 0.0) for name in self.rivals.effects
+        }
+        for key, p in self.choice.probabilities.items():
+            for own, share in self.states.share(key).items():
+                for effect in self.states.louder(own):
+                    found[effect.name] += p * share
+        return found
+
+    @property
+    def outliers(self) -> dict[float, float]:
+        """Probability that each trial is the one, if one has a gross error."""
+        return self.states.outliers(self.choice.key) if self.detection.alarm else {}
 
     def model(self, key: ModelKey) -> LinearModel:
         """Return a fitted model."""
@@ -76,7 +242,8 @@ class Misfit:
     def posterior(self, key: ModelKey, use: NDArray[np.bool_]) -> Posterior:
         """Return the posterior of a model by some parts of the trials."""
         found = self.search.found[key]
-        return self.search.errors.posterior(found.model, found.grams, use)
+        given = found.model, found.grams, use
+        return self.search.errors.posterior(*given, process=self.is_missed)
 
     def covariances(self, key: ModelKey) -> tuple[Array, Array]:
         """Return covariances of a model's coordinates about its best fit, (d, d).
@@ -95,21 +262,6 @@ class Misfit:
             action,
             between=self._between(key),
         )
-
-    def replaces(self, verdict: str) -> bool:
-        """Return whether it says more than a verdict of numbers without a time axis.
-
-        All models have numbers that scatter more than declared, each for itself: beside
-        them effects that help have a Bayes factor of 100, or one is probably the cause.
-        Several effects, which fit much, give way to a probable cause.
-        """
-        choice = self.choice
-        if verdict == UNEXPLAINED:
-            return bool(choice.key.effects)
-        own, bare = (self.search.found[k].log_p for k in (choice.key, ModelKey()))
-        if verdict == SCATTER and own - bare > np.log(self.rule.decisive):
-            return True
-        return any(choice.support[n].better > self.rule.sure for n in choice.named)
 
     @cached_property
     def weights(self) -> dict[ModelKey, float]:
@@ -138,18 +290,13 @@ class Misfit:
         return total / np.maximum(norm, 1e-300)
 
     def selected_without(self, fold: int) -> ModelKey:
-        """Return the model that is chosen without one part of the trials."""
-        errors = self.search.errors
-        use = np.ones(errors.num_folds, bool)
+        """Return the effects that are chosen without one part of the trials."""
+        use = np.ones(self.search.errors.num_folds, bool)
         use[fold] = False
+        if self._log_bayes_factor(use) < THRESHOLD and not self.detection.by_chi_square:
+            return ModelKey()
         standard = standard_errors(self.search, use)
-
-        def score(c: Candidate) -> Scored:
-            posterior = errors.posterior(c.model, c.grams, use)
-            log_p = c.log_prior + posterior.log_process
-            return Scored(log_p, standard(c), c.model.rms**2)
-
-        return settled(self.search, score, self.equivalent, self.rule).key
+        return self._settled(partial(self._scored, use=use, standard=standard)).key
 
     def outlying(self) -> tuple[OutlyingTrial, ...]:
         """Return the trials that err far more than the others let expect.
@@ -175,18 +322,10 @@ class Misfit:
 
     def is_robust(self) -> bool:
         """Return whether effect priors of another scale leave what helps."""
-        errors = self.search.errors
-        for factor in RESCALED:
-
-            def score(c: Candidate, factor: float = factor) -> Scored:
-                posterior = errors.posterior(c.model, c.grams, factor=factor)
-                log_p = c.log_prior + posterior.log_process
-                return Scored(log_p, self.standard(c), c.model.rms**2)
-
-            again = settled(self.search, score, self.equivalent, self.rule)
-            if again.key != self.choice.key:
-                return False
-        return True
+        if not self.detection.alarm:
+            return True
+        others = (self._settled(partial(self._scored, factor=f)) for f in RESCALED)
+        return all(choice.key == self.choice.key for choice in others)
 
 
 def standard_errors(
@@ -217,98 +356,11 @@ def standard_errors(
     return standard
 
 
-def find_misfit(
-    search: Search | None,
-    equivalent: Sequence[frozenset[str]] = (),
-    *,
-    is_known: bool = False,
-    rule: Rule = Rule(),  # noqa: B008  (frozen)
-) -> Misfit | None:
-    """Return the models and what helps; None if one fits to the sensor's error.
-
-    A model fits if no model is improved by a residual process by a Bayes factor of 20,
-    or if a single trial, which may have a gross error, accounts for the improvement. A
-    set of several effects that fits proves little: so many imitate what was not
-    declared. It is judged as if it missed, and so by what left-out trials say of each
-    of its effects.
-
-    Args:
-        search: Fits the models; None if no linear model has the error.
-        equivalent: Groups of effects that no permitted action separates.
-        is_known: No model fits: what remains was found to be no error of a sensor.
-            Without a time axis nothing else tells.
-        rule: What decides which effects help.
-    """
-    if search is None or not search.sensor.is_known:
-        return None
-    if not (is_known or search.rivals.measurements.is_sequence):
-        return None
-    rivals = search.rivals
-    search.fit_singles()
-    if not is_known and not _misses(search):
-        return None
-    if search.look_again() and not is_known and not _misses(search):
-        return None
-    search.fit_larger()
-    if not is_known:
-        if is_large(rivals.library) and not _misses(search):
-            return None
-        if _is_one_trial(search):
-            return None
-
-    standard = standard_errors(search)
-
-    def score(c: Candidate) -> Scored:
-        return Scored(c.log_p, standard(c), c.model.rms**2)
-
-    timed = rivals.measurements.is_sequence
-    guessed = None if timed else partial(gained_by_guesses, search)
-    choice = settled(search, score, equivalent, rule, guessed)
-    log_p = [c.log_p for c in search.found.values()]
-    sensor_alone = search.found[ModelKey()].posterior.log_sensor
-    log_b = log_sum_exp(np.array(log_p)) - sensor_alone
-    given = search, rivals, equivalent, choice, standard
-    return Misfit(*given, float(log_b), rule)
-
-
 def without(trials: Trials, outlying: Sequence[OutlyingTrial]) -> Trials:
     """Return all trials but some of those that were fitted."""
     fitted = [k for k, role in enumerate(trials.role) if role == "fit"]
     gone = {fitted[trial.position] for trial in outlying}
     return trials.select([k for k in range(len(trials)) if k not in gone])
-
-
-def settled(
-    search: Search,
-    score: Callable[[Candidate], Scored],
-    equivalent: Sequence[frozenset[str]],
-    rule: Rule,
-    guessed: Callable[[ModelKey, str], float] | None = None,
-) -> Choice:
-    """Return the choice, once every part of the top model is fitted.
-
-    Args:
-        search: The models so far.
-        score: Function that returns what the rule needs of a model.
-        equivalent: Groups of effects that nothing separates.
-        rule: Rule that decides which effects help.
-        guessed: Function that returns the nats that guesses in the place of an effect
-            gain over it; None asks none.
-    """
-    scored: dict[ModelKey, Scored] = {}
-    timed = search.rivals.measurements.is_sequence
-    while True:
-        for key, candidate in search.found.items():
-            if key not in scored:
-                scored[key] = score(candidate)
-        tops = rule.starts(scored, search.names, timed=timed)
-        missing = [key for top in tops for key in _missing(search, top)]
-        if not missing:
-            return rule.choose(
-                *(scored, search.names, equivalent), timed=timed, guessed=guessed
-            )
-        for key in missing:
-            search.fit_set(key)
 
 
 def _missing(search: Search, key: ModelKey) -> list[ModelKey]:
@@ -322,45 +374,3 @@ def _missing(search: Search, key: ModelKey) -> list[ModelKey]:
                 todo.append(part)
     missing = [k for k in wanted if k not in search.found]
     return sorted(missing, key=lambda k: len(k.effects))
-
-
-def _misses(
-    search: Search, use: NDArray[np.bool_] | None = None, most: int | None = None
-) -> bool:
-    """Return whether even the best model gains by a residual process.
-
-    Args:
-        search: Search that has fitted the models.
-        use: Parts of the trials that count; None for all.
-        most: Effects of the models that count; None for all.
-    """
-    best_sensor = best_process = -np.inf
-    for key, c in search.found.items():
-        if most is not None and len(key.effects) > most:
-            continue
-        p: Posterior = c.posterior
-        if use is not None:
-            p = search.errors.posterior(c.model, c.grams, use)
-        best_sensor = max(best_sensor, c.log_prior + p.log_sensor)
-        best_process = max(best_process, c.log_prior + p.log_process)
-    return best_process - best_sensor > THRESHOLD
-
-
-def _is_one_trial(search: Search) -> bool:
-    """Return whether a model of at most one effect fits all trials but one.
-
-    Several effects fit all but the one trial that tells.
-    """
-    errors, trial = search.errors, search.rivals.measurements.trial
-    if len(np.unique(trial)) < FEWEST_TRIALS:  # two that agree outvote one
-        return False
-    models = [c for k, c in search.found.items() if len(k.effects) <= 1]
-    best = max(models, key=lambda c: c.log_prior + c.posterior.log_sensor)
-    square = np.bincount(trial, best.model.residual**2)
-    for suspect in np.argsort(-square)[:NUM_SUSPECTS]:
-        # A part of few trials is a piece of one: all pieces of the suspect go.
-        use = np.ones(errors.num_folds, bool)
-        use[np.unique(errors.fold[trial == suspect])] = False
-        if not _misses(search, use, 1):
-            return True
-    return False

@@ -87,11 +87,3 @@ class Sampled:
     def needed(self, key: ModelKey) -> tuple[float, ...]:
         """Return the trials without which the data do not point to some effects."""
         return needed_trials(self.rivals, key)
-
-    def p_value(self, key: ModelKey) -> float:
-        """Return NaN: of a sample nobody asks."""
-        return float("nan")
-
-    def log_process(self, key: ModelKey) -> float:
-        """Return -inf: of a sample nobody asks."""
-        return -float("inf")

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.results import (
     CATCH_ALLS,
@@ -27,6 +26,7 @@ from sbi_active.criticism.steps.detection import THRESHOLD, alternatives
 from sbi_active.criticism.steps.equivalence import equivalent_effects
 from sbi_active.criticism.steps.influence import is_left_to_chance, withdrawn
 from sbi_active.criticism.steps.near_aliases import near_aliases
+from sbi_active.criticism.steps.sampled import Sampled
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
@@ -66,82 +66,8 @@ def log_priors(
     return {name: float(np.log(p)) for name, p in found.items()}
 
 
-class Evidences(Protocol):
-    """Evidence of each model, by samples or by linear algebra."""
-
-    @property
-    def rivals(self) -> RivalSet:
-        """The models."""
-        ...
-
-    @property
-    def equivalent(self) -> Sequence[frozenset[str]]:
-        """Groups of effects that no permitted action separates."""
-        ...
-
-    @property
-    def catch_alls(self) -> tuple[str, ...]:
-        """Catch-alls that are compared after an alarm."""
-        ...
-
-    def detected(self) -> Detection:
-        """Return whether the bare model misses the trials."""
-        ...
-
-    def log_evidence(self, key: ModelKey, *, factor: float = 1.0) -> float:
-        """Return a model's log evidence, priors of effects as many times as wide."""
-        ...
-
-    def larger(
-        self, singles: Mapping[str, float], prior: Mapping[str, float]
-    ) -> dict[ModelKey, float]:
-        """Return log posteriors of sets of several effects, where they gain enough.
-
-        Args:
-            singles: Log posterior of each effect alone, unnormalized.
-            prior: Log prior probability of each.
-        """
-        ...
-
-    def is_refuted(self, key: ModelKey, detection: Detection) -> bool:
-        """Return whether the error leaves no room for what a model leaves over.
-
-        Args:
-            key: Key of the model.
-            detection: Detection of the bare model.
-        """
-        ...
-
-    def log_with_process(self, key: ModelKey) -> float:
-        """Return the log evidence of effects with a residual process beside them."""
-        ...
-
-    def record(self, key: ModelKey) -> Evidence:
-        """Return the record of a model."""
-        ...
-
-    def outliers(self) -> dict[float, float]:
-        """Return the probability that each trial is the one, if one has a gross error.
-
-        Keys are the trials' indices, most probable first.
-        """
-        ...
-
-    def needed(self, key: ModelKey) -> tuple[float, ...]:
-        """Return the trials without which the data do not point to some effects."""
-        ...
-
-    def p_value(self, key: ModelKey) -> float:
-        """Return the tail probability of a model's chi-square; NaN for none."""
-        ...
-
-    def log_process(self, key: ModelKey) -> float:
-        """Return the log Bayes factor of a process beside a model; -inf for none."""
-        ...
-
-
 def trace(
-    found: Evidences,
+    found: Sampled,
     detection: Detection,
     *,
     actions: ActionSpace | None = None,
@@ -231,8 +157,6 @@ def trace(
         beside=beside,
         outliers=found.outliers() if detection.alarm else {},
         needed=found.needed(verdict) if verdict.effects else (),
-        p_value=found.p_value(verdict),
-        log_process=found.log_process(verdict),
         trial_names=dict(
             zip(rivals.trials.index.tolist(), rivals.trials.names, strict=True)
         ),
@@ -262,7 +186,7 @@ def beside_imitations(p: dict[ModelKey, float]) -> dict[ModelKey, float]:
     return dict(sorted(kept.items(), key=lambda item: -item[1]))
 
 
-def verdict_of(probabilities: Mapping[ModelKey, float], found: Evidences) -> ModelKey:
+def verdict_of(probabilities: Mapping[ModelKey, float], found: Sampled) -> ModelKey:
     """Return the verdict: the kind of explanation, then the most probable of it.
 
     Several effects that share the probability do not lose it to a catch-all. Equivalent
@@ -282,7 +206,7 @@ def verdict_of(probabilities: Mapping[ModelKey, float], found: Evidences) -> Mod
     return max(likeliest, key=likeliest.__getitem__)
 
 
-def kind_of(key: ModelKey, found: Evidences) -> frozenset[str]:
+def kind_of(key: ModelKey, found: Sampled) -> frozenset[str]:
     """Return the subject of a set: families of forces, or groups of similar effects."""
     effects = [found.rivals.effects[name] for name in key.effects]
     groups = [group for group in found.equivalent if NONE not in group]
@@ -295,17 +219,22 @@ def kind_of(key: ModelKey, found: Evidences) -> frozenset[str]:
     return frozenset(map(kind, effects))
 
 
-def log_bayes_factor(log_z: Mapping[ModelKey, float], found: Evidences) -> float:
+def log_bayes_factor(
+    log_z: Mapping[ModelKey, float],
+    library: Sequence[Effect],
+    equivalent: Sequence[frozenset[str]],
+) -> float:
     """Return the log Bayes factor of everything else against the bare model.
 
     Args:
         log_z: Evidences; what was screened out has none to speak of.
-        found: The models.
+        library: All effects.
+        equivalent: Groups of them that no permitted action separates.
     """
-    names = [e.name for e in found.rivals.library]
+    names = [e.name for e in library]
     parts = [
         log_z[ModelKey.of(name)] + float(np.log(w))
-        for name, w in alternatives(names, found.equivalent).items()
+        for name, w in alternatives(names, equivalent).items()
         if ModelKey.of(name) in log_z
     ]
     return float(log_sum_exp(np.array(parts)) - log_z[ModelKey()])
@@ -354,20 +283,24 @@ def likeliest_first(estimates: Iterable[Estimate]) -> tuple[Estimate, ...]:
 
 
 def _is_robust(
-    found: Evidences,
+    found: Sampled,
     detection: Detection,
     log_prior: Mapping[ModelKey, float],
     log_z: Mapping[ModelKey, float],
     verdict: ModelKey,
 ) -> bool:
     """Return whether priors a third and three times as wide give the same verdict."""
+    rivals = found.rivals
     for factor in RESCALED:
         scaled = {
             key: found.log_evidence(key, factor=factor) if key.effects else value
             for key, value in log_z.items()
         }
         other = ModelKey()
-        if log_bayes_factor(scaled, found) > THRESHOLD or detection.by_chi_square:
+        if (
+            log_bayes_factor(scaled, rivals.library, found.equivalent) > THRESHOLD
+            or detection.by_chi_square
+        ):
             log_p = {key: log_prior[key] + scaled[key] for key in scaled}
             other = verdict_of(probabilities_of(log_p), found)
         same = kind_of(other, found) == kind_of(verdict, found)

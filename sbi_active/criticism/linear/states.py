@@ -1,0 +1,256 @@
+r"""States of the error that all models share, and the evidence of a model in each.
+
+.. math::
+    p(x \mid m) = \sum_s P(s)\, Z_s(m)
+
+The error is the sensor's alone; or beside it a residual process in all trials, which is
+what nobody declared ("unexplained"); or larger than declared ("scatter"); or there is a
+process in one trial alone, whichever it is, which is a gross error ("outlier"); or it
+is what an effect on the noise makes of it. The same states for every model: whether an
+effect is there is one question, and what its error is like another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.linear.errors import WIDTHS, Mixture, summed
+from sbi_active.criticism.linear.left_out import Candidate
+from sbi_active.criticism.linear.search import Search
+from sbi_active.criticism.results import OUTLIER, SCATTER, UNEXPLAINED, ModelKey
+from sbi_active.inference.sampling.weights import log_sum_exp
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.support import support_bounds, support_of
+
+Array = NDArray[Any]
+
+
+@dataclass
+class States:
+    """Evidence of linear models in each state of the error.
+
+    Attributes:
+        search: Search that fits the models.
+        chance: Probability of each state that is not the sensor's alone; with half or
+            twice of it an error has to speak for one of them by .7 nats more or less.
+        fewest: Trials below which none can be told to have a gross error: two that
+            agree outvote one.
+        num_louder: Draws of effects on the noise, over which their evidence is a mean.
+    """
+
+    search: Search
+    chance: float = 0.1
+    fewest: int = 3
+    num_louder: int = 200
+    _known: dict[ModelKey, Mixture] = field(default_factory=dict)
+
+    def keys(self, key: ModelKey) -> dict[ModelKey, float]:
+        """Return a model in each state, and the state's log probability.
+
+        Args:
+            key: Effects on the prediction; the first state is the sensor's alone.
+        """
+        errors, effects = [UNEXPLAINED, SCATTER], self.search.rivals.effects
+        if len(self.search.errors.trials) >= self.fewest:
+            errors.append(OUTLIER)
+        states = {ModelKey(key.effects, e): np.log(self.chance) for e in errors}
+        for name, effect in effects.items():
+            if effect.hook == "noise":
+                both = tuple(n for n in effects if n in (*key.effects, name))
+                states[ModelKey(both)] = self.search.prior[name]
+        rest = 1 - np.exp([*states.values()]).sum()
+        return {key: float(np.log(rest)), **states}
+
+    def share(self, key: ModelKey) -> dict[ModelKey, float]:
+        """Return a model in each state, and the state's probability given the model."""
+        log_p = {k: p + self.mixture(k).log_evidence for k, p in self.keys(key).items()}
+        total = log_sum_exp(np.array([*log_p.values()]))
+        return {k: float(np.exp(p - total)) for k, p in log_p.items()}
+
+    def log_p(
+        self, c: Candidate, use: NDArray[np.bool_] | None = None, factor: float = 1.0
+    ) -> float:
+        """Return a model's log posterior probability, unnormalized, nats.
+
+        Args:
+            c: The model.
+            use: Parts of the trials that count, shape (f,); None takes all. Of some,
+                smooth functions of the action are no state.
+            factor: Factor on the scales of effects' priors.
+        """
+        parts = [
+            p + self.mixture(key, use, factor).log_evidence
+            for key, p in self.keys(c.model.key).items()
+        ]
+        return c.log_prior + log_sum_exp(np.array(parts))
+
+    def log_evidence(self, key: ModelKey) -> float:
+        """Return the log evidence of a model in one state, nats."""
+        return self.mixture(key).log_evidence
+
+    def mixture(
+        self,
+        key: ModelKey,
+        use: NDArray[np.bool_] | None = None,
+        factor: float = 1.0,
+    ) -> Mixture:
+        """Return the posterior of a model in one state.
+
+        Args:
+            key: Effects, and the state of the error.
+            use: Parts of the trials that count, shape (f,); None takes all.
+            factor: Factor on the scales of effects' priors.
+        """
+        if use is None and factor == 1:
+            if key not in self._known:
+                self._known[key] = self._summed(key, None, 1.0)
+            return self._known[key]
+        return self._summed(key, use, factor)
+
+    def _summed(
+        self, key: ModelKey, use: NDArray[np.bool_] | None, factor: float
+    ) -> Mixture:
+        c, errors = self.search.found[self.predicting(key)], self.search.errors
+        some = np.ones(errors.num_folds, bool) if use is None else use
+        n, grams = len(errors.log_sensor), c.grams
+        log_weight = errors.constants(grams, some)
+        widths = [factor * width for width in WIDTHS] if key.effects else [1.0]
+        gram = grams.gram[:, some].sum(1)
+        if key.error == OUTLIER:
+            gram, log_p = errors.one_trial(c.model, grams, some)
+        elif key.error == SCATTER:
+            size = np.sqrt(1 + errors.sizes**2)
+            log_p = errors.log_sensor + log_weight[:n]
+            log_p = log_p - grams.count[some].sum() * np.log(size)[:, None]
+            log_p = (log_p - np.log(len(size))).ravel()
+            gram = (gram[:n] / size[:, None, None, None] ** 2).reshape(
+                -1, *gram.shape[1:]
+            )
+        elif key.error == UNEXPLAINED:
+            gram, log_p = gram[n:], errors.log_prior + log_weight[n:]
+            timed = self.search.rivals.measurements.is_sequence
+            if not (timed and self.search.sensor.is_known):
+                # Errors of their own are scatter; what differs by trial is not.
+                own = slice(errors.num_processes, None)
+                gram, log_p = gram[own], log_p[own]
+                if use is None or not len(log_p):
+                    smooth = self.search.smooth(c.model)
+                    gram = np.concatenate([gram, smooth[0]])
+                    log_p = np.concatenate([log_p, smooth[1]])
+        elif louder := self.louder(key):
+            scale = self._scales(louder, factor)[1]
+            gram, log_p = errors.scaled(c.model.rows, scale, some)
+            log_p = log_p - np.log(len(scale))
+        else:
+            gram, log_p = gram[:n], errors.log_sensor + log_weight[:n]
+        return summed(gram, log_p, c.model, widths)
+
+    def predicting(self, key: ModelKey) -> ModelKey:
+        """Return the effects of a set that change the prediction."""
+        return ModelKey(tuple(n for n in key.effects if n in self.search.names))
+
+    def louder(self, key: ModelKey) -> list[Effect]:
+        """Return the effects of a set that act on the noise alone."""
+        effects = [self.search.rivals.effects[name] for name in key.effects]
+        return [e for e in effects if e.hook == "noise"]
+
+    def louder_draws(self, key: ModelKey) -> tuple[Array, Array]:
+        """Return posterior draws of a set's effects on the noise, and its factors.
+
+        Args:
+            key: Key of the set.
+
+        Returns:
+            Natural values, shape (n, k), and factors on the error, shape (n, N).
+        """
+        rng = np.random.default_rng(derive_seed(self.search.rivals.seed, "louder"))
+        num = self.num_louder
+        share = self.mixture(key).share.reshape(-1, num).sum(0)
+        drawn = rng.choice(num, size=num, p=share / share.sum())
+        phi, scale = self._scales(self.louder(key), 1.0)
+        return phi[drawn], scale[drawn]
+
+    def _scales(self, effects: Sequence[Effect], factor: float) -> tuple[Array, Array]:
+        """Return draws of effects on the noise, and its factors, (n, k) and (n, N)."""
+        rivals, num, parts = self.search.rivals, self.num_louder, []
+        for e in effects:
+            with forked_generators(rivals.seed, "louder", e.name):
+                phi = e.sample(num).double()
+            null = e.null_phi(1)
+            ends = np.stack(support_bounds(support_of(e.prior), e.phi_dim))
+            if bool(null.isfinite().all()) and not np.isfinite(ends).all(0).any():
+                width = torch.tensor(factor * np.resize(WIDTHS, num))
+                phi = null + width[:, None] * (phi - null)
+            parts.append(phi)
+        named = {e.name: phi for e, phi in zip(effects, parts, strict=True)}
+        scale = rivals.simulator.noise_scale(named, num)
+        assert scale is not None
+        phi = np.concatenate([part.numpy() for part in parts], 1)
+        return phi, np.maximum(scale, 1e-12)
+
+    def outliers(self, key: ModelKey) -> dict[float, float]:
+        """Return the probability that each trial is the one, if one has a gross error.
+
+        Args:
+            key: Effects of the model.
+
+        Returns:
+            Probabilities by the trials' indices, most probable first; empty for few.
+        """
+        own = ModelKey(key.effects, OUTLIER)
+        if own not in self.keys(key):
+            return {}
+        rivals = self.search.rivals
+        trials = rivals.trials.index.numpy()[np.unique(rivals.measurements.trial)]
+        share = self.mixture(own).share.reshape(len(trials), -1).sum(1)
+        order = np.argsort(-share, kind="stable")
+        return {float(trials[k]): float(share[k]) for k in order}
+
+    def needed(self, key: ModelKey, least: float) -> tuple[float, ...]:
+        """Return the trials without which the data do not point to some effects.
+
+        Args:
+            key: Effects of the model.
+            least: Log Bayes factor against the bare model that points to them, nats.
+        """
+        bare, found = ModelKey(), self.search.found
+        gain = self.log_evidence(key) - self.log_evidence(bare)
+        many = len(self.search.errors.trials) >= self.fewest
+        if key not in found or gain < least or not many:
+            return ()
+        without = [
+            self.mixture(key, ~own).log_evidence - self.mixture(bare, ~own).log_evidence
+            for own in self.search.errors.trials
+        ]
+        rivals = self.search.rivals
+        trials = rivals.trials.index.numpy()[np.unique(rivals.measurements.trial)]
+        return (*trials[np.array(without) < least].tolist(),)
+
+    def chi_square(self, key: ModelKey) -> tuple[float, float]:
+        """Return a model's chi-square and its tail, by all that is declared.
+
+        Of effects on the noise it is the smallest among draws of their posterior. Where
+        the correlation of errors is declared it counts; where it is unknown, numbers
+        count as independent.
+
+        Args:
+            key: Effects of the model.
+        """
+        cells, model = self.search.errors.cells, self.search.model(self.predicting(key))
+        residual, (square, freedom, p) = model.residual[None], model.chi_square
+        if is_louder := bool(self.louder(key)):
+            residual = residual / self.louder_draws(key)[1]
+        if is_correlated := len(cells) == 1 and bool(cells[0].rho.any()):
+            residual = cells[0].whiten(residual)
+        if is_louder or is_correlated:
+            square = float((residual**2).sum(1).min())
+            p = float(chi2.sf(square, freedom))
+        return square, p
