@@ -182,7 +182,6 @@ def test_without_an_alarm_no_trial_is_suspected():
     found = criticism(measured()).trace()
     assert found.verdict == "none"
     assert found.outliers == {}
-    assert "outlier" not in found.probabilities
 
 
 def test_noise_declared_too_large_is_said():
@@ -269,7 +268,7 @@ def test_effects_that_further_trials_refute_are_withdrawn():
 def test_held_out_trials_refute_an_alias():
     xi = torch.tensor([-2.5, -0.5, 1.0, 0.5, -1.5, 2.0, 4.5, 5.0])
     x = measured(xi)
-    x[6:] += torch.tensor([[20.0], [25.0]])  # twice the same slip
+    x[6:] += torch.tensor([[10.0], [12.5]])  # twice the same slip
     further = torch.arange(3.0, 6.0, 0.25)
     both = torch.cat([x, measured(further, seed=5)])
     role = ["fit"] * 8 + ["held out"] * len(further)

@@ -379,10 +379,7 @@ def integrated(
     gram: Array, model: LinearModel, width: float
 ) -> tuple[Array, Array, Array]:
     """Return evidences less their constants, and posterior moments of u."""
-    sd = model.widened(width)
-    shift = np.eye(gram.shape[1])
-    shift[1:, 0] = -model.center
-    gram = shift.T @ gram @ shift
+    sd, off = model.widened(width), model.center - model.u
     g, b, rr = gram[:, 1:, 1:], gram[:, 1:, 0], gram[:, 0, 0]
     precision = sd[:, None] * g * sd + np.eye(len(sd))
     # Columns of very different size, as of what jumps, keep their digits in units of
@@ -390,11 +387,12 @@ def integrated(
     size = np.sqrt(np.einsum("hii->hi", precision))
     own = size[:, :, None] * size[:, None]
     cov = np.linalg.inv(precision / own) / own
-    mean = np.einsum("hij,hj->hi", cov, sd * b)
-    log_z = -0.5 * (rr - (sd * b * mean).sum(1))
+    pull = sd * b + off / sd
+    mean = np.einsum("hij,hj->hi", cov, pull)
+    log_z = -0.5 * (rr + ((off / sd) ** 2).sum() - (pull * mean).sum(1))
     log_det = np.linalg.slogdet(precision / own)[1] + 2 * np.log(size).sum(1)
-    log_z = log_z - 0.5 * log_det
-    mean, cov = sd * mean, sd[:, None] * cov * sd
+    log_z = log_z - 0.5 * log_det  # and from here on about the prior's center
+    mean, cov = sd * mean - off, sd[:, None] * cov * sd
     low, high = model.low - model.center, model.high - model.center
     some = np.isfinite(low) | np.isfinite(high)
     if some.any():

@@ -119,7 +119,7 @@ def leave_out(
     f = errors.num_folds
     use = np.ones(f, bool) if folds is None else folds
     rows = model.rows * np.sqrt(weight)[..., None]
-    rows[:, 0] -= rows[:, 1:] @ model.center
+    rows[:, 0] -= rows[:, 1:] @ (model.center - model.u)
     scaled = rows / max(float(np.sqrt(np.mean(weight * model.residual**2))), 1.0)
     gram = np.stack([_gram(scaled[errors.fold == j]) for j in range(f)])
     gram[~use] = 0.0

@@ -55,9 +55,12 @@ class LinearModel:
 
     @property
     def rows(self) -> Array:
-        """Residual at u = 0 and minus its derivatives, shape (N, 1 + d)."""
-        at_zero = self.residual - self.jacobian @ self.u
-        return np.concatenate([at_zero[:, None], -self.jacobian], 1)
+        """Residual at the best fit and minus its derivatives, shape (N, 1 + d).
+
+        Far from the fit residuals may be thousands of sensor deviations, and of their
+        squares nothing would be left of what the sensor tells.
+        """
+        return np.concatenate([self.residual[:, None], -self.jacobian], 1)
 
     @property
     def rms(self) -> float:

@@ -75,6 +75,11 @@ class States:
         total = log_sum_exp(np.array([*log_p.values()]))
         return {k: float(np.exp(p - total)) for k, p in log_p.items()}
 
+    def likeliest(self, key: ModelKey) -> ModelKey:
+        """Return a model in its most probable state."""
+        share = self.share(key)
+        return max(share, key=share.__getitem__)
+
     def log_p(
         self, c: Candidate, use: NDArray[np.bool_] | None = None, factor: float = 1.0
     ) -> float:

@@ -75,7 +75,8 @@ def _prediction(misfit: Verdict, key: ModelKey, fold: int, place: int) -> Predic
     rng = np.random.default_rng(seed)
     whole = np.flatnonzero(errors.fold == fold)
     rest = errors.is_scored[whole]
-    rows, mean, cov = candidate.model.rows[whole], posterior.mean, posterior.cov
+    model = candidate.model
+    rows, mean, cov = model.rows[whole], posterior.mean - model.u, posterior.cov
     noise = _covariance(m.time[whole], m.channel[whole], posterior)
     if not rest.all():  # the first samples tell of the trial's nuisances
         first = rows[~rest]
@@ -89,7 +90,7 @@ def _prediction(misfit: Verdict, key: ModelKey, fold: int, place: int) -> Predic
     values, vectors = eigh(cov)
     root = vectors * np.sqrt(np.clip(values, 0, None))
     u = mean + rng.normal(size=(NUM_DRAWS, len(root))) @ root.T
-    u = np.clip(u, candidate.model.low, candidate.model.high)
+    u = np.clip(u, model.low - model.u, model.high - model.u)
     residual = rows[:, 0] - u @ rows[:, 1:].T
     factor = np.linalg.cholesky(noise[np.ix_(rest, rest)])
     error = rng.normal(size=residual.shape) @ factor.T

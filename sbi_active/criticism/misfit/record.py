@@ -77,7 +77,8 @@ def traced(
         return _beside_misfit(found, held_out)
     is_missed = key.error == UNEXPLAINED  # by an error whose size is not declared
     chosen = () if is_missed else key.effects
-    keys = [*found.states.keys(ModelKey()), *found.choice.probabilities, key]
+    shown = [k for k, p in found.choice.probabilities.items() if p >= SHOWN]
+    keys = [*found.states.keys(ModelKey()), *shown[:MOST_SHOWN], key]
     keys += [ModelKey((name,)) for name in rivals.effects]
     keys = [k for k in dict.fromkeys(keys) if k.error is None or not k.effects]
     probabilities = found.probabilities
@@ -219,13 +220,15 @@ def _record(found: Verdict, key: ModelKey) -> Evidence:
 
 
 def _is_sampled(found: Verdict, key: ModelKey) -> bool:
-    states = found.states
-    if found.rivals.measurements.is_sequence or key not in found.search.found:
+    states, search = found.states, found.search
+    if found.rivals.measurements.is_sequence or key not in search.found:
         return False
-    likely = max(map(states.log_evidence, states.keys(found.choice.key)))
-    if key.effects and states.log_evidence(key) < likely - THRESHOLD:
+    others = [*search.found, *states.keys(ModelKey())]
+    least = max(map(states.log_evidence, others)) - THRESHOLD
+    several = len(key.effects) > 1 and key != found.key
+    if several or (key.effects and states.log_evidence(key) < least):
         return False
-    return bends(found.search, key)
+    return bends(search, key)
 
 
 def _record_misfit(misfit: Verdict, key: ModelKey) -> Evidence:

@@ -55,24 +55,33 @@ class Scored:
     """Scores of a model, as the rule uses them.
 
     Attributes:
-        log_p: Unnormalized log posterior probability.
+        log_p: Unnormalized log posterior probability, states of the error summed out.
         square: Mean squared error on each left-out part, in sensor variances and units
             of what is expected of it, (f,): trials to which a fit can but extrapolate
             tell little of a model.
         fitted: Mean squared residual of the fit, in sensor variances.
-        fits: Whether the sensor's error, or what a declared effect makes of it, is the
-            most probable state of the error beside the model.
+        fits: Whether the most probable state of the error beside the model is that of
+            the sensor or of a declared effect, with or without one gross error.
+        beside: Unnormalized log posterior probability beside a residual process, or a
+            parameter that differs from trial to trial; NaN takes ``log_p``.
     """
 
     log_p: float
     square: Array
     fitted: float
     fits: bool = False
+    beside: float = np.nan
 
     @property
     def error(self) -> float:
         """Mean squared error on left-out parts, in sensor variances."""
         return float(np.nanmean(self.square))
+
+    def gain(self, other: Scored) -> float:
+        """Return the nats that it gains over another model beside a process."""
+        own = np.array([[m.log_p, m.beside] for m in (self, other)])
+        gain = float(own[0, 1] - own[1, 1])
+        return float(own[0, 0] - own[1, 0]) if np.isnan(gain) else gain
 
     @property
     def excess(self) -> float:
@@ -182,7 +191,7 @@ class Rule:
                 n: sum(v for k, v in probabilities.items() if groups[n] & {*k.effects})
                 for n in names
             }
-            return *self._pruned(models, top, pooled), pooled
+            return *self._pruned(models, top, pooled, timed=timed), pooled
 
         top, *larger = self.starts(models, names, timed=timed)
         key, better, pooled = helping(top)
@@ -198,7 +207,7 @@ class Rule:
             support[n] = Support(
                 inclusion=either,
                 better=better[n],
-                gained=max(models[key].log_p - models[key.without(n)].log_p, 0.0),
+                gained=max(models[key].gain(models[key.without(n)]), 0.0),
                 remains=_remains(models, key, n),
                 guessed=-np.inf if guessed is None else guessed(key, n),
             )
@@ -317,6 +326,8 @@ class Rule:
         models: Mapping[ModelKey, Scored],
         key: ModelKey,
         pooled: Mapping[str, float],
+        *,
+        timed: bool,
     ) -> tuple[ModelKey, dict[str, float]]:
         """Return the part of a set whose effects all help, and how surely each does."""
         while True:
@@ -328,11 +339,14 @@ class Rule:
             # Few trials that are badly predicted without an effect hide from a t test
             # how much it is needed.
             most = self.needed**2 * models[key].error
+            # What fits to the sensor needs no more than evidence, unless several effects
+            # may imitate a trajectory.
+            enough = _explains(models, key) or (models[key].fits and not timed)
             failing = [
                 n
                 for n in key.effects
                 if pooled[n] < self.included
-                or (better[n] < self.better and without[n] < most)
+                or not (enough or better[n] >= self.better or without[n] >= most)
             ]
             if not failing:
                 return key, better
@@ -357,9 +371,10 @@ class Rule:
                 return True
             return timed and predicts_better(best.square, model.square) < self.sure
 
-        as_good = {
-            k for k, m in models.items() if is_as_good(m) or _explains(models, k)
-        }
+        as_good = {key for key, m in models.items() if is_as_good(m)}
+        # Whether anything is missing is a question of evidence where something fits.
+        if explaining := {key for key in models if _explains(models, key)}:
+            as_good |= {ModelKey(), *explaining}
         net = {key: m.log_p - self._cost(key, timed=timed) for key, m in models.items()}
         enough = max(net[key] for key in as_good) + self.ahead
         return [key for key in models if key in as_good or net[key] > enough]

@@ -28,10 +28,16 @@ from sbi_active.criticism.misfit.guesses import gained_by_guesses
 from sbi_active.criticism.misfit.intervals import covariances
 from sbi_active.criticism.misfit.rule import Choice, Rule, Scored
 from sbi_active.criticism.misfit.weights import weights_by_error
-from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Detection, ModelKey
+from sbi_active.criticism.results import (
+    OUTLIER,
+    SCATTER,
+    UNEXPLAINED,
+    Detection,
+    ModelKey,
+)
 from sbi_active.criticism.steps.detection import LEVEL, THRESHOLD
 from sbi_active.criticism.steps.missed_trials import outlying_trials
-from sbi_active.criticism.steps.tracing import RESCALED, log_bayes_factor
+from sbi_active.criticism.steps.tracing import RESCALED, kind_of, log_bayes_factor
 from sbi_active.seeding import derive_seed
 
 Array = NDArray[Any]
@@ -116,11 +122,15 @@ class Verdict:
         lower = float(chi2.cdf(square, spare))
         return replace(found, least_chi_square=square, lower_p_value=lower)
 
-    def _log_bayes_factor(self, use: NDArray[np.bool_] | None = None) -> float:
+    def _log_bayes_factor(
+        self, use: NDArray[np.bool_] | None = None, factor: float = 1.0
+    ) -> float:
         """Return the log Bayes factor of everything else against the bare model."""
         names = (UNEXPLAINED, SCATTER, *self.rivals.effects)
         keys = [ModelKey(), *map(ModelKey.of, names)]
-        log_z = {key: self.states.mixture(key, use).log_evidence for key in keys}
+        log_z = {
+            key: self.states.mixture(key, use, factor).log_evidence for key in keys
+        }
         return log_bayes_factor(log_z, self.rivals.library, self.equivalent)
 
     @cached_property
@@ -148,12 +158,15 @@ class Verdict:
         standard: Callable[[Candidate], Array] | None = None,
     ) -> Scored:
         """Return what the rule needs of a model."""
-        key, log_p = c.model.key, self.states.log_p(c, use, factor)
-        fits = self._is_explained(self.states.share(key))
-        return Scored(log_p, (standard or self.standard)(c), c.model.rms**2, fits)
-
-    def _is_explained(self, share: dict[ModelKey, float]) -> bool:
-        return max(share, key=share.__getitem__).error is None
+        log_p = self.states.log_p(c, use, factor)
+        fits = self.states.likeliest(c.model.key).error in (None, OUTLIER)
+        beside = c.posterior
+        if use is not None or factor != 1:
+            errors = self.search.errors
+            beside = errors.posterior(c.model, c.grams, use, factor=factor)
+        square = (standard or self.standard)(c)
+        log_beside = c.log_prior + beside.log_process
+        return Scored(log_p, square, c.model.rms**2, fits, log_beside)
 
     def _settled(
         self,
@@ -186,8 +199,7 @@ class Verdict:
         """Effects that help, with the most probable state of the error."""
         if not self.detection.alarm:
             return ModelKey()
-        share = self.states.share(self.choice.key)
-        return max(share, key=share.__getitem__)
+        return self.states.likeliest(self.choice.key)
 
     @property
     def is_missed(self) -> bool:
@@ -229,7 +241,11 @@ class Verdict:
     @property
     def outliers(self) -> dict[float, float]:
         """Probability that each trial is the one, if one has a gross error."""
-        return self.states.outliers(self.choice.key) if self.detection.alarm else {}
+        if not self.detection.alarm:
+            return {}
+        # In place of effects, or beside them.
+        is_beside = self.key.error == OUTLIER
+        return self.states.outliers(self.choice.key if is_beside else ModelKey())
 
     def model(self, key: ModelKey) -> LinearModel:
         """Return a fitted model."""
@@ -322,10 +338,15 @@ class Verdict:
 
     def is_robust(self) -> bool:
         """Return whether effect priors of another scale leave what helps."""
-        if not self.detection.alarm:
-            return True
-        others = (self._settled(partial(self._scored, factor=f)) for f in RESCALED)
-        return all(choice.key == self.choice.key for choice in others)
+        own = kind_of(self.choice.key, self.rivals, self.equivalent)
+        for factor in RESCALED:
+            other = ModelKey()
+            gains = self._log_bayes_factor(factor=factor) >= THRESHOLD
+            if gains or self.detection.by_chi_square:
+                other = self._settled(partial(self._scored, factor=factor)).key
+            if kind_of(other, self.rivals, self.equivalent) != own:
+                return False
+        return True
 
 
 def standard_errors(

@@ -71,7 +71,7 @@ def is_left_to_chance(tracing: Tracing) -> bool:
     suspect = next(iter(tracing.outliers))
     p = tracing.probabilities
     declared = sum(v for name, v in p.items() if name not in (NONE, *CATCH_ALLS))
-    return suspect in tracing.needed and declared < DECISIVE * p[OUTLIER]
+    return suspect in tracing.needed and declared < DECISIVE * p.get(OUTLIER, 0.0)
 
 
 def unless_refuted(tracing: Tracing, evaluation: Evaluation | None) -> Tracing:

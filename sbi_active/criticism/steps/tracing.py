@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.results import (
     CATCH_ALLS,
@@ -194,10 +195,11 @@ def verdict_of(probabilities: Mapping[ModelKey, float], found: Sampled) -> Model
     form.
     """
     catch_alls = {k: p for k, p in probabilities.items() if k.error}
+    given = found.rivals, found.equivalent
     classes: dict[frozenset[str], dict[ModelKey, float]] = {}
     for key, p in probabilities.items():
         if key.effects:
-            classes.setdefault(kind_of(key, found), {})[key] = p
+            classes.setdefault(kind_of(key, *given), {})[key] = p
     declared = sum(p for members in classes.values() for p in members.values())
     best = max(catch_alls, key=catch_alls.__getitem__, default=ModelKey())
     if catch_alls.get(best, 0.0) > declared or not classes:
@@ -206,10 +208,18 @@ def verdict_of(probabilities: Mapping[ModelKey, float], found: Sampled) -> Model
     return max(likeliest, key=likeliest.__getitem__)
 
 
-def kind_of(key: ModelKey, found: Sampled) -> frozenset[str]:
-    """Return the subject of a set: families of forces, or groups of similar effects."""
-    effects = [found.rivals.effects[name] for name in key.effects]
-    groups = [group for group in found.equivalent if NONE not in group]
+def kind_of(
+    key: ModelKey, rivals: RivalSet, equivalent: Sequence[frozenset[str]]
+) -> frozenset[str]:
+    """Return the subject of a set: families of forces, or groups of similar effects.
+
+    Args:
+        key: Key of the set.
+        rivals: The models.
+        equivalent: Groups of effects that no permitted action separates.
+    """
+    effects = [rivals.effects[name] for name in key.effects]
+    groups = [group for group in equivalent if NONE not in group]
 
     def kind(effect: Effect) -> str:
         if is_force(effect):
@@ -290,7 +300,7 @@ def _is_robust(
     verdict: ModelKey,
 ) -> bool:
     """Return whether priors a third and three times as wide give the same verdict."""
-    rivals = found.rivals
+    given = rivals, _ = found.rivals, found.equivalent
     for factor in RESCALED:
         scaled = {
             key: found.log_evidence(key, factor=factor) if key.effects else value
@@ -303,7 +313,7 @@ def _is_robust(
         ):
             log_p = {key: log_prior[key] + scaled[key] for key in scaled}
             other = verdict_of(probabilities_of(log_p), found)
-        same = kind_of(other, found) == kind_of(verdict, found)
+        same = kind_of(other, *given) == kind_of(verdict, *given)
         if not same or other.error != verdict.error:
             return False
     return True

@@ -1,5 +1,7 @@
 """The evidence under a residual process, against dense Gaussian integrals."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal, norm
@@ -11,7 +13,7 @@ from sbi_active.criticism.linear.left_out import leave_out
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.misfit.intervals import shared_process
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
+from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell, NoiseGrid
 
 NUM, SAMPLES = 7, 5
 KERNELS = (
@@ -46,6 +48,12 @@ def problem(*, low=-np.inf, ragged=False, num=NUM):
     return model, errors
 
 
+def about_zero(model):
+    """Residual at u = 0 and minus its derivatives, shape (N, 1 + d)."""
+    at_zero = model.residual - model.jacobian @ model.u
+    return np.concatenate([at_zero[:, None], -model.jacobian], 1)
+
+
 def kernel(m, shape, tau):
     apart = np.abs(m.time[:, None] - m.time) / tau
     return shape(apart) * (m.trial[:, None] == m.trial)
@@ -54,8 +62,8 @@ def kernel(m, shape, tau):
 @pytest.mark.parametrize("ragged", [False, True])
 def test_the_evidence_is_that_of_the_dense_integral(ragged):
     model, errors = problem(ragged=ragged)
-    m, rows = errors.measurements, model.rows
-    found = errors.posterior(model, errors.grams(rows))
+    m, rows = errors.measurements, about_zero(model)
+    found = errors.posterior(model, errors.grams(model.rows))
     logs, means = [], []
     for shape in KERNELS:
         for tau in errors.times:
@@ -84,12 +92,12 @@ def test_the_evidence_is_that_of_the_dense_integral(ragged):
 
 def test_a_parameter_that_differs_from_trial_to_trial_is_a_dense_integral_too():
     model, plain = problem()
-    m, rows = plain.measurements, model.rows
+    m, rows = plain.measurements, about_zero(model)
     varying = np.stack([3 * model.jacobian[:, 0], np.zeros(len(m))], 1)
     cells = [NoiseCell.of(m, sd=plain.unit)]
     errors = Errors(m, plain.unit, NoiseGrid(cells), largest=2.0, varying=varying)
-    found = errors.posterior(model, errors.grams(rows))
-    without = plain.posterior(model, plain.grams(rows))
+    found = errors.posterior(model, errors.grams(model.rows))
+    without = plain.posterior(model, plain.grams(model.rows))
     j = model.jacobian[:, 0] / np.sqrt(np.mean(model.jacobian[:, 0] ** 2))
     logs = []
     for column in (j, 0 * j):
@@ -107,8 +115,11 @@ def test_a_parameter_that_differs_from_trial_to_trial_is_a_dense_integral_too():
     assert found.size == pytest.approx(without.size)  # those of the process
     assert found.time_scale == without.time_scale
     use = np.arange(errors.num_folds) != 3
-    part = errors.posterior(model, errors.grams(rows), use)
-    assert part.log_sensor == plain.posterior(model, plain.grams(rows), use).log_sensor
+    part = errors.posterior(model, errors.grams(model.rows), use)
+    assert (
+        part.log_sensor
+        == plain.posterior(model, plain.grams(model.rows), use).log_sensor
+    )
 
 
 def test_a_bound_of_phi_counts_by_the_posterior_within_it():
@@ -126,7 +137,7 @@ def test_a_bound_of_phi_counts_by_the_posterior_within_it():
 def test_left_out_errors_are_those_of_refits():
     model, errors = problem()
     left = leave_out(model, errors)
-    rows, fold = model.rows, errors.fold
+    rows, fold = about_zero(model), errors.fold
     scale = max(model.rms, 1.0)
     prior = np.diag(1 / model.widened(3.0))
     for k in range(errors.num_folds):
@@ -160,7 +171,7 @@ def test_few_trials_are_left_out_in_parts():
 
 def test_a_process_that_trials_share_is_that_of_the_dense_integral():
     model, errors = problem()
-    m, rows = errors.measurements, model.rows
+    m, rows = errors.measurements, about_zero(model)
     action = np.linspace(-1, 1, NUM)[:, None]
     mean, cov = shared_process(model, errors, action)
     scaled = action / action.std()
@@ -197,3 +208,33 @@ def test_a_process_that_trials_share_is_that_of_the_dense_integral():
 def test_trials_of_different_times_share_no_process():
     model, errors = problem(ragged=True)
     assert shared_process(model, errors, np.arange(NUM)[:, None] + 0.0) is None
+
+
+@pytest.mark.parametrize("far", [1.0, 1e6])
+def test_evidence_keeps_its_digits_however_far_the_prior_is(far):
+    """Residuals at the prior's center are a million sensor deviations."""
+    model, errors = problem()
+    column = far * np.linspace(1, 2, len(model.residual))[:, None]
+    away = replace(
+        model,
+        u=np.append(model.u, 1.0),
+        jacobian=np.concatenate([model.jacobian, column], 1),
+        center=np.append(model.center, 0.0),
+        sd=np.append(model.sd, 1.0),
+        scaled=np.append(model.scaled, False),
+        low=np.append(model.low, -np.inf),
+        high=np.append(model.high, np.inf),
+        trial_of=np.append(model.trial_of, -1),
+    )
+    found = errors.posterior(away, errors.grams(away.rows)).log_sensor
+    logs = []
+    for width in WIDTHS:
+        jacobian, sd = away.jacobian, away.widened(width)
+        values = np.linalg.svd(jacobian * sd, compute_uv=False)
+        a = np.concatenate([jacobian, np.diag(1 / sd)])
+        b = np.concatenate([away.residual, (away.u - away.center) / sd])
+        left = b - a @ np.linalg.lstsq(a, b, rcond=None)[0]
+        log_det = np.log1p(values**2).sum()
+        logs.append(-0.5 * (left @ left + log_det + len(b[: len(column)]) * LOG_2PI))
+    exact = np.logaddexp.reduce(logs) - np.log(len(logs))
+    assert found == pytest.approx(exact, abs=1e-5)

@@ -1,7 +1,6 @@
 """Numbers that do not follow each other in time, beside what nobody declared."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -10,7 +9,6 @@ from torch.distributions import Independent, Normal
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
-from sbi_active.criticism.results import ModelKey
 
 SENSOR, NUM_TRIALS = 0.05, 16
 THETA, QUADRATIC, HIDDEN = (1.0, 0.5), 0.8, 0.4
@@ -78,16 +76,6 @@ def test_the_report_speaks_of_no_time(beside):
     text = " ".join(str(beside.report(evaluate=False, plan=False)).split())
     assert "an error of unknown size in each number, beside the sensor's" in text
     assert "time scale" not in text
-
-
-def test_scatter_gives_way_to_effects_that_help_beside_it(beside):
-    beside.trace()
-    misfit = beside._misfit
-    unnamed = replace(misfit.choice, named=())
-    assert replace(misfit, choice=unnamed).replaces("scatter")
-    assert not replace(misfit, choice=unnamed).replaces("step + quadratic")
-    nothing = replace(unnamed, key=ModelKey(), support={})
-    assert not replace(misfit, choice=nothing).replaces("scatter")
 
 
 def test_a_formula_that_does_better_leaves_an_imitation_unnamed():
