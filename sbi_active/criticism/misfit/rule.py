@@ -339,8 +339,8 @@ class Rule:
             # Few trials that are badly predicted without an effect hide from a t test
             # how much it is needed.
             most = self.needed**2 * models[key].error
-            # What fits to the sensor needs no more than evidence, unless several effects
-            # may imitate a trajectory.
+            # What fits to the sensor needs no more than evidence, but for several
+            # effects that may imitate a trajectory.
             enough = _explains(models, key) or (models[key].fits and not timed)
             failing = [
                 n

@@ -36,9 +36,6 @@ PROBABILITY_OF_NONE = 0.5  # by convention, neither for nor against
 #: Probability that what is missing, if anything is, is each of the catch-alls.
 PROBABILITY_OF_CATCH_ALL = 0.1
 MASS = 0.9  # of the credible set
-#: Probability that an effect beyond the first, beside which a set fits to the sensor's
-#: error, is real and imitates nothing; empirical.
-REAL = 0.85
 #: Factors on the scale of the effects' priors under which a verdict should stand.
 RESCALED = (1 / 3, 3.0)
 
@@ -121,7 +118,6 @@ def trace(
         verdict = verdict_of(p, found)
         if verdict == process and rest > alone:
             beside = names
-    p = beside_imitations(p)
     evidences = {str(key): found.record(key) for key in log_p}
     groups = equivalent_effects(rivals, None) if compare and near else ()
     aliases = ()
@@ -172,19 +168,6 @@ def probabilities_of(log_p: dict[ModelKey, float]) -> dict[ModelKey, float]:
     order = np.argsort(-p, kind="stable")
     keys = [*log_p]
     return {keys[i]: float(p[i]) for i in order}
-
-
-def beside_imitations(p: dict[ModelKey, float]) -> dict[ModelKey, float]:
-    """Return probabilities where a set may owe its fit to something undeclared.
-
-    Along a trajectory two effects imitate a force that was not declared to the sensor's
-    error more often than one: each beyond the first is real with a probability of .85
-    (in six such worlds of ``benchmarks/misfit``, none of which judge, 7 of 15 were).
-    """
-    kept = {k: v * REAL ** max(len(k.effects) - 1, 0) for k, v in p.items()}
-    process = ModelKey(error=UNEXPLAINED)
-    kept[process] += 1.0 - sum(kept.values())
-    return dict(sorted(kept.items(), key=lambda item: -item[1]))
 
 
 def verdict_of(probabilities: Mapping[ModelKey, float], found: Sampled) -> ModelKey:

@@ -67,7 +67,9 @@ def test_probabilities_are_priors_times_evidences(phi):
             log_p[own] -= np.log(5) * (len(key.effects) > 1)
         # Beside the sensor's error alone, in densities of its deviations.
         exact = linear_world.log_evidence(x, key.effects) + len(x) * np.log(NOISE)
-        assert states.log_evidence(key) == pytest.approx(exact, abs=0.3)
+        # There several effects have scales of their own.
+        several = len(key.effects) > 1
+        assert states.log_evidence(key) == pytest.approx(exact, abs=0.2 + 0.5 * several)
         beside = [p for own, p in states.keys(key).items() if own != key]
         assert np.exp(beside) == pytest.approx([0.1, 0.1, 0.1])
     total = np.logaddexp.reduce([*log_p.values()])

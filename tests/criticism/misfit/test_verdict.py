@@ -16,10 +16,11 @@ from sbi_active.criticism.forces import force_effects
 from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.sensor import sensor_of
-from sbi_active.criticism.misfit.linear_evidence import LinearEvidence
+from sbi_active.criticism.misfit.record import traced
+from sbi_active.criticism.misfit.verdict import judge
 from sbi_active.criticism.results import OUTLIER, SCATTER, UNEXPLAINED, ModelKey
 from sbi_active.criticism.steps.detection import REFUTED
-from sbi_active.criticism.steps.tracing import log_priors, trace
+from sbi_active.criticism.steps.tracing import log_priors
 from tests.criticism.forces.test_forces import MODEL, PRIOR, SD, measured
 from tests.criticism.misfit.oscillator import EFFECTS
 from tests.criticism.misfit.oscillator import MODEL as OSCILLATOR
@@ -99,9 +100,7 @@ def test_a_gross_error_of_one_trial_is_found_without_simulations(few):
         Trials(trials.action, x, sample_times=trials.sample_times),
         list(few.rivals.effects.values()),
     )
-    wrong.fit_singles()
-    verdict = LinearEvidence(wrong, wrong.rivals)
-    tracing = trace(verdict, verdict.detected(), compare=False)
+    tracing = traced(judge(wrong), None, compare=False)
     assert tracing.verdict == OUTLIER
     assert next(iter(tracing.outliers)) == 3.0
 
@@ -187,7 +186,8 @@ def test_likely_models_that_bend_have_samples_of_their_posterior():
     assert own.draws[:, :2].std(0).min() > 0.5
     # Seven standard errors of the slope beside a bias, .135, for all 400 draws.
     assert own.draws[:, 0] * own.draws[:, 1] == pytest.approx(4.0, abs=1.0)
-    assert loop._found.record(ModelKey(("bias",))).log_evidence == own.log_evidence
+    linear = loop._judge().states.log_evidence(ModelKey(("bias",)))
+    assert own.log_evidence == linear  # asked by one, drawn by the other
 
 
 def scattered(size, *effects):
