@@ -190,7 +190,13 @@ class Verdict:
             missing = [key for top in tops for key in _missing(search, top)]
             if not missing:
                 given = scored, search.names, self.equivalent
-                return self.rule.choose(*given, timed=timed, guessed=guessed)
+                choice = self.rule.choose(*given, timed=timed, guessed=guessed)
+                gain = scored[choice.key].gain(scored[ModelKey()])
+                # Numbers that scatter each for itself may follow anything a little.
+                scatters = self.states.likeliest(ModelKey()).error == SCATTER
+                if timed or not scatters or gain >= np.log(self.rule.decisive):
+                    return choice
+                return replace(choice, key=ModelKey(), named=(), support={}, instead={})
             for key in missing:
                 search.fit_set(key)
 
