@@ -12,13 +12,6 @@ from benchmarks.published import published
 from benchmarks.rows import column
 from sbi_active.display.table import Table
 
-__all__ = [
-    "REPORTED",
-    "STAGES",
-    "coverage_table",
-    "summarize",
-]
-
 REPORTED = (3.0, 5.0, 7.0)  # m/s
 STAGES = ("simulation", "training", "design", "scoring", "update")
 PARTS = {  # of a round, in the paper's words

@@ -27,8 +27,6 @@ from benchmarks.criticism.worlds import get_world
 from sbi_active import InformationGainDesigner
 from sbi_active.criticism import Criticism
 
-__all__ = ["ACTIVE_COLUMNS", "DETECTABLE", "score_active"]
-
 ACTIVE_COLUMNS = [
     *["case", "effects", "policy", "trials", "action", "verdict", "top", "place"],
     *["probability", "lambda", "trial_simulations", "cpu_seconds", "failure"],

@@ -41,8 +41,6 @@ from sbi_active import Campaign, CampaignOptions
 from sbi_active.criticism import Report
 from sbi_active.seeding import derive_seed, forked_generators, row_normals
 
-__all__ = ["COLUMNS", "run_case", "summary"]
-
 RESULTS = Path(__file__).parent / "results"
 KINDS = ("hidden", "clean")
 POLICIES = ("auto", "theta", "check")

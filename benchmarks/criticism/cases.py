@@ -23,8 +23,6 @@ from sbi_active.criticism import Context, Effect, Trials
 from sbi_active.criticism.data import Role
 from sbi_active.seeding import derive_seed, forked_generators, row_normals, row_seeds
 
-__all__ = ["Case", "Kind", "Problem", "Truth", "draw_case"]
-
 Kind = Literal["clean", "library", "outside", "removed", "inexpressible", "pair"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 HELD_OUT = 8  # trials that no step may fit or choose by

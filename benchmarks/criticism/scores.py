@@ -17,8 +17,6 @@ from sbi_active import SimulatorModel
 from sbi_active.criticism import Report, close_loop
 from sbi_active.criticism.under_misfit import UNDECLARED
 
-__all__ = ["COLUMNS", "counted", "score_case"]
-
 COLUMNS = [
     *["case", "effects", "strengths", "theta", "correlation", "lambda", "support"],
     *["verdict", "probabilities", "credible_set", "equivalent", "formula"],

@@ -33,8 +33,6 @@ from benchmarks.rows import resumed
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task
 
-__all__ = ["CONTRASTIVE", "roll_out"]
-
 CONTRASTIVE = 500_000  # L, as in Foster et al. (2021)
 PARTICLES = 2_000  # of the posterior behind the proposal
 COLUMNS = [

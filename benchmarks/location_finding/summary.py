@@ -14,8 +14,6 @@ from benchmarks.location_finding.bounds import near_cap
 from benchmarks.published import published
 from sbi_active.display.table import Table
 
-__all__ = ["PUBLISHED", "RESULTS", "Rows", "difference", "mean_and_error", "table"]
-
 RESULTS = Path(__file__).parent / "results"
 FULL = 500_000  # contrastive draws that a file's name leaves out
 

@@ -28,8 +28,6 @@ from sbi_active import SimulatorModel
 from sbi_active.criticism import Effect, Trials
 from sbi_active.seeding import derive_seed, forked_generators
 
-__all__ = ["FIRST_JUDGED", "KINDS", "Case", "Kind", "Problem", "draw_case"]
-
 Kind = Literal["E", "R", "M", "P", "C", "CE"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 #: Seeds below are for tuning; those from here on judge, and nothing is tuned on them.

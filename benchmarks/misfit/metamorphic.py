@@ -37,8 +37,6 @@ from sbi_active.criticism import Effect, Trials, close_loop
 from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
 
-__all__ = ["CHANGES", "main", "table"]
-
 RESULT = Path(__file__).parent / "results" / "metamorphic.csv"
 COLUMNS = ["group", "machine", "kind", "case", "change", "named", "helps"]
 #: Kinds by turns; E and R, whose names are hardest, as often as all others.

@@ -12,8 +12,6 @@ from benchmarks.misfit.truth import Truth
 from benchmarks.misfit.verdicts import Outcome, read_report
 from sbi_active.criticism import Effect, close_loop
 
-__all__ = ["COLUMNS", "score_case"]
-
 COLUMNS = [
     *["case", "machine", "trials", "kind", "true", "equivalent", "sizes", "strengths"],
     *["discrepancy", "detail", "size", "excess", "theta"],

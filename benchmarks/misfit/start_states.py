@@ -34,8 +34,6 @@ from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.report.words import TOLD
 from sbi_active.criticism.results import NONE
 
-__all__ = ["Case", "draw_case", "main", "score_case", "summary"]
-
 PATH = Path(__file__).parent / "results" / "start_states.csv"
 NUM_TRIALS, NUM_SAMPLES, STEPS, DT = 12, 30, 4, 0.025
 TIMES = DT * STEPS * torch.arange(1, NUM_SAMPLES + 1, dtype=torch.float64)

@@ -14,8 +14,6 @@ from benchmarks.criticism.intervals import rate
 from benchmarks.misfit.machines import get_machine
 from sbi_active.display.table import Table
 
-__all__ = ["summary"]
-
 Row = Mapping[str, str]
 #: Gains of the true effect, 1 - held-out error with it / without.
 LARGE, SOME = 0.5, 0.2

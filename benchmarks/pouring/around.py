@@ -52,8 +52,6 @@ from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import images_of
 
-__all__ = ["Box", "Campaign", "box_around", "summarize"]
-
 OUTSIDE = 0.02  # share of the pooled beliefs beyond each side of the box
 NUM_CELLS = 14  # along each side of the box, of the reference
 NUM_COMPONENTS = 36

@@ -14,8 +14,6 @@ from benchmarks.pouring.summary import column, label
 from benchmarks.rows import read
 from sbi_active.display.figures import save
 
-__all__ = ["log_prob_figure", "selected_figure"]
-
 RESULTS = Path(__file__).parent / "results"
 COLORS: dict[str, str] = {"asbi": "C0", "nsbi": "C1", "alhi": "C2", "nlhi": "C7"}
 CLIPPED = -7.0  # the paper's Figure 11 too shows no less

@@ -48,8 +48,6 @@ from sbi_active.display.table import Table
 from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import images_of
 
-__all__ = ["of_bank", "summarize"]
-
 NUM_FOLDS = 3
 COLUMNS = [
     *["target", "seed", "num_pours", "cpu_pours", "power"],

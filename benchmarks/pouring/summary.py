@@ -10,12 +10,6 @@ from scipy import stats
 from benchmarks.rows import column
 from sbi_active.display.table import Table
 
-__all__ = [
-    "coverage_table",
-    "label",
-    "summarize",
-]
-
 #: Section 5.4, read from the text: medians of ASBI after the first and last rounds.
 PUBLISHED = {
     ("asbi", "1"): "above 1.0 .. over 2.6",

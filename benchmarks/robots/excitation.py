@@ -52,8 +52,6 @@ from sbi_active.mujoco.models.spec import mujoco_of
 from sbi_active.mujoco.robot import Robot
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 
-__all__ = ["MACHINES", "main", "score", "summary"]
-
 RESULT = Path(__file__).parent / "results" / "excitation.csv"
 COLUMNS = ["machine", "case", "arm", "seconds", "sds", "covered", "cpu_seconds"]
 NOISE, RATE, GRID = 0.001, 50.0, 200.0  # rad; Hz of encoders and of goals

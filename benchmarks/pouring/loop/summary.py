@@ -7,8 +7,6 @@ import numpy as np
 from benchmarks.pouring.summary import Rows
 from sbi_active.display.table import Table
 
-__all__ = ["summarize"]
-
 
 def summarize(rows: Rows) -> str:
     """Return one line a set and the counts."""

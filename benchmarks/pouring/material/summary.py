@@ -16,8 +16,6 @@ from benchmarks.rows import read
 from sbi_active.display.figures import save
 from sbi_active.display.table import Table
 
-__all__ = ["checks_table", "intervol_figure", "summarize"]
-
 RESULTS = Path(__file__).parents[1] / "results"
 #: Section 6, medians of ASBI, mm summed over pixels of 1,000 particles, and how far
 #: NSBI is below it at the last round.
