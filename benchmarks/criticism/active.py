@@ -89,7 +89,8 @@ def first_actions(world: str) -> Tensor:
 
 def _row(case: Case, number: int, policy: str) -> dict[str, object]:
     action = case.truth.action
-    return {
+    blank: dict[str, object] = dict.fromkeys(ACTIVE_COLUMNS, "")
+    return blank | {
         "case": number,
         "effects": " + ".join(case.truth.names),
         "policy": policy,

@@ -50,7 +50,8 @@ def score_case(case: Case, number: int, *, oracle: bool = False) -> dict[str, ob
         oracle: Also score the model that is given the true effect.
     """
     problem, truth = case.problem, case.truth
-    row: dict[str, object] = {
+    row: dict[str, object] = dict.fromkeys(COLUMNS, "")
+    row |= {
         "case": number,
         "effects": " + ".join(truth.names) or "none",
         "strengths": " ".join(f"{float(s):.6g}" for s in truth.strengths),

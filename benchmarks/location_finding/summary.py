@@ -41,7 +41,7 @@ def read(folder: Path, policy: str, num_trials: int, num_contrastive: int) -> Ro
     with path.open(newline="") as file:
         return {
             int(row["rollout"]): {
-                key: float(row[key]) if row[key] else np.nan
+                key: float(row.get(key) or "nan")
                 for key in (*BOUNDS, *COSTS, "effective", "belief_gain")
             }
             for row in csv.DictReader(file)

@@ -33,7 +33,7 @@ def score_case(case: Case, number: int) -> dict[str, object]:
         number: Its number, also the loop's seed.
     """
     problem, truth = case.problem, case.truth
-    row = _known(truth) | {"case": number}
+    row = dict.fromkeys(COLUMNS, "") | _known(truth) | {"case": number}
     model, count = counted(problem.model)
     start = time.process_time()
     try:

@@ -46,7 +46,7 @@ from benchmarks.pouring.learned import (
 from benchmarks.pouring.likelihood import ImageLikelihood, observed
 from benchmarks.pouring.power import best_power, grid, told_by
 from benchmarks.pouring.run import RESULTS, TEMPERED
-from benchmarks.rows import read, resumed
+from benchmarks.rows import column, read, resumed
 from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.tasks import get_task
@@ -57,11 +57,6 @@ NUM_CELLS = 14  # along each side of the box, of the reference
 NUM_COMPONENTS = 36
 NUM_FOLDS = 5
 NUM_JUDGED = 60  # parameters on which both are judged, a campaign
-COLUMNS = [
-    *["target", "seed", "num_pours", "volume", "inside", "power", "ours", "reference"],
-    *["left_out_ours", "left_out_reference", "left_out_se", "num_left_out"],
-    *["in_half", "in_most"],
-]
 
 
 @dataclass(frozen=True)
@@ -274,7 +269,6 @@ def row_of(
         whole += by_place[place].at(cells, image[None])[0]
     gap = np.array(reference) - np.array(ours)
     return {
-        "seed": own.seed,
         "num_pours": len(theta),
         "volume": box.volume,
         "inside": float(np.exp(belief)[inside].sum() / len(belief)),
@@ -297,7 +291,7 @@ def summarize(rows: list[dict[str, str]]) -> str:
     table = []
     for target in sorted({row["target"] for row in rows}):
         own = [row for row in rows if row["target"] == target]
-        value = {k: np.array([float(row[k]) for row in own]) for k in COLUMNS[2:]}
+        value = {k: column(own, k) for k in own[0]}
         gap = value["left_out_reference"] - value["left_out_ours"]
         at_truth = value["reference"] - value["ours"]
         error = np.sqrt((value["left_out_se"] ** 2).mean() / len(own))
@@ -334,12 +328,11 @@ def run_missing(
     pours = dict(zip(places, found, strict=True))
     by_seed = {own.seed: own for own in every}
 
-    def made(target: str, seed: int) -> dict[str, object]:
-        row = row_of(by_seed[seed], learned, box, pours, task)
-        return {"target": target} | row
+    def made(_: str, seed: int) -> dict[str, object]:
+        return row_of(by_seed[seed], learned, box, pours, task)
 
     jobs = [(target, seed) for seed in by_seed]
-    resumed(results / "around.csv", COLUMNS[:2], jobs, made, columns=COLUMNS)
+    resumed(results / "around.csv", ["target", "seed"], jobs, made)
 
 
 @dataclass(frozen=True)

@@ -43,18 +43,12 @@ from benchmarks.pouring.grid_belief import GridBelief
 from benchmarks.pouring.learned import PARTS, ByAction, learned_of
 from benchmarks.pouring.power import best_power
 from benchmarks.pouring.run import RESULTS
-from benchmarks.rows import read, resumed
+from benchmarks.rows import column, read, resumed
 from sbi_active.display.table import Table
 from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import images_of
 
 NUM_FOLDS = 3
-COLUMNS = [
-    *["target", "seed", "num_pours", "cpu_pours", "power"],
-    *["ours", "refined", "reference"],
-    *["left_out_ours", "left_out_refined", "left_out_reference", "gap", "gap_se"],
-    "num_left_out",
-]
 
 
 def of_bank(rows: Rows, action: Tensor, task: Any) -> Pours:
@@ -149,8 +143,6 @@ def row_of(
     ]
     gap = np.array(told[1]) - np.array(told[0])
     return {
-        "target": target,
-        "seed": own.seed,
         "num_pours": sum(len(pours.theta) for pours in fresh),
         "cpu_pours": spent,
         "power": refined_power,
@@ -173,7 +165,7 @@ def summarize(rows: list[dict[str, str]]) -> str:
     table = []
     for target in sorted({row["target"] for row in rows}):
         own = [row for row in rows if row["target"] == target]
-        value = {k: np.array([float(row[k]) for row in own]) for k in COLUMNS[2:]}
+        value = {k: column(own, k) for k in own[0]}
         names = ("ours", "refined", "reference")
         error = np.sqrt((value["gap_se"] ** 2).mean() / len(own))
         table.append(
@@ -239,7 +231,7 @@ def run_missing(
 
     path = arguments.results / "refined.csv"
     jobs = [(target, seed) for seed in by_seed]
-    resumed(path, COLUMNS[:2], jobs, made, columns=COLUMNS)
+    resumed(path, ["target", "seed"], jobs, made)
 
 
 def main(arguments: Settings) -> None:

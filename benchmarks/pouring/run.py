@@ -42,11 +42,6 @@ ACTIVE, BY_NETWORK = ("asbi", "alhi"), ("alhi", "nlhi")
 #: gain is chosen for the error of its learned likelihood too. From seeds 100 to 149.
 TEMPERED = 0.25
 NUM_DRAWS = 2_000  # behind the share of a belief that is denser than the truth
-COLUMNS = [
-    *["seed", "theta_true", "round", "height", "position", "rate", "delta", "in_view"],
-    *["eig", "eig_se", "eig_pca", "eig_mesh", "log_prob_true", "hpd"],
-    *["num_rows", "power", "cpu_design", "cpu_trial"],
-]
 
 
 def run_trial(
@@ -78,7 +73,6 @@ def run_trial(
         with forked_generators(derive_seed(seed, "draws", index)):
             draws = belief.sample(torch.Size([NUM_DRAWS]))
         row = {
-            "seed": seed,
             "theta_true": " ".join(f"{v:.6g}" for v in task.theta_true.tolist()),
             "round": index + 1,
             **dict(zip(("height", "position", "rate"), action.tolist(), strict=True)),
@@ -173,7 +167,7 @@ def run_missing(
     last = arguments.first + arguments.trials
     seeds = [(seed,) for seed in range(arguments.first, last)]
     path = path_of(method, target, arguments)
-    resumed(path, ["seed"], seeds, trial, columns=COLUMNS)
+    resumed(path, ["seed"], seeds, trial)
 
 
 def main(arguments: Settings) -> None:
