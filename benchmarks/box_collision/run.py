@@ -67,16 +67,6 @@ SETTINGS: dict[str, tuple[CampaignOptions, dict[str, Any]]] = {
         ),
         {"left_table": "paper"},
     ),
-    # The paper's simulations with this library's inference; as in the paper, those of
-    # the training give the information as well.
-    "paper_size": (
-        CampaignOptions(
-            num_simulations=41 * 500,
-            details=CampaignDetails(num_scored=500, design_on="training"),
-            refinement=RefinementOptions(num_effective=100, num_draws=100),
-        ),
-        {},
-    ),
     "default": (
         CampaignOptions(num_samples=250, details=CampaignDetails(num_scored=500)),
         {},

@@ -103,14 +103,7 @@ def _row(case: Case, number: int, policy: str) -> dict[str, object]:
 def _verdict(case: Case, number: int) -> tuple[Criticism, dict[str, object]]:
     problem, world = case.problem, case.truth.world
     model, count = counted(problem.model)
-    criticism = Criticism(
-        model,
-        problem.prior,
-        problem.trials,
-        effects=problem.effects,
-        actions=problem.actions,
-        seed=number,
-    )
+    criticism = replace(problem, model=model).criticism(number)
     tracing = criticism.trace()
     stated = merged(world, tracing.probabilities)
     truth = next(iter(merged(world, {true_name(world, *case.truth.names): 1.0})))

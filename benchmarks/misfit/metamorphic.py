@@ -33,7 +33,7 @@ from benchmarks.misfit.machines import GROUPS, LAYOUTS, get_machine
 from benchmarks.misfit.verdicts import Outcome, read_report
 from benchmarks.rows import benchmark
 from sbi_active import GaussianNoise, SimulatorModel
-from sbi_active.criticism import Effect, Trials, close_loop
+from sbi_active.criticism import Effect, Trials
 from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
 
@@ -176,15 +176,7 @@ def _in_units(effect: Effect) -> Effect:
 
 def judged(problem: Problem, seed: int) -> Outcome:
     """Return what the loop says of a problem."""
-    report = close_loop(
-        problem.model,
-        problem.prior,
-        problem.trials,
-        effects=problem.effects,
-        seed=seed,
-        evaluate=False,
-        plan=False,
-    )
+    report = problem.report(seed, evaluate=False, plan=False)
     return read_report(report, [])
 
 

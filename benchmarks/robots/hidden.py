@@ -38,6 +38,7 @@ from torch import Tensor
 
 from benchmarks.criticism.intervals import rate
 from benchmarks.criticism.scores import counted
+from benchmarks.robots.machines import sines
 from benchmarks.robots.public import PUBLIC, Public
 from benchmarks.rows import benchmark, column
 from sbi_active.criticism import AugmentedSimulator, Criticism, Effect, Trials
@@ -50,8 +51,7 @@ Array = NDArray[Any]
 
 RESULTS = Path(__file__).parent / "results/hidden.csv"
 NUM_TRIALS, NUM_READINGS = 8, 25
-#: Of the control's grid, s; sines of a control and their frequencies, Hz.
-STEP, NUM_SINES, FREQUENCIES = 0.02, 3, (0.3, 2.0)
+STEP = 0.02  # of the control's grid, s
 #: Chi-square over its degrees of freedom that the refitted bare model is left with.
 EXCESS = 40.0, 2_000.0
 TRIES = 8
@@ -74,12 +74,9 @@ def planned(
     )
     inputs = {name: [] for name in own.drive}
     for _ in range(NUM_TRIALS):
-        for name, (size, center) in own.drive.items():
-            frequency = rng.uniform(*FREQUENCIES, NUM_SINES)
-            phase = rng.uniform(0, 2 * np.pi, NUM_SINES)
-            share = rng.dirichlet(np.ones(NUM_SINES)) * rng.uniform(0.4, 1.0)
-            angle = 2 * np.pi * frequency * inner[:, None] + phase
-            inputs[name].append(center + size * np.sin(angle) @ share)
+        played = sines(inner, own.drive.values(), rng).T
+        for name, signal in zip(own.drive, played, strict=True):
+            inputs[name].append(signal)
     starts = {
         name: center + half * rng.uniform(-1, 1, NUM_TRIALS)
         for name, (center, half) in own.start.items()

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -22,7 +23,7 @@ import torch
 from benchmarks.criticism.cases import draw_case
 from benchmarks.criticism.worlds import get_world
 from benchmarks.rows import benchmark
-from sbi_active.criticism import Criticism, Trials
+from sbi_active.criticism import Trials
 from sbi_active.criticism.report.summary import suspects
 from sbi_active.seeding import derive_seed
 
@@ -50,14 +51,7 @@ def measure(name: str, size: int, number: int) -> dict[str, object]:
     x[trial] += sign * size * world.noise_sd
     wrong = Trials(trials.action, x, role=trials.role, index=trials.index)
     start = time.process_time()
-    loop = Criticism(
-        problem.model,
-        problem.prior,
-        wrong,
-        effects=problem.effects,
-        actions=problem.actions,
-        seed=number,
-    )
+    loop = replace(problem, trials=wrong).criticism(number)
     alone = loop.trace()
     report = loop.report(plan=False)
     rmse = report.before_after.set_index("metric").to_dict("index")["rmse"]
