@@ -34,11 +34,12 @@ from benchmarks.box_collision.bank import PriorBank
 from benchmarks.box_collision.summary import (
     REPORTED,
     STAGES,
-    coverage_table,
+    gap,
     summarize,
 )
+from benchmarks.rounds import coverage_table
 from benchmarks.rows import read, resumed, short, write
-from sbi_active import Campaign, CampaignOptions, MixtureDensity, RefinementOptions
+from sbi_active import Campaign, CampaignOptions, MixtureDensity
 from sbi_active.campaign import Trial
 from sbi_active.campaign.learning.methods import METHODS, find_method
 from sbi_active.campaign.options import CampaignDetails
@@ -344,4 +345,7 @@ def main(arguments: Settings) -> None:
             rows = [row for row in rows if int(row["seed"]) < arguments.num_trials]
             if rows:
                 cells[method, target] = rows
-    print(coverage_table(cells) if is_coverage else summarize(cells))
+    if is_coverage:
+        print(coverage_table(cells, (3, 4, 6), ("gap", gap)))
+    else:
+        print(summarize(cells))

@@ -30,7 +30,8 @@ import torch
 from benchmarks.pouring.grid_belief import GridBelief
 from benchmarks.pouring.learned import ByAction, Earlier, kept, learned_of
 from benchmarks.pouring.network import ByNetwork, learn_networks
-from benchmarks.pouring.summary import coverage_table, summarize
+from benchmarks.pouring.summary import mean_log_p, summarize
+from benchmarks.rounds import coverage_table
 from benchmarks.rows import read, resumed
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task
@@ -186,4 +187,8 @@ def main(arguments: Settings) -> None:
             rows = read(path_of(method, target, arguments))
             if rows:
                 cells[method, target] = rows
-    print(coverage_table(cells) if is_coverage else summarize(cells))
+    if is_coverage:
+        last = ("mean log p", mean_log_p)
+        print(coverage_table(cells, range(1, arguments.rounds + 1), last))
+    else:
+        print(summarize(cells))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.pouring.figures import boxes, subplots
-from benchmarks.pouring.summary import Rows
+from benchmarks.rounds import Rows
 from benchmarks.rows import read
 from sbi_active.display.figures import save
 from sbi_active.display.table import Table
