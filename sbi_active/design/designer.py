@@ -14,7 +14,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.callers import stack_level
 from sbi_active.design.design import Design
-from sbi_active.design.elimination import as_batch, choose, eliminate
+from sbi_active.design.elimination import as_batch, eliminate
 from sbi_active.design.estimators.automatic import find_estimator
 from sbi_active.design.estimators.base import (
     InformationGainEstimator,
@@ -214,7 +214,7 @@ class InformationGainDesigner(Shown):
                     f"single outcomes; got {num_actions} and {len(others)} pending; "
                     "leave out simulations="
                 )
-            return _by_given(problem)
+            return GivenGains(problem).design()
         steps = [_by_simulation(problem)]
         for k in range(1, num_actions):
             others = torch.cat([others, steps[-1].action[None]])
@@ -270,32 +270,7 @@ def _by_simulation(problem: DesignProblem, *, search_share: int = 12) -> Design:
             min_probability_valid=limits.least,
         )
     )
-    estimates = eliminate(evaluator, action, budget)
-    return choose(
-        replace(estimates, notes=(*estimates.notes, *notes)),
-        limits,
-        estimator=type(evaluator.estimator).__name__,
-        bound=evaluator.bound,
-        num_simulations=evaluator.sampler.num_drawn,
-        num_missing=evaluator.sampler.num_missing,
-        seed=seed,
-    )
-
-
-def _by_given(problem: DesignProblem) -> Design:
-    """Return the design by rows at hand; nothing is simulated."""
-    listed, notes = problem.limits.listed()
-    given = GivenGains(problem)
-    estimates = given.of_space() if listed is None else given.of_list(listed)
-    return choose(
-        replace(estimates, notes=(*estimates.notes, *notes)),
-        problem.limits,
-        estimator=type(given.estimator).__name__,
-        bound="none",  # the model may have seen the rows
-        num_simulations=0,
-        num_missing=0,
-        seed=problem.seed,
-    )
+    return eliminate(evaluator, action, budget, notes=notes)
 
 
 def _find_search(search: str | Search, actions: ActionSpace) -> Search:
