@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -31,6 +31,7 @@ from sbi_active.design.search import (
     Objective,
     Search,
 )
+from sbi_active.design.target import Target
 from sbi_active.expected import Shown, suggests
 from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed
@@ -125,7 +126,7 @@ class InformationGainDesigner(Shown):
         simulator: Callable[..., Any] | None = None,
         *,
         belief: Distribution | None = None,
-        target: str | Sequence[str] = "theta",
+        target: Target = "theta",
         simulations: Simulations | None = None,
         cost: Callable[[Tensor], Tensor] | Tensor | None = None,
         constraint: Callable[[Tensor], Tensor] | None = None,
@@ -147,9 +148,13 @@ class InformationGainDesigner(Shown):
             belief: Distribution of the parameters; None is ``model.belief``.
             target: "theta", all parameters; one or several names of the simulator's
                 parameters, the others being nuisances (:class:`.ParameterGain`, or
-                :class:`.LinearGain` where the estimator is "linear"); or "model", the
-                index of the rivals (:class:`.ModelIndexGain`). The estimates of
-                ParameterGain and of the latter are lower bounds.
+                :class:`.LinearGain` where the estimator is "linear"); a function of
+                the parameters, such as a controller's loss, whose value the action is
+                to tell: ``g(theta)``, or ``g(theta, effect)`` with a dict of the
+                effects' parameters by name, (n, theta_dim) -> (n,) or (n, k), by the
+                same estimators; or "model", the index of the rivals
+                (:class:`.ModelIndexGain`). The estimates of ParameterGain and of the
+                latter are lower bounds.
             simulations: Rows under the belief, such as those that the model was trained
                 on; then nothing is simulated. Half of them choose and half report, but
                 where the model has seen them, both are too high.

@@ -9,6 +9,14 @@ import torch
 from torch import Tensor
 
 
+class PosteriorModel(Protocol):
+    """Anything with a conditional density of parameters."""
+
+    def log_posterior(self, theta: Tensor, x: Tensor, action: Tensor) -> Tensor:
+        """Return log q(theta_i | x_i, action_i), shape (n,)."""
+        ...
+
+
 class LikelihoodModel(Protocol):
     """Anything with a conditional density of outcomes.
 
