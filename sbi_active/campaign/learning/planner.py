@@ -162,6 +162,12 @@ class Planner:
             return about_model, "model"
         own = "theta" if target in ("auto", "model") else target
         if isinstance(learner, PooledLearner):
+            if callable(own):
+                raise ValueError(
+                    "expected target 'theta' with max_simulations or a SummaryAction, "
+                    f"whose pool tells of all parameters; got {name_of(own)!r}; leave "
+                    "out target=, or max_simulations="
+                )
             design, own = learner.design(index, limits), "theta"
         else:
             design = self._about_parameters(index, own, learner, limits)
