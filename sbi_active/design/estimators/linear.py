@@ -45,7 +45,7 @@ class LinearGain(InformationGainEstimator):
     of it, counts as no information.
 
     Args:
-        target: Places of the parameters S, or a function of parameters (n, d) whose
+        index: Places of the parameters S, or a function of parameters (n, d) whose
             numbers (n, k) stand for them; None are all.
 
     Raises:
@@ -74,9 +74,9 @@ class LinearGain(InformationGainEstimator):
     needs_model = False
 
     def __init__(
-        self, target: Sequence[int] | Callable[[Tensor], Tensor] | None = None
+        self, index: Sequence[int] | Callable[[Tensor], Tensor] | None = None
     ) -> None:
-        self.target = None if target is None else numbers_of(target)
+        self.target = None if index is None else numbers_of(index)
 
     @override
     def remarks(

@@ -102,7 +102,7 @@ class ParameterGain(InformationGainEstimator):
     numbers of x are present.
 
     Args:
-        target: Places of the parameters S, or a function of parameters (n, d) whose
+        index: Places of the parameters S, or a function of parameters (n, d) whose
             numbers (n, k) stand for them.
         num_marginal: Number of draws of the belief for the marginal of the target; of a
             tenth its entropy has an error of .03 nat, common to all candidates.
@@ -122,12 +122,12 @@ class ParameterGain(InformationGainEstimator):
 
     def __init__(
         self,
-        target: Sequence[int] | Callable[[Tensor], Tensor],
+        index: Sequence[int] | Callable[[Tensor], Tensor],
         *,
         num_marginal: int = 20_000,
         few: int = 24,
     ) -> None:
-        self.target = numbers_of(target)
+        self.target = numbers_of(index)
         self.num_marginal, self.few = num_marginal, few
         self._marginal: tuple[Distribution, list[NormalScores], float] | None = None
 
