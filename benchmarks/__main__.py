@@ -38,12 +38,20 @@ def benchmarks() -> dict[str, str]:
     found = {}
     for path in sorted(HERE.rglob("*.py")):
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        mains = [node for node in tree.body if getattr(node, "name", "") == "main"]
-        if mains and path.name != "__main__.py":
+        if path.name != "__main__.py" and any(map(_is_main, tree.body)):
             *folders, last = path.relative_to(HERE).with_suffix("").parts
             parts = folders if last == "run" and folders else [*folders, last]
             found[".".join(parts)] = (ast.get_docstring(tree) or "").split("\n")[0]
     return found
+
+
+def _is_main(node: ast.stmt) -> bool:
+    """Return whether a statement defines ``main``, or makes one of its parts."""
+    targets = getattr(node, "targets", ())
+    return "main" in (
+        getattr(node, "name", ""),
+        *(getattr(t, "id", "") for t in targets),
+    )
 
 
 def module_of(name: str) -> str:

@@ -1,38 +1,62 @@
-"""Rows of results in CSV and JSON files, to which resumable benchmarks add."""
+"""Rows of results in files, and the one loop of benchmarks that add to them."""
 
 from __future__ import annotations
 
 import csv
+import inspect
+import io
 import json
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import product
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
+import pandas as pd
 from torch import Tensor
 
 T = TypeVar("T")
 Row = Mapping[str, Any]
+LONGEST = 300  # characters of an error that are kept
 
 
-def read(path: Path) -> list[dict[str, str]]:
-    """Return the rows of a CSV file, none if it is not there."""
+def read(path: Path) -> list[dict[str, Any]]:
+    """Return the rows of a file of CSV or of JSON lines, none if it is not there."""
     if not path.exists():
         return []
     with path.open(newline="") as file:
+        if path.suffix == ".jsonl":
+            return [json.loads(line) for line in file]
         return [*csv.DictReader(file)]
 
 
-def append(path: Path, columns: Sequence[str], rows: Sequence[Row]) -> None:
-    """Add rows to a CSV file, which is begun with its header, six digits a number."""
+def append(path: Path, rows: Sequence[Row]) -> None:
+    """Add rows to a file, six digits a number in CSV; new columns come last."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    is_new = not path.exists()
-    with path.open("a", newline="") as file:
+    known = read(path)
+    if path.suffix == ".jsonl":
+        with path.open("a") as file:
+            file.writelines(json.dumps(row) + "\n" for row in rows)
+        return
+    columns = dict.fromkeys(key for row in (*known[:1], *rows) for key in row)
+    if known and len(columns) == len(known[0]):
+        with path.open("a", newline="") as file:
+            writer = csv.DictWriter(file, columns, lineterminator="\n")
+            writer.writerows({k: short(v) for k, v in row.items()} for row in rows)
+    else:
+        write(path, [*known, *rows])
+
+
+def write(path: Path, rows: Sequence[Row]) -> None:
+    """Write a CSV file of these rows, whole: a kill costs nothing that was there."""
+    part = path.with_suffix(".part")
+    with part.open("w", newline="") as file:
+        columns = dict.fromkeys(key for row in rows for key in row)
         writer = csv.DictWriter(file, columns, lineterminator="\n")
-        if is_new:
-            writer.writeheader()
+        writer.writeheader()
         writer.writerows({k: short(v) for k, v in row.items()} for row in rows)
+    part.replace(path)
 
 
 def resumed(
@@ -41,45 +65,117 @@ def resumed(
     jobs: Iterable[Sequence[Any]],
     make: Callable[..., Row | Sequence[Row]],
     *,
-    columns: Sequence[str] | None = None,
     others: Sequence[Path] = (),
-) -> list[dict[str, str]]:
-    """Add the rows of jobs that a CSV file does not have yet, and return all its rows.
+    may_fail: bool = False,
+) -> list[dict[str, Any]]:
+    """Add the rows of jobs that a file does not have yet, and return all its rows.
 
     Args:
         path: Path of the file.
         keys: Columns that tell jobs apart.
         jobs: Values of these columns, which are the arguments of ``make``.
-        make: Function that returns the row, or the rows, of a job.
-        columns: Columns of the file; those of the first row by default.
+        make: Function that returns the row, or the rows, of a job; the columns that
+            tell jobs apart are added.
         others: Further files, whose rows are not made again either.
+        may_fail: Whether a crash is a result too, in the column "failure".
     """
     known = [row for own in (path, *others) for row in read(own)]
-    done = {tuple(row[key] for key in keys) for row in known}
+    done = {tuple(str(row[key]) for key in keys) for row in known}
     for job in jobs:
         if tuple(map(str, job)) in done:
             continue
         start = time.process_time()
-        made = make(*job)
-        rows = [made] if isinstance(made, Mapping) else [*made]
-        append(path, columns or [*rows[0]], rows)
+        try:
+            made = make(*job)
+        except Exception as error:
+            if not may_fail:
+                raise
+            made = {"failure": f"{type(error).__name__}: {error}"[:LONGEST]}
+        each = [made] if isinstance(made, Mapping) else made
+        rows = [dict(zip(keys, job, strict=True)) | {**row} for row in each]
+        if not rows:
+            continue
+        append(path, rows)
         said = rows[-1].get("failure") or rows[-1].get("verdict") or ""
         spent = f"{time.process_time() - start:.0f} CPU s"
         print(path.stem, *job, said, spent, flush=True)
     return read(path)
 
 
-def or_failure(make: Callable[[], Row]) -> Row:
-    """Return a row, or the column "failure" alone: a crash is a result too."""
-    try:
-        return make()
-    except Exception as error:
-        return {"failure": f"{type(error).__name__}: {error}"[:300]}
+def benchmark(
+    path: Path,
+    make: Callable[..., Row | Sequence[Row]],
+    table: Callable[[list[dict[str, Any]]], str],
+    *,
+    skip: Callable[..., bool] = lambda *job: False,
+    may_fail: bool = False,
+    **axes: Iterable[Any],
+) -> Callable[..., None]:
+    """Return the main of a benchmark: every case a row of one file, and their table.
+
+    Args:
+        path: File of the rows.
+        make: Function of a case that returns its row or rows.
+        table: Function that returns the table of the rows that are asked for: of a
+            range all from its first number on.
+        skip: Function that says which cases are not run.
+        may_fail: Whether a crash is a result too.
+        axes: Values of the columns that make a case; ranges vary slowest. Each is an
+            option, a range by its ends and in the plural: ``--seeds 0 10``.
+    """
+    ranges = {key: axis for key, axis in axes.items() if isinstance(axis, range)}
+    option = {key: key + "s" * (key in ranges) for key in axes}
+
+    def main(*, summary: bool = False, out: Path = path, **given: Any) -> None:
+        chosen = {
+            k: range(*given[name]) if k in ranges else given[name]
+            for k, name in option.items()
+        }
+        slowest = sorted(axes, key=lambda k: k not in ranges)
+        cases = product(*(chosen[k] for k in slowest))
+        named = (dict(zip(slowest, case, strict=True)) for case in cases)
+        jobs = (job for by in named if not skip(*(job := [by[k] for k in axes])))
+        rows = resumed(out, [*axes], () if summary else jobs, make, may_fail=may_fail)
+        print(table([r for r in rows if all(_is_asked(r[k], chosen[k]) for k in axes)]))
+
+    hints: dict[str, Any] = {"summary": bool, "out": Path}
+    defaults: dict[str, Any] = {"summary": False, "out": path}
+    lines = ["summary: Whether to run nothing, and print the table of the rows."]
+    lines += ["out: File of the rows."]
+    for key, axis in axes.items():
+        values = (axis.start, axis.stop) if isinstance(axis, range) else (*axis,)
+        kind = tuple[int, int] if key in ranges else Sequence[type(values[0])]
+        is_named = key not in ranges and isinstance(values[0], str)
+        hints[option[key]] = Annotated[kind, values] if is_named else kind
+        defaults[option[key]] = values
+        what = "First, and one past the last" if key in ranges else "Those that are run"
+        lines.append(f"{option[key]}: {what}, of each {key}.")
+    main.__doc__ = "Run the cases that are missing, and print the table.\n\nArgs:\n"
+    main.__doc__ += "\n".join(f"    {line}" for line in lines)
+    main.__annotations__ = hints
+    parameters = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default)
+        for name, default in defaults.items()
+    ]
+    main.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    return main
+
+
+def _is_asked(value: Any, among: Any) -> bool:
+    """Return whether a row's value is among an option's."""
+    if isinstance(among, range):
+        return int(value) >= among.start
+    return str(value) in map(str, among)
+
+
+def frame(rows: Sequence[Row]) -> pd.DataFrame:
+    """Return rows of text as a data frame of numbers, flags and texts."""
+    return pd.read_csv(io.StringIO(pd.DataFrame(rows).to_csv(index=False)))
 
 
 def column(rows: Sequence[Row], key: str, round_: int | None = None) -> np.ndarray:
     """Return a column of one round, or of all, as numbers; NaN where it is empty."""
-    kept = [r[key] for r in rows if round_ is None or int(r["round"]) == round_]
+    kept = [r.get(key) for r in rows if round_ is None or int(r["round"]) == round_]
     return np.array([float(v) if v else np.nan for v in kept])
 
 

@@ -10,9 +10,9 @@ __getattr__ = former_names(
         "CandidateSimulations": (
             "sbi_active.design.estimators.base:CandidateSimulations"
         ),
-        "ContrastiveGain": "sbi_active.design.estimators.likelihood:ContrastiveGain",
+        "ContrastiveGain": "sbi_active.design.estimators.contrast:ContrastiveGain",
         "EntropyGain": "sbi_active.design:EntropyGain",
-        "InfoNCEGain": "sbi_active.design.estimators.ratio:InfoNCEGain",
+        "InfoNCEGain": "sbi_active.design.estimators.contrast:InfoNCEGain",
         "InformationGainEstimator": "sbi_active.design:InformationGainEstimator",
         "LikelihoodGain": "sbi_active.design:LikelihoodGain",
         "LinearGain": "sbi_active.design:LinearGain",

@@ -6,11 +6,11 @@ import time
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import Normal
 
 from sbi_active import SimulatorModel, StudentTNoise, progress
-from sbi_active.criticism import Effect, Trials, close_loop
+from sbi_active.criticism import Trials, close_loop
 from sbi_active.progress import stage
+from tests.effects import BIAS
 
 SOON = 0.05
 
@@ -55,14 +55,6 @@ def test_steps_of_an_unknown_number_are_counted(caplog):
 
 
 def loop(**options):
-    bias = Effect(
-        "bias",
-        hook="observation",
-        prior=Normal(0.0, 1.0),
-        null=0.0,
-        apply=lambda x, phi, action, context: x + phi,
-    )
-
     def slow(theta, action):
         time.sleep(0.001)
         return theta * action
@@ -71,7 +63,7 @@ def loop(**options):
     action = torch.linspace(-1, 1, 6)[:, None]
     prior = BoxUniform(-5 * torch.ones(1), 5 * torch.ones(1))
     trials = Trials(action, 2 * action + 1)
-    return close_loop(model, prior, trials, effects=[bias], **options)
+    return close_loop(model, prior, trials, effects=[BIAS], **options)
 
 
 def test_the_closed_loop_tells_of_its_stages(caplog, capsys):

@@ -206,6 +206,13 @@ def test_question_which_parameters(run, capsys):
     assert "friction * mass" in capsys.readouterr().out
 
 
+def test_question_target(run):
+    (asked,) = run("docs/howto/target.md")
+    assert (float(asked.every.action), float(asked.own.action)) == (1.0, 0.0)
+    gain, error = asked.own.expected_information_gain, asked.own.standard_error
+    assert abs(float(gain[1])) < 0.05 + 3 * float(error[1])  # ice: nothing of it
+
+
 def test_question_two_models(run):
     (rivals,) = run("docs/howto/two_models.md")
     assert rivals.actions.contains(torch.as_tensor(rivals.found.action)[None]).all()

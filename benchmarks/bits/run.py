@@ -49,7 +49,7 @@ from sbi_active import (
     simulate,
 )
 from sbi_active.campaign.options import CampaignDetails
-from sbi_active.criticism import close_loop, generic_effects
+from sbi_active.criticism import generic_effects
 from sbi_active.inference.rounds.rows import Observation
 from sbi_active.seeding import forked_generators, row_normals
 from sbi_active.tasks import get_task
@@ -199,7 +199,7 @@ def adoption() -> list[Any]:
     run = Campaign(
         problem.model,
         problem.prior,
-        problem.actions,
+        get_world("A").actions,
         effects=problem.effects,
         seed=1,
         options=options,
@@ -222,15 +222,7 @@ def adoption() -> list[Any]:
 def verdict(world: str, kind: Any, number: int) -> list[Any]:
     """Return the probabilities of a report and its error before and after."""
     problem = draw_case(get_world(world), kind, number, num_trials=8).problem
-    report = close_loop(
-        problem.model,
-        problem.prior,
-        problem.trials,
-        effects=problem.effects,
-        actions=problem.actions,
-        seed=number,
-        plan=False,
-    )
+    report = problem.report(number, plan=False)
     table = report.before_after
     return [
         report.verdict,
@@ -244,14 +236,7 @@ def plan() -> list[Any]:
     task = get_task("numerical")
     problem = draw_case(get_world("A"), "library", 2, num_trials=8).problem
     effects = generic_effects(problem.model, task.actions, prior=problem.prior)
-    report = close_loop(
-        problem.model,
-        problem.prior,
-        problem.trials,
-        effects=effects,
-        actions=problem.actions,
-        seed=0,
-    )
+    report = problem.report(0, effects=effects)
     return [report.verdict, str(report.next_action)]
 
 

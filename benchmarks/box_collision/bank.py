@@ -17,8 +17,6 @@ from sbi_active.simulation.bank import Bank
 from sbi_active.simulation.workers import run_digest
 from sbi_active.tasks import Task
 
-__all__ = ["PriorBank"]
-
 
 class PriorBank:
     """A simulator's noise-free positions, looked up in a bank while it is open.

@@ -21,7 +21,6 @@ posterior density.
 
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -35,11 +34,12 @@ from benchmarks.box_collision.bank import PriorBank
 from benchmarks.box_collision.summary import (
     REPORTED,
     STAGES,
-    coverage_table,
+    gap,
     summarize,
 )
-from benchmarks.rows import read, resumed, short
-from sbi_active import Campaign, CampaignOptions, MixtureDensity, RefinementOptions
+from benchmarks.rounds import coverage_table
+from benchmarks.rows import read, resumed, short, write
+from sbi_active import Campaign, CampaignOptions, MixtureDensity
 from sbi_active.campaign import Trial
 from sbi_active.campaign.learning.methods import METHODS, find_method
 from sbi_active.campaign.options import CampaignDetails
@@ -68,16 +68,6 @@ SETTINGS: dict[str, tuple[CampaignOptions, dict[str, Any]]] = {
         ),
         {"left_table": "paper"},
     ),
-    # The paper's simulations with this library's inference; as in the paper, those of
-    # the training give the information as well.
-    "paper_size": (
-        CampaignOptions(
-            num_simulations=41 * 500,
-            details=CampaignDetails(num_scored=500, design_on="training"),
-            refinement=RefinementOptions(num_effective=100, num_draws=100),
-        ),
-        {},
-    ),
     "default": (
         CampaignOptions(num_samples=250, details=CampaignDetails(num_scored=500)),
         {},
@@ -91,15 +81,6 @@ SETTINGS: dict[str, tuple[CampaignOptions, dict[str, Any]]] = {
         {},
     ),
 }
-COLUMNS = [
-    *["seed", "theta_true", "round", "speed", "is_valid", "x", "y", "z", "eig"],
-    *["log_prob_true", "log_p_exact", "log_p_exact_se", "gap", "hpd"],
-    *[f"rep_err_{speed:g}" for speed in REPORTED],
-    *[f"exact_rep_err_{speed:g}" for speed in REPORTED],
-    *["num_simulations", "num_reused", "exact_ess", "exact_simulations", "exact_cpu"],
-    *[f"cpu_{s}" for s in STAGES],
-    *[f"wall_{s}" for s in STAGES],
-]
 
 
 class Resampled:
@@ -215,7 +196,7 @@ def run_trial(
             row["exact_cpu"] = time.process_time() - start
             if is_last:
                 row |= errors(task, Resampled(past), "exact_rep_err")
-        rows.append({"seed": seed, "round": index + 1} | row)
+        rows.append({"round": index + 1} | row)
     return rows
 
 
@@ -309,7 +290,7 @@ def add_references(method: str, target: str, arguments: Settings) -> None:
     for last in rows:
         seed, number = int(last["seed"]), int(last["round"])
         wanted = arguments.first <= seed < arguments.num_trials
-        if not wanted or number != arguments.rounds or last["log_p_exact"]:
+        if not wanted or number != arguments.rounds or last.get("log_p_exact"):
             continue
         start = time.process_time()
         task = make_task(target, arguments, seed)
@@ -324,12 +305,7 @@ def add_references(method: str, target: str, arguments: Settings) -> None:
         found["exact_cpu"] = time.process_time() - start
         found |= errors(task, Resampled(exact), "exact_rep_err")
         last |= {k: str(short(v)) for k, v in found.items()}
-        whole = path.with_suffix(".part")  # a kill must not cost what was there
-        with whole.open("w", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
-        whole.replace(path)
+        write(path, rows)
         spent = time.process_time() - start
         print(f"{path.stem} trial {seed}: reference, {spent:.0f} CPU s", flush=True)
 
@@ -349,7 +325,7 @@ def run_missing(method: str, target: str, arguments: Settings) -> None:
 
     seeds = [(seed,) for seed in range(arguments.first, arguments.num_trials)]
     path = path_of(method, target, arguments)
-    resumed(path, ["seed"], seeds, trial, columns=COLUMNS)
+    resumed(path, ["seed"], seeds, trial)
 
 
 def main(arguments: Settings) -> None:
@@ -369,4 +345,7 @@ def main(arguments: Settings) -> None:
             rows = [row for row in rows if int(row["seed"]) < arguments.num_trials]
             if rows:
                 cells[method, target] = rows
-    print(coverage_table(cells) if is_coverage else summarize(cells))
+    if is_coverage:
+        print(coverage_table(cells, (3, 4, 6), ("gap", gap)))
+    else:
+        print(summarize(cells))

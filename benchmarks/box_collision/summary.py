@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from benchmarks.published import published
+from benchmarks.rounds import (
+    Cells,
+    Rows,
+    active_against_random,
+    by_round,
+    num_rounds,
+)
 from benchmarks.rows import column
 from sbi_active.display.table import Table
-
-__all__ = [
-    "REPORTED",
-    "STAGES",
-    "coverage_table",
-    "summarize",
-]
 
 REPORTED = (3.0, 5.0, 7.0)  # m/s
 STAGES = ("simulation", "training", "design", "scoring", "update")
@@ -36,13 +34,7 @@ COMPARED = 3  # round by which target 2 should be pushed more slowly
 
 #: Of the reference's log p, nats, above which importance sampling has failed.
 LARGEST_ERROR = 0.5
-Rows = Sequence[Mapping[str, str]]
-Cells = Mapping[tuple[str, str], Rows]  # by method and target
-
-
-def num_rounds(rows: Rows) -> int:
-    """Return the last round."""
-    return max(int(r["round"]) for r in rows)
+PAIRS = (("asbi", "nsbi"), ("alhi", "nlhi"))  # chosen and random actions
 
 
 def summarize(cells: Cells) -> str:
@@ -54,7 +46,9 @@ def summarize(cells: Cells) -> str:
     if not cells:
         return "no trials yet"
     parts = [errors_table(cells), rounds_table(cells), time_table(cells)]
-    return "\n\n".join([*parts, *slower_pushes(cells), *active_against_random(cells)])
+    return "\n\n".join(
+        [*parts, *slower_pushes(cells), *active_against_random(cells, PAIRS)]
+    )
 
 
 def errors_table(cells: Cells) -> str:
@@ -81,10 +75,9 @@ def rounds_table(cells: Cells) -> str:
     table = []
     for (method, target), rows in cells.items():
         last = num_rounds(rows)
-        rounds = range(1, last + 1)
-        medians = [np.median(column(rows, "log_prob_true", r)) for r in rounds]
-        speeds = [column(rows, "speed", r).mean() for r in rounds]
-        shares = [1 - column(rows, "is_valid", r).mean() for r in rounds]
+        medians = [np.median(v) for v in by_round(rows, "log_prob_true")]
+        speeds = [v.mean() for v in by_round(rows, "speed")]
+        shares = [1 - v.mean() for v in by_round(rows, "is_valid")]
         table.append(
             [
                 f"target {target}, {method.upper()}",
@@ -138,50 +131,6 @@ def slower_pushes(cells: Cells) -> list[str]:
                 f"of {len(shared)} trials ({lower / len(shared):.2f}; bar .80)"
             )
     return lines
-
-
-def active_against_random(cells: Cells) -> list[str]:
-    """Return whether designed actions have the higher median, round by round."""
-    lines = []
-    for active, random in (("asbi", "nsbi"), ("alhi", "nlhi")):
-        for target in ("1", "2"):
-            if (active, target) not in cells or (random, target) not in cells:
-                continue
-            ours, theirs = cells[active, target], cells[random, target]
-            differences = [
-                np.median(column(ours, "log_prob_true", r))
-                - np.median(column(theirs, "log_prob_true", r))
-                for r in range(2, num_rounds(ours) + 1)
-            ]
-            above = sum(d > 0 for d in differences)
-            text = " / ".join(f"{d:+.2f}" for d in differences)
-            lines.append(
-                f"target {target}: {active.upper()} above {random.upper()} in median "
-                f"log p in {above} of rounds 2 to {num_rounds(ours)} ({text})"
-            )
-    return lines
-
-
-def coverage_table(cells: Cells) -> str:
-    """Return how often the truth is within regions of highest density."""
-    table = []
-    for (method, _), rows in cells.items():
-        for round_ in [r for r in (3, 4, 6) if r <= num_rounds(rows)]:
-            hpd = column(rows, "hpd", round_)
-            entry = [method.upper(), str(round_), str(len(hpd))]
-            for level in (0.5, 0.9):
-                inside = int((hpd <= level).sum())
-                low, high = stats.binom.interval(0.95, len(hpd), level)
-                share = f"{inside / len(hpd):.3f}"
-                verdict = "within" if low <= inside <= high else "outside"
-                bounds = f"[{low / len(hpd):.3f}, {high / len(hpd):.3f}]"
-                entry.append(f"{share} {verdict} {bounds}")
-            entry.append(gap(rows, round_))
-            table.append(entry)
-    if not table:
-        return "no trials of three rounds yet"
-    header = ["", "round", "trials", "in 50 % region", "in 90 % region", "gap"]
-    return Table(header, table).text()
 
 
 def by_seed(rows: Rows, round_: int) -> dict[int, float]:

@@ -1,9 +1,16 @@
-"""Refined beliefs, right ones and ones with a known error."""
+"""Are refined beliefs flagged that have a known error, and right ones not?
+
+    python -m benchmarks calibration.beliefs --problem square
+
+Beliefs are right, twice as wide, half as wide, or without one of two modes; "always"
+where every inference has the error, and ranks alone can tell. Seeds from 2000 on judge.
+"""
 
 from __future__ import annotations
 
 import math
 import time
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,6 +19,8 @@ from sbi.utils.sbiutils import within_support
 from torch import Tensor
 from torch.distributions import Distribution
 
+from benchmarks.calibration.table import shares
+from benchmarks.rows import benchmark
 from sbi_active.diagnostics import check_belief
 from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.refinement.refining import refine
@@ -29,10 +38,6 @@ KINDS = (
 )
 NUM_TRIALS = 3
 NUM_BANK = 4_000  # draws behind a damaged belief
-COLUMNS = [
-    *("problem", "kind", "seed", "verdict", "beyond", "within", "spread", "p_value"),
-    *("cpu_seconds", "reason"),
-]
 
 
 class Scaled(Belief):
@@ -117,9 +122,6 @@ def belief_row(problem: str, kind: str, seed: int) -> dict[str, object]:
         seed=derive_seed(seed, "check"),
     )
     return {
-        "problem": problem,
-        "kind": kind,
-        "seed": seed,
         "verdict": found.verdict,
         "beyond": " ".join(f"{v:.3g}" for v in found.beyond),
         "within": " ".join(f"{v:.3g}" for v in found.within),
@@ -128,3 +130,13 @@ def belief_row(problem: str, kind: str, seed: int) -> dict[str, object]:
         "cpu_seconds": time.process_time() - begin,
         "reason": found.reasons[0] if found.reasons else "",
     }
+
+
+main = benchmark(
+    Path(__file__).parent / "results/beliefs.csv",
+    belief_row,
+    shares,
+    problem=PROBLEMS,
+    kind=KINDS,
+    seed=range(2_000, 2_040),
+)

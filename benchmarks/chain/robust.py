@@ -13,16 +13,13 @@ judge.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
-from itertools import product
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import torch
 
 from benchmarks.chain.run import RESULTS
-from benchmarks.rows import resumed
+from benchmarks.rows import benchmark, frame
 from sbi_active import ASBI
 from sbi_active.display.table import Table
 from sbi_active.pyro import RobustASBI
@@ -72,9 +69,6 @@ def judged(seed: int, case: str, method: str) -> dict[str, Any]:
         else:
             belief = inference.update(x, action=action, seed=own)
     return {
-        "seed": seed,
-        "case": case,
-        "method": method,
         "log_prob_truth": float(belief.log_prob(task.theta_true)),
         "probability_outlier": flagged,
         "probability_others": max(others, default=0.0),
@@ -83,30 +77,6 @@ def judged(seed: int, case: str, method: str) -> dict[str, Any]:
         "divergences": divergences,
         "cpu_s": time.process_time() - start,
     }
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
-
-    Args:
-        seeds: Seeds, from the first to before the second.
-        summary: Whether to run nothing, and print the table of the rows.
-        out: File of the results.
-    """
-
-    seeds: tuple[int, int] = (2000, 2010)
-    summary: bool = False
-    out: Path = RESULTS
-
-
-def main(options: Settings) -> None:
-    """Run what is asked for and is not there yet, and print the table."""
-    seeds = () if options.summary else range(*options.seeds)
-    jobs = product(seeds, ("gross", "clean"), METHODS)
-    path = options.out / "robust.csv"
-    resumed(path, ["seed", "case", "method"], jobs, judged)
-    print(summary(pd.read_csv(path)))
 
 
 def summary(rows: pd.DataFrame) -> str:
@@ -137,3 +107,13 @@ def summary(rows: pd.DataFrame) -> str:
     header += ["largest P of others", "largest r_hat: median (most)"]
     header += ["least effective draws", "divergences"]
     return Table([*header, *(f"CPU s, {m}" for m in METHODS)], lines).text()
+
+
+main = benchmark(
+    RESULTS / "robust.csv",
+    judged,
+    lambda rows: summary(frame(rows)),
+    seed=range(2000, 2010),
+    case=("gross", "clean"),
+    method=METHODS,
+)

@@ -87,8 +87,6 @@ def judged(parameters: int, seed: int, *, with_reference: bool) -> dict[str, Any
     log_p = belief.log_prob(torch.cat([task.theta_true[None], draws[:NUM_RANKED]]))
     d = belief.diagnostics
     row: dict[str, Any] = {
-        "parameters": parameters,
-        "seed": seed,
         "method": type(belief).__name__,
         "covered": covered,
         "density_rank": float((log_p[1:] < log_p[0]).double().mean()),
@@ -131,8 +129,7 @@ def rounds(parameters: int, seed: int) -> list[dict[str, Any]]:
         seconds = time.process_time() - start
         parts = campaign.history[i].cpu_seconds
         d = campaign.belief.diagnostics  # pyright: ignore
-        row = {"parameters": parameters, "seed": seed, "round": i + 1}
-        row |= {"cpu_s": seconds, "trustworthy": bool(d.trustworthy)}
+        row = {"round": i + 1, "cpu_s": seconds, "trustworthy": bool(d.trustworthy)}
         row |= {f"{name}_s": value for name, value in sorted(parts.items())}
         rows.append(row)
     return rows

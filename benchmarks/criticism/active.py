@@ -27,8 +27,6 @@ from benchmarks.criticism.worlds import get_world
 from sbi_active import InformationGainDesigner
 from sbi_active.criticism import Criticism
 
-__all__ = ["ACTIVE_COLUMNS", "DETECTABLE", "score_active"]
-
 ACTIVE_COLUMNS = [
     *["case", "effects", "policy", "trials", "action", "verdict", "top", "place"],
     *["probability", "lambda", "trial_simulations", "cpu_seconds", "failure"],
@@ -91,7 +89,8 @@ def first_actions(world: str) -> Tensor:
 
 def _row(case: Case, number: int, policy: str) -> dict[str, object]:
     action = case.truth.action
-    return {
+    blank: dict[str, object] = dict.fromkeys(ACTIVE_COLUMNS, "")
+    return blank | {
         "case": number,
         "effects": " + ".join(case.truth.names),
         "policy": policy,
@@ -104,14 +103,7 @@ def _row(case: Case, number: int, policy: str) -> dict[str, object]:
 def _verdict(case: Case, number: int) -> tuple[Criticism, dict[str, object]]:
     problem, world = case.problem, case.truth.world
     model, count = counted(problem.model)
-    criticism = Criticism(
-        model,
-        problem.prior,
-        problem.trials,
-        effects=problem.effects,
-        actions=problem.actions,
-        seed=number,
-    )
+    criticism = replace(problem, model=model).criticism(number)
     tracing = criticism.trace()
     stated = merged(world, tracing.probabilities)
     truth = next(iter(merged(world, {true_name(world, *case.truth.names): 1.0})))

@@ -23,7 +23,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -36,12 +35,10 @@ from torch.distributions import Distribution
 from benchmarks.criticism.intervals import rate
 from benchmarks.criticism.worlds import get_world
 from benchmarks.criticism.worlds.numerical import NOISE_SD, response
-from benchmarks.rows import or_failure, resumed
+from benchmarks.rows import resumed
 from sbi_active import Campaign, CampaignOptions
 from sbi_active.criticism import Report
 from sbi_active.seeding import derive_seed, forked_generators, row_normals
-
-__all__ = ["COLUMNS", "run_case", "summary"]
 
 RESULTS = Path(__file__).parent / "results"
 KINDS = ("hidden", "clean")
@@ -101,8 +98,6 @@ def run_case(
     theta, strength = draw_truth(kind, number)
     measure = real_system(theta, strength, number)
     row: dict[str, object] = {
-        "case": number,
-        "kind": kind,
         "strength": strength,
         "theta": " ".join(f"{v:.6g}" for v in theta[0].tolist()),
     }
@@ -317,9 +312,8 @@ def main(arguments: Settings) -> None:
     """Run what is asked for and print the table."""
 
     def made(number: int, kind: str) -> Mapping[str, Any]:
-        case = partial(run_case, kind, number, num_trials=arguments.trials)
-        row = or_failure(partial(case, policy=arguments.policy))
-        return {"case": number, "kind": kind, **row}
+        options = {"num_trials": arguments.trials, "policy": arguments.policy}
+        return dict.fromkeys(COLUMNS, "") | run_case(kind, number, **options)
 
     last = arguments.first + arguments.cases
     rows: list[dict[str, str]] = []
@@ -327,5 +321,5 @@ def main(arguments: Settings) -> None:
         is_run = not arguments.summary and arguments.kind in (None, kind)
         jobs = [(n, kind) for n in range(arguments.first, last) if is_run]
         path = arguments.out / f"campaign_{kind}_{arguments.policy}.csv"
-        rows += resumed(path, ["case", "kind"], jobs, made, columns=COLUMNS)
+        rows += resumed(path, ["case", "kind"], jobs, made, may_fail=True)
     print("\n".join(summary(rows)))

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain, combinations, count
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from sbi.utils import BoxUniform
@@ -19,11 +19,16 @@ from torch import Tensor
 from benchmarks.criticism.refit import residual_sum_of_squares
 from benchmarks.criticism.worlds import World
 from sbi_active import DiscreteActions, SimulatorModel
-from sbi_active.criticism import Context, Effect, Trials
+from sbi_active.criticism import (
+    Context,
+    Criticism,
+    Effect,
+    Report,
+    Trials,
+    close_loop,
+)
 from sbi_active.criticism.data import Role
 from sbi_active.seeding import derive_seed, forked_generators, row_normals, row_seeds
-
-__all__ = ["Case", "Kind", "Problem", "Truth", "draw_case"]
 
 Kind = Literal["clean", "library", "outside", "removed", "inexpressible", "pair"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -51,7 +56,18 @@ class Problem:
     prior: BoxUniform
     trials: Trials
     effects: list[Effect]
-    actions: DiscreteActions
+    actions: DiscreteActions | None = None
+
+    def criticism(self, seed: int) -> Criticism:
+        """Return the loop, step by step."""
+        given = {"effects": self.effects, "actions": self.actions, "seed": seed}
+        return Criticism(self.model, self.prior, self.trials, **given)
+
+    def report(self, seed: int, **options: Any) -> Report:
+        """Return the report of the loop in one call."""
+        given = {"effects": self.effects, "actions": self.actions, "seed": seed}
+        given |= options
+        return close_loop(self.model, self.prior, self.trials, **given)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,8 +9,6 @@ import numpy as np
 
 from benchmarks.criticism.active import DETECTABLE
 
-__all__ = ["SCORES", "Curves"]
-
 #: Scores of a row, by what a table calls them.
 SCORES = {
     "top-1": lambda row: row["top"] == "True",

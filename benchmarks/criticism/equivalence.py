@@ -6,8 +6,6 @@ from collections.abc import Mapping
 
 from benchmarks.criticism.worlds import World
 
-__all__ = ["merged", "true_name"]
-
 
 def true_name(world: World, effects: str) -> str:
     """Return the name that the loop should give a single truth."""

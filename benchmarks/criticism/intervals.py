@@ -7,8 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import norm
 
-__all__ = ["brier_score", "rate", "reliability", "wilson"]
-
 Z = float(norm.ppf(0.975))
 
 

@@ -13,8 +13,6 @@ from benchmarks.criticism.refit import local_fits
 from sbi_active.criticism import joint_prior
 from sbi_active.seeding import derive_seed
 
-__all__ = ["oracle_rmse"]
-
 NUM_DRAWS = 2_000
 DEGREES = 5  # of freedom of the proposal
 INFLATION = 1.5  # of its covariance

@@ -10,8 +10,6 @@ from sbi.utils import BoxUniform
 from scipy.optimize import OptimizeResult, differential_evolution, least_squares
 from torch import Tensor
 
-__all__ = ["local_fits", "residual_sum_of_squares"]
-
 STARTS = 8
 GENERATIONS = 20  # of as many candidates as starts, where the simulator is rough
 RUNS = 4  # there at most, as each finds an upper bound

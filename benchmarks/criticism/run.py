@@ -27,9 +27,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from benchmarks.criticism import tables
-from benchmarks.criticism.active import ACTIVE_COLUMNS, score_active
+from benchmarks.criticism.active import score_active
 from benchmarks.criticism.cases import KINDS, draw_case
-from benchmarks.criticism.scores import COLUMNS, score_case
+from benchmarks.criticism.scores import score_case
 from benchmarks.criticism.worlds import get_world
 from benchmarks.rows import read, resumed
 
@@ -108,7 +108,6 @@ def run_setting(arguments: Settings, kind: str) -> None:
         ["case"],
         [(number,) for number in range(arguments.first, last)],
         made,
-        columns=ACTIVE_COLUMNS if is_active else COLUMNS,
         others=others,
     )
 

@@ -7,6 +7,7 @@ import functools
 import json
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from torch import Tensor
@@ -14,10 +15,8 @@ from torch import Tensor
 from benchmarks.criticism.cases import Case
 from benchmarks.criticism.oracle import oracle_rmse
 from sbi_active import SimulatorModel
-from sbi_active.criticism import Report, close_loop
+from sbi_active.criticism import Report
 from sbi_active.criticism.under_misfit import UNDECLARED
-
-__all__ = ["COLUMNS", "counted", "score_case"]
 
 COLUMNS = [
     *["case", "effects", "strengths", "theta", "correlation", "lambda", "support"],
@@ -52,7 +51,8 @@ def score_case(case: Case, number: int, *, oracle: bool = False) -> dict[str, ob
         oracle: Also score the model that is given the true effect.
     """
     problem, truth = case.problem, case.truth
-    row: dict[str, object] = {
+    row: dict[str, object] = dict.fromkeys(COLUMNS, "")
+    row |= {
         "case": number,
         "effects": " + ".join(truth.names) or "none",
         "strengths": " ".join(f"{float(s):.6g}" for s in truth.strengths),
@@ -64,15 +64,8 @@ def score_case(case: Case, number: int, *, oracle: bool = False) -> dict[str, ob
     model, count = counted(problem.model)
     start = time.process_time()
     try:
-        report = close_loop(
-            model,
-            problem.prior,
-            problem.trials,
-            effects=problem.effects,
-            actions=problem.actions,
-            seed=number,
-            plan=False,  # no table needs it but that of active choice
-        )
+        # No table needs a plan but that of active choice.
+        report = replace(problem, model=model).report(number, plan=False)
     except Exception as error:  # a crash is a result of the benchmark
         return row | {"failure": f"{type(error).__name__}: {error}"[:300]}
     row |= {

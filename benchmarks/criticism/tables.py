@@ -16,8 +16,6 @@ from benchmarks.criticism.intervals import brier_score, rate, reliability
 from benchmarks.criticism.worlds import World
 from sbi_active.criticism.under_misfit import UNDECLARED
 
-__all__ = ["summary"]
-
 Row = Mapping[str, str]
 #: Of lambda, residual sum of squares in units of the noise.
 BINS = ((0.0, 10.0), (10.0, 25.0), (25.0, np.inf))

@@ -13,27 +13,22 @@ made at seeds below 100. Resumable; rows in benchmarks/dear/results/skewed.csv.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import torch
 from sbi.utils import BoxUniform
 from scipy.stats import t as student
 from torch import Tensor
 
 from benchmarks.dear.run import stock
-from benchmarks.rows import resumed
+from benchmarks.rows import benchmark, column, grouped
 from sbi_active.display import Table
 from sbi_active.inference import RefinementOptions, refine
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.support import within_support
 
-ROWS = Path(__file__).parent / "results" / "skewed.csv"
-COLUMNS = ["method", "histories", "seed", "kl", "shift", "trustworthy", "cpu"]
 TIMES = torch.linspace(0.5, 2.5, 5)
 ACTION = torch.tensor([[0.6], [1.0], [1.4], [1.8]])
 TRUTH = torch.tensor([[1.5, 0.8, 0.7]])
@@ -96,59 +91,43 @@ def judged(task: Skewed, belief: Any, x: Tensor) -> dict[str, float]:
     return {"kl": 0.5 * float(kl), "shift": shift}
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
-
-    Args:
-        seeds: First seed, and the one after the last.
-        histories: Numbers of parameter draws.
-        methods: Names of methods.
-        summary: Whether to run nothing, and print the table of the rows.
-    """
-
-    seeds: tuple[int, int] = (3000, 3006)
-    histories: Sequence[int] = (500, 3_000)
-    methods: Sequence[str] = ("refine", "TSNPE", "SNPE-C")
-    summary: bool = False
-
-
-def main(given: Settings) -> None:
-    """Run what is asked for and is not there yet, and print the table."""
+def row_of(method: str, num: int, seed: int) -> dict[str, object]:
+    """Return the error of a belief by a method, from so many histories."""
     task = Skewed()
+    with forked_generators(derive_seed(seed, "real")):
+        x = task.simulator(TRUTH.expand(len(ACTION), -1), ACTION)
+    start = time.process_time()
+    trust: object = ""
+    if method == "refine":
+        own = RefinementOptions(num_histories=num)
+        belief = refine(
+            *(task.simulator, task.prior, ACTION, x), settings=own, seed=seed
+        )
+        trust = belief.diagnostics.trustworthy
+    else:
+        trials = [*zip(ACTION, x, strict=True)]
+        belief = stock(task, method, num * len(ACTION), trials, seed)
+    cpu = time.process_time() - start
+    return {**judged(task, belief, x), "trustworthy": trust, "cpu": cpu}
 
-    def made(method: str, num: int, seed: int) -> Mapping[str, object]:
-        with forked_generators(derive_seed(seed, "real")):
-            x = task.simulator(TRUTH.expand(len(ACTION), -1), ACTION)
-        start = time.process_time()
-        if method == "refine":
-            own = RefinementOptions(num_histories=num)
-            belief = refine(
-                *(task.simulator, task.prior, ACTION, x), settings=own, seed=seed
-            )
-            trust: object = belief.diagnostics.trustworthy
-        else:
-            trials = [*zip(ACTION, x, strict=True)]
-            belief, trust = stock(task, method, num * len(ACTION), trials, seed), ""
-        row = {"method": method, "histories": num, "seed": seed, "trustworthy": trust}
-        return row | {"cpu": time.process_time() - start, **judged(task, belief, x)}
 
-    seeds = () if given.summary else range(*given.seeds)
-    jobs = [(m, n, s) for s in seeds for n in given.histories for m in given.methods]
-    keys = ["method", "histories", "seed"]
-    rows = pd.DataFrame(resumed(ROWS, keys, jobs, made, columns=COLUMNS))
-    if rows.empty:
-        return
-    numbers = rows.astype({"kl": float, "shift": float, "cpu": float})
-    lines = [
-        [
-            *(str(part) for part in key),
-            str(len(own)),
-            f"{own['kl'].mean():.3f} / {own['kl'].median():.3f}",
-            *(f"{own['shift'].mean():.2f}", f"{own['cpu'].mean():.1f}"),
-        ]
-        for key, own in numbers.groupby(["histories", "method"])
-        if isinstance(key, tuple)
-    ]
+def table(rows: list[dict[str, str]]) -> str:
+    """Return errors and cost, by histories and method."""
+    lines = []
+    groups = grouped(rows, "histories", "method")
+    for key in sorted(groups):
+        kl, shift, cpu = (column(groups[key], k) for k in ("kl", "shift", "cpu"))
+        errors = f"{kl.mean():.3f} / {np.median(kl):.3f}", f"{shift.mean():.2f}"
+        lines.append([*key, str(len(kl)), *errors, f"{cpu.mean():.1f}"])
     header = ["histories", "method", "seeds", "KL: mean / median", "shift [sd]"]
-    print(Table([*header, "CPU s"], lines).text())
+    return Table([*header, "CPU s"], lines).text()
+
+
+main = benchmark(
+    Path(__file__).parent / "results/skewed.csv",
+    row_of,
+    table,
+    method=("refine", "TSNPE", "SNPE-C"),
+    histories=(500, 3_000),
+    seed=range(3000, 3006),
+)

@@ -1,6 +1,6 @@
 """What three chosen trials do to a verdict, beside random and spread-out ones.
 
-    python -m benchmarks experiments --first 6000 --cases 40
+    python -m benchmarks experiments --cases 6000 6040
     python -m benchmarks experiments --summary
 
 The machines, the effects and what nobody declared are those of the misfit benchmark, of
@@ -16,9 +16,7 @@ design, in benchmarks/experiments/results.jsonl. The groups of machines take tur
 
 from __future__ import annotations
 
-import json
 import time
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -29,6 +27,7 @@ from benchmarks.criticism.intervals import rate
 from benchmarks.experiments.reality import Reality, spread_out
 from benchmarks.misfit.cases import Case, Kind, draw_case
 from benchmarks.misfit.verdicts import read_report
+from benchmarks.rows import benchmark
 from sbi_active.criticism import Report, close_loop
 from sbi_active.criticism.experiments.settle import with_trial
 from sbi_active.display.table import Table
@@ -38,7 +37,6 @@ RESULTS = Path(__file__).parent / "results.jsonl"
 DESIGNS = ("chosen", "random", "spread out")
 KINDS: tuple[Kind, ...] = ("E", "R")
 NUM_TRIALS = 3
-FIRST_JUDGED = 6_000
 NO_NAMES = {"none", "unexplained", "scatter", "outlier"}
 
 Row = dict[str, Any]
@@ -71,19 +69,16 @@ def verdict_of(case: Case, number: int, design: str) -> Report:
     return close_loop(*given, trials, plan=False, **options)
 
 
-def row_of(group: str, kind: Kind, number: int, design: str) -> Row:
+def row_of(number: int, kind: Kind, design: str) -> Row:
     """Return the row of one case and design."""
+    group = ("own", "letters")[number % 2]
     case = draw_case(group, kind, number)
     truth = case.truth
     right = frozenset().union(*[truth.machine.equivalent(n) for n in truth.names])
-    row: Row = {"group": group, "kind": kind, "case": number, "design": design}
-    row |= {"machine": truth.machine.name, "true": [*truth.names]}
+    row = {"group": group, "machine": truth.machine.name, "true": [*truth.names]}
     row |= {"right": sorted(right) if kind == "E" else []}
     start = time.process_time()
-    try:
-        report = verdict_of(case, number, design)
-    except Exception as error:  # a crash is a result of the benchmark
-        return row | {"failure": f"{type(error).__name__}: {error}"[:300]}
+    report = verdict_of(case, number, design)
     tested = [
         {
             "action": [round(v, 4) for v in trial.registered.action.tolist()],
@@ -106,22 +101,14 @@ def row_of(group: str, kind: Kind, number: int, design: str) -> Row:
     }
 
 
-def read_rows() -> list[Row]:
-    """Return the rows so far."""
-    if not RESULTS.exists():
-        return []
-    return [json.loads(line) for line in RESULTS.read_text().splitlines()]
-
-
-def lines_of(rows: Sequence[Row]) -> list[str]:
+def lines_of(rows: Sequence[Row]) -> str:
     """Return the lines of the summary, of cases that have all designs."""
     of: dict[tuple[Any, ...], dict[str, Row]] = {}
     for row in rows:
-        key = row["group"], row["kind"], row["case"]
-        of.setdefault(key, {})[row["design"]] = row
+        of.setdefault((row["kind"], row["case"]), {})[row["design"]] = row
     whole = [c for c in of.values() if {*DESIGNS} <= {*c}]
-    failed = [r for c in whole for r in c.values() if "failure" in r]
-    whole = [c for c in whole if not any("failure" in r for r in c.values())]
+    failed = [r for c in whole for r in c.values() if r.get("failure")]
+    whole = [c for c in whole if not any(r.get("failure") for r in c.values())]
     cells = []
     for design in ("none", *DESIGNS):
         own = [c[design] if design in c else _before(c["chosen"]) for c in whole]
@@ -144,7 +131,7 @@ def lines_of(rows: Sequence[Row]) -> list[str]:
         kind = "right names" if named <= {*row["right"]} else "a wrong name"
         parts.setdefault("no name" if nothing else kind, []).append(trial["held"])
     lines += [f"90 % predictions after {k} held: {rate(v)}" for k, v in parts.items()]
-    return lines
+    return "\n".join(lines)
 
 
 def _before(chosen: Row) -> Row:
@@ -161,31 +148,12 @@ def _is_right(row: Row) -> bool:
     return bool(row["named"]) and {*row["named"]} <= {*row["right"]}
 
 
-def main(first: int = FIRST_JUDGED, cases: int = 40, *, summary: bool = False) -> None:
-    """Run what is not there yet, and print the summary.
-
-    Args:
-        first: Number of the first case.
-        cases: Number of cases of each kind.
-        summary: Whether to run nothing.
-    """
-    warnings.simplefilter(
-        "ignore"
-    )  # trials are at actions that are not permitted again
-    done = {(r["group"], r["kind"], r["case"], r["design"]) for r in read_rows()}
-    for number in range(first, first + cases) if not summary else ():
-        group = ("own", "letters")[number % 2]
-        for kind in KINDS:
-            for design in DESIGNS:
-                if (group, kind, number, design) in done:
-                    continue
-                row = row_of(group, kind, number, design)
-                with RESULTS.open("a") as file:
-                    file.write(json.dumps(row) + "\n")
-                said = (
-                    row.get("failure") or f"{row['verdict']} ({row['cpu_seconds']} s)"
-                )
-                print(f"{kind} {number} {row['true']}, {design}: {said}", flush=True)
-    is_judged = first >= FIRST_JUDGED
-    rows = [r for r in read_rows() if (r["case"] >= FIRST_JUDGED) == is_judged]
-    print(*lines_of(rows), sep="\n")
+main = benchmark(
+    RESULTS,
+    row_of,
+    lines_of,
+    may_fail=True,
+    case=range(6_000, 6_040),
+    kind=KINDS,
+    design=DESIGNS,
+)

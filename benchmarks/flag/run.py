@@ -15,23 +15,14 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Iterator, Sequence
-from itertools import product
 from pathlib import Path
 
-import torch
-
-from benchmarks import rows
 from benchmarks.flag.problems import FAMILIES, problem
+from benchmarks.rows import benchmark
 from tests.oracles.judging import Found, Limits, judged
 from tests.oracles.reference import answer
 from tests.oracles.ways import refined
 
-ROWS = Path(__file__).parent / "rows.csv"
-COLUMNS = [
-    *["family", "noise", "dim", "seed", "belief", "kl", "shift", "trustworthy"],
-    *["effective", "num_simulations", "cpu_seconds"],
-]
-FIRST_SEED, NUM_SEEDS, DIMS = 200, 10, (3, 4, 6)
 NUM, FINAL, FEWEST_EFFECTIVE = 4_000, 12_000, 500.0
 
 
@@ -55,10 +46,6 @@ def row_of(family: str, noise: str, dim: int, seed: int) -> dict[str, object]:
     known = answer(own, num=NUM, final=FINAL, seed=seed)
     result = judged(own, known, found)
     return {
-        "family": family,
-        "noise": noise,
-        "dim": dim,
-        "seed": seed,
         "belief": found.kind,
         "kl": f"{result.kl:.4f}",
         "shift": f"{result.shift:.3f}",
@@ -93,24 +80,12 @@ def table_of(table: Sequence[dict[str, str]]) -> Iterator[str]:
         )
 
 
-def main(
-    *, summary: bool = False, first_seed: int = FIRST_SEED, path: Path = ROWS
-) -> None:
-    """Run what is not there yet, and print the table.
-
-    Args:
-        summary: Whether to run nothing.
-        first_seed: First of ten seeds of each family, noise and size.
-        path: File of the rows.
-    """
-    torch.set_num_threads(1)
-    keys = "family", "noise", "dim", "seed"
-    done = {tuple(r[key] for key in keys) for r in rows.read(path)}
-    seeds = range(first_seed, first_seed + NUM_SEEDS)
-    cases = product(("declared", "drawn"), FAMILIES, DIMS, seeds)
-    for noise, family, dim, seed in () if summary else cases:
-        if (family, noise, str(dim), str(seed)) not in done:
-            row = row_of(family, noise, dim, seed)
-            rows.append(path, COLUMNS, [row])
-            print(", ".join(map(str, row.values())), flush=True)
-    print("\n".join(table_of(rows.read(path))))
+main = benchmark(
+    Path(__file__).parent / "rows.csv",
+    row_of,
+    lambda rows: "\n".join(table_of(rows)),
+    family=FAMILIES,
+    noise=("declared", "drawn"),
+    dim=(3, 4, 6),
+    seed=range(200, 210),
+)

@@ -1,6 +1,6 @@
 """Forces that nobody declared, hidden in machines whose truth is known.
 
-    python -m benchmarks forces --machine pendulum --kind single --first 2000
+    python -m benchmarks forces --machine pendulum --kind single
     python -m benchmarks forces --summary
 
 Machines are in ``machines.py``. single: one force of the dictionary, of a size at which
@@ -22,9 +22,7 @@ its own (OMP_NUM_THREADS=1).
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import torch
@@ -33,7 +31,7 @@ from torch import Tensor
 from benchmarks.forces.hidden import FITTED, HELD_OUT, NUM_TRIALS, Hidden, draw
 from benchmarks.forces.machines import MACHINES, Machine, machine
 from benchmarks.forces.summary import summary
-from benchmarks.rows import resumed
+from benchmarks.rows import benchmark
 from sbi_active.criticism import (
     AugmentedSimulator,
     Criticism,
@@ -46,23 +44,6 @@ from sbi_active.criticism.forces import force_effects
 from sbi_active.criticism.results import Tracing
 
 RESULT = Path(__file__).parent / "result.csv"
-COLUMNS = [
-    *["machine", "kind", "case", "form", "size", "excess", "verdict", "family"],
-    *[
-        "p_family",
-        "p_form",
-        "set",
-        "misses",
-        "stand_in",
-        "refuted",
-        "p_value",
-        "p_held_out",
-    ],
-    "log_process",
-    *["held_bare", "held_after", "simulated_trials", "scored_trials", "cpu_seconds"],
-]
-KINDS = ("single", "outside", "clean", "magnet")
-FIRST_JUDGED = 2_000
 #: Level of the set of effects that is to hold the truth.
 LEVEL = 0.95
 #: Posterior draws behind a prediction of held-out trials.
@@ -101,9 +82,6 @@ def run_case(name: str, kind: str, number: int) -> dict[str, object]:
         for names in ((), judged.chosen)
     )
     return {
-        "machine": name,
-        "kind": kind,
-        "case": number,
         "form": hidden.name,
         "size": hidden.size,
         "excess": hidden.excess,
@@ -183,41 +161,12 @@ def _held_out(
     return float((scaled**2).mean().sqrt())
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
-
-    Args:
-        machine: Name of a machine.
-        kind: Kind of cases; all by default.
-        first: Number of the first case.
-        cases: Number of cases.
-        result: File of the results.
-        summary: Whether to run nothing, and print the table of the rows.
-    """
-
-    machine: Annotated[str | None, MACHINES] = None
-    kind: Annotated[str | None, KINDS] = None
-    first: int = FIRST_JUDGED
-    cases: int = 10
-    result: Path = RESULT
-    summary: bool = False
-
-
-def main(arguments: Settings) -> None:
-    """Run what is asked for and print the table of the judging seeds."""
-    names = [arguments.machine] if arguments.machine else [*MACHINES]
-    kinds = [arguments.kind] if arguments.kind else [*KINDS]
-    numbers = range(arguments.first, arguments.first + arguments.cases)
-    jobs = [
-        (name, kind, number)
-        for number in numbers
-        for name in names
-        for kind in kinds
-        if not arguments.summary and (kind != "magnet" or name == "pendulum")
-    ]
-    keys = ["machine", "kind", "case"]
-    rows = resumed(arguments.result, keys, jobs, run_case, columns=COLUMNS)
-    first = FIRST_JUDGED if arguments.first >= FIRST_JUDGED else 0
-    judged = [r for r in rows if int(r["case"]) >= first]
-    print(*summary(judged), sep="\n")
+main = benchmark(
+    RESULT,
+    run_case,
+    summary,
+    skip=lambda machine, kind, case: kind == "magnet" and machine != "pendulum",
+    machine=MACHINES,
+    kind=("single", "outside", "clean", "magnet"),
+    case=range(2_000, 2_010),
+)

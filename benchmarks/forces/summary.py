@@ -59,7 +59,7 @@ def is_flagged(row: Row) -> bool:
     return bool(row["stand_in"]) or withdrawn or row["verdict"] == "unexplained"
 
 
-def summary(rows: Sequence[Row]) -> list[str]:
+def summary(rows: Sequence[Row]) -> str:
     """Return the lines of the table, machines apart and together."""
     machines = [*dict.fromkeys(r["machine"] for r in rows)]
     lines = []
@@ -86,4 +86,4 @@ def summary(rows: Sequence[Row]) -> list[str]:
             f"{trials.max():,.0f} and {seconds.max():.0f} at most; held-out errors "
             f"take {np.median(scored):,.0f} more"
         )
-    return lines
+    return "\n".join(lines)

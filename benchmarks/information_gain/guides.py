@@ -11,8 +11,6 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import constraints
 
-__all__ = ["Pilot", "conditional", "marginal", "posterior"]
-
 NUM_MARGINAL = 12  # components of the marginal's mixture
 HIDDEN = 64  # units of the mixture's network
 

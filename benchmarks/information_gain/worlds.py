@@ -16,8 +16,6 @@ from torch.distributions.constraints import real_vector
 from benchmarks.information_gain.guides import Pilot
 from sbi_active.tasks import Task, get_task
 
-__all__ = ["NUM_PILOT", "World", "worlds"]
-
 POOL = 200_000  # draws that stand in for the belief of round 2
 NUM_PILOT = 1_000  # simulations an action that standardize the outcomes
 

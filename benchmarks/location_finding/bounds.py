@@ -44,14 +44,6 @@ from torch import Tensor
 from benchmarks.location_finding.kernels import KernelProposal
 from sbi_active.tasks.location_finding.model import log_likelihood
 
-__all__ = [
-    "contrastive_bounds",
-    "history_log_likelihood",
-    "near_cap",
-    "posterior_bounds",
-    "proposal_bounds",
-]
-
 CHUNK = 20_000  # parameters at once
 CLOSE = 1.0  # nats below log(L + 1), within which the lower bound is no longer tight
 

@@ -31,8 +31,6 @@ from benchmarks.location_finding.bounds import history_log_likelihood
 from sbi_active.inference import Belief
 from sbi_active.tasks import Task
 
-__all__ = ["ParticleBelief"]
-
 EFFECTIVE = 0.5  # share of the particles, in a step
 NUM_SWEEPS = 12  # of moves, a step
 SCALES = (0.05, 1.2)  # of differences, between which moves are log-uniform

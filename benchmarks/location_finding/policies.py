@@ -24,16 +24,6 @@ from sbi_active import ASBI, DiscreteActions, InformationGainDesigner
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import Task
 
-__all__ = [
-    "POLICIES",
-    "Fixed",
-    "Myopic",
-    "MyopicParticles",
-    "Policy",
-    "Random",
-    "candidates",
-]
-
 
 class Policy(ABC):
     """Chooses places in one roll-out.

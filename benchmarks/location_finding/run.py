@@ -33,15 +33,8 @@ from benchmarks.rows import resumed
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task
 
-__all__ = ["CONTRASTIVE", "roll_out"]
-
 CONTRASTIVE = 500_000  # L, as in Foster et al. (2021)
 PARTICLES = 2_000  # of the posterior behind the proposal
-COLUMNS = [
-    *["rollout", "theta_true", "spce", "snmc", "lower", "upper"],
-    *["effective", "belief_gain", "num_simulations"],
-    *["cpu_design", "cpu_belief", "cpu_bounds", "places", "outcomes"],
-]
 
 
 def roll_out(
@@ -89,7 +82,6 @@ def roll_out(
         particles.theta, action, x, truth, seed=derive_seed(rollout, "proposal")
     )
     row: dict[str, Any] = {
-        "rollout": rollout,
         "theta_true": " ".join(f"{v:.6g}" for v in truth.tolist()),
         "spce": float(spce),
         "snmc": float(snmc),
@@ -143,7 +135,7 @@ def run(policy: str, arguments: Settings) -> None:
     last = arguments.first + arguments.rollouts
     jobs = [(rollout,) for rollout in range(arguments.first, last)]
     path = arguments.out / f"{name}.csv"
-    resumed(path, ["rollout"], jobs, made, columns=COLUMNS)
+    resumed(path, ["rollout"], jobs, made)
 
 
 def main(arguments: Settings) -> None:

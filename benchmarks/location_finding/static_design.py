@@ -28,8 +28,6 @@ from torch import Tensor
 
 from sbi_active.tasks.location_finding.model import NOISE_SD, mean
 
-__all__ = ["PATH", "contrastive_bound", "load", "optimize"]
-
 PATH = Path(__file__).parent / "static_design.csv"
 
 

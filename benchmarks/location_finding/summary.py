@@ -14,8 +14,6 @@ from benchmarks.location_finding.bounds import near_cap
 from benchmarks.published import published
 from sbi_active.display.table import Table
 
-__all__ = ["PUBLISHED", "RESULTS", "Rows", "difference", "mean_and_error", "table"]
-
 RESULTS = Path(__file__).parent / "results"
 FULL = 500_000  # contrastive draws that a file's name leaves out
 
@@ -43,7 +41,7 @@ def read(folder: Path, policy: str, num_trials: int, num_contrastive: int) -> Ro
     with path.open(newline="") as file:
         return {
             int(row["rollout"]): {
-                key: float(row[key]) if row[key] else np.nan
+                key: float(row.get(key) or "nan")
                 for key in (*BOUNDS, *COSTS, "effective", "belief_gain")
             }
             for row in csv.DictReader(file)

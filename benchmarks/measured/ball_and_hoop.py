@@ -50,8 +50,6 @@ from sbi_active.tasks.ball_and_hoop.recordings import (  # pyright: ignore
 )
 from sbi_active.tasks.records import Pieces, Record, cut  # pyright: ignore
 
-__all__ = ["fit_hoop", "free_run", "main", "make_bench", "run_pieces"]
-
 RESULT = Path(__file__).parent / "results" / "ball_and_hoop.json"
 CHANNEL = "speed [V]"
 LABELS = ("begin [s]", "start [V]")

@@ -41,8 +41,6 @@ from sbi_active.tasks.ball_drops import (  # pyright: ignore
     trials_of,
 )
 
-__all__ = ["called", "judge", "main", "score", "tables"]
-
 Array = NDArray[Any]
 Row = dict[str, Any]
 DATA = Path("../shared/data/ball_drops")

@@ -11,8 +11,6 @@ from matplotlib.figure import Figure
 from benchmarks.measured.ball_forecast import Forecast
 from sbi_active.tasks.ball_drops import Drop  # pyright: ignore
 
-__all__ = ["draw_exponents", "draw_forecasts"]
-
 BEFORE, AFTER, FAINT = "#b5533c", "#2b6a8f", "#8a949c"
 
 

@@ -20,15 +20,6 @@ from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.tasks.ball_drops.data import Drop  # pyright: ignore
 from sbi_active.tasks.ball_drops.model import GRAVITY  # pyright: ignore
 
-__all__ = [
-    "KINDS",
-    "Forecast",
-    "aligned_error",
-    "forecast",
-    "forecast_error",
-    "second_drop_error",
-]
-
 Array = NDArray[Any]
 
 NUM_DRAWS = 200

@@ -45,8 +45,6 @@ from sbi_active.tasks.cascaded_tanks.recordings import (  # pyright: ignore
 )
 from sbi_active.tasks.records import Pieces, Record, cut  # pyright: ignore
 
-__all__ = ["fit_pieces", "fit_tanks", "main", "make_bench", "run_pieces", "score"]
-
 RESULT = Path(__file__).parent / "results" / "cascaded_tanks.json"
 CHANNEL = "level [V]"
 LABELS = ("begin [s]", "start [V]", "slope [V/s]")

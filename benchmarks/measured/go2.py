@@ -43,8 +43,6 @@ from sbi_active.display.table import Table
 from sbi_active.mujoco import force_effects, mjcf_effects
 from sbi_active.mujoco.robot import Robot
 
-__all__ = ["fit_leg", "judge", "main", "tables"]
-
 Array = NDArray[np.float64]
 RESULT = Path(__file__).parent / "results" / "go2.json"
 ROUNDS = 5

@@ -13,8 +13,6 @@ import torch
 from benchmarks.measured.go2_leg import JOINTS, Leg, usual_parameters
 from sbi_active.mujoco import mjcf_effects
 
-__all__ = ["draw"]
-
 
 def draw(row: Mapping[str, Any], leg: Leg, folder: Path) -> Path:
     """Draw one free run of the record, and its residuals.

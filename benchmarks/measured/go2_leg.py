@@ -19,8 +19,6 @@ from sbi_active.mujoco.models.spec import mujoco_of
 from sbi_active.mujoco.robot import Robot
 from sbi_active.simulation import AutocorrelatedNoise
 
-__all__ = ["DATA", "FITTED", "JOINTS", "LEGS", "Leg", "read_leg", "usual_parameters"]
-
 Array = NDArray[Any]
 
 DATA = Path("../shared/data/go2_in_air")

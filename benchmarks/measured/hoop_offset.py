@@ -26,8 +26,6 @@ from sbi_active.tasks.ball_and_hoop import (  # pyright: ignore
     read_recordings,
 )
 
-__all__ = ["main", "table"]
-
 RESULT = Path(__file__).parent / "results" / "hoop_offset.json"
 SDS = (0.01, 0.02, 0.05)  # V; the first is the task's
 #: Readings of the pieces that are kept: one in 1, .5 and .3 s.

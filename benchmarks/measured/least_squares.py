@@ -16,8 +16,6 @@ from torch.distributions import HalfNormal, Uniform
 from sbi_active.criticism import Context, Effect
 from sbi_active.tasks.records import Pieces  # pyright: ignore
 
-__all__ = ["Fit", "best_in_box", "effect_bounds", "fit_record", "run_rows"]
-
 Array = NDArray[np.float64]
 LARGEST = 3.0  # strengths of effects, in deviations of their priors
 LOST = 1e3  # reading in place of one that is not finite

@@ -30,8 +30,6 @@ from sbi_active.criticism import Effect, Trials, close_loop
 from sbi_active.criticism.results import NONE
 from sbi_active.display.table import Table
 
-__all__ = ["Bench", "Settings", "aliases", "judge", "run_settings", "run_stages"]
-
 Errors = dict[str, float]
 #: Seed of the first replay; nothing was chosen by those from here on.
 FIRST_REPLAYED = 2_000

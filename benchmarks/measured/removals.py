@@ -33,8 +33,6 @@ from sbi_active.display.table import Table
 from sbi_active.tasks.servo_pendulum import ServoPendulumTask  # pyright: ignore
 from sbi_active.tasks.servo_pendulum.task import DATA as SERVO  # pyright: ignore
 
-__all__ = ["main", "removed", "table"]
-
 RESULT = Path(__file__).parent / "results" / "removals.json"
 #: The servo's stages, by the name that its rows have here and there.
 STAGES = {"servo": "powered", "servo, motor off": "motor off"}

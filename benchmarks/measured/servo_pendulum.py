@@ -46,8 +46,6 @@ from sbi_active.tasks.servo_pendulum.model import (  # pyright: ignore
 )
 from sbi_active.tasks.servo_pendulum.task import DATA  # pyright: ignore
 
-__all__ = ["Fit", "fit", "judge", "main", "simulated", "tables"]
-
 Array = NDArray[Any]
 Row = dict[str, Any]
 RESULT = Path(__file__).parent / "results" / "servo_pendulum.json"

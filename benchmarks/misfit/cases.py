@@ -16,19 +16,16 @@ from typing import Literal, get_args
 
 import numpy as np
 import torch
-from sbi.utils import BoxUniform
 from torch import Tensor
 from torch.distributions import Uniform
 
+from benchmarks.criticism.cases import Problem
 from benchmarks.misfit.discrepancies import Discrepancy, draw_discrepancy
 from benchmarks.misfit.machines import GROUPS, LAYOUTS, Machine, get_machine
 from benchmarks.misfit.machines.machine import is_positive, scale_of
 from benchmarks.misfit.truth import LARGEST, Truth, excess, respond, sized
-from sbi_active import SimulatorModel
 from sbi_active.criticism import Effect, Trials
 from sbi_active.seeding import derive_seed, forked_generators
-
-__all__ = ["FIRST_JUDGED", "KINDS", "Case", "Kind", "Problem", "draw_case"]
 
 Kind = Literal["E", "R", "M", "P", "C", "CE"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -39,23 +36,6 @@ RATIO = 1.0, 6.0  # of an effect to the discrepancy, or to one sensor deviation
 MOST = 2e3  # sensor deviations that a discrepancy may make anywhere
 FARTHEST = 1.0  # standard deviation of the logarithm of what wanders
 NUM_DRAWS = 12  # of a strength that has no null to grow from
-
-
-@dataclass(frozen=True, kw_only=True)
-class Problem:
-    """What the loop is given.
-
-    Attributes:
-        model: The bare simulator, with the sensor's noise.
-        prior: Of theta.
-        trials: Measured ones to fit.
-        effects: The declared library.
-    """
-
-    model: SimulatorModel
-    prior: BoxUniform
-    trials: Trials
-    effects: list[Effect]
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,6 @@ from torch import Tensor
 from benchmarks.misfit.machines import Machine
 from benchmarks.misfit.machines.machine import Hidden
 
-__all__ = ["Discrepancy", "draw_discrepancy", "smooth_series"]
-
 LENGTHS = 0.07, 0.3  # of a trial: correlation lengths
 SLOW_LENGTHS = 0.2, 0.6  # of what wanders
 SHARED = 0.0, 0.5  # shares of the variance that all trials have together

@@ -1,8 +1,7 @@
 """Whether a verdict stays the same where what changes is not data.
 
-    python -m benchmarks misfit.metamorphic --first 700 --cases 20
-    python -m benchmarks misfit.metamorphic --first 5200 --cases 40
-    python -m benchmarks misfit.metamorphic --summary --first 5200
+    python -m benchmarks misfit.metamorphic --cases 5200 5240
+    python -m benchmarks misfit.metamorphic --summary
 
 A case of :mod:`benchmarks.misfit.cases`, its kind by turns, is judged as it is and
 again after each change: "irrelevant", four more declared effects that explain nothing;
@@ -21,26 +20,25 @@ from __future__ import annotations
 import inspect
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from benchmarks.misfit.cases import FIRST_JUDGED, Case, Kind, Problem, draw_case
+from benchmarks.misfit.cases import Case, Kind, Problem, draw_case
 from benchmarks.misfit.machines import GROUPS, LAYOUTS, get_machine
 from benchmarks.misfit.verdicts import Outcome, read_report
-from benchmarks.rows import append, read
+from benchmarks.rows import benchmark
 from sbi_active import GaussianNoise, SimulatorModel
-from sbi_active.criticism import Effect, Trials, close_loop
+from sbi_active.criticism import Effect, Trials
 from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
 
-__all__ = ["CHANGES", "main", "table"]
-
 RESULT = Path(__file__).parent / "results" / "metamorphic.csv"
-COLUMNS = ["group", "machine", "kind", "case", "change", "named", "helps"]
+
 #: Kinds by turns; E and R, whose names are hardest, as often as all others.
 KINDS: tuple[Kind, ...] = ("E", "R", "P", "E", "R", "CE", "E", "R", "M", "C")
 UNIT, FINER, DENSER = 1000.0, 10.0, 4
@@ -178,19 +176,11 @@ def _in_units(effect: Effect) -> Effect:
 
 def judged(problem: Problem, seed: int) -> Outcome:
     """Return what the loop says of a problem."""
-    report = close_loop(
-        problem.model,
-        problem.prior,
-        problem.trials,
-        effects=problem.effects,
-        seed=seed,
-        evaluate=False,
-        plan=False,
-    )
+    report = problem.report(seed, evaluate=False, plan=False)
     return read_report(report, [])
 
 
-def table(rows: Sequence[Mapping[str, str]]) -> list[str]:
+def table(rows: Sequence[Mapping[str, str]]) -> str:
     """Return how often the names stay, by change."""
     names, helps = (
         {
@@ -210,54 +200,26 @@ def table(rows: Sequence[Mapping[str, str]]) -> list[str]:
             for of in (names, helps)
         )
         cells.append((change, f"{same}/{len(keys)}", f"{alike}/{len(keys)}"))
-    return [
-        *Table(("change", "same names", "same helps"), cells).markdown().split("\n")
-    ]
+    return Table(("change", "same names", "same helps"), cells).markdown()
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
-
-    Args:
-        first: Number of the first case.
-        cases: Number of cases.
-        out: File of the results.
-        summary: Whether to run nothing, and print the table of the rows.
-    """
-
-    first: int = 700
-    cases: int = 40
-    out: Path = RESULT
-    summary: bool = False
+@lru_cache(1)
+def drawn(number: int) -> tuple[str, Kind, Case]:
+    """Return the group, the kind and the case of a number."""
+    group = [*GROUPS][number // len(KINDS) % len(GROUPS)]
+    kind = KINDS[number % len(KINDS)]
+    return group, kind, draw_case(group, kind, number)
 
 
-def main(arguments: Settings) -> None:
-    """Run the cases that are asked for and print the table."""
-    numbers = range(arguments.first, arguments.first + arguments.cases)
-    done = {(int(r["case"]), r["change"]) for r in read(arguments.out)}
-    for number in () if arguments.summary else numbers:
-        group = [*GROUPS][number // len(KINDS) % len(GROUPS)]
-        kind = KINDS[number % len(KINDS)]
-        case = draw_case(group, kind, number)
-        for change, changed in CHANGES.items():
-            if (number, change) in done or (problem := changed(case)) is None:
-                continue
-            found = judged(problem, number)
-            row = {
-                "group": group,
-                "machine": case.truth.machine.name,
-                "kind": kind,
-                "case": number,
-                "change": change,
-                "named": json.dumps(sorted(found.named)),
-                "helps": json.dumps(sorted(found.helps)),
-            }
-            append(arguments.out, COLUMNS, [row])
-            print(group, kind, number, change, row["named"], flush=True)
-    is_judged = arguments.first >= FIRST_JUDGED
-    rows = read(arguments.out)
-    print(
-        *table([r for r in rows if (int(r["case"]) >= FIRST_JUDGED) == is_judged]),
-        sep="\n",
-    )
+def row_of(number: int, change: str) -> Sequence[Mapping[str, object]]:
+    """Return the row of a verdict after a change; none where it cannot be made."""
+    group, kind, case = drawn(number)
+    if (problem := CHANGES[change](case)) is None:
+        return []
+    found = judged(problem, number)
+    row = {"group": group, "machine": case.truth.machine.name, "kind": kind}
+    names = {k: json.dumps(sorted(getattr(found, k))) for k in ("named", "helps")}
+    return [row | names]
+
+
+main = benchmark(RESULT, row_of, table, case=range(5_200, 5_240), change=CHANGES)

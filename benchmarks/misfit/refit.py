@@ -7,8 +7,6 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-__all__ = ["least_squares"]
-
 ITERATIONS = 12
 DIFFERENCE = 1e-5  # of the scale of a parameter
 ENOUGH = 1e-4  # relative fall of the cost below which a fit has ended

@@ -3,7 +3,6 @@
     python -m benchmarks misfit --group own --kind E --first 1000 --cases 40
     python -m benchmarks misfit --group letters --first 1000 --cases 40
     python -m benchmarks misfit --summary --first 1000
-    python -m benchmarks misfit --truth --kind E --cases 12
 
 Machines have a declared sensor, wide priors, about nine declared effects, and a smooth
 discrepancy of 2 to 10 sensor deviations that nobody declared. Kinds: E, an effect
@@ -18,8 +17,7 @@ be tuned on them.
 
 Resumable: a case that stands in the CSV is not run again. One row a case, one file a
 group and kind, in benchmarks/misfit/results. Give each command a core of its own
-(OMP_NUM_THREADS=1) and another --first, which writes its own file. ``--truth`` prints
-the cases and runs no loop.
+(OMP_NUM_THREADS=1) and another --first, which writes its own file.
 """
 
 from __future__ import annotations
@@ -30,52 +28,29 @@ from typing import Annotated
 
 from benchmarks.misfit.cases import FIRST_JUDGED, KINDS, Kind, draw_case
 from benchmarks.misfit.machines import GROUPS
-from benchmarks.misfit.scores import COLUMNS, score_case
+from benchmarks.misfit.scores import score_case
 from benchmarks.misfit.summary import summary
-from benchmarks.rows import append, read
+from benchmarks.rows import read, resumed
 
 RESULTS = Path(__file__).parent / "results"
 
 
 def run_kind(group: str, kind: Kind, first: int, cases: int) -> None:
     """Run the cases that are in none of the files yet."""
-    done = {int(row["case"]) for row in rows_of(group, kind)}
-    RESULTS.mkdir(parents=True, exist_ok=True)
     path = RESULTS / f"{group}_{kind}_from_{first}.csv"
-    for number in range(first, first + cases):
-        if number in done:
-            continue
-        row = score_case(draw_case(group, kind, number), number)
-        append(path, COLUMNS, [row])
-        outcome = row.get("failure") or row.get("verdict")
-        print(
-            f"{group} {kind} {number}, {row['machine']}: {row['true']} beside "
-            f"{row['discrepancy'] or 'nothing'} of {row['size']:.1f} -> {outcome}; "
-            f"{float(str(row.get('cpu_seconds') or 'nan')):.0f} CPU s",
-            flush=True,
-        )
+
+    def made(number: int) -> dict[str, object]:
+        return score_case(draw_case(group, kind, number), number)
+
+    numbers = [(number,) for number in range(first, first + cases)]
+    others = [*RESULTS.glob(f"{group}_{kind}_from_*.csv")]
+    resumed(path, ["case"], numbers, made, others=others)
 
 
 def rows_of(group: str, kind: str) -> list[dict[str, str]]:
     """Return the rows of all files of a group and kind."""
     files = sorted(RESULTS.glob(f"{group}_{kind}_from_*.csv"))
     return [row for file in files for row in read(file)]
-
-
-def print_truth(group: str, kind: Kind, first: int, cases: int) -> None:
-    """Print what cases are made of."""
-    for number in range(first, first + cases):
-        truth = draw_case(group, kind, number).truth
-        what, bare = truth.discrepancy, truth.held_out_error(())
-        full = truth.held_out_error(truth.effects)
-        print(
-            f"{kind} {number}: {truth.machine.name}, {truth.machine.num_trials} "
-            f"trials, {' + '.join(truth.names) or 'none'} "
-            f"{[round(size, 1) for size in truth.sizes]}, "
-            f"{f'{what.kind} {what.detail} {truth.size:.1f}' if what else 'nothing'}; "
-            f"excess {truth.excess():.1f}, held out {bare:.2f} -> {full:.2f}",
-            flush=True,
-        )
 
 
 @dataclass(frozen=True)
@@ -88,7 +63,6 @@ class Settings:
         first: Number of the first case.
         cases: Number of cases.
         summary: Whether to run nothing, and print the table of the rows.
-        truth: Whether to print the cases, and run nothing.
     """
 
     group: Annotated[str | None, GROUPS] = None
@@ -96,7 +70,6 @@ class Settings:
     first: int = FIRST_JUDGED
     cases: int = 40
     summary: bool = False
-    truth: bool = False
 
 
 def main(arguments: Settings) -> None:
@@ -108,14 +81,12 @@ def main(arguments: Settings) -> None:
     for group in groups:
         rows = []
         for kind in kinds:
-            if arguments.truth:
-                print_truth(group, kind, arguments.first, arguments.cases)
-            elif not arguments.summary:
+            if not arguments.summary:
                 run_kind(group, kind, arguments.first, arguments.cases)
             every = rows_of(group, kind)
             rows += [r for r in every if (int(r["case"]) >= FIRST_JUDGED) == is_judged]
         pooled += rows
-        if rows and not arguments.truth:
+        if rows:
             print(f"\n## {group}, {seeds} seeds", *summary(rows), sep="\n")
     if len(groups) > 1 and pooled:
         print(f"\n## {' and '.join(groups)}, {seeds} seeds", *summary(pooled), sep="\n")

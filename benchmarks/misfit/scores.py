@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 from benchmarks.criticism.scores import counted
 from benchmarks.misfit.cases import Case
 from benchmarks.misfit.truth import Truth
 from benchmarks.misfit.verdicts import Outcome, read_report
-from sbi_active.criticism import Effect, close_loop
-
-__all__ = ["COLUMNS", "score_case"]
+from sbi_active.criticism import Effect
 
 COLUMNS = [
     *["case", "machine", "trials", "kind", "true", "equivalent", "sizes", "strengths"],
@@ -35,19 +34,13 @@ def score_case(case: Case, number: int) -> dict[str, object]:
         number: Its number, also the loop's seed.
     """
     problem, truth = case.problem, case.truth
-    row = _known(truth) | {"case": number}
+    row = dict.fromkeys(COLUMNS, "") | _known(truth) | {"case": number}
     model, count = counted(problem.model)
     start = time.process_time()
     try:
-        report = close_loop(
-            model,
-            problem.prior,
-            problem.trials,
-            effects=problem.effects,
-            seed=number,
-            evaluate=False,  # the truth has the held-out trials
-            plan=False,
-        )
+        # The truth has the held-out trials.
+        counting = replace(problem, model=model)
+        report = counting.report(number, evaluate=False, plan=False)
     except Exception as error:  # a crash is a result of the benchmark
         return row | {"failure": f"{type(error).__name__}: {error}"[:300]}
     seconds = time.process_time() - start

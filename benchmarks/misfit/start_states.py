@@ -1,6 +1,6 @@
 """A trajectory verdict with a start state in each trial: what it costs.
 
-    python -m benchmarks misfit.start_states --first 1000 --cases 10
+    python -m benchmarks misfit.start_states --cases 1000 1010
     python -m benchmarks misfit.start_states --summary
 
 A pendulum driven by a sine: two parameters, eight declared effects, twelve trials of 30
@@ -28,13 +28,11 @@ from torch import Tensor
 from torch.distributions import HalfNormal, Independent, Normal
 
 from benchmarks.criticism.intervals import rate
-from benchmarks.rows import append, read
+from benchmarks.rows import benchmark
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.report.words import TOLD
 from sbi_active.criticism.results import NONE
-
-__all__ = ["Case", "draw_case", "main", "score_case", "summary"]
 
 PATH = Path(__file__).parent / "results" / "start_states.csv"
 NUM_TRIALS, NUM_SAMPLES, STEPS, DT = 12, 30, 4, 0.025
@@ -43,9 +41,6 @@ SENSOR = 0.01  # rad
 WARM_UP = 0.55  # s
 LEVEL = 0.9  # of intervals
 BARS = {"ess": 50.0, "cpu_seconds": 120.0, "simulations": 100_000.0}
-COLUMNS = ["case", "hidden", "size", "true", "verdict", "chosen", "is_misfit"]
-COLUMNS += [*BARS, "simulator_seconds", "ess_alone", "not_printed"]
-COLUMNS += ["inside", "intervals", "dearest"]
 
 PRIOR = Independent(Normal(torch.tensor([9.0, 0.4]), torch.tensor([2.0, 0.15])), 1)
 START = Effect.keyword(
@@ -138,9 +133,9 @@ def draw_case(number: int, *, is_hidden: bool) -> Case:
     return Case(trials, theta, effect.name, phi, size)
 
 
-def score_case(number: int, *, is_hidden: bool) -> dict[str, object]:
+def score_case(number: int, hidden: int) -> dict[str, object]:
     """Return the row of one case."""
-    case, spent = draw_case(number, is_hidden=is_hidden), [0.0]
+    case, spent = draw_case(number, is_hidden=bool(hidden)), [0.0]
 
     def timed(theta: Tensor, action: Tensor, **keywords: Tensor) -> Tensor:
         begin = time.process_time()
@@ -164,8 +159,6 @@ def score_case(number: int, *, is_hidden: bool) -> dict[str, object]:
     dearest = max(tracing.evidences.values(), key=lambda e: e.num_simulations)
     inside, intervals = _coverage(loop, case)
     return {
-        "case": number,
-        "hidden": int(is_hidden),
         "size": case.size,
         "true": case.name,
         "verdict": tracing.verdict,
@@ -191,7 +184,7 @@ def _coverage(loop: Criticism, case: Case) -> tuple[int, int]:
     return int(((low <= truth) & (truth <= high)).sum()), len(truth)
 
 
-def summary(rows: Sequence[dict[str, str]]) -> list[str]:
+def summary(rows: Sequence[dict[str, str]]) -> str:
     """Return the table of the bars, with and without the hidden force."""
     lines = [
         "| hidden force | smallest ESS | ESS >= 50 | effects alone without a printed "
@@ -226,38 +219,7 @@ def summary(rows: Sequence[dict[str, str]]) -> list[str]:
             f"{np.median(trials):,.0f} ({trials.max():,.0f}) | {rate(named)} | "
             f"{rate(covered)} |"
         )
-    return lines
+    return "\n".join(lines)
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
-
-    Args:
-        first: Number of the first case.
-        cases: Number of cases.
-        out: File of the results.
-        bare: Whether no force is hidden.
-        summary: Whether to run nothing, and print the table of the rows.
-    """
-
-    first: int = 1000
-    cases: int = 10
-    out: Path = PATH
-    bare: bool = False
-    summary: bool = False
-
-
-def main(arguments: Settings) -> None:
-    """Run the cases that are missing and print the summary."""
-    done = {(int(r["case"]), r["hidden"]) for r in read(arguments.out)}
-    last = arguments.first if arguments.summary else arguments.first + arguments.cases
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
-    for number in range(arguments.first, last):
-        for is_hidden in (False,) if arguments.bare else (False, True):
-            if (number, str(int(is_hidden))) in done:
-                continue
-            row = score_case(number, is_hidden=is_hidden)
-            append(arguments.out, COLUMNS, [row])
-            print(*(f"{k} {row[k]}," for k in COLUMNS), flush=True)
-    print(*summary(read(arguments.out)), sep="\n")
+main = benchmark(PATH, score_case, summary, case=range(1000, 1010), hidden=(0, 1))

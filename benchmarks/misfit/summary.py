@@ -14,8 +14,6 @@ from benchmarks.criticism.intervals import rate
 from benchmarks.misfit.machines import get_machine
 from sbi_active.display.table import Table
 
-__all__ = ["summary"]
-
 Row = Mapping[str, str]
 #: Gains of the true effect, 1 - held-out error with it / without.
 LARGE, SOME = 0.5, 0.2
@@ -164,23 +162,26 @@ def _lost_pairs(rows: Sequence[Row]) -> str:
 
 
 def _coverage(groups: Mapping[str, list[Row]]) -> list[str]:
-    """Return how often 90 % intervals hold the truth, given the right effects."""
+    """Return how often intervals of theta and phi hold the truth.
+
+    What depends on the state, a form, is what declared effects can imitate.
+    """
+    hidden, other = (
+        [r for kind in kinds for r in groups.get(kind, [])]
+        for kinds in (("M", "E", "P"), ("C", "CE"))
+    )
+    parts = {
+        "with misfit": hidden,
+        "without": other,
+        "beside a form": [r for r in hidden if r["discrepancy"] == "form"],
+        "beside any other": [r for r in hidden if r["discrepancy"] != "form"],
+    }
     lines = []
-    for title, kinds in (("with misfit", ("M", "E", "P")), ("without", ("C", "CE"))):
-        for column in ("theta_covered", "phi_covered"):
-            cells = [r[column] for k in kinds for r in groups.get(k, []) if r[column]]
+    for title, rows in parts.items():
+        for what in ("theta", "phi"):
+            cells = [r[f"{what}_covered"] for r in rows if r[f"{what}_covered"]]
             pairs = [tuple(map(int, cell.split("/"))) for cell in cells]
             hits = [i < k for k, n in pairs for i in range(n)]
-            what = column.removesuffix("_covered")
-            lines.append(f"90 % intervals of {what} {title}: {rate(hits)}")
-    # What depends on the state is what declared effects can imitate.
-    rows = [r for k in ("M", "E", "P") for r in groups.get(k, [])]
-    for title, is_form in (("beside a form", True), ("beside any other", False)):
-        own = [r for r in rows if (r["discrepancy"] == "form") == is_form]
-        for column in ("theta_covered", "phi_covered"):
-            pairs = [tuple(map(int, r[column].split("/"))) for r in own if r[column]]
-            hits = [i < k for k, n in pairs for i in range(n)]
-            what = column.removesuffix("_covered")
             lines.append(f"90 % intervals of {what} {title}: {rate(hits)}")
     return lines
 

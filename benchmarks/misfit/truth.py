@@ -16,8 +16,6 @@ from benchmarks.misfit.machines.machine import is_positive, scale_of
 from benchmarks.misfit.refit import least_squares
 from sbi_active.criticism import Context, Effect
 
-__all__ = ["Truth", "excess", "respond", "sized"]
-
 #: Prior of phi in plain fits, in its declared deviations: as wide as the loop's widest.
 WEAK = 3.0
 #: Largest strength of an effect, in its declared deviations.

@@ -10,8 +10,6 @@ import numpy as np
 from sbi_active.criticism import Report
 from sbi_active.criticism.results import NONE
 
-__all__ = ["Outcome", "read_report"]
-
 LEVEL = 0.9  # of intervals
 
 

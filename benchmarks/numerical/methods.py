@@ -30,7 +30,6 @@ from sbi.utils.metrics import c2st
 from torch import Tensor
 
 from benchmarks.numerical.run import (
-    COLUMNS,
     REPORTED,
     RESULTS,
     exact_limits,
@@ -89,7 +88,7 @@ def run_trial(task: Task, method: str, setting: str, seed: int) -> list[dict[str
         campaign.tell(task.real_system(trial.action, seed=real_seed))
         campaign.update()
         rows.append(
-            {"seed": seed, "round": index + 1, "c2st": compared(task, campaign, index)}
+            {"round": index + 1, "c2st": compared(task, campaign, index)}
             | round_row(task, campaign, gain, index)
         )
     return rows
@@ -121,7 +120,7 @@ def run_method(
 
     path = RESULTS / f"methods_{setting}_{method}.csv"
     seeds = [(seed,) for seed in range(trials) if not is_summary]
-    rows = resumed(path, ["seed"], seeds, trial, columns=[*COLUMNS, "c2st"])
+    rows = resumed(path, ["seed"], seeds, trial)
     return [row for row in rows if int(row["seed"]) < trials]
 
 

@@ -39,15 +39,7 @@ SETTINGS: dict[str, CampaignOptions] = {
     ),
 }
 NUMERICAL = ("linear", "sinh", "square")
-NUM_EXACT = 200  # trials of the exact limit
 STAGES = ("simulation", "training", "design", "update")
-COLUMNS = [
-    *["seed", "theta_true", "round", "action", "eig", "exact_eig", "regret"],
-    *["log_prob_true", "exact_log_prob_true", "gap", "kl", "hpd", "exact_hpd"],
-    *["mass_positive", *[f"rep_err_{action:g}" for action in REPORTED]],
-    *["num_simulations", *[f"cpu_{s}" for s in STAGES], *[f"wall_{s}" for s in STAGES]],
-    *["chained_loss", "chained_bluntness", "trustworthy"],
-]
 
 
 def make_task(name: str, truth: str, seed: int) -> Task:
@@ -120,9 +112,7 @@ def run_trial(
             executed = executed * (1 + arguments.jitter * off)
         campaign.tell(task.real_system(executed, seed=real_seed), action=executed)
         campaign.update()
-        rows.append(
-            {"seed": seed, "round": index + 1} | round_row(task, campaign, gain, index)
-        )
+        rows.append({"round": index + 1} | round_row(task, campaign, gain, index))
     return rows
 
 
@@ -181,7 +171,7 @@ def run_setting(arguments: Settings, method: str, setting: str) -> list[dict]:
 
     seeds = [(s,) for s in range(arguments.trials) if not arguments.summary]
     path = RESULTS / f"{name}.csv"
-    rows = resumed(path, ["seed"], seeds, trial, columns=COLUMNS)
+    rows = resumed(path, ["seed"], seeds, trial)
     return [row for row in rows if int(row["seed"]) < arguments.trials]
 
 

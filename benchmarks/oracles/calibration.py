@@ -11,20 +11,19 @@ from __future__ import annotations
 import time
 import warnings
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.stats import kstest
 
-from benchmarks import rows
+from benchmarks.rows import benchmark
 from sbi_active.display.table import Table
 from tests.oracles.problem import Problem
 from tests.oracles.problems import PROBLEMS
 from tests.oracles.ways import WAYS
 
-ROWS = Path(__file__).with_name("ranks.csv")
-COLUMNS = ("problem", "way", "draw", "ranks", "trustworthy", "cpu_seconds")
 CASES = ("linear_3_10", "edge")
 CALIBRATED = {
     "refine": CASES,
@@ -35,7 +34,6 @@ CALIBRATED = {
     "least squares + importance sampling": CASES,
     "RobustASBI": ("linear_1_1",),
 }
-NUM = 200
 
 
 def drawn(name: str, draw: int) -> Problem:
@@ -60,9 +58,6 @@ def row_of(name: str, way: str, draw: int) -> dict[str, object]:
         found = WAYS[way].run(own, simulator, draw)
     ranks = (found.theta < own.truth).mean(0)
     return {
-        "problem": name,
-        "way": way,
-        "draw": draw,
         "ranks": " ".join(f"{rank:.4f}" for rank in ranks),
         "trustworthy": found.trustworthy,
         "cpu_seconds": round(time.process_time() - start, 2),
@@ -83,18 +78,12 @@ def text(known: list[dict[str, str]]) -> str:
     return Table(("problem", "way", "draws", *shares), lines).markdown()
 
 
-def main(*, summary: bool = False, path: Path = ROWS) -> None:
-    """Run what is not there yet, and print the table.
-
-    Args:
-        summary: Whether to run nothing.
-        path: File of the rows.
-    """
-    torch.set_num_threads(1)
-    done = {(r["problem"], r["way"], r["draw"]) for r in rows.read(path)}
-    for way, names in () if summary else CALIBRATED.items():
-        for name in names:
-            for draw in range(NUM):
-                if (name, way, str(draw)) not in done:
-                    rows.append(path, COLUMNS, [row_of(name, way, draw)])
-    print(text(rows.read(path)))
+main = benchmark(
+    Path(__file__).with_name("ranks.csv"),
+    row_of,
+    text,
+    skip=lambda problem, way, draw: problem not in CALIBRATED[way],
+    problem=dict.fromkeys(chain(*CALIBRATED.values())),
+    way=CALIBRATED,
+    draw=range(200),
+)

@@ -13,18 +13,12 @@ from pathlib import Path
 
 import torch
 
-from benchmarks import rows
 from benchmarks.oracles import table
+from benchmarks.rows import benchmark
 from tests.oracles.judging import judged
 from tests.oracles.problems import PROBLEMS
 from tests.oracles.reference import answers
 from tests.oracles.ways import WAYS
-
-ROWS = Path(__file__).with_name("rows.csv")
-COLUMNS = (
-    *("problem", "way", "seed", "kl", "shift", "narrowest", "widest", "region"),
-    *("evidence", "rows", "cpu_seconds", "trustworthy", "faults", "error"),
-)
 
 
 def row_of(problem: str, way: str, seed: int) -> dict[str, object]:
@@ -37,7 +31,7 @@ def row_of(problem: str, way: str, seed: int) -> dict[str, object]:
     """
     (own, num_rows), used = PROBLEMS[problem]().counted(), WAYS[way]
     simulator = own.simulator(is_declared=used.is_declared)
-    row: dict[str, object] = {"problem": problem, "way": way, "seed": seed}
+    row: dict[str, object] = {}
     start = time.process_time()
     try:
         with warnings.catch_warnings():
@@ -55,32 +49,12 @@ def row_of(problem: str, way: str, seed: int) -> dict[str, object]:
     return {**row, "rows": sum(num_rows), "cpu_seconds": round(cpu, 2)}
 
 
-def main(
-    *,
-    summary: bool = False,
-    problems: list[str] | None = None,
-    ways: list[str] | None = None,
-    seed: int = 0,
-    path: Path = ROWS,
-) -> None:
-    """Run what is not there yet, and print the table.
-
-    Args:
-        summary: Whether to run nothing.
-        problems: Names of problems; all by default.
-        ways: Names of ways; all by default.
-        seed: Seed of all ways.
-        path: File of the rows.
-    """
-    torch.set_num_threads(1)
-    done = {(r["problem"], r["way"], r["seed"]) for r in rows.read(path)}
-    for problem in [] if summary else problems or PROBLEMS:
-        for way in ways or WAYS:
-            claims = WAYS[way].claims(PROBLEMS[problem]())
-            if not claims or (problem, way, str(seed)) in done:
-                continue
-            row = row_of(problem, way, seed)
-            rows.append(path, COLUMNS, [row])
-            shown = {k: rows.short(v) for k, v in row.items()}
-            print(", ".join(f"{k} {v}" for k, v in shown.items()), flush=True)
-    print(table.text(rows.read(path)))
+main = benchmark(
+    Path(__file__).with_name("rows.csv"),
+    row_of,
+    table.text,
+    skip=lambda problem, way, seed: not WAYS[way].claims(PROBLEMS[problem]()),
+    problem=PROBLEMS,
+    way=WAYS,
+    seed=range(1),
+)

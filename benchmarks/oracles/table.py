@@ -13,7 +13,7 @@ Row = dict[str, str]
 
 def divergence(row: Row) -> str:
     """Return the divergence of a belief, and what it says where it is wrong."""
-    if row["error"]:
+    if row.get("error"):
         return row["error"].partition(" ")[0]
     shown = f"{float(row['kl']):.2g}"
     if not set(row["faults"].split()) - {"evidence"}:
@@ -24,7 +24,7 @@ def divergence(row: Row) -> str:
 
 def evidence(row: Row) -> str:
     """Return the error of a log evidence, in standard errors."""
-    has_none = row["error"] or row["evidence"] in ("", "nan")
+    has_none = row.get("error") or row.get("evidence") in (None, "", "nan")
     return "" if has_none else f"{float(row['evidence']):.1f}"
 
 

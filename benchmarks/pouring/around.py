@@ -23,6 +23,7 @@ has an error. Resumable; one row a campaign, in ``results/around.csv``.
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -46,24 +47,17 @@ from benchmarks.pouring.learned import (
 from benchmarks.pouring.likelihood import ImageLikelihood, observed
 from benchmarks.pouring.power import best_power, grid, told_by
 from benchmarks.pouring.run import RESULTS, TEMPERED
-from benchmarks.rows import read, resumed
+from benchmarks.rows import column, read, resumed
 from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import images_of
-
-__all__ = ["Box", "Campaign", "box_around", "summarize"]
 
 OUTSIDE = 0.02  # share of the pooled beliefs beyond each side of the box
 NUM_CELLS = 14  # along each side of the box, of the reference
 NUM_COMPONENTS = 36
 NUM_FOLDS = 5
 NUM_JUDGED = 60  # parameters on which both are judged, a campaign
-COLUMNS = [
-    *["target", "seed", "num_pours", "volume", "inside", "power", "ours", "reference"],
-    *["left_out_ours", "left_out_reference", "left_out_se", "num_left_out"],
-    *["in_half", "in_most"],
-]
 
 
 @dataclass(frozen=True)
@@ -235,10 +229,9 @@ def nearest(cells: np.ndarray, theta: np.ndarray) -> int:
     return int(((cells - theta) ** 2).sum(1).argmin())
 
 
-def row_of(
-    own: Campaign, learned: ByAction, box: Box, pours: dict[int, Pours], task: Any
-) -> dict[str, object]:
+def row_of(own: Campaign, known: Reference) -> dict[str, object]:
     """Return a campaign's row."""
+    learned, box, pours, task = known.learned, known.box, known.pours, known.task
     cells, middles = box.cells(), GridBelief.middles().double().numpy()
     inside, truth = box.holds(middles), task.theta_true.double().numpy()
     distinct = [own.places.index(place) for place in dict.fromkeys(own.places)]
@@ -276,7 +269,6 @@ def row_of(
         whole += by_place[place].at(cells, image[None])[0]
     gap = np.array(reference) - np.array(ours)
     return {
-        "seed": own.seed,
         "num_pours": len(theta),
         "volume": box.volume,
         "inside": float(np.exp(belief)[inside].sum() / len(belief)),
@@ -299,7 +291,7 @@ def summarize(rows: list[dict[str, str]]) -> str:
     table = []
     for target in sorted({row["target"] for row in rows}):
         own = [row for row in rows if row["target"] == target]
-        value = {k: np.array([float(row[k]) for row in own]) for k in COLUMNS[2:]}
+        value = {k: column(own, k) for k in own[0]}
         gap = value["left_out_reference"] - value["left_out_ours"]
         at_truth = value["reference"] - value["ours"]
         error = np.sqrt((value["left_out_se"] ** 2).mean() / len(own))
@@ -320,28 +312,41 @@ def summarize(rows: list[dict[str, str]]) -> str:
     return Table([*header, "pours an action, volume"], table).text()
 
 
-def run_missing(
-    bank: Path, learned: ByAction, target: str, num: int, results: Path
-) -> None:
-    """Make the rows of a target that are missing."""
-    task: Any = get_task("pouring", target=int(target))
-    every = campaigns(target, learned.actions, results)
-    beliefs = [
-        belief_of(learned, own, own.images(task, learned.actions)) for own in every
-    ]
-    box = box_around(beliefs)
-    print("box", box.low, box.high, f"volume {box.volume:.3f}", flush=True)
-    places = sorted({place for own in every for place in own.places})
-    found = pour_around(bank, target, box, learned.actions[places], num, task)
-    pours = dict(zip(places, found, strict=True))
-    by_seed = {own.seed: own for own in every}
+@dataclass(frozen=True)
+class Reference:
+    """What the campaigns of a target are judged by.
 
-    def made(target: str, seed: int) -> dict[str, object]:
-        row = row_of(by_seed[seed], learned, box, pours, task)
-        return {"target": target} | row
+    Attributes:
+        task: The task of this target.
+        campaigns: Its campaigns.
+        learned: What they learned their beliefs from.
+        box: Box around their beliefs.
+        pours: Pours in the box, by the place of the action.
+    """
 
-    jobs = [(target, seed) for seed in by_seed]
-    resumed(results / "around.csv", COLUMNS[:2], jobs, made, columns=COLUMNS)
+    task: Any
+    campaigns: list[Campaign]
+    learned: ByAction
+    box: Box
+    pours: dict[int, Pours]
+
+    @staticmethod
+    def of(
+        target: str, learned: ByAction, bank: Path, arguments: Settings
+    ) -> Reference:
+        """Return that of a target; pours that are missing are made."""
+        task: Any = get_task("pouring", target=int(target))
+        every = campaigns(target, learned.actions, arguments.results)
+        beliefs = [
+            belief_of(learned, own, own.images(task, learned.actions)) for own in every
+        ]
+        box = box_around(beliefs)
+        print("box", box.low, box.high, f"volume {box.volume:.3f}", flush=True)
+        places = sorted({place for own in every for place in own.places})
+        actions = learned.actions[places]
+        found = pour_around(bank, target, box, actions, arguments.rows, task)
+        pours = dict(zip(places, found, strict=True))
+        return Reference(task, every, learned, box, pours)
 
 
 @dataclass(frozen=True)
@@ -352,7 +357,8 @@ class Settings:
         bank: Folder of pours.
         learned: File that keeps what is learned of the pours.
         target: Target of the paper; both by default.
-        rows: Number of rows (pours an action).
+        rows: Number of rows (of the reference).
+        trials: Number of trials; all by default.
         results: Folder of the results.
         summary: Whether to run nothing, and print the table of the rows.
     """
@@ -361,18 +367,35 @@ class Settings:
     learned: Path | None = None
     target: Literal["1", "2"] | None = None
     rows: int = 200
+    trials: int | None = None
     results: Path = RESULTS
     summary: bool = False
 
 
-def main(arguments: Settings) -> None:
-    """Run what is asked for and is not there yet, and print the table."""
+def run(
+    arguments: Settings,
+    name: str,
+    make: Callable[[Campaign, Reference], dict[str, object]],
+    table: Callable[[list[dict[str, str]]], str],
+) -> None:
+    """Make the rows of campaigns that a file does not have yet, and print its table."""
+    path = arguments.results / name
     if not arguments.summary:
         if arguments.bank is None:
             raise SystemExit("expected --bank FOLDER; got none; make one, see bank.py")
         learned = learned_of(arguments.bank, arguments.learned)
         for target in [arguments.target] if arguments.target else ["1", "2"]:
-            run_missing(
-                arguments.bank, learned, target, arguments.rows, arguments.results
-            )
-    print(summarize(read(arguments.results / "around.csv")))
+            known = Reference.of(target, learned, arguments.bank, arguments)
+            by_seed = {own.seed: own for own in known.campaigns[: arguments.trials]}
+
+            def made(_: str, seed: int, by: Any = by_seed, known: Any = known) -> Any:
+                return make(by[seed], known)
+
+            jobs = [(target, seed) for seed in by_seed]
+            resumed(path, ["target", "seed"], jobs, made)
+    print(table(read(path)))
+
+
+def main(arguments: Settings) -> None:
+    """Run what is asked for and is not there yet, and print the table."""
+    run(arguments, "around.csv", row_of, summarize)

@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.pouring.summary import column, label
+from benchmarks.pouring.summary import label
+from benchmarks.rounds import by_round
 from benchmarks.rows import read
 from sbi_active.display.figures import save
-
-__all__ = ["log_prob_figure", "selected_figure"]
 
 RESULTS = Path(__file__).parent / "results"
 COLORS: dict[str, str] = {"asbi": "C0", "nsbi": "C1", "alhi": "C2", "nlhi": "C7"}
@@ -57,14 +56,12 @@ def log_prob_figure(results: Path = RESULTS) -> Any:
     """Return log p(truth) by round: the paper's Figure 11."""
     figure, both = subplots(2)
     for target, axes in zip(("1", "2"), both, strict=True):
-        by_round = {}
+        shown = {}
         for method in COLORS:
-            rows = read(results / f"target_{target}_{method}.csv")
-            if rows:
-                last = max(int(r["round"]) for r in rows)
-                values = [column(rows, "log_prob_true", k + 1) for k in range(last)]
-                by_round[method] = [np.maximum(v, CLIPPED) for v in values]
-        boxes(axes, by_round)
+            if rows := read(results / f"target_{target}_{method}.csv"):
+                values = by_round(rows, "log_prob_true")
+                shown[method] = [np.maximum(v, CLIPPED) for v in values]
+        boxes(axes, shown)
         axes.axhline(0, color="0.5", ls=":", lw=1)
         axes.set_title(f"target {target}")
         axes.set_ylabel("log p(truth)")

@@ -7,8 +7,6 @@ import math
 import torch
 from torch import Tensor
 
-__all__ = ["GridBelief"]
-
 SIDE = 20  # cells along each parameter
 
 

@@ -26,19 +26,6 @@ from sbi_active.seeding import forked_generators
 from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import images_of, mesh_coverage
 
-__all__ = [
-    "ByAction",
-    "Earlier",
-    "Learned",
-    "both_summaries",
-    "gains_of",
-    "kept",
-    "learn",
-    "learned_of",
-    "looked_at",
-    "told_of",
-]
-
 T = TypeVar("T")
 
 NUM_OUTER, NUM_ALL = 100, 300  # draws behind an expected gain

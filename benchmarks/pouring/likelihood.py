@@ -48,8 +48,6 @@ from sbi_active.inference.sampling.gaussian_process import (
     ProcessSettings,
 )
 
-__all__ = ["ImageLikelihood", "components", "doubted", "observed", "thumbnails"]
-
 Array = NDArray[Any]
 
 SIDE = 150  # pixels of an image

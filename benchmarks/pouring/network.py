@@ -38,8 +38,6 @@ from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.seeding import forked_generators
 from sbi_active.tasks import get_task
 
-__all__ = ["ByNetwork", "learn_networks"]
-
 HIDDEN, NUM_ITERATIONS, BATCH = (64, 64), 1_000, 30  # the paper's, section 5.4
 NUM_OUTER, NUM_ALL = 40, 100  # draws behind a gain; the paper's M is 100
 AT_ONCE = 2_000  # rows of a network's input

@@ -22,8 +22,6 @@ from scipy.special import logsumexp
 
 from benchmarks.pouring.likelihood import ImageLikelihood, observed
 
-__all__ = ["POWERS", "best_power", "cross_validated", "grid", "told_by"]
-
 Array = NDArray[Any]
 
 NUM_FOLDS = 5

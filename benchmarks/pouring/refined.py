@@ -19,20 +19,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.pouring import around
 from benchmarks.pouring.around import (
     NUM_JUDGED,
-    Box,
     Campaign,
     Pours,
+    Reference,
     belief_of,
     box_around,
-    campaigns,
     density,
     nearest,
     pour_around,
@@ -40,23 +40,13 @@ from benchmarks.pouring.around import (
 from benchmarks.pouring.bank import Rows, read_parts
 from benchmarks.pouring.bank import read as read_bank
 from benchmarks.pouring.grid_belief import GridBelief
-from benchmarks.pouring.learned import PARTS, ByAction, learned_of
+from benchmarks.pouring.learned import PARTS
 from benchmarks.pouring.power import best_power
-from benchmarks.pouring.run import RESULTS
-from benchmarks.rows import read, resumed
+from benchmarks.rows import column
 from sbi_active.display.table import Table
-from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import images_of
 
-__all__ = ["of_bank", "summarize"]
-
 NUM_FOLDS = 3
-COLUMNS = [
-    *["target", "seed", "num_pours", "cpu_pours", "power"],
-    *["ours", "refined", "reference"],
-    *["left_out_ours", "left_out_refined", "left_out_reference", "gap", "gap_se"],
-    "num_left_out",
-]
 
 
 def of_bank(rows: Rows, action: Tensor, task: Any) -> Pours:
@@ -92,17 +82,17 @@ def power_of(fresh: list[Pours], others: list[Pours], cells: np.ndarray) -> floa
     return best_power(log_p, log_p[np.arange(len(theta)), at])
 
 
-def row_of(
-    bank: Path,
-    target: str,
-    num: int,
-    own: Campaign,
-    learned: ByAction,
-    box: Box,
-    known: dict[int, Pours],
-    task: Any,
-) -> dict[str, object]:
-    """Return a campaign's row."""
+def row_of(own: Campaign, judge: Reference, bank: Path, num: int) -> dict[str, object]:
+    """Return a campaign's row.
+
+    Args:
+        own: The campaign.
+        judge: What it is judged by.
+        bank: Folder of pours.
+        num: Number of fresh pours an action.
+    """
+    learned, box, task = judge.learned, judge.box, judge.task
+    known, target = judge.pours, task.target
     images = own.images(task, learned.actions)
     belief = belief_of(learned, own, images)
     narrow = box_around([belief])
@@ -151,8 +141,6 @@ def row_of(
     ]
     gap = np.array(told[1]) - np.array(told[0])
     return {
-        "target": target,
-        "seed": own.seed,
         "num_pours": sum(len(pours.theta) for pours in fresh),
         "cpu_pours": spent,
         "power": refined_power,
@@ -175,7 +163,7 @@ def summarize(rows: list[dict[str, str]]) -> str:
     table = []
     for target in sorted({row["target"] for row in rows}):
         own = [row for row in rows if row["target"] == target]
-        value = {k: np.array([float(row[k]) for row in own]) for k in COLUMNS[2:]}
+        value = {k: column(own, k) for k in own[0]}
         names = ("ours", "refined", "reference")
         error = np.sqrt((value["gap_se"] ** 2).mean() / len(own))
         table.append(
@@ -195,61 +183,23 @@ def summarize(rows: list[dict[str, str]]) -> str:
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(around.Settings):
     """What is run.
 
     Args:
-        bank: Folder of pours.
-        learned: File that keeps what is learned of the pours.
-        target: Target of the paper; both by default.
-        rows: Number of rows (of the reference).
         pours: Number of pours an action.
         trials: Number of trials.
-        results: Folder of the results.
-        summary: Whether to run nothing, and print the table of the rows.
     """
 
-    bank: Path | None = None
-    learned: Path | None = None
-    target: Literal["1", "2"] | None = None
-    rows: int = 200
+    trials: int | None = 5
     pours: int = 100
-    trials: int = 5
-    results: Path = RESULTS
-    summary: bool = False
-
-
-def run_missing(
-    bank: Path, learned: ByAction, target: str, arguments: Settings
-) -> None:
-    """Make the rows of a target that are missing."""
-    task: Any = get_task("pouring", target=int(target))
-    every = campaigns(target, learned.actions, arguments.results)
-    box = box_around(
-        [belief_of(learned, own, own.images(task, learned.actions)) for own in every]
-    )
-    places = sorted({place for own in every for place in own.places})
-    known = pour_around(
-        bank, target, box, learned.actions[places], arguments.rows, task
-    )
-    pours = dict(zip(places, known, strict=True))
-    by_seed = {own.seed: own for own in every[: arguments.trials]}
-
-    def made(target: str, seed: int) -> dict[str, object]:
-        own = bank, target, arguments.pours, by_seed[seed], learned, box, pours, task
-        return row_of(*own)
-
-    path = arguments.results / "refined.csv"
-    jobs = [(target, seed) for seed in by_seed]
-    resumed(path, COLUMNS[:2], jobs, made, columns=COLUMNS)
 
 
 def main(arguments: Settings) -> None:
     """Run what is asked for and is not there yet, and print the table."""
-    if not arguments.summary:
-        if arguments.bank is None:
-            raise SystemExit("expected --bank FOLDER; got none; make one, see bank.py")
-        learned = learned_of(arguments.bank, arguments.learned)
-        for target in [arguments.target] if arguments.target else ["1", "2"]:
-            run_missing(arguments.bank, learned, target, arguments)
-    print(summarize(read(arguments.results / "refined.csv")))
+
+    def made(own: Campaign, known: Reference) -> dict[str, object]:
+        assert arguments.bank is not None
+        return row_of(own, known, arguments.bank, arguments.pours)
+
+    around.run(arguments, "refined.csv", made, summarize)

@@ -30,7 +30,8 @@ import torch
 from benchmarks.pouring.grid_belief import GridBelief
 from benchmarks.pouring.learned import ByAction, Earlier, kept, learned_of
 from benchmarks.pouring.network import ByNetwork, learn_networks
-from benchmarks.pouring.summary import coverage_table, summarize
+from benchmarks.pouring.summary import mean_log_p, summarize
+from benchmarks.rounds import coverage_table
 from benchmarks.rows import read, resumed
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task
@@ -42,11 +43,6 @@ ACTIVE, BY_NETWORK = ("asbi", "alhi"), ("alhi", "nlhi")
 #: gain is chosen for the error of its learned likelihood too. From seeds 100 to 149.
 TEMPERED = 0.25
 NUM_DRAWS = 2_000  # behind the share of a belief that is denser than the truth
-COLUMNS = [
-    *["seed", "theta_true", "round", "height", "position", "rate", "delta", "in_view"],
-    *["eig", "eig_se", "eig_pca", "eig_mesh", "log_prob_true", "hpd"],
-    *["num_rows", "power", "cpu_design", "cpu_trial"],
-]
 
 
 def run_trial(
@@ -78,7 +74,6 @@ def run_trial(
         with forked_generators(derive_seed(seed, "draws", index)):
             draws = belief.sample(torch.Size([NUM_DRAWS]))
         row = {
-            "seed": seed,
             "theta_true": " ".join(f"{v:.6g}" for v in task.theta_true.tolist()),
             "round": index + 1,
             **dict(zip(("height", "position", "rate"), action.tolist(), strict=True)),
@@ -173,7 +168,7 @@ def run_missing(
     last = arguments.first + arguments.trials
     seeds = [(seed,) for seed in range(arguments.first, last)]
     path = path_of(method, target, arguments)
-    resumed(path, ["seed"], seeds, trial, columns=COLUMNS)
+    resumed(path, ["seed"], seeds, trial)
 
 
 def main(arguments: Settings) -> None:
@@ -192,4 +187,8 @@ def main(arguments: Settings) -> None:
             rows = read(path_of(method, target, arguments))
             if rows:
                 cells[method, target] = rows
-    print(coverage_table(cells) if is_coverage else summarize(cells))
+    if is_coverage:
+        last = ("mean log p", mean_log_p)
+        print(coverage_table(cells, range(1, arguments.rounds + 1), last))
+    else:
+        print(summarize(cells))

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
-from scipy import stats
 
+from benchmarks.rounds import Cells, Rows, active_against_random, by_round
 from benchmarks.rows import column
 from sbi_active.display.table import Table
-
-__all__ = [
-    "coverage_table",
-    "label",
-    "summarize",
-]
 
 #: Section 5.4, read from the text: medians of ASBI after the first and last rounds.
 PUBLISHED = {
@@ -25,8 +19,6 @@ PUBLISHED = {
     ("alhi", "1"): "below -7",
     ("alhi", "2"): "below -7",
 }
-Rows = Sequence[Mapping[str, str]]
-Cells = Mapping[tuple[str, str], Rows]  # by method and target
 
 
 def summarize(cells: Cells) -> str:
@@ -39,10 +31,9 @@ def summarize(cells: Cells) -> str:
         return "no trials yet"
     log_p, chosen = [], []
     for (method, target), rows in cells.items():
-        rounds = range(1, max(int(r["round"]) for r in rows) + 1)
-        by_round = [column(rows, "log_prob_true", r) for r in rounds]
+        log_probs = by_round(rows, "log_prob_true")
         label = f"target {target}, {method.upper()}"
-        last = by_round[-1]
+        last = log_probs[-1]
         seconds = sum(
             np.array([float(r[f"cpu_{part}"]) for r in rows]).mean()
             for part in ("design", "trial")
@@ -51,19 +42,17 @@ def summarize(cells: Cells) -> str:
             [
                 label,
                 str(len(last)),
-                " / ".join(f"{np.median(v):.2f}" for v in by_round),
+                " / ".join(f"{np.median(v):.2f}" for v in log_probs),
                 f"{last.min():.2f} .. {last.max():.2f}",
                 PUBLISHED.get((method, target), "-"),
-                f"{column(rows, 'power', rounds[-1]).mean():.2f}".replace("nan", "-"),
+                f"{by_round(rows, 'power')[-1].mean():.2f}".replace("nan", "-"),
                 f"{seconds:.0f}",
             ]
         )
-        low = [(column(rows, "height", r) == 20).mean() for r in rounds]
-        mesh = [column(rows, "delta", r).mean() for r in rounds]
-        common = [
-            np.mean(column(rows, "eig_mesh", r) - column(rows, "eig_pca", r))
-            for r in rounds
-        ]
+        low = [(v == 20).mean() for v in by_round(rows, "height")]
+        mesh = [v.mean() for v in by_round(rows, "delta")]
+        pairs = zip(by_round(rows, "eig_mesh"), by_round(rows, "eig_pca"), strict=True)
+        common = [np.mean(one - other) for one, other in pairs]
         chosen.append(
             [
                 label,
@@ -108,40 +97,6 @@ def actions_table(rows: Rows, target: str) -> str:
     return Table([head, "share of ASBI's trials by round"], table).text()
 
 
-def active_against_random(cells: Cells) -> list[str]:
-    """Return whether designed actions have the higher median, round by round."""
-    lines = []
-    for target in ("1", "2"):
-        if ("asbi", target) in cells and ("nsbi", target) in cells:
-            ours, theirs = cells["asbi", target], cells["nsbi", target]
-            last = max(int(r["round"]) for r in ours)
-            gaps = [
-                np.median(column(ours, "log_prob_true", r))
-                - np.median(column(theirs, "log_prob_true", r))
-                for r in range(2, last + 1)
-            ]
-            text = " / ".join(f"{gap:+.2f}" for gap in gaps)
-            above = sum(gap > 0 for gap in gaps)
-            lines.append(
-                f"target {target}: ASBI above NSBI in median log p in {above} of "
-                f"rounds 2 to {last} ({text})"
-            )
-    return lines
-
-
-def coverage_table(cells: Cells) -> str:
-    """Return how often the truth is within regions of highest density."""
-    table = []
-    for (method, _), rows in cells.items():
-        for number in range(1, max(int(r["round"]) for r in rows) + 1):
-            hpd = column(rows, "hpd", number)
-            entry = [method.upper(), str(number), str(len(hpd))]
-            for level in (0.5, 0.9):
-                inside = int((hpd <= level).sum())
-                low, high = stats.binom.interval(0.95, len(hpd), level)
-                verdict = "within" if low <= inside <= high else "outside"
-                entry.append(f"{inside} {verdict} {low:.0f}..{high:.0f}")
-            log_p = column(rows, "log_prob_true", number)
-            table.append([*entry, f"{log_p.mean():.2f}"])
-    header = ["", "round", "truths", "in 50 % region", "in 90 % region", "mean log p"]
-    return Table(header, table).text() if table else "no trials yet"
+def mean_log_p(rows: Rows, number: int) -> str:
+    """Return the mean log p(truth) of a round."""
+    return f"{column(rows, 'log_prob_true', number).mean():.2f}"

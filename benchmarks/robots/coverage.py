@@ -1,7 +1,7 @@
 """Coverage of 95 % intervals beside those of ``mujoco.sysid``, in logs with a truth.
 
     python -m benchmarks robots.coverage --machine spring-mass --seeds 2000 2200
-    python -m benchmarks robots.coverage --summary [--by-parameter]
+    python -m benchmarks robots.coverage --summary
 
 Sets are made by :mod:`.machines`: white noise, noise of autocorrelation .9 and .98, and
 white noise beside dry friction that the model lacks. On each set, in one process:
@@ -26,33 +26,26 @@ from __future__ import annotations
 import contextlib
 import copy
 import io
-import sys
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import pandas as pd
 import torch
 
-from benchmarks.criticism.intervals import wilson
-from benchmarks.robots.machines import CONDITIONS, MACHINES, Machine, Set, recorded
-from benchmarks.rows import resumed
+from benchmarks.robots.machines import CONDITIONS, MACHINES, Set, recorded
+from benchmarks.rows import benchmark, column, grouped
 from sbi_active import GaussianNoise
 from sbi_active.criticism import close_loop
 from sbi_active.criticism.identification import identify
+from sbi_active.display.table import Table
 from sbi_active.mujoco import from_sysid, mjcf_effects
 from sbi_active.mujoco.identification import identify_robot
 from sbi_active.mujoco.robot import Robot
 
 RESULTS = Path(__file__).parent / "results/coverage.csv"
-FIELDS: list[str] = [
-    *("machine", "condition", "seed", "way", "parameter", "truth", "low", "high"),
-    *("cpu_seconds", "verdict", "warned"),
-]
-LEVEL, FIRST = 0.95, 2000
+WAYS = ("sysid", "ours", "bare", "loop")
+LEVEL = 0.95
 #: Effects among which the loop looks.
 LIBRARY = ("* friction loss", "* quadratic damping", "* quadratic stiffness")
 
@@ -117,134 +110,41 @@ def rows_of(machine: str, condition: str, seed: int, way: str) -> list[dict[str,
     else:
         found, verdict, words = by_us(own, seed, bare=way == "bare")
     spent = round(time.process_time() - start, 3)
+    told = {"cpu_seconds": spent, "verdict": verdict, "warned": words}
     return [
-        dict(
-            zip(
-                FIELDS,
-                (machine, condition, seed, way, name, truth, *ends, spent)
-                + (verdict, words),
-                strict=True,
-            )
-        )
-        for (name, ends), truth in zip(found.items(), own.truth, strict=True)
+        {"parameter": name, "truth": truth, "low": low, "high": high} | told
+        for (name, (low, high)), truth in zip(found.items(), own.truth, strict=True)
     ]
 
 
-def jobs_of(options: Settings) -> Iterator[tuple[str, str, int, str]]:
-    """Yield sets and ways; where there is friction, two more ways."""
-    for seed in range(*options.seeds):
-        for condition in options.conditions:
-            rough = ["bare", "loop"][: 1 + options.loop]
-            more = rough if condition.startswith("friction") else []
-            for way in ("sysid", "ours", *more):
-                yield options.machine, condition, seed, way
+def summary(rows: list[dict[str, str]]) -> str:
+    """Return coverage over all parameters and the cost, one row a condition."""
+    cells = []
+    for (machine, condition), own in grouped(rows, "machine", "condition").items():
+        shares, cpu, sets = [], {}, {}
+        for way in WAYS:
+            some = [r for r in own if r["way"] == way]
+            low, truth, high = (column(some, k) for k in ("low", "truth", "high"))
+            share = ((low <= truth) & (truth <= high)).mean() if some else np.nan
+            shares.append(f"{share:.2f}" if some else "-")
+            by_seed = {r["seed"]: float(r["cpu_seconds"]) for r in some}
+            sets[way], cpu[way] = len(by_seed), np.mean([*by_seed.values()] or [np.nan])
+        shares[-1] += f" ({sets['loop']} sets)" if sets["loop"] else ""
+        seconds = f"{cpu['sysid']:.1f}, {cpu['ours']:.1f}"
+        cells.append((machine, condition, *shares, sets["ours"], seconds))
+    header = ("machine", "condition", *WAYS, "sets", "CPU s, sysid and ours")
+    return Table(header, cells).markdown()
 
 
-def table(rows: Any) -> pd.DataFrame:
-    """Return coverage with its 95 % interval, widths and cost, by way.
-
-    Args:
-        rows: As they are written.
-    """
-    found = []
-    keys = ["machine", "condition", "way"]
-    for key, own in rows.groupby(keys, sort=False):
-        inside = (own.low <= own.truth) & (own.truth <= own.high)
-        width = (own.high - own.low) / 2
-        each = []
-        for name in own.parameter.unique():
-            some = own.parameter == name
-            each.append(
-                f"{name} {inside[some].mean():.2f} ({width[some].median():.2g})"
-            )
-        cpu = own.drop_duplicates("seed").cpu_seconds
-        low, high = wilson(int(inside.sum()), len(inside))
-        found.append(
-            dict(zip(keys, key, strict=True))
-            | {
-                "sets": own.seed.nunique(),
-                "coverage": f"{inside.mean():.2f} ({low:.2f} to {high:.2f})",
-                "by parameter (median half width)": ", ".join(each),
-                "CPU s": f"{cpu.mean():.2f}",
-            }
-        )
-    return pd.DataFrame(found)
-
-
-def summary(rows: Any) -> pd.DataFrame:
-    """Return coverage over all parameters and the cost, one row a condition.
-
-    Args:
-        rows: As they are written.
-    """
-    found = []
-    for (machine, condition), own in rows.groupby(["machine", "condition"], sort=False):
-        row: dict[str, Any] = {"machine": machine, "condition": condition}
-        for way in ("sysid", "ours", "bare", "loop"):
-            some = own[own.way == way]
-            inside = (some.low <= some.truth) & (some.truth <= some.high)
-            row[way] = f"{inside.mean():.2f}" if len(some) else "-"
-            if way == "loop" and len(some):
-                row[way] += f" ({some.seed.nunique()} sets)"
-        ours, theirs = (
-            own[own.way == way].drop_duplicates("seed").cpu_seconds.mean()
-            for way in ("ours", "sysid")
-        )
-        row["sets"] = own[own.way == "ours"].seed.nunique()
-        row["CPU s, sysid and ours"] = f"{theirs:.1f}, {ours:.1f}"
-        found.append(row)
-    return pd.DataFrame(found)
-
-
-def missing(machine: str) -> str:
-    """Return why a machine cannot be made here, or ""."""
-    try:
-        from mujoco import sysid  # pyright: ignore
-
-        if not hasattr(sysid, "optimize"):
-            return "needs mujoco.sysid; run pip install 'sbi-active[sysid]'"
-        own: Machine = MACHINES[machine]
-        own.spec()
-    except (ImportError, ValueError, OSError) as error:
-        return f"{machine} cannot be made here: {error}"
-    return ""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
-
-    Args:
-        summary: Whether to run nothing, and print the table of the rows.
-        machine: Name of a machine.
-        conditions: Names of the conditions.
-        seeds: Seeds, from the first to before the second.
-        by_parameter: Whether to print a line a parameter.
-        loop: Whether to run the closed loop too.
-        out: File of the results.
-    """
-
-    summary: bool = False
-    machine: Annotated[str, MACHINES] = "spring-mass"
-    conditions: Sequence[str] = (*CONDITIONS,)
-    seeds: tuple[int, int] = (FIRST, FIRST + 200)
-    by_parameter: bool = False
-    loop: bool = False
-    out: Path = RESULTS
-
-
-def main(options: Settings) -> None:
-    """Run from a shell."""
-    if options.summary:
-        rows: Any = pd.read_csv(options.out)
-        told = table if options.by_parameter else summary
-        print(
-            told(rows[rows.seed >= FIRST]).to_markdown(
-                index=False, disable_numparse=True
-            )
-        )
-        return
-    if words := missing(options.machine):
-        print(words, file=sys.stderr)
-        return
-    resumed(options.out, FIELDS[:4], jobs_of(options), rows_of, columns=FIELDS)
+main = benchmark(
+    RESULTS,
+    rows_of,
+    summary,
+    skip=lambda machine, condition, seed, way: (
+        way in ("bare", "loop") and not condition.startswith("friction")
+    ),
+    machine=MACHINES,
+    condition=CONDITIONS,
+    seed=range(2000, 2200),
+    way=WAYS,
+)

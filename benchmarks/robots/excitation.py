@@ -1,7 +1,7 @@
 """Chosen excitation against chirps: how long a robot must move for the same intervals.
 
-    python -m benchmarks robots.excitation --machine arm --first 2000 --cases 5
-    python -m benchmarks robots.excitation --machine leg --first 2000 --cases 5
+    python -m benchmarks robots.excitation --machine arm --cases 2000 2005
+    python -m benchmarks robots.excitation --machine leg --cases 2000 2005
     python -m benchmarks robots.excitation --summary
 
 A two-link arm and one leg of the Go2 (whose files are looked for beside the project, or
@@ -32,9 +32,8 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -43,7 +42,7 @@ from torch import Tensor
 from benchmarks.robots.machines import go2_leg
 from benchmarks.robots.models import ARM
 from benchmarks.robots.signals import SHARE, Played, largest, plain
-from benchmarks.rows import resumed
+from benchmarks.rows import benchmark
 from sbi_active import DiscreteActions, InformationGainDesigner, MixedActions
 from sbi_active.actions import SignalActions
 from sbi_active.criticism import Trials, identify
@@ -52,10 +51,8 @@ from sbi_active.mujoco.models.spec import mujoco_of
 from sbi_active.mujoco.robot import Robot
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 
-__all__ = ["MACHINES", "main", "score", "summary"]
-
 RESULT = Path(__file__).parent / "results" / "excitation.csv"
-COLUMNS = ["machine", "case", "arm", "seconds", "sds", "covered", "cpu_seconds"]
+
 NOISE, RATE, GRID = 0.001, 50.0, 200.0  # rad; Hz of encoders and of goals
 SWEEP, SWEEPS, LENGTH, NUM_CHOSEN = 20.0, 3, 8.25, 3  # s
 NUM_DRAWN, NUM_SAMPLES = 100, 64
@@ -240,8 +237,6 @@ def score(name: str, case: int) -> list[dict[str, object]]:
         true = theta[0].numpy()
         rows.append(
             {
-                "machine": name,
-                "case": case,
                 "arm": arm,
                 "seconds": seconds,
                 "sds": json.dumps([float(f"{v:.4g}") for v in belief.draws.std(0)]),
@@ -282,7 +277,7 @@ def score(name: str, case: int) -> list[dict[str, object]]:
     return rows
 
 
-def summary(rows: Sequence[Mapping[str, str]]) -> list[str]:
+def summary(rows: Sequence[Mapping[str, str]]) -> str:
     """Return the table: deviations beside those of the chirps."""
     lines = [
         "| machine | cases | signals | s | deviations, of the chirps' in 60 s: median, "
@@ -311,33 +306,7 @@ def summary(rows: Sequence[Mapping[str, str]]) -> list[str]:
                 f"{int((ratio <= 1).sum())} of {ratio.size} | "
                 f"{inside} of {ratio.size} | {cpu:.0f} |"
             )
-    return lines
+    return "\n".join(lines)
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
-
-    Args:
-        machine: Name of a machine.
-        first: Number of the first case.
-        cases: Number of cases.
-        out: File of the results.
-        summary: Whether to run nothing, and print the table of the rows.
-    """
-
-    machine: Annotated[str | None, MACHINES] = None
-    first: int = 2000
-    cases: int = 5
-    out: Path = RESULT
-    summary: bool = False
-
-
-def main(arguments: Settings) -> None:
-    """Run the cases that are missing and print the table."""
-    machines = [arguments.machine] if arguments.machine else [*MACHINES]
-    cases = range(arguments.first, arguments.first + arguments.cases)
-    jobs = [] if arguments.summary else product(machines, cases)
-    keys = ["machine", "case"]
-    rows = resumed(arguments.out, keys, jobs, score, columns=COLUMNS)
-    print(*summary(rows), sep="\n")
+main = benchmark(RESULT, score, summary, machine=MACHINES, case=range(2000, 2005))

@@ -25,14 +25,12 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import pandas as pd
 import torch
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
@@ -40,26 +38,20 @@ from torch import Tensor
 
 from benchmarks.criticism.intervals import rate
 from benchmarks.criticism.scores import counted
+from benchmarks.robots.machines import sines
 from benchmarks.robots.public import PUBLIC, Public
-from benchmarks.rows import resumed
+from benchmarks.rows import benchmark, column
 from sbi_active.criticism import AugmentedSimulator, Criticism, Effect, Trials
 from sbi_active.criticism.effects.trial_conditions import conditions_of_trials
+from sbi_active.display.table import Table
 from sbi_active.mujoco import from_mjcf, mjcf_effects
 from sbi_active.mujoco.robot import Robot
 
 Array = NDArray[Any]
 
 RESULTS = Path(__file__).parent / "results/hidden.csv"
-FIELDS = [
-    *("robot", "kind", "seed", "effect", "phi", "excess", "library"),
-    *("verdict", "alarm", "p_verdict", "p_effect", "stated", "right"),
-    *("simulated_trials", "cpu_seconds"),
-]
-KINDS = ("hidden", "clean")
-FIRST = 2000
 NUM_TRIALS, NUM_READINGS = 8, 25
-#: Of the control's grid, s; sines of a control and their frequencies, Hz.
-STEP, NUM_SINES, FREQUENCIES = 0.02, 3, (0.3, 2.0)
+STEP = 0.02  # of the control's grid, s
 #: Chi-square over its degrees of freedom that the refitted bare model is left with.
 EXCESS = 40.0, 2_000.0
 TRIES = 8
@@ -82,12 +74,9 @@ def planned(
     )
     inputs = {name: [] for name in own.drive}
     for _ in range(NUM_TRIALS):
-        for name, (size, center) in own.drive.items():
-            frequency = rng.uniform(*FREQUENCIES, NUM_SINES)
-            phase = rng.uniform(0, 2 * np.pi, NUM_SINES)
-            share = rng.dirichlet(np.ones(NUM_SINES)) * rng.uniform(0.4, 1.0)
-            angle = 2 * np.pi * frequency * inner[:, None] + phase
-            inputs[name].append(center + size * np.sin(angle) @ share)
+        played = sines(inner, own.drive.values(), rng).T
+        for name, signal in zip(own.drive, played, strict=True):
+            inputs[name].append(signal)
     starts = {
         name: center + half * rng.uniform(-1, 1, NUM_TRIALS)
         for name, (center, half) in own.start.items()
@@ -213,8 +202,8 @@ def run_case(name: str, kind: str, seed: int) -> dict[str, object]:
     share = rng.uniform(MARGIN, 1 - MARGIN, len(truth.low))
     theta = (truth.low + (truth.high - truth.low) * torch.from_numpy(share)).numpy()
     effects = mjcf_effects(robot, trials=trials)
-    row: dict[str, object] = {"robot": name, "kind": kind, "seed": seed}
-    row |= {"effect": "none", "phi": "", "excess": 0.0, "library": len(effects)}
+    row: dict[str, object] = {"effect": "none", "phi": "", "excess": 0.0}
+    row["library"] = len(effects)
     if kind == "hidden":
         effect, phi, excess = hidden_effect(truth, effects, theta, rng)
         x = truth.run(theta[None], effect, phi)[0]
@@ -243,60 +232,39 @@ def run_case(name: str, kind: str, seed: int) -> dict[str, object]:
     }
 
 
-def summary(table: Any) -> Iterator[str]:
-    """Yield the lines of the table, a row a robot.
-
-    Args:
-        table: As it is written.
-    """
-    yield (
-        "| robot | effects listed | named exactly | or a stated group | P of the "
-        "effect > .1 | false alarms | named in clean sets | simulated trials | CPU s |"
-    )
-    yield "|---" * 9 + "|"
-    names = [*dict.fromkeys(table.robot)]
-    for name in [*names, "all"]:
-        own = table if name == "all" else table[table.robot == name]
-        some, clean = own[own.kind == "hidden"], own[own.kind == "clean"]
-        exact = some.verdict == some.effect
+def summary(rows: list[dict[str, str]]) -> str:
+    """Return the table, a row a robot."""
+    header = ["robot", "effects listed", "named exactly", "or a stated group"]
+    header += ["P of the effect > .1", "false alarms", "named in clean sets"]
+    cells = []
+    for name in [*dict.fromkeys(r["robot"] for r in rows), "all"]:
+        own = [r for r in rows if name in (r["robot"], "all")]
+        some, clean = ([r for r in own if r["kind"] == k] for k in ("hidden", "clean"))
         told = rate if name == "all" else lambda hits: f"{sum(hits)}/{len(hits)}"
-        cells = [
-            f"{own.library.median():.0f}",
-            told([*exact]),
-            told([*(some.right == 1)]),
-            told([*(some.p_effect > 0.1)]),
-            told([*(clean.alarm == 1)]) if len(clean) else "-",
-            told([*(clean.verdict != "none")]) if len(clean) else "-",
-            f"{own.simulated_trials.median():,.0f}",
-            f"{own.cpu_seconds.median():.0f}",
-        ]
-        yield f"| {name} | {' | '.join(cells)} |"
+        alarms = [r["alarm"] == "1" for r in clean]
+        library, simulated, cpu = (
+            np.median(column(own, key))
+            for key in ("library", "simulated_trials", "cpu_seconds")
+        )
+        cells.append(
+            (
+                *(name, f"{library:.0f}"),
+                told([r["verdict"] == r["effect"] for r in some]),
+                told([r["right"] == "1" for r in some]),
+                told([float(r["p_effect"]) > 0.1 for r in some]),
+                told(alarms) if clean else "-",
+                told([r["verdict"] != "none" for r in clean]) if clean else "-",
+                *(f"{simulated:,.0f}", f"{cpu:.0f}"),
+            )
+        )
+    return Table([*header, "simulated trials", "CPU s"], cells).markdown()
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
-
-    Args:
-        summary: Whether to run nothing, and print the table of the rows.
-        robots: Names of the robots.
-        kind: Kind of cases; all by default.
-        seeds: Seeds, from the first to before the second.
-        out: File of the results.
-    """
-
-    summary: bool = False
-    robots: Annotated[Sequence[str], PUBLIC] = (*PUBLIC,)
-    kind: Annotated[Sequence[str], KINDS] = (*KINDS,)
-    seeds: tuple[int, int] = (FIRST, FIRST + 10)
-    out: Path = RESULTS
-
-
-def main(options: Settings) -> None:
-    """Run from a shell."""
-    seeds = () if options.summary else range(*options.seeds)
-    jobs = [(r, k, s) for s in seeds for k in options.kind for r in options.robots]
-    keys = ["robot", "kind", "seed"]
-    resumed(options.out, keys, jobs, run_case, columns=FIELDS)
-    table: Any = pd.read_csv(options.out)
-    print(*summary(table[table.seed >= FIRST]), sep="\n")
+main = benchmark(
+    RESULTS,
+    run_case,
+    summary,
+    robot=PUBLIC,
+    kind=("hidden", "clean"),
+    seed=range(2000, 2010),
+)

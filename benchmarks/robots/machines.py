@@ -9,7 +9,7 @@ is fitted does not have.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -124,7 +124,7 @@ def recorded(machine: Machine, condition: str, seed: int) -> Set:
     times = np.arange(0.0, machine.seconds, model.opt.timestep)
     parts: tuple[list[Any], ...] = ([], [], [])
     for _ in range(machine.num):
-        control = _sines(times, machine.drive, rng)
+        control = sines(times, machine.drive, rng)
         data.qpos[:] = home + np.array(machine.start) * rng.uniform(-1, 1, model.nq)
         start = sysid.create_initial_state(model, data.qpos, 0 * data.qvel, data.act)
         state, sensor = mujoco.rollout.rollout(
@@ -142,8 +142,8 @@ def recorded(machine: Machine, condition: str, seed: int) -> Set:
     return Set(sequences, params, np.array(truth))
 
 
-def _sines(
-    times: Array, drive: tuple[tuple[float, float], ...], rng: np.random.Generator
+def sines(
+    times: Array, drive: Iterable[tuple[float, float]], rng: np.random.Generator
 ) -> Array:
     """Return controls, shape (steps, actuators), within their amplitudes."""
     found = []

@@ -10,8 +10,6 @@ from itertools import product
 import torch
 from torch import Tensor
 
-__all__ = ["FACTORS", "SHARE", "Played", "largest", "plain"]
-
 BAND = 0.1, 10.0  # Hz
 #: Of the signals in which all joints do the same, Hz.
 BANDS = (

@@ -16,8 +16,6 @@ from typing import Any
 
 import torch
 
-__all__ = ["Attack", "Attacks", "Outcome", "attempt"]
-
 #: Where the checkout lies, which rows do not tell.
 ROOT = str(Path(__file__).parents[2])
 

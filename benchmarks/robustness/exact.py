@@ -2,7 +2,7 @@ r"""Linear-Gaussian problems with a closed form: the error of a belief and what 
 
     python -m benchmarks robustness.exact
     python -m benchmarks robustness.exact --prior box
-    python -m benchmarks robustness.exact --histories 150
+    python -m benchmarks robustness.exact --histories 200
     python -m benchmarks robustness.exact --summary
 
 Three trials of
@@ -32,11 +32,9 @@ Resumable: a problem that has a row is not run again.
 from __future__ import annotations
 
 import time
-import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -44,36 +42,18 @@ from sbi.utils import BoxUniform
 from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal
 
-from benchmarks.rows import append, read
+from benchmarks.rows import benchmark, grouped
 from sbi_active import ASBI, RefinementOptions
 from sbi_active.inference import Belief
 from sbi_active.seeding import derive_seed, forked_generators
 
 DIMS = (2, 4, 6, 8, 10, 15, 20)
 SIZES = (2, 10, 30, 80, 200)
-SEEDS = range(5)
 ACTIONS = ((-1.0,), (0.0,), (1.0,))
 SD = 0.5
 NUM_DRAWS = 4_000
 BEYOND = 8.0  # posterior deviations from the middle to the edge of a box prior
 RESULTS = Path(__file__).parent / "results" / "exact.csv"
-COLUMNS = [
-    "prior",
-    "histories",
-    "dim",
-    "size",
-    "seed",
-    "kl",
-    "kl_error",
-    "kl_reverse",
-    "kl_gaussian",
-    "error_nats",
-    "effective_sample_size",
-    "trustworthy",
-    "assumptions",
-    "cpu_seconds",
-    "failure",
-]
 
 
 @dataclass(frozen=True)
@@ -159,19 +139,12 @@ class Problem:
 
 
 def row_of(
-    prior: str, num_histories: int | None, dim: int, size: int, seed: int
-) -> dict[str, object]:
-    """Return the row of a problem; an error becomes the row's failure."""
+    prior: str, histories: str, dim: int, size: int, seed: int
+) -> Mapping[str, object]:
+    """Return the error of a belief and what it says, with so many histories or all."""
     start = time.process_time()
-    row: dict[str, object] = {"prior": prior, "histories": num_histories or ""}
-    row |= {"dim": dim, "size": size, "seed": seed}
     problem = Problem.draw(prior, dim, size, seed)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            belief = problem.infer(seed, num_histories)
-    except Exception as error:  # a crash is a result
-        return row | {"failure": f"{type(error).__name__}: {error}"[:200]}
+    belief = problem.infer(seed, int(histories) if histories else None)
     seconds = time.process_time() - start
     diagnostics = belief.diagnostics
     broken = [name for name, a in diagnostics.assumptions.items() if not a.holds]
@@ -179,49 +152,27 @@ def row_of(
         "error_nats": diagnostics.error_nats,
         "effective_sample_size": diagnostics.effective_sample_size,
     }
-    return (
-        row
-        | {name: f"{figure:.4g}" for name, figure in figures.items()}
-        | {
-            "trustworthy": diagnostics.trustworthy,
-            "assumptions": " ".join(broken),
-            "cpu_seconds": f"{seconds:.1f}",
-        }
-    )
-
-
-def rows(prior: str, num_histories: int | None) -> list[dict[str, str]]:
-    """Return the rows of a prior and a number of simulations so far."""
-    kind = prior, str(num_histories or "")
-    return [r for r in read(RESULTS) if (r["prior"], r["histories"]) == kind]
-
-
-def problems(prior: str, seeds: range) -> Iterator[tuple[int, int, int]]:
-    """Yield parameters, numbers and seeds; a box needs numbers for each parameter."""
-    for dim in DIMS:
-        for size in SIZES:
-            for seed in seeds:
-                if prior == "gaussian" or size >= dim:
-                    yield dim, size, seed
-
-
-def run(prior: str, num_histories: int | None, seeds: range) -> None:
-    """Run the problems that have no row yet."""
-    done = {
-        (int(r["dim"]), int(r["size"]), int(r["seed"]))
-        for r in rows(prior, num_histories)
+    return {name: f"{figure:.4g}" for name, figure in figures.items()} | {
+        "trustworthy": diagnostics.trustworthy,
+        "assumptions": " ".join(broken),
+        "cpu_seconds": f"{seconds:.1f}",
     }
-    for dim, size, seed in problems(prior, seeds):
-        if (dim, size, seed) not in done:
-            row = row_of(prior, num_histories, dim, size, seed)
-            append(RESULTS, COLUMNS, [row])
-            print(" ".join(str(value) for value in row.values()), flush=True)
 
 
-def summary(found: list[dict[str, str]]) -> Iterator[str]:
+def summary(rows: list[dict[str, str]]) -> str:
+    """Return the lines of each prior and number of histories."""
+    groups = grouped(rows, "prior", "histories").items()
+    parts = [
+        "\n".join([f"{prior} prior, {num or 'all'} histories", *lines_of(own)])
+        for (prior, num), own in groups
+    ]
+    return "\n\n".join(parts)
+
+
+def lines_of(found: list[dict[str, str]]) -> Iterator[str]:
     """Yield the table of median and largest KL, then what the flag says of it."""
-    crashed = [row for row in found if row["failure"]]
-    ended = [row for row in found if not row["failure"]]
+    crashed = [row for row in found if row.get("failure")]
+    ended = [row for row in found if not row.get("failure")]
     yield f"problems {len(found)}, crashes {len(crashed)}"
     yield f"{'KL: median (largest)':<20}" + "".join(
         f"{f'{n} numbers':>18}" for n in SIZES
@@ -243,23 +194,15 @@ def summary(found: list[dict[str, str]]) -> Iterator[str]:
         yield f"{name}: trustworthy is {said} in {len(agree)} of {len(among)}"
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
-
-    Args:
-        prior: Kind of the prior.
-        histories: Number of histories of a refinement.
-        summary: Whether to run nothing, and print the table of the rows.
-    """
-
-    prior: Literal["gaussian", "box"] = "gaussian"
-    histories: int | None = None
-    summary: bool = False
-
-
-def main(arguments: Settings) -> None:
-    """Run what is missing and print the table."""
-    if not arguments.summary:
-        run(arguments.prior, arguments.histories, SEEDS)
-    print("\n".join(summary(rows(arguments.prior, arguments.histories))))
+main = benchmark(
+    RESULTS,
+    row_of,
+    summary,
+    skip=lambda prior, histories, dim, size, seed: prior == "box" and size < dim,
+    may_fail=True,
+    prior=("gaussian", "box"),
+    histories=("", "200"),
+    dim=DIMS,
+    size=SIZES,
+    seed=range(5),
+)

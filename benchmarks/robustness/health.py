@@ -2,7 +2,7 @@ r"""False alarms: campaigns whose simulator is right, by how many numbers a tria
 
     python -m benchmarks robustness.health
     python -m benchmarks robustness.health --summary
-    python -m benchmarks robustness.health --campaigns 20 --numbers 50 --lost sensor
+    python -m benchmarks robustness.health --campaigns 0 20 --numbers 50 --lost sensor
 
 Each campaign draws its parameters from the prior and three trials from the simulator
 itself, so that any alarm is false; at most 5 % may raise one. Simulators take turns:
@@ -17,18 +17,16 @@ as too few simulations leave the belief off, are listed as such. Resumable:
 from __future__ import annotations
 
 import time
-import warnings
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-from scipy.stats import beta
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from benchmarks.rows import append, read
+from benchmarks.rows import benchmark
 from sbi_active import (
     BoxActions,
     Campaign,
@@ -37,21 +35,17 @@ from sbi_active import (
     RefinementOptions,
 )
 from sbi_active.campaign.options import CampaignDetails
+from sbi_active.diagnostics.verdict import clopper_pearson
 from sbi_active.inference.refinement.regression_error import LARGE
 from sbi_active.seeding import derive_seed, forked_generators
 
 RESULTS = Path(__file__).parent / "results" / "health.csv"
-COLUMNS = [
-    "numbers", "lost", "campaign", "simulator", "health",
-    *(f"{name}_{k}" for name in ("surprise", "misfit") for k in (1, 2, 3)),
-    "untested", "seconds",
-]  # fmt: skip
 NUMBERS = (1, 10, 50, 200, 500, 1_000)
 LOST = ("nothing", "sensor", "simulator")
 MANY = 200  # numbers
 SHARE = 0.2  # of the numbers
 NOISE = 0.1
-NUM_CAMPAIGNS, NUM_TRIALS = 200, 3
+NUM_TRIALS = 3
 PRIOR = MultivariateNormal(torch.zeros(2), torch.eye(2))
 ACTIONS = BoxActions([0.5], [2.0])
 NETWORK = MixtureDensity(
@@ -117,7 +111,7 @@ def ends_early(simulator: Callable[..., Tensor]) -> Callable[..., Tensor]:
     return simulate
 
 
-def campaign(q: int, lost: str, index: int) -> dict[str, Any]:
+def run_campaign(q: int, lost: str, index: int) -> dict[str, Any]:
     """Run one campaign and return its row."""
     truth, start = SIMULATORS[index % len(SIMULATORS)], time.process_time()
     seed = derive_seed(index, f"health {q} {lost}")
@@ -141,7 +135,7 @@ def campaign(q: int, lost: str, index: int) -> dict[str, Any]:
         else:
             run.tell(x)
         run.update()
-    row = {"numbers": q, "lost": lost, "campaign": index, "simulator": truth.__name__}
+    row: dict[str, Any] = {"simulator": truth.__name__}
     untested = 0
     for trial in run.history:
         for name in ("surprise", "misfit"):
@@ -153,22 +147,6 @@ def campaign(q: int, lost: str, index: int) -> dict[str, Any]:
     seconds = time.process_time() - start
     row |= {"health": run.health, "untested": untested, "seconds": f"{seconds:.1f}"}
     return row
-
-
-def fill(path: Path, cells: list[tuple[int, str]], campaigns: range) -> None:
-    """Run the campaigns that have no row yet."""
-    done = {(row["numbers"], row["lost"], row["campaign"]) for row in read(path)}
-    for index in campaigns:
-        for q, lost in cells:
-            if (str(q), lost, str(index)) not in done:
-                append(path, COLUMNS, [campaign(q, lost, index)])
-
-
-def interval(count: int, n: int) -> tuple[float, float]:
-    """Return the binomial interval of 95 % (Clopper & Pearson, Biometrika 1934)."""
-    low = beta.ppf(0.025, count, n - count + 1) if count else 0.0
-    high = beta.ppf(0.975, count + 1, n - count) if count < n else 1.0
-    return float(low), float(high)
 
 
 def _share(rows: list[dict[str, str]], name: str) -> float:
@@ -194,7 +172,7 @@ def summary(rows: list[dict[str, str]]) -> Iterator[str]:
             if not cell:
                 continue
             n, count = len(cell), sum(row["health"] == "alarm" for row in cell)
-            low, high = interval(count, n)
+            low, high = clopper_pearson(count, n, 0.05)
             seconds = sum(float(row["seconds"]) for row in cell) / n
             yield (
                 f"{q:>7}  {lost:<10}{n:>4}  "
@@ -204,33 +182,11 @@ def summary(rows: list[dict[str, str]]) -> Iterator[str]:
             )
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
-
-    Args:
-        summary: Whether to run nothing, and print the table of the rows.
-        first: Number of the first case.
-        campaigns: Number of campaigns a cell.
-        numbers: Numbers of an outcome.
-        lost: Kinds of lost numbers.
-        results: Folder of the results.
-    """
-
-    summary: bool = False
-    first: int = 0
-    campaigns: int = NUM_CAMPAIGNS
-    numbers: Sequence[int] = (*NUMBERS,)
-    lost: Annotated[Sequence[str], LOST] = (*LOST,)
-    results: Path = RESULTS
-
-
-def main(chosen: Settings) -> None:
-    """Run what is missing and print the table."""
-    torch.set_num_threads(1)
-    warnings.simplefilter("ignore")
-    if not chosen.summary:
-        cells = [(q, lost) for q in chosen.numbers for lost in chosen.lost]
-        campaigns = range(chosen.first, chosen.first + chosen.campaigns)
-        fill(chosen.results, cells, campaigns)
-    print("\n".join(summary(read(chosen.results))))
+main = benchmark(
+    RESULTS,
+    run_campaign,
+    lambda rows: "\n".join(summary(rows)),
+    numbers=NUMBERS,
+    lost=LOST,
+    campaign=range(200),
+)

@@ -15,26 +15,22 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from benchmarks.criticism.cases import draw_case
 from benchmarks.criticism.worlds import get_world
-from benchmarks.rows import append, read
-from sbi_active.criticism import Criticism, Trials
+from benchmarks.rows import benchmark
+from sbi_active.criticism import Trials
 from sbi_active.criticism.report.summary import suspects
 from sbi_active.seeding import derive_seed
 
 RESULTS = Path(__file__).parent / "results" / "outliers.csv"
-#: World, size of the error in standard deviations, and number of sets.
-SETTINGS = (("A", 8, 40), ("A", 20, 40), ("A", 0, 20), ("B", 8, 20), ("B", 20, 20))
+#: Number of sets, by world and size of the error in standard deviations.
+SETS = {("A", 8): 40, ("A", 20): 40, ("A", 0): 20, ("B", 8): 20, ("B", 20): 20}
 CATCH_ALLS = ("none", "unexplained", "scatter", "outlier")
-COLUMNS = [
-    *["world", "size", "case", "trial", "action", "verdict", "alone", "instead_of"],
-    *["suspects", "probability", "rmse_before", "rmse_after"],
-    *["trial_simulations", "cpu_seconds"],
-]
 
 
 def measure(name: str, size: int, number: int) -> dict[str, object]:
@@ -55,22 +51,12 @@ def measure(name: str, size: int, number: int) -> dict[str, object]:
     x[trial] += sign * size * world.noise_sd
     wrong = Trials(trials.action, x, role=trials.role, index=trials.index)
     start = time.process_time()
-    loop = Criticism(
-        problem.model,
-        problem.prior,
-        wrong,
-        effects=problem.effects,
-        actions=problem.actions,
-        seed=number,
-    )
+    loop = replace(problem, trials=wrong).criticism(number)
     alone = loop.trace()
     report = loop.report(plan=False)
     rmse = report.before_after.set_index("metric").to_dict("index")["rmse"]
     spent = sum(e.num_simulations for e in report.tracing.evidences.values())
     return {
-        "world": name,
-        "size": size,
-        "case": number,
         "trial": trial,
         "action": float(trials.action[trial, 0]),
         "verdict": report.verdict,
@@ -85,19 +71,9 @@ def measure(name: str, size: int, number: int) -> dict[str, object]:
     }
 
 
-def run() -> None:
-    """Run the sets that have no row yet."""
-    done = {(r["world"], int(r["size"]), int(r["case"])) for r in read(RESULTS)}
-    for world, size, num in SETTINGS:
-        for number in range(num):
-            if (world, size, number) not in done:
-                append(RESULTS, COLUMNS, [measure(world, size, number)])
-
-
-def shares() -> Iterator[str]:
+def shares(rows: list[dict[str, str]]) -> Iterator[str]:
     """Yield the shares of each setting."""
-    rows = read(RESULTS)
-    for world, size, _ in SETTINGS:
+    for world, size in SETS:
         some = [r for r in rows if (r["world"], int(r["size"])) == (world, size)]
         if not some:
             continue
@@ -117,12 +93,12 @@ def shares() -> Iterator[str]:
         )
 
 
-def main(*, summary: bool = False) -> None:
-    """Run what is missing and print the shares.
-
-    Args:
-        summary: Whether to run nothing, and print the table of the rows.
-    """
-    if not summary:
-        run()
-    print("\n".join(shares()))
+main = benchmark(
+    RESULTS,
+    measure,
+    lambda rows: "\n".join(shares(rows)),
+    skip=lambda world, size, case: case >= SETS.get((world, size), 0),
+    world=("A", "B"),
+    size=(8, 20, 0),
+    case=range(40),
+)

@@ -47,7 +47,6 @@ AREAS: dict[str, tuple[str, ...]] = {
     "process_state": (),
 }
 RESULTS = Path(__file__).parent / "results"
-COLUMNS = ["attack", "case", "survived", "answer", "cpu_seconds"]
 LONGEST = 3_600.0  # s that all tests of an area may take
 Row = dict[str, object]
 
@@ -114,7 +113,7 @@ def run(area: str, *, fresh: bool) -> None:
     if patterns and done:
         return
     for row in by_tests(patterns) if patterns else attacked(area, done):
-        append(path, COLUMNS, [row])
+        append(path, [row])
         word = "survived" if row["survived"] else f"NOT: {row['answer']}"
         print(f"{area}: {row['attack']} [{row['case']}]: {word}", flush=True)
 

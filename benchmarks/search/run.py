@@ -44,7 +44,7 @@ from sbi_active.seeding import derive_seed
 from sbi_active.tasks import get_task
 
 RESULT = Path(__file__).with_name("result.csv")
-COLUMNS = ["case", "search", "seed", "regret", "error", "num_simulations", "cpu_s"]
+
 GRID = DiscreteActions(torch.linspace(-5, 5, 101))
 FOUND = 0.05  # nats of regret
 
@@ -163,9 +163,6 @@ def run(case: Case, search: str) -> dict[str, Any]:
     seconds = time.process_time() - start
     utility = float(case.utility(design.action[None])[0])
     return {
-        "case": case.name,
-        "search": search,
-        "seed": case.seed,
         "regret": round(case.scale * (case.best - utility), 5),
         "error": round(float(design.utility[design.index]) - utility, 4),
         "num_simulations": design.num_simulations,
@@ -230,5 +227,7 @@ def main(
         for search in searches
         if case.seed >= first and (name, search) != ("mixed", "exhaustive")
     }
-    rows = resumed(RESULT, COLUMNS[:3], every, lambda *job: run(*every[job]))
+    rows = resumed(
+        RESULT, ["case", "search", "seed"], every, lambda *job: run(*every[job])
+    )
     print(table([r for r in rows if int(r["seed"]) >= first]))

@@ -32,7 +32,7 @@ FURTHER = {
     "design": {
         "sbi_active.export": ("to_inference_data",),
         "sbi_active.design.estimators.base": ("CandidateSimulations",),
-        "sbi_active.design.estimators.ratio": ("InfoNCEGain",),
+        "sbi_active.design.estimators.contrast": ("InfoNCEGain",),
         "sbi_active.design.search": ("Evaluations", "Objective"),
     },
     "diagnostics": {

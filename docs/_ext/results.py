@@ -45,6 +45,7 @@ TABLES = {
         "search --summary",
         "search --summary --cases mixed --first 40",
     ),
+    "Trials for a controller": ("target --summary",),
     "Source location finding": ("location_finding.summary",),
     "The simulation engine": (
         "table engine/result.json --only *overhead,*overhead,*median* "
@@ -53,7 +54,6 @@ TABLES = {
     "What an adversary found": (
         "robustness --summary",
         "robustness.exact --summary",
-        "robustness.exact --summary --histories 200",
         "robustness.outliers --summary",
         "robustness.health --summary",
     ),
@@ -86,7 +86,7 @@ TABLES = {
     ),
     "Verdicts where every model is wrong": (
         "misfit --summary",
-        "misfit.metamorphic --summary --first 5200",
+        "misfit.metamorphic --summary",
         "misfit.start_states --summary",
     ),
     "Trials that decide": ("experiments --summary",),
@@ -100,7 +100,10 @@ TABLES = {
         "chain --summary",
         "chain --campaign --summary",
     ),
-    "Bad networks and beliefs flagged": ("calibration --summary",),
+    "Bad networks and beliefs flagged": (
+        "calibration.networks --summary",
+        "calibration.beliefs --summary",
+    ),
     "Every way to a belief, where the answer is known": (
         "oracles --summary",
         "oracles.calibration --summary",

@@ -27,6 +27,7 @@ from sbi_active.campaign.storage.loading import load
 from sbi_active.campaign.storage.manifest import make_campaign
 from sbi_active.campaign.storage.simulations import Storage, num_rows, stored
 from sbi_active.campaign.trials import CampaignTrials
+from sbi_active.design.target import Target
 from sbi_active.renamed import set_later
 from sbi_active.simulation.workers.meter import SimulationBudgetError, metering
 
@@ -239,12 +240,13 @@ class Campaign(CampaignTrials):
         return self._learner.round.posterior(index)
 
     @stored
-    def ask(self, *, target: str | Sequence[str] = "auto") -> Trial:
+    def ask(self, *, target: Target = "auto") -> Trial:
         """Return the pending trial, or design the next one.
 
         Args:
-            target: Target of the design: "theta", names of parameters, or "model",
-                whether the simulator lacks one of the campaign's effects and which.
+            target: Target of the design: "theta", names or a function of parameters
+                as in :meth:`.InformationGainDesigner.select`, or "model", whether the
+                simulator lacks one of the campaign's effects and which.
                 "auto" is "theta" without effects; with them it is the one of which the
                 best action tells more, in nats, and under an alarm "model".
 

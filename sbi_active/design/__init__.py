@@ -8,13 +8,12 @@ tells, in nats. It contains no inference of parameters.
 from sbi_active.design.design import Design
 from sbi_active.design.designer import InformationGainDesigner
 from sbi_active.design.estimators.base import InformationGainEstimator
+from sbi_active.design.estimators.contrast import LikelihoodGain, RatioGain
 from sbi_active.design.estimators.entropy import EntropyGain
-from sbi_active.design.estimators.likelihood import LikelihoodGain
 from sbi_active.design.estimators.linear import LinearGain
 from sbi_active.design.estimators.model_index import ModelIndexGain
 from sbi_active.design.estimators.nested import NestedGain
 from sbi_active.design.estimators.posterior import PosteriorGain
-from sbi_active.design.estimators.ratio import RatioGain
 from sbi_active.design.random_designer import RandomDesigner
 from sbi_active.design.search import GradientSearch, Search
 from sbi_active.renamed import former_names
@@ -42,7 +41,7 @@ __getattr__ = former_names(
             "sbi_active.design.estimators.base:CandidateSimulations"
         ),
         "Evaluations": "sbi_active.design.search:Evaluations",
-        "InfoNCEGain": "sbi_active.design.estimators.ratio:InfoNCEGain",
+        "InfoNCEGain": "sbi_active.design.estimators.contrast:InfoNCEGain",
         "Objective": "sbi_active.design.search:Objective",
     },
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +14,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.callers import stack_level
 from sbi_active.design.design import Design
-from sbi_active.design.elimination import as_batch, choose, eliminate
+from sbi_active.design.elimination import as_batch, eliminate
 from sbi_active.design.estimators.automatic import find_estimator
 from sbi_active.design.estimators.base import (
     InformationGainEstimator,
@@ -31,6 +31,7 @@ from sbi_active.design.search import (
     Objective,
     Search,
 )
+from sbi_active.design.target import Target
 from sbi_active.expected import Shown, suggests
 from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed
@@ -125,7 +126,7 @@ class InformationGainDesigner(Shown):
         simulator: Callable[..., Any] | None = None,
         *,
         belief: Distribution | None = None,
-        target: str | Sequence[str] = "theta",
+        target: Target = "theta",
         simulations: Simulations | None = None,
         cost: Callable[[Tensor], Tensor] | Tensor | None = None,
         constraint: Callable[[Tensor], Tensor] | None = None,
@@ -147,9 +148,13 @@ class InformationGainDesigner(Shown):
             belief: Distribution of the parameters; None is ``model.belief``.
             target: "theta", all parameters; one or several names of the simulator's
                 parameters, the others being nuisances (:class:`.ParameterGain`, or
-                :class:`.LinearGain` where the estimator is "linear"); or "model", the
-                index of the rivals (:class:`.ModelIndexGain`). The estimates of
-                ParameterGain and of the latter are lower bounds.
+                :class:`.LinearGain` where the estimator is "linear"); a function of
+                the parameters, such as a controller's loss, whose value the action is
+                to tell: ``g(theta)``, or ``g(theta, effect)`` with a dict of the
+                effects' parameters by name, (n, theta_dim) -> (n,) or (n, k), by the
+                same estimators; or "model", the index of the rivals
+                (:class:`.ModelIndexGain`). The estimates of ParameterGain and of the
+                latter are lower bounds.
             simulations: Rows under the belief, such as those that the model was trained
                 on; then nothing is simulated. Half of them choose and half report, but
                 where the model has seen them, both are too high.
@@ -214,7 +219,7 @@ class InformationGainDesigner(Shown):
                     f"single outcomes; got {num_actions} and {len(others)} pending; "
                     "leave out simulations="
                 )
-            return _by_given(problem)
+            return GivenGains(problem).design()
         steps = [_by_simulation(problem)]
         for k in range(1, num_actions):
             others = torch.cat([others, steps[-1].action[None]])
@@ -270,32 +275,7 @@ def _by_simulation(problem: DesignProblem, *, search_share: int = 12) -> Design:
             min_probability_valid=limits.least,
         )
     )
-    estimates = eliminate(evaluator, action, budget)
-    return choose(
-        replace(estimates, notes=(*estimates.notes, *notes)),
-        limits,
-        estimator=type(evaluator.estimator).__name__,
-        bound=evaluator.bound,
-        num_simulations=evaluator.sampler.num_drawn,
-        num_missing=evaluator.sampler.num_missing,
-        seed=seed,
-    )
-
-
-def _by_given(problem: DesignProblem) -> Design:
-    """Return the design by rows at hand; nothing is simulated."""
-    listed, notes = problem.limits.listed()
-    given = GivenGains(problem)
-    estimates = given.of_space() if listed is None else given.of_list(listed)
-    return choose(
-        replace(estimates, notes=(*estimates.notes, *notes)),
-        problem.limits,
-        estimator=type(given.estimator).__name__,
-        bound="none",  # the model may have seen the rows
-        num_simulations=0,
-        num_missing=0,
-        seed=problem.seed,
-    )
+    return eliminate(evaluator, action, budget, notes=notes)
 
 
 def _find_search(search: str | Search, actions: ActionSpace) -> Search:

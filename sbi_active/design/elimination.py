@@ -2,49 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from sbi_active.design.design import Design, naming
-from sbi_active.design.estimators.base import (
-    Bound,
-    CandidateSimulations,
-    standard_error,
-)
+from sbi_active.design.estimators.base import CandidateSimulations, standard_error
 from sbi_active.design.limits import DesignLimits
 from sbi_active.design.problem import GainEvaluator
 from sbi_active.seeding import derive_seed
-
-
-@dataclass(frozen=True)
-class Estimates:
-    """Contributions to the information gain of candidates.
-
-    Attributes:
-        action: Candidates, shape (a, action_dim).
-        choosing: Contributions of the simulations that chose, one tensor (n,) a
-            candidate.
-        reporting: Contributions of the simulations that report, one tensor (n,) a
-            candidate.
-        num_samples: Simulations of each candidate, shape (a,).
-        probability_valid: Share of them with a measurement, shape (a,).
-        eligible: Mask of those that may be chosen, shape (a,), bool.
-        leader: The candidate of the largest utility.
-        stopped: Reason why no further simulations were run.
-        notes: Notes on the estimates.
-    """
-
-    action: Tensor
-    choosing: list[Tensor]
-    reporting: list[Tensor]
-    num_samples: Tensor
-    probability_valid: Tensor
-    eligible: Tensor
-    leader: int
-    stopped: str
-    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -122,7 +91,7 @@ class Race:
         return "difference negligible" if self.regret < negligible else None
 
 
-def paired_errors(contributions: list[Tensor], chosen: int) -> Tensor:
+def paired_errors(contributions: Sequence[Tensor], chosen: int) -> Tensor:
     """Return standard errors of the differences to one candidate, on shared rows."""
     other = contributions[chosen]
     return torch.stack(
@@ -131,14 +100,20 @@ def paired_errors(contributions: list[Tensor], chosen: int) -> Tensor:
 
 
 def eliminate(
-    evaluator: GainEvaluator, action: Tensor, budget: int, *, most: int = 4
-) -> Estimates:
-    """Simulate candidates until one leads, in ever smaller groups.
+    evaluator: GainEvaluator,
+    action: Tensor,
+    budget: int,
+    *,
+    notes: Sequence[str] = (),
+    most: int = 4,
+) -> Design:
+    """Simulate candidates until one leads, in ever smaller groups; return it.
 
     Args:
         evaluator: Evaluator that simulates and estimates.
         action: Candidates, shape (a, action_dim).
         budget: Simulations in all, those of the evaluator so far included.
+        notes: Notes on the candidates, the last of the design's.
         most: Times ``num_samples`` that a candidate may get at most.
     """
     problem, sampler = evaluator.problem, evaluator.sampler
@@ -148,11 +123,11 @@ def eliminate(
     size = max(8, num_samples // (2 if problem.eliminate else 1))
     size = min(size, (budget - sampler.num_drawn) // (num_actions + others)) // 4 * 4
     first = evaluator.draw(size, place)
-    notes = [*evaluator.notes, *evaluator.estimator.remarks(first)]
+    said = [*evaluator.notes, *evaluator.estimator.remarks(first)]
     halves = _halves(first)
     num_valid, num_counted = first.num_valid()
     eligible = limits.reached_by(num_valid / num_counted)
-    notes += limits.excluded_note(eligible)
+    said += limits.excluded_note(eligible)
     cost = limits.cost(action)
     weight = cost.mean() / cost
     gains = [[torch.empty(0)] * num_actions for _ in range(2)]
@@ -189,20 +164,24 @@ def eliminate(
             for half, new in zip(halves, _halves(drawn), strict=True)
         ]
     contributions = torch.stack([gains[0][a] for a in active])
-    notes += evaluator.disagreements(halves[0], contributions)
-    notes += sampler.notes
-    return Estimates(
+    said += evaluator.disagreements(halves[0], contributions)
+    return choose(
+        limits,
         action=action,
-        choosing=gains[0],
-        reporting=gains[1],
+        halves=gains,
+        eligible=eligible,
+        leader=int(active[race.leader]),
+        seed=problem.seed,
+        probability_valid=num_valid / num_counted.double(),
         num_samples=torch.tensor(
             [runs * (len(a) + len(b)) for a, b in zip(*gains, strict=True)]
         ),
-        probability_valid=num_valid / num_counted.double(),
-        eligible=eligible,
-        leader=int(active[race.leader]),
+        estimator=type(evaluator.estimator).__name__,
+        bound=evaluator.bound,
+        num_simulations=sampler.num_drawn,
+        num_missing=sampler.num_missing,
         stopped=stopped,
-        notes=tuple(notes),
+        notes=(*said, *sampler.notes, *notes),
     )
 
 
@@ -212,41 +191,44 @@ def _halves(simulations: CandidateSimulations) -> list[CandidateSimulations]:
 
 
 def choose(
-    estimates: Estimates,
     limits: DesignLimits,
     *,
-    estimator: str,
-    bound: Bound,
-    num_simulations: int,
-    num_missing: int,
+    action: Tensor,
+    halves: Sequence[Sequence[Tensor]],
+    eligible: Tensor,
+    leader: int,
     seed: int,
+    **known: Any,
 ) -> Design:
-    """Return the design of the leader; the seed is that behind probabilities."""
-    price = limits.cost(estimates.action)
-    chosen, report = estimates.leader, estimates.reporting
-    both = zip(estimates.choosing, report, estimates.eligible, price, strict=True)
+    """Return the design of the leading candidate.
+
+    Args:
+        limits: Limits and costs of the actions.
+        action: Candidates, shape (a, action_dim).
+        halves: Contributions of the simulations that chose, and of those that report,
+            one tensor (n,) a candidate.
+        eligible: Mask of the candidates that may be chosen, shape (a,), bool.
+        leader: The candidate of the largest utility.
+        seed: Seed of the draws behind probabilities.
+        **known: Fields of the :class:`.Design` that are known already.
+    """
+    price, report = limits.cost(action), halves[1]
+    both = zip(*halves, eligible, price, strict=True)
     probability_best = torch.zeros(len(price), dtype=torch.float64)
-    probability_best[estimates.eligible] = Race.run(
+    probability_best[eligible] = Race.run(
         [torch.cat([a, b]) / c for a, b, e, c in both if e], seed
     ).probability_best
     return Design(
-        action=estimates.action[chosen],
-        candidates=estimates.action,
+        action=action[leader],
+        candidates=action,
         expected_information_gain=torch.stack([row.nanmean() for row in report]),
         standard_error=torch.stack([standard_error(row) for row in report]),
-        difference_standard_error=paired_errors(report, chosen),
+        difference_standard_error=paired_errors(report, leader),
         probability_best=probability_best,
-        probability_valid=estimates.probability_valid,
-        bound=bound,
-        index=chosen,
-        num_simulations=num_simulations,
-        estimator=estimator,
-        num_samples=estimates.num_samples,
-        stopped=estimates.stopped,
-        num_missing=num_missing,
-        notes=estimates.notes,
+        index=leader,
         cost=None if limits.price is None else price,
         **naming(limits.actions),
+        **known,
     )
 
 

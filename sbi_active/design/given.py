@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
 from sbi_active.design.coordinates import Coordinates, cells
-from sbi_active.design.elimination import Estimates, Race
+from sbi_active.design.design import Design
+from sbi_active.design.elimination import Race, choose
 from sbi_active.design.estimators.automatic import choose_estimator
 from sbi_active.design.estimators.base import (
     CandidateSimulations,
@@ -77,8 +79,13 @@ class GivenGains:
         rows = torch.arange(len(self.rows))[:num_rows]
         return choose_estimator(self.problem.model, self._simulations(rows))[0]
 
-    def of_list(self, action: Tensor) -> Estimates:
-        """Return estimates of candidates on their own rows.
+    def design(self) -> Design:
+        """Return the design by these rows; nothing is simulated."""
+        listed, notes = self.problem.limits.listed()
+        return self._of_space() if listed is None else self._of_list(listed, notes)
+
+    def _of_list(self, action: Tensor, notes: Sequence[str]) -> Design:
+        """Return the design of candidates by their own rows.
 
         Raises:
             ValueError: If no candidate has rows enough.
@@ -103,10 +110,10 @@ class GivenGains:
                 "candidate; got fewer of every one; pass rows at the actions of the "
                 "list"
             )
-        return self._estimates(action, halves, share)
+        return self._chosen(action, halves, share, notes)
 
-    def of_space(self) -> Estimates:
-        """Search a continuous space; return the estimates of the finalists.
+    def _of_space(self) -> Design:
+        """Return the design of the finalists of a search.
 
         Raises:
             ValueError: If the estimator does not score rows one by one.
@@ -150,7 +157,7 @@ class GivenGains:
                 error = (valid * (1 - valid) / num + 1e-4).sqrt()
                 share = space.regression(knots, valid, error)(point)[0][:, 0]
             shares.append(share.clamp(0, 1))
-        return self._estimates(action, halves, torch.stack(shares).mean(0))
+        return self._chosen(action, halves, torch.stack(shares).mean(0))
 
     def _split(self, rows: Tensor) -> list[Tensor]:
         seed = derive_seed(self.problem.seed, "split")
@@ -192,32 +199,38 @@ class GivenGains:
         )
         return averages, torch.tensor([len(g) for g in groups])
 
-    def _estimates(
-        self, action: Tensor, halves: list[list[Tensor]], share: Tensor
-    ) -> Estimates:
-        limits = self.problem.limits
+    def _chosen(
+        self,
+        action: Tensor,
+        halves: list[list[Tensor]],
+        share: Tensor,
+        notes: Sequence[str] = (),
+    ) -> Design:
+        limits, seed = self.problem.limits, self.problem.seed
         known = torch.tensor([bool(g.isfinite().any()) for g in halves[0]])
         eligible, cost = known & limits.reached_by(share), limits.cost(action)
         index = torch.nonzero(eligible)[:, 0]
-        race = Race.run([halves[0][a] / cost[a] for a in index], self.problem.seed)
+        race = Race.run([halves[0][a] / cost[a] for a in index], seed)
         few = int((~known).sum())
-        notes = [IN_SAMPLE, *limits.excluded_note(eligible | ~known)]
+        said = [IN_SAMPLE, *limits.excluded_note(eligible | ~known)]
         if few:
-            notes.append(
-                f"{few} candidates with fewer than {self.fewest} rows excluded"
-            )
-        return Estimates(
+            said.append(f"{few} candidates with fewer than {self.fewest} rows excluded")
+        return choose(
+            limits,
             action=action,
-            choosing=halves[0],
-            reporting=halves[1],
+            halves=halves,
+            eligible=eligible,
+            leader=int(index[race.leader]),
+            seed=seed,
+            probability_valid=share,
             num_samples=torch.tensor(
                 [len(a) + len(b) for a, b in zip(*halves, strict=True)]
             ),
-            probability_valid=share,
-            eligible=eligible,
-            leader=int(index[race.leader]),
+            estimator=type(self.estimator).__name__,
+            bound="none",  # the model may have seen the rows
+            num_simulations=0,
             stopped="simulations given",
-            notes=tuple(notes),
+            notes=(*said, *notes),
         )
 
 

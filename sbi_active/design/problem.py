@@ -27,6 +27,7 @@ from sbi_active.design.limits import DesignLimits
 from sbi_active.design.outcomes import JointLikelihood, conditional_gain
 from sbi_active.design.sampler import CandidateSampler
 from sbi_active.design.search import Search
+from sbi_active.design.target import Quantity, Target, name_of, places
 from sbi_active.simulation import Simulations
 from sbi_active.simulation.workers.settings import Workers
 from sbi_active.threads import single_thread
@@ -37,7 +38,7 @@ class DesignProblem:
     """The choice of one action; see :class:`.InformationGainDesigner`.
 
     Attributes:
-        target: "theta", names of parameters, or "model".
+        target: "theta", names of parameters, a function of these, or "model".
         given_estimator: Estimator of the information, as the designer was given it.
         model: Model that the estimator needs.
         simulator: ``simulator(theta, action)``.
@@ -58,7 +59,7 @@ class DesignProblem:
         ValueError: If what the target needs is lacking.
     """
 
-    target: str | Sequence[str]
+    target: Target
     given_estimator: str | InformationGainEstimator
     model: Any
     simulator: Callable[..., Any] | None
@@ -80,8 +81,8 @@ class DesignProblem:
         if self.target != "theta" and self.given_estimator not in own:
             raise ValueError(
                 f"expected estimator={' or '.join(map(repr, own))} for "
-                f"target={self.target!r}; got {self.given_estimator!r}; leave out "
-                "estimator="
+                f"target={name_of(self.target)!r}; got {self.given_estimator!r}; "
+                "leave out estimator="
             )
         if self.target == "model":
             if not isinstance(self.model, Sequence) or not simulates:
@@ -102,6 +103,13 @@ class DesignProblem:
                 "the model has none; pass the belief of this round"
             )
 
+    def _numbers(self) -> list[int] | Quantity:
+        """Return the places of the parameters that it is about, or their function."""
+        if callable(self.target):
+            assert self.belief is not None
+            return Quantity(self.target, self.simulator, self.belief)
+        return places(self.target, self.simulator)
+
     def estimator(self) -> InformationGainEstimator | None:
         """Return the estimator; None if the simulations are to decide.
 
@@ -111,9 +119,11 @@ class DesignProblem:
         if self.target == "model":
             return None
         if self.target != "theta":
-            index = _parameters(self.target, self.simulator)
+            target, options = self._numbers(), {}
+            if isinstance(target, Quantity):
+                options["num_marginal"] = target.num_draws
             is_linear = self.given_estimator == "linear"
-            return LinearGain(index) if is_linear else ParameterGain(index)
+            return LinearGain(target) if is_linear else ParameterGain(target, **options)
         estimator = find_estimator(self.given_estimator)
         if estimator is not None and estimator.needs_model and self.model is None:
             raise ValueError(
@@ -254,21 +264,3 @@ def _sampler(
         most_numbers=float("inf") if learns else problem.most_numbers,
     )
     return sampler, estimator
-
-
-def _parameters(target: str | Sequence[str], simulator: Any) -> list[int]:
-    """Return the places of parameters by name."""
-    names = getattr(simulator, "parameter_names", None)
-    if not names:
-        raise ValueError(
-            f"expected a simulator with parameter_names for target={target!r}; got "
-            "none; build SimulatorModel(fn, parameter_names=[...])"
-        )
-    wanted = [target] if isinstance(target, str) else list(target)
-    unknown = [name for name in wanted if name not in names]
-    if unknown or not wanted:
-        raise ValueError(
-            f"expected target 'theta', 'model' or names among {list(names)}; got "
-            f"{target!r}; choose one or more of these"
-        )
-    return [list(names).index(name) for name in wanted]

@@ -12,7 +12,7 @@ def test_a_case_is_run_once_and_its_row_is_whole(tmp_path, monkeypatch, capsys):
     for _ in range(2):
         run.run_kind("letters", "CE", 0, 1)
     (row,) = run.rows_of("letters", "CE")
-    assert capsys.readouterr().out.count("letters CE 0") == 1
+    assert capsys.readouterr().out.count("letters_CE_from_0 0") == 1
     assert [*row] == COLUMNS
     assert not row["failure"]
     assert float(row["held_true"]) < float(row["held_bare"])

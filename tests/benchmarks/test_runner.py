@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import pytest
 
 from benchmarks.__main__ import HERE, benchmarks, main, module_of, parser_of
+from benchmarks.rows import benchmark, read
 
 ROOT = Path(__file__).parents[2]
 
@@ -55,6 +56,39 @@ def test_options_are_arguments():
     for wrong in ("--seeds one", "--kind c", "--names z", "--pair 1"):
         with pytest.raises(SystemExit):
             parse(wrong.split())
+
+
+def test_cases_are_run_once_and_those_that_are_asked_for_are_told(tmp_path, capsys):
+    made = []
+
+    def row(kind, seed):
+        made.append((kind, seed))
+        if seed == 3:
+            raise ValueError("no")
+        return {"value": 10.0 * seed, **({"extra": 1} if kind == "b" else {})}
+
+    run = benchmark(
+        tmp_path / "rows.csv",
+        row,
+        lambda rows: " ".join(f"{r['kind']}{r['seed']}" for r in rows),
+        skip=lambda kind, seed: (kind, seed) == ("b", 2),
+        may_fail=True,
+        kind=("a", "b"),
+        seed=range(1, 3),
+    )
+    parse = parser_of(run, "some").parse_args
+    run(**vars(parse(["--summary"])))
+    assert not made
+    run(**vars(parse([])))
+    assert made == [("a", 1), ("b", 1), ("a", 2)]  # ranges vary slowest
+    capsys.readouterr()
+    run(**vars(parse(["--seeds", "2", "4", "--kind", "a"])))
+    assert made[3:] == [("a", 3)]
+    assert capsys.readouterr().out.splitlines()[-1] == "a2 a3"
+    rows = read(tmp_path / "rows.csv")
+    assert [*rows[0]] == ["kind", "seed", "value", "extra", "failure"]
+    assert rows[-1]["failure"] == "ValueError: no"
+    assert (rows[1]["value"], rows[1]["extra"], rows[0]["extra"]) == ("10", "1", "")
 
 
 @pytest.mark.parametrize("name", benchmarks())

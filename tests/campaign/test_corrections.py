@@ -5,10 +5,8 @@ import re
 import numpy as np
 import pytest
 import torch
-from torch.distributions import Independent, Normal
 
 from sbi_active.campaign.options import CampaignDetails
-from sbi_active.criticism import Effect
 from tests.campaign.problem import (  # noqa: F401 # others import them from here
     ACTIONS,
     OPTIONS,
@@ -17,6 +15,7 @@ from tests.campaign.problem import (  # noqa: F401 # others import them from her
     campaign,
     draws,
 )
+from tests.effects import BIAS
 
 TOLD = [(1.0, 0.62), (3.0, 1.75), (0.5, 0.33)]  # action, x at theta = .6
 
@@ -149,17 +148,10 @@ def test_a_pending_trial_can_be_withdrawn():
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:trial [0-4] at action")
 def test_a_correction_behind_an_adoption():
-    bias = Effect(
-        "bias",
-        hook="observation",
-        prior=Independent(Normal(torch.zeros(1), torch.ones(1)), 1),
-        null=0.0,
-        apply=lambda x, phi, action, context: x + phi,
-    )
     told = [(a, 0.6 * a + 0.8) for a in (1.0, 3.0, 0.5, 3.0, 1.0)]
     campaigns = [tell(campaign(), told), tell(campaign(), told)]
     for c in campaigns:
-        report = c.criticize([bias], evaluate=False)
+        report = c.criticize([BIAS], evaluate=False)
         assert report.verdict == "bias"
         c.adopt(report)
     right, wrong = campaigns

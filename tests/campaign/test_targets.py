@@ -33,6 +33,13 @@ def test_without_effects_trials_are_for_the_parameters():
     assert c.ask().target == "theta"
     c.tell([1.0])
     assert c.ask(target="slope").target == "slope"
+    c.tell([1.0])
+
+    def loss(theta):
+        return theta[:, 0] ** 2
+
+    trial = c.ask(target=loss)
+    assert (trial.target, trial.design.estimator) == ("loss", "ParameterGain")
 
 
 def test_with_effects_a_trial_is_for_what_it_tells_more_about():

@@ -52,7 +52,7 @@ def test_committed_rows_are_printed_and_their_absence_is_a_fault(results, monkey
     text = results.printed("forces --summary")
     assert "| single: right family |" in results.as_markdown(text)
     with pytest.raises(ValueError, match="commit its rows"):
-        results.printed("calibration --summary --first 1000000")
+        results.printed("calibration.beliefs --summary --seeds 1000000 1000001")
 
 
 def test_each_section_shows_its_tables(results):

@@ -18,8 +18,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-__all__ = ["slide"]
-
 GRAVITY = 9.81  # m/s^2
 EDGE = 0.5  # b, m
 STEP = 0.02  # s

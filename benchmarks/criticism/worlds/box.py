@@ -18,8 +18,6 @@ from benchmarks.criticism.worlds.world import World, half_normal
 from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.criticism import Effect
 
-__all__ = ["DECLARED", "HIDDEN", "SPEEDS", "make_world"]
-
 #: m/s, at which the pusher reaches the cube and seldom throws it off the table.
 SPEEDS = (2.0, 2.5, 3.0, 3.5, 4.0, 4.5, 5.0)
 HIDDEN = ("restitution", "tilt", "aim", "camera bias")

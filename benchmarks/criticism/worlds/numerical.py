@@ -25,8 +25,6 @@ from benchmarks.criticism.worlds.world import (
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect
 
-__all__ = ["make_world", "response"]
-
 NOISE_SD = 1.0
 #: Logarithms of the limits of a sensor that saturates: 10 to 100,000.
 LOG_LIMIT = (2.302585, 11.512925)

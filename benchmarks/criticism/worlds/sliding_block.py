@@ -25,8 +25,6 @@ from benchmarks.criticism.worlds.world import (
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect
 
-__all__ = ["ALIASES", "library", "make_world", "outside", "scatter"]
-
 NOISE_SD = 0.005  # m
 TIMES = (0.1, 0.25, 0.5, 0.8, 1.2, 2.0)  # s
 SPEEDS = (1.0, 1.5, 2.0, 2.5, 3.0)  # m/s

@@ -18,8 +18,6 @@ from benchmarks.criticism.worlds import sliding_block
 from benchmarks.criticism.worlds.world import World
 from sbi_active import GaussianNoise, SimulatorModel
 
-__all__ = ["CORRELATIONS", "TIMES", "make_world"]
-
 NUM_SAMPLES = 50
 TIMES = tuple(np.round(np.linspace(0.04, 2.0, NUM_SAMPLES), 2).tolist())  # s
 CORRELATIONS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98)

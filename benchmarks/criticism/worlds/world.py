@@ -20,8 +20,6 @@ from torch.distributions import (
 from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.criticism import Effect
 
-__all__ = ["World", "half_normal", "normal", "signed_uniform", "uniform"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class World:

@@ -32,8 +32,6 @@ from benchmarks.misfit.machines.machine import (
 )
 from sbi_active.criticism import Effect
 
-__all__ = ["FORMS", "UNSEEN_FORMS", "Declared", "Joint", "read", "row"]
-
 #: Forces of position and speed in units of their typical sizes, for tuning seeds.
 FORMS = {
     "magnet": Form(lambda q, v: -(q / 0.3) / (1 + (q / 0.3) ** 2) ** 2),

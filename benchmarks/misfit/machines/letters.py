@@ -17,8 +17,6 @@ from benchmarks.criticism.worlds import get_world
 from benchmarks.criticism.worlds.sliding_block import TIMES
 from benchmarks.misfit.machines.machine import Hidden, Machine
 
-__all__ = ["make_letter"]
-
 #: Where the undeclared forms vanish, and their names for tuning and judging seeds.
 FORMS = {"A": (("sine", "bump"), ("step", "power"))}
 FORMS |= dict.fromkeys("BC", (("magnet",), ("stribeck", "edge_shift")))

@@ -14,19 +14,6 @@ from torch.distributions import HalfNormal
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect
 
-__all__ = [
-    "Form",
-    "Hidden",
-    "Machine",
-    "box",
-    "is_positive",
-    "sample_times",
-    "scale_of",
-    "sensor_effects",
-    "signs",
-    "uniform_rows",
-]
-
 #: Name of a form or of a parameter that wanders, to one number or one series a row.
 Hidden = Mapping[str, Tensor]
 

@@ -22,8 +22,6 @@ from benchmarks.misfit.machines.machine import (
     uniform_rows,
 )
 
-__all__ = ["make_pendulum", "swing"]
-
 GRAVITY = 9.81  # m/s^2
 NOISE_SD = 0.01  # rad
 JOINT = Joint(3.0, 120, (1.0, 4.0))  # s; undeclared forms in rad and rad/s

@@ -23,8 +23,6 @@ from benchmarks.misfit.machines.machine import (
     uniform_rows,
 )
 
-__all__ = ["make_spring", "oscillate"]
-
 NOISE_SD = 0.01  # m
 JOINT = Joint(4.0, 160, (0.35, 1.5))  # s; undeclared forms in m and m/s
 

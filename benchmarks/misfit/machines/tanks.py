@@ -30,8 +30,6 @@ from benchmarks.misfit.machines.machine import (
 )
 from sbi_active.criticism import Effect
 
-__all__ = ["fill", "make_tanks"]
-
 DURATION, NUM_STEPS = 240.0, 120  # s
 AREA = 28.0  # cm^2, of the upper tank
 SWITCH = 0.45

@@ -39,8 +39,6 @@ from sbi_active.inference.sampling.gaussian_process import (
 )
 from sbi_active.tasks.pouring.raster import NUM_PIXELS, PIXEL
 
-__all__ = ["SHIFTS", "Emulator", "pictures_numbers"]
-
 Array = NDArray[Any]
 
 SHIFTS = (-10, -5, 0, 5, 10)  # pixels along y

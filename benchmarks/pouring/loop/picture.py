@@ -29,8 +29,6 @@ from benchmarks.pouring.loop.worlds import get_world
 from sbi_active.display.figures import save
 from sbi_active.seeding import derive_seed
 
-__all__ = ["blocks", "residual_figure", "standardized"]
-
 NUM_POURS = 12
 BLOCK = 5  # pixels, 1 cm
 FLOOR = 0.05  # mm, of the deviation of a square's mean height

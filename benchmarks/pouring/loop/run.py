@@ -46,11 +46,6 @@ FIRST = {"hidden": 2_700, "clean": 2_750, "material": 2_520}  # seeds
 BARE = "compared"  # part without effects, of material.bank, at one of the actions
 NUM_POURS = 2  # of an action that are fitted, and as many that are held out
 STRONG = 1.0, 2.5  # of the prior's deviation
-COLUMNS = [
-    *["kind", "case", "theta", "truth", "phi", "alarm", "log_bayes", "chi_square_p"],
-    *["verdict", "top", "top_probability", "p_truth", "place", "p_unexplained"],
-    *["rmse_before", "rmse_after", "cpu_seconds"],
-]
 
 
 @cache
@@ -195,8 +190,6 @@ def row_of(bank: Path, kind: str, case: int) -> dict[str, object]:
     places = [k + 1 for k, name in enumerate(order) if name in names]
     evaluation = report.evaluation
     return {
-        "kind": kind,
-        "case": case,
         **truth,
         "alarm": detection.alarm,
         "log_bayes": float(detection.log_bayes_factor),
@@ -245,5 +238,5 @@ def main(arguments: Settings) -> None:
             )
         jobs = [(kind, case) for kind in arguments.kind for case in range(CASES[kind])]
         own = partial(row_of, arguments.bank)
-        resumed(path, COLUMNS[:2], jobs, own, columns=COLUMNS)
+        resumed(path, ["kind", "case"], jobs, own)
     print(summarize(read(path)))

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.pouring.summary import Rows
+from benchmarks.rounds import Rows
 from sbi_active.display.table import Table
-
-__all__ = ["summarize"]
 
 
 def summarize(rows: Rows) -> str:

@@ -27,8 +27,6 @@ from sbi_active.criticism import Effect
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.tasks import get_task
 
-__all__ = ["WORLDS", "World", "draw", "phi_of", "poured_effects"]
-
 WIDTHS, WIDTH_SHARES = (0.0, 1.0, 2.5), (0.5, 0.3, 0.2)
 
 

@@ -25,8 +25,6 @@ from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring.real import COMPARED_AT, HEIGHTS, RATES
 
-__all__ = ["draw"]
-
 PARTS = ("prior", "compared")
 PLACES, PLACE_SHARES = (-30.0, 0.0, 30.0), (0.4, 0.5, 0.1)
 RATE_SHARES = (0.25, 0.375, 0.375)

@@ -40,8 +40,6 @@ from sbi_active.tasks.pouring import images_of, intersection_volume
 from sbi_active.tasks.pouring.real import COMPARED_AT, HEIGHTS, RATES
 from sbi_active.tasks.pouring.task import PLACES
 
-__all__ = ["ByPlace", "Overlap", "PointBelief", "compared_pours", "learn"]
-
 Array = NDArray[Any]
 
 NUM_PARAMETERS = 8

@@ -49,11 +49,6 @@ METHODS = ("asbi", "nsbi")
 MATERIALS = ("beads", "gravel")
 NUM_ROUNDS = 4
 NUM_REAL = 4  # pours of the material that images are compared with
-COLUMNS = [
-    *["seed", "material", "method", "round", "height", "position", "rate", "delta"],
-    *["in_view", "eig", "intervol", "effective", "cpu_design", "cpu_trial"],
-]
-CHECKED = ["seed", "material", "method", "num", "poured", "poured_se", "learned"]
 
 
 @cache
@@ -70,8 +65,7 @@ def run_trial(
 ) -> tuple[list[dict[str, object]], PointBelief]:
     """Return one row a round of one campaign, and its last belief."""
     belief, points = PointBelief.uniform(), PointBelief.points()
-    first = {"seed": seed, "material": task.material, "method": method}
-    rows = [{**first, "round": 0, "intervol": overlap.mean(belief)}]
+    rows: list[dict[str, object]] = [{"round": 0, "intervol": overlap.mean(belief)}]
     total = np.zeros(len(points))
     earlier: Earlier = defaultdict(list)
     for index in range(NUM_ROUNDS):
@@ -92,7 +86,6 @@ def run_trial(
         belief = PointBelief(total * (index + 1.0) ** -TEMPERED)
         rows.append(
             {
-                **first,
                 "round": index + 1,
                 **dict(
                     zip(("height", "position", "rate"), action.tolist(), strict=True)
@@ -165,18 +158,15 @@ def run_missing(bank: Path, learned: ByPlace, arguments: Settings) -> None:
             made, belief = trial(method, seed)
             volume = poured(belief, material, arguments.check, seed)
             error = volume.std(ddof=1) / np.sqrt(len(volume))
-            told = seed, material, method, len(volume), volume.mean(), error
-            learned = made[-1]["intervol"]
-            return dict(zip(CHECKED, (*told, learned), strict=True))
+            told = {"num": len(volume), "poured": volume.mean(), "poured_se": error}
+            return told | {"learned": made[-1]["intervol"]}
 
         jobs = [(s, material, m) for s in range(arguments.first, last) for m in METHODS]
-        name, make, columns = (
-            ("intervol_poured", check, CHECKED)
-            if arguments.check
-            else ("intervol", rows, COLUMNS)
-        )
-        path = arguments.results / f"{name}.csv"
-        resumed(path, CHECKED[:3], jobs, make, columns=columns)
+        is_check = arguments.check > 0
+        name = "intervol_poured.csv" if is_check else "intervol.csv"
+        path = arguments.results / name
+        keys = ("seed", "material", "method")
+        resumed(path, keys, jobs, check if is_check else rows)
 
 
 def main(arguments: Settings) -> None:

@@ -11,12 +11,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.pouring.figures import boxes, subplots
-from benchmarks.pouring.summary import Rows
+from benchmarks.rounds import Rows
 from benchmarks.rows import read
 from sbi_active.display.figures import save
 from sbi_active.display.table import Table
-
-__all__ = ["checks_table", "intervol_figure", "summarize"]
 
 RESULTS = Path(__file__).parents[1] / "results"
 #: Section 6, medians of ASBI, mm summed over pixels of 1,000 particles, and how far

@@ -20,6 +20,7 @@ from sbi_active.design.designer import InformationGainDesigner
 from sbi_active.design.estimators.automatic import ESTIMATORS
 from sbi_active.design.limits import DesignLimits, pricing
 from sbi_active.design.random_designer import RandomDesigner
+from sbi_active.design.target import Target, name_of
 from sbi_active.seeding import derive_seed
 
 if TYPE_CHECKING:
@@ -86,7 +87,7 @@ class Planner:
             else RandomDesigner(actions, workers=options.workers)
         )
 
-    def require(self, target: str | Sequence[str]) -> None:
+    def require(self, target: Target) -> None:
         """Raise a ValueError if a trial cannot be designed for a target."""
         if target in ("auto", "theta"):
             return
@@ -130,7 +131,7 @@ class Planner:
     def design(
         self,
         index: int,
-        target: str | Sequence[str],
+        target: Target,
         learner: Learner,
         *,
         alarmed: bool,
@@ -161,17 +162,23 @@ class Planner:
             return about_model, "model"
         own = "theta" if target in ("auto", "model") else target
         if isinstance(learner, PooledLearner):
+            if callable(own):
+                raise ValueError(
+                    "expected target 'theta' with max_simulations or a SummaryAction, "
+                    f"whose pool tells of all parameters; got {name_of(own)!r}; leave "
+                    "out target=, or max_simulations="
+                )
             design, own = learner.design(index, limits), "theta"
         else:
             design = self._about_parameters(index, own, learner, limits)
         if about_model is not None and _utility(about_model) > _utility(design):
             return about_model, "model"
-        return design, own if isinstance(own, str) else ", ".join(own)
+        return design, name_of(own)
 
     def _about_model(
         self,
         index: int,
-        target: str | Sequence[str],
+        target: Target,
         learner: Learner,
         limits: DesignLimits,
     ) -> Design | None:
@@ -187,7 +194,7 @@ class Planner:
     def _about_parameters(
         self,
         index: int,
-        target: str | Sequence[str],
+        target: Target,
         learner: Learner,
         limits: DesignLimits,
     ) -> Design:

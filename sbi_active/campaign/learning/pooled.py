@@ -19,7 +19,7 @@ from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.score import Score, compared
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.design.design import Design
-from sbi_active.design.elimination import Estimates, choose
+from sbi_active.design.elimination import choose
 from sbi_active.design.limits import DesignLimits
 from sbi_active.identifiability.known import note_combinations
 from sbi_active.inference.emulation.joint import candidate_gains
@@ -191,25 +191,20 @@ class PooledLearner(Learner):
         eligible = limits.reached_by(shares)
         utility = (rows.mean(1) / limits.cost(listed)).masked_fill(~eligible, -math.inf)
         middle = rows.shape[1] // 2
-        estimates = Estimates(
+        return choose(
+            limits,
             action=listed,
-            choosing=[*rows[:, :middle]],
-            reporting=[*rows[:, middle:]],
-            num_samples=torch.full((len(listed),), rows.shape[1]),
-            probability_valid=shares,
+            halves=([*rows[:, :middle]], [*rows[:, middle:]]),
             eligible=eligible,
             leader=int(utility.argmax()),
-            stopped="budget spent",
-            notes=(*notes, *limits.excluded_note(eligible)),
-        )
-        return choose(
-            estimates,
-            limits,
+            seed=seed,
+            probability_valid=shares,
+            num_samples=torch.full((len(listed),), rows.shape[1]),
             estimator="PooledGain",
             bound="none",
             num_simulations=self.state.meter.spent - start,
-            num_missing=0,
-            seed=seed,
+            stopped="budget spent",
+            notes=(*notes, *limits.excluded_note(eligible)),
         )
 
     def _candidates(

@@ -14,12 +14,16 @@ from sbi_active.design.estimators.base import (
     InformationGainEstimator,
     standard_error,
 )
+from sbi_active.design.estimators.contrast import (
+    ContrastiveGain,
+    InfoNCEGain,
+    LikelihoodGain,
+    RatioGain,
+)
 from sbi_active.design.estimators.entropy import EntropyGain
-from sbi_active.design.estimators.likelihood import ContrastiveGain, LikelihoodGain
 from sbi_active.design.estimators.linear import LinearGain
 from sbi_active.design.estimators.nested import NestedGain
 from sbi_active.design.estimators.posterior import PosteriorGain
-from sbi_active.design.estimators.ratio import InfoNCEGain, RatioGain
 from sbi_active.messages import warn
 
 #: Name of an estimator: its class.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -208,15 +208,21 @@ def at_least(value: int, least: int, name: str, usual: int) -> int:
     return value
 
 
-def distinct(index: Sequence[int]) -> list[int]:
-    """Return the places of some parameters.
+def numbers_of(
+    target: Sequence[int] | Callable[[Tensor], Tensor],
+) -> Callable[[Tensor], Tensor]:
+    """Return a function of parameters (n, d) that gives those of some places, (n, k).
+
+    A function is returned as it is.
 
     Raises:
-        ValueError: If there is none, or one twice.
+        ValueError: If there is no place, or one twice.
     """
+    if callable(target):
+        return target
+    index = list(target)
     if not index or len(set(index)) < len(index):
         raise ValueError(
-            f"expected one or more different parameters; got {list(index)}; "
-            "name each once"
+            f"expected one or more different parameters; got {index}; name each once"
         )
-    return list(index)
+    return lambda theta: theta[:, index]

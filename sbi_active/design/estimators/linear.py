@@ -2,7 +2,7 @@ r"""Information gain of outcomes of many numbers, as if linear in the parameters
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -12,7 +12,7 @@ from typing_extensions import override
 from sbi_active.design.estimators.base import (
     CandidateSimulations,
     InformationGainEstimator,
-    distinct,
+    numbers_of,
 )
 from sbi_active.simulation import NoiseModel
 from sbi_active.simulation.noise.whitening import whitened
@@ -45,7 +45,8 @@ class LinearGain(InformationGainEstimator):
     of it, counts as no information.
 
     Args:
-        index: Parameters S; None are all.
+        index: Places of the parameters S, or a function of parameters (n, d) whose
+            numbers (n, k) stand for them; None are all.
 
     Raises:
         ValueError: If no parameter or one twice is named.
@@ -72,8 +73,10 @@ class LinearGain(InformationGainEstimator):
     needs_noise = True
     needs_model = False
 
-    def __init__(self, index: Sequence[int] | None = None) -> None:
-        self.index = None if index is None else distinct(index)
+    def __init__(
+        self, index: Sequence[int] | Callable[[Tensor], Tensor] | None = None
+    ) -> None:
+        self.target = None if index is None else numbers_of(index)
 
     @override
     def remarks(
@@ -82,11 +85,11 @@ class LinearGain(InformationGainEstimator):
         mean, noise = simulations.mean, simulations.noise
         if mean is None or noise is None:
             return []
-        bent = []
+        bent, theta = [], simulations.theta.double()
         for row in mean:
             y = _rows(noise, row)
             complete = y.isfinite().all(1)
-            off = _off_plane(simulations.theta[complete].double())
+            off = _off_plane(theta[complete])
             rest = off @ y[complete]
             bent.append(float((rest.square().sum() / off.trace() / y.shape[1]).sqrt()))
         worst = max(bent, default=0.0)
@@ -107,8 +110,8 @@ class LinearGain(InformationGainEstimator):
                 "expected declared noise for LinearGain; got replicates; build "
                 "SimulatorModel(fn, noise=...) around a noise-free fn"
             )
-        theta = simulations.theta.double()
-        theta = theta if self.index is None else theta[:, self.index]
+        theta = simulations.theta
+        theta = (theta if self.target is None else self.target(theta)).double()
         gain = torch.full(mean.shape[:2], torch.nan, dtype=torch.float64)
         for a, row in enumerate(mean):
             y = _rows(noise, row)

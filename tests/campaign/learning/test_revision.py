@@ -5,13 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import Independent, Normal
 
 from sbi_active import Campaign, DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.campaign.learning.planner import most_unlike
 from sbi_active.campaign.options import CampaignDetails
-from sbi_active.criticism import Effect
 from tests.campaign import problem
+from tests.effects import BIAS, on_outcomes
 
 PRIOR = BoxUniform(-2 * torch.ones(1), 2 * torch.ones(1))
 ACTIONS = DiscreteActions([-2.0, -1.0, 1.0, 2.0])
@@ -24,16 +23,7 @@ OPTIONS = replace(problem.OPTIONS, details=CampaignDetails(num_scored=400))
 SHIFT = 0.8
 
 
-def normal(sd):
-    return Independent(Normal(torch.zeros(1), torch.full((1,), sd)), 1)
-
-
-def effect(name, apply, sd=1.0):
-    return Effect(name, hook="observation", prior=normal(sd), null=0.0, apply=apply)
-
-
-BIAS = effect("bias", lambda x, phi, action, context: x + phi)
-DRIFT = effect(
+DRIFT = on_outcomes(
     "drift", lambda x, phi, action, context: x + phi * context.index[:, None]
 )
 LIBRARY = [BIAS, DRIFT]

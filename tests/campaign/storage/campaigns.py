@@ -45,15 +45,10 @@ def outcome(action, index):
 
 
 def new(directory=None, simulator=drawn, method="nsbi", **more):
-    return Campaign(
-        simulator,
-        PRIOR,
-        ACTIONS,
-        method=method,
-        options=OPTIONS,
-        directory=directory,
-        **more,
-    )
+    """Return a campaign; what is given besides takes the place of what is usual."""
+    usual = {"prior": PRIOR, "actions": ACTIONS, "options": OPTIONS}
+    given = {**usual, "method": method, "directory": directory, **more}
+    return Campaign(simulator, **given)
 
 
 def go_on(campaign, num_trials):

@@ -7,17 +7,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch.distributions import Normal
 
 from sbi_active import BoxActions, Campaign
-from sbi_active.criticism import Effect
 from sbi_active.messages import RenamedWarning
 from sbi_active.simulation.bank import Bank, LockedError
 from tests.campaign.storage.campaigns import (
-    ACTIONS,
     MODEL,
     OPTIONS,
-    PRIOR,
     TRUTH,
     drawn,
     draws,
@@ -26,6 +22,7 @@ from tests.campaign.storage.campaigns import (
     new,
     outcome,
 )
+from tests.effects import BIAS
 from tests.simulation.bank.filled import execute
 
 CALLS = []  # sizes of what was simulated
@@ -172,7 +169,8 @@ def test_a_new_campaign_wants_an_empty_directory(tmp_path):
         Campaign.load(tmp_path / "other")
 
 
-def test_another_simulator_is_refused_or_computes_everything_again(tmp_path):
+@pytest.mark.parametrize("told_since", [False, True])
+def test_another_simulator_is_refused_or_not_forgotten_by_a_kill(tmp_path, told_since):
     go_on(new(tmp_path / "c"), 2).close()
 
     def mended(theta, action):
@@ -180,27 +178,6 @@ def test_another_simulator_is_refused_or_computes_everything_again(tmp_path):
 
     with pytest.raises(ValueError, match="got another: simulator.*source"):
         Campaign.load(tmp_path / "c", simulator=mended)
-    with Campaign.load(
-        tmp_path / "c", simulator=mended, simulator_changed=True
-    ) as campaign:
-        campaign.update()
-        shifted = draws(campaign).mean(0)
-    anew = new(simulator=mended)
-    for trial in campaign.history:
-        anew.attach(trial.action, trial.x)
-    anew.update()
-    assert torch.equal(draws(campaign), draws(anew))
-    again = Campaign.load(tmp_path / "c", simulator=mended)
-    assert torch.equal(draws(again).mean(0), shifted)
-
-
-@pytest.mark.parametrize("told_since", [False, True])
-def test_a_changed_simulator_is_not_forgotten_by_a_kill(tmp_path, told_since):
-    go_on(new(tmp_path / "c"), 2).close()
-
-    def mended(theta, action):
-        return drawn(theta, action) + 0.1
-
     changed = Campaign.load(tmp_path / "c", simulator=mended, simulator_changed=True)
     if told_since:
         changed.attach([1.0], outcome(torch.tensor([1.0]), 2))
@@ -220,13 +197,8 @@ def test_a_changed_simulator_is_not_forgotten_by_a_kill(tmp_path, told_since):
 
 def test_options_and_actions_are_taken_as_by_the_constructor(tmp_path):
     listed = [0.5, 1.0, 2.0]
-    whole = Campaign(
-        *(drawn, PRIOR, listed),
-        method="nsbi",
-        options=OPTIONS,
-        directory=tmp_path / "c",
-    )
-    go_on(whole, 1).close()
+    whole = go_on(new(tmp_path / "c", actions=listed), 1)
+    whole.close()
     fields = {f.name: getattr(OPTIONS, f.name) for f in dataclasses.fields(OPTIONS)}
     again = Campaign.load(
         tmp_path / "c", simulator=drawn, options=fields, actions=listed
@@ -262,14 +234,8 @@ class OwnPrior(torch.distributions.Uniform):
 
 def test_what_only_its_author_can_make_is_asked_for(tmp_path):
     prior = torch.distributions.Independent(OwnPrior(torch.zeros(2), torch.ones(2)), 1)
-    campaign = Campaign(
-        *(drawn, prior, new().actions),
-        method="nsbi",
-        options=OPTIONS,
-        directory=tmp_path / "c",
-        cost=price,
-    )
-    go_on(campaign, 1).close()
+    campaign = go_on(new(tmp_path / "c", prior=prior, cost=price), 1)
+    campaign.close()
     with pytest.raises(ValueError, match="expected prior=, which only its author"):
         Campaign.load(tmp_path / "c", simulator=drawn, cost=price)
     reader = Campaign.load(tmp_path / "c")  # by the draws that are kept
@@ -286,14 +252,7 @@ def test_what_only_its_author_can_make_is_asked_for(tmp_path):
 
 
 def test_adopted_effects_come_back(tmp_path):
-    bias = Effect(
-        "bias",
-        hook="observation",
-        prior=Normal(0.0, 1.0),
-        null=0.0,
-        apply=lambda x, phi, action, context: x + phi,
-    )
-    campaign = new(tmp_path / "c", simulator=MODEL, effects=[bias])
+    campaign = new(tmp_path / "c", simulator=MODEL, effects=[BIAS])
     for index, action in enumerate(torch.linspace(0.5, 2.0, 6)):
         campaign.attach([float(action)], outcome(action[None], index) + 1)
     report = campaign.criticize(evaluate=False)
@@ -306,7 +265,7 @@ def test_adopted_effects_come_back(tmp_path):
     assert reader.parameter_names == ["a", "b", "bias"]
     with pytest.raises(ValueError, match=r"expected the effects \['bias'\]; got"):
         Campaign.load(tmp_path / "c", simulator=MODEL)
-    again = Campaign.load(tmp_path / "c", simulator=MODEL, effects=[bias])
+    again = Campaign.load(tmp_path / "c", simulator=MODEL, effects=[BIAS])
     assert again.state.version.effects == ("bias",)
     assert torch.equal(draws(again), draws(campaign))
     assert draws(again).shape[1] == 3
@@ -318,9 +277,7 @@ def test_a_bank_that_campaigns_share(tmp_path, caplog):
 
     def run(seed):
         CALLS.clear()
-        campaign = Campaign(
-            *(counted, PRIOR, new().actions), method="asbi", options=options, seed=seed
-        )
+        campaign = new(simulator=counted, method="asbi", options=options, seed=seed)
         assert campaign.posterior is not None  # the first round's network
         campaign.close()
         return sum(CALLS), campaign
@@ -339,11 +296,11 @@ def test_a_bank_that_campaigns_share(tmp_path, caplog):
 
 def test_earlier_rows_of_other_actions_are_not_taken(tmp_path):
     options = replace(OPTIONS, bank=tmp_path / "bank")
-    with Campaign(counted, PRIOR, ACTIONS, method="asbi", options=options) as campaign:
+    with new(simulator=counted, method="asbi", options=options) as campaign:
         assert campaign.posterior is not None
     CALLS.clear()
-    fast = BoxActions([3.0], [4.0])
-    with Campaign(counted, PRIOR, fast, method="asbi", options=options) as campaign:
+    fast = {"actions": BoxActions([3.0], [4.0]), "options": options}
+    with new(simulator=counted, method="asbi", **fast) as campaign:
         assert campaign.posterior is not None
     assert sum(CALLS) >= OPTIONS.num_simulations
 

@@ -13,8 +13,7 @@ from sbi_active.design.estimators.automatic import (
     find_estimator,
 )
 from sbi_active.design.estimators.base import CandidateSimulations
-from sbi_active.design.estimators.likelihood import ContrastiveGain
-from sbi_active.design.estimators.ratio import InfoNCEGain
+from sbi_active.design.estimators.contrast import ContrastiveGain, InfoNCEGain
 from tests.linear_gaussian import (
     PRIOR,
     ExactLikelihood,

@@ -11,8 +11,7 @@ import torch
 
 from sbi_active.design import LikelihoodGain, RatioGain
 from sbi_active.design.estimators.base import CandidateSimulations, standard_error
-from sbi_active.design.estimators.likelihood import ContrastiveGain
-from sbi_active.design.estimators.ratio import InfoNCEGain
+from sbi_active.design.estimators.contrast import ContrastiveGain, InfoNCEGain
 from tests.design.fragile import PRIOR as FRAGILE_PRIOR
 from tests.design.fragile import Fragile, log_normal
 from tests.linear_gaussian import (

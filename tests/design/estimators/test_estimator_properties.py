@@ -15,8 +15,7 @@ from sbi_active.design import (
 )
 from sbi_active.design.estimators.automatic import ESTIMATORS as NAMES
 from sbi_active.design.estimators.base import CandidateSimulations
-from sbi_active.design.estimators.likelihood import ContrastiveGain
-from sbi_active.design.estimators.ratio import InfoNCEGain
+from sbi_active.design.estimators.contrast import ContrastiveGain, InfoNCEGain
 from sbi_active.simulation import GaussianNoise
 from tests.linear_gaussian import (
     PRIOR,

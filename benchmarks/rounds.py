@@ -1,0 +1,75 @@
+"""Tables of campaigns by round: rows of several methods on several targets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from scipy import stats
+
+from benchmarks.rows import column
+from sbi_active.display.table import Table
+
+Rows = Sequence[Mapping[str, str]]
+Cells = Mapping[tuple[str, str], Rows]  # by method and target
+
+
+def num_rounds(rows: Rows) -> int:
+    """Return the number of rounds of the trials."""
+    return max(int(r["round"]) for r in rows)
+
+
+def by_round(rows: Rows, key: str) -> list[np.ndarray]:
+    """Return a column, an array a round."""
+    return [column(rows, key, k + 1) for k in range(num_rounds(rows))]
+
+
+def active_against_random(
+    cells: Cells, pairs: Sequence[tuple[str, str]] = (("asbi", "nsbi"),)
+) -> list[str]:
+    """Return how far the chosen actions' median log p is above the random ones'."""
+    lines = []
+    for active, random in pairs:
+        for target in ("1", "2"):
+            if (active, target) not in cells or (random, target) not in cells:
+                continue
+            ours, theirs = (
+                [np.median(v) for v in by_round(cells[method, target], "log_prob_true")]
+                for method in (active, random)
+            )
+            gaps = [a - b for a, b in zip(ours[1:], theirs[1:], strict=False)]
+            text = " / ".join(f"{gap:+.2f}" for gap in gaps)
+            lines.append(
+                f"target {target}: {active.upper()} above {random.upper()} in median "
+                f"log p in {sum(gap > 0 for gap in gaps)} of rounds 2 to {len(ours)} "
+                f"({text})"
+            )
+    return lines
+
+
+def coverage_table(
+    cells: Cells,
+    rounds: Sequence[int],
+    last: tuple[str, Callable[[Rows, int], str]],
+) -> str:
+    """Return how often the truth lies in regions of highest density, by round.
+
+    Args:
+        cells: Rows by method and target.
+        rounds: Rounds that are shown, where there are so many.
+        last: Header of the last column, and the function of its cells.
+    """
+    table = []
+    for (method, _), rows in cells.items():
+        for number in [r for r in rounds if r <= num_rounds(rows)]:
+            hpd = column(rows, "hpd", number)
+            n, entry = len(hpd), [method.upper(), str(number), str(len(hpd))]
+            for level in (0.5, 0.9):
+                inside = int((hpd <= level).sum())
+                low, high = stats.binom.interval(0.95, n, level)
+                verdict = "within" if low <= inside <= high else "outside"
+                bounds = f"[{low / n:.3f}, {high / n:.3f}]"
+                entry.append(f"{inside / n:.3f} {verdict} {bounds}")
+            table.append([*entry, last[1](rows, number)])
+    header = ["", "round", "trials", "in 50 % region", "in 90 % region", last[0]]
+    return Table(header, table).text() if table else "no trials yet"

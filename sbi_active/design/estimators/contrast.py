@@ -1,0 +1,333 @@
+r"""Information gain by a learned likelihood or ratio, against other parameters.
+
+Every estimate here is :math:`E[f(x_i, \theta_i) - \log \hat p(x_i)]` with a function f
+of the model; the classes differ in the parameters whose mean is :math:`\hat p`.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from abc import abstractmethod
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+from typing_extensions import override
+
+from sbi_active.design.estimators.base import (
+    Bound,
+    CandidateSimulations,
+    InformationGainEstimator,
+    at_least,
+)
+from sbi_active.design.estimators.critic import Critic, RatioModel
+from sbi_active.seeding import derive_seed, forked_generators
+
+
+class RatioGain(InformationGainEstimator):
+    r"""Mean log ratio of likelihood to marginal, the utility of LFIRE.
+
+    .. math::
+        U(\xi) = \frac1n \sum_{i=1}^n \log r(x_i, \theta_i | \xi), \qquad
+        r(x, \theta | \xi) \approx \frac{p(x | \theta, \xi)}{p(x | \xi)}
+
+    with :math:`\theta_i \sim p`, :math:`x_i \sim p(x | \theta_i, \xi)`. With the exact
+    ratio it has no bias, however large the information; a learned one gives no bound,
+    as nothing makes its normalization right. Where a network leaves it open
+    (multi-class ratio estimation does, up to a function of x) take
+    :class:`.InfoNCEGain`.
+
+    Args:
+        batch_size: Rows in one pass of the network.
+
+    References:
+        Thomas, Dutta, Corander, Kaski & Gutmann, Bayesian Analysis 2022 (LFIRE);
+        Kleinegesse, Drovandi & Gutmann, Bayesian Analysis 2021 (the utility).
+    """
+
+    rowwise = True
+
+    def __init__(self, *, batch_size: int = 50_000) -> None:
+        self.batch_size = batch_size
+
+    def _contributions(
+        self, model: RatioModel, simulations: CandidateSimulations, belief: object
+    ) -> Tensor:
+        critic = Critic(model, ("log_ratio",), type(self).__name__, self.batch_size)
+        theta, action = simulations.rows()
+        counted = simulations.counted.flatten()
+        gain = torch.full(counted.shape, torch.nan, dtype=torch.float64)
+        gain[counted] = torch.stack(
+            [
+                critic.rows(x.flatten(0, 1)[counted], theta[counted], action[counted])
+                for x in simulations.outcomes()
+            ]
+        ).mean(0)
+        return gain.reshape(simulations.x.shape[:2])
+
+
+class _Contrast(InformationGainEstimator):
+    r"""Log of f at an outcome's own parameters, less its mean over others.
+
+    A contribution includes what parameters do to the evidence of outcomes that they are
+    compared with; this has mean zero and makes the error honest.
+
+    Attributes:
+        functions: Methods of a model that may be f, the first that it has.
+        caution: Words where an estimate is near its limit, with {limit} and {where}.
+    """
+
+    functions: ClassVar[tuple[str, ...]] = ("log_likelihood",)
+    caution: ClassVar[str]
+    batch_size: int
+
+    @abstractmethod
+    def _compared(
+        self, counted: Tensor, simulations: CandidateSimulations, belief: Any
+    ) -> list[tuple[Tensor, Tensor]]:
+        """Return groups of the counted rows (n,), and the parameters for each."""
+
+    @abstractmethod
+    def _limit(self, counted: Tensor) -> int:
+        """Return the number whose log the estimate from counted rows is limited by."""
+
+    def _terms(self, own: Tensor, others: Tensor) -> Tensor:
+        """Return what the mean is of, from f (n,) at own parameters and at others."""
+        return others
+
+    def _contributions(
+        self, model: Any, simulations: CandidateSimulations, belief: Any
+    ) -> Tensor:
+        critic = Critic(model, self.functions, type(self).__name__, self.batch_size)
+        gain = torch.full(simulations.x.shape[:2], torch.nan, dtype=torch.float64)
+        for a, counted in enumerate(simulations.counted):
+            action = simulations.action[a]
+            for rows, others in self._compared(counted, simulations, belief):
+                theta = simulations.theta[rows]
+                of_each = [
+                    self._of_rows(critic, x[a, rows], theta, others, action)
+                    for x in simulations.outcomes()
+                ]
+                gain[a, rows] = torch.stack(of_each).mean(0)
+        return gain
+
+    def _of_rows(
+        self, critic: Critic, x: Tensor, theta: Tensor, others: Tensor, action: Tensor
+    ) -> Tensor:
+        """Return contributions of outcomes of one candidate, shape (n,)."""
+        n, m = len(x), len(others)
+        own = critic.rows(x, theta, action.expand(n, -1))
+        log_p = torch.empty(n, dtype=torch.float64)
+        share = torch.zeros(m, dtype=torch.float64)  # in the evidences of all outcomes
+        for block in torch.arange(n).split(max(64, self.batch_size // m)):
+            table = critic.table(x[block], others, action)
+            terms = self._terms(own[block], table)
+            log_p[block] = terms.logsumexp(1) - math.log(terms.shape[1])
+            share += terms.softmax(1)[:, -m:].nan_to_num(0.0).sum(0)
+        effect = torch.zeros(n, dtype=torch.float64)
+        effect.index_add_(0, torch.arange(m) % n, share - share.mean())
+        return torch.where(own == -torch.inf, own, own - log_p) - effect
+
+    @override
+    def cautions(self, gain: Tensor, *, near: float = 1.0) -> list[str]:
+        """Return a caution where estimates are near their limit or above it.
+
+        Args:
+            gain: Contributions, shape (a, n).
+            near: Distance to the log of a number of draws, within which too few are
+                effective, nats.
+        """
+        limits = [math.log(max(1, self._limit(row.isfinite()))) for row in gain]
+        above = gain.nanmean(1) > torch.tensor(limits, dtype=gain.dtype) - near
+        if not bool(above.any()):
+            return []
+        where = f"{int(above.sum())} of {len(gain)} actions"
+        return [self.caution.format(limit=f"{max(limits):.1f} nats", where=where)]
+
+
+class LikelihoodGain(_Contrast):
+    r"""Nested Monte Carlo on a likelihood, the utility of ALHI.
+
+    .. math::
+        U(\xi) = \frac1n \sum_{i=1}^n \log q(x_i | \theta_i, \xi)
+        - \log \hat p(x_i | \xi), \qquad
+        \hat p(x | \xi) = \frac1L \sum_{l=1}^L q(x | \theta'_l, \xi)
+
+    with :math:`\theta_i, \theta'_l \sim p`, :math:`x_i \sim p(x | \theta_i, \xi)`. With
+    the exact likelihood it is an upper bound in expectation, by Jensen's inequality,
+    whose excess is about half the relative variance of :math:`\hat p`: it needs L well
+    above the exponential of the information. A learned likelihood gives no bound: to
+    the same excess it adds minus the divergence of the posterior that it implies.
+    :class:`.NestedGain` does better on few draws where the
+    noise is declared.
+
+    Args:
+        num_contrastive: Number of contrastive draws L.
+        seed: Seed of the draws.
+        batch_size: Rows in one pass of the network.
+
+    Raises:
+        ValueError: If ``num_contrastive`` is below 1.
+
+    References:
+        Kim & Matsubara, Applied Intelligence 2025 (ALHI, the two equations of section
+        5.1); Rainforth et al., ICML 2018 (nested Monte Carlo).
+
+    Example:
+        >>> import torch
+        >>> from sbi_active.design.estimators.base import CandidateSimulations
+        >>> class Scale:
+        ...     exact_likelihood = True
+        ...     def log_likelihood(self, x, theta, action):
+        ...         normal = torch.distributions.Normal(action * theta, 1.0)
+        ...         return normal.log_prob(x).sum(-1)
+        >>> _ = torch.manual_seed(0)
+        >>> prior = torch.distributions.MultivariateNormal(torch.zeros(1), torch.eye(1))
+        >>> theta, action = prior.sample((2_000,)), torch.tensor([[2.0], [4.0]])
+        >>> x = action[:, None] * theta + torch.randn(2, 2_000, 1)
+        >>> rows = CandidateSimulations(theta, action, x)
+        >>> gain = LikelihoodGain()(Scale(), rows, prior).mean(1)
+        >>> bool((gain - torch.tensor([0.80, 1.42])).abs().max() < 0.15)  # exact values
+        True
+        >>> LikelihoodGain().bound_on(Scale())
+        'upper'
+    """
+
+    caution = (
+        "LikelihoodGain is near log L = {limit} or above at {where}: few of the draws "
+        "explain an outcome, and it is too large there; raise num_contrastive"
+    )
+
+    def __init__(
+        self, *, num_contrastive: int = 500, seed: int = 0, batch_size: int = 50_000
+    ) -> None:
+        self.num_contrastive = at_least(num_contrastive, 1, "num_contrastive", 100)
+        self.seed, self.batch_size = seed, batch_size
+
+    @override
+    def bound_on(self, model: Any) -> Bound:
+        return "upper" if getattr(model, "exact_likelihood", False) else "none"
+
+    def _limit(self, counted: Tensor) -> int:
+        return self.num_contrastive
+
+    def _compared(
+        self, counted: Tensor, simulations: CandidateSimulations, belief: Any
+    ) -> list[tuple[Tensor, Tensor]]:
+        rows = torch.nonzero(counted)[:, 0]
+        return [(rows, self._draw(belief, simulations))] if len(rows) else []
+
+    def _draw(
+        self, belief: Distribution | None, simulations: CandidateSimulations
+    ) -> Tensor:
+        if belief is None:
+            raise ValueError(
+                f"expected a belief for {type(self).__name__} to draw from; got None; "
+                "pass the distribution of theta in the simulations"
+            )
+        key = zlib.crc32(simulations.theta.numpy(force=True).tobytes())
+        with forked_generators(derive_seed(self.seed, "contrastive", key)):
+            return belief.sample(torch.Size([self.num_contrastive]))
+
+
+class ContrastiveGain(LikelihoodGain):
+    r"""Prior contrastive estimation (PCE).
+
+    .. math::
+        U(\xi) = \frac1n \sum_{i=1}^n \log q(x_i | \theta_i, \xi)
+        - \log \hat p_i(x_i | \xi), \qquad
+        \hat p_i(x | \xi) = \frac{1}{L + 1} \left[ q(x | \theta_i, \xi)
+        + \sum_{l=1}^L q(x | \theta'_l, \xi) \right]
+
+    with :math:`\theta_i, \theta'_l \sim p`, :math:`x_i \sim p(x | \theta_i, \xi)`. It
+    tells :math:`\theta_i` from L others by x and is a lower bound for any positive
+    function q, so on simulations that q was not trained on a learned likelihood keeps
+    it below the information, if not close. With the exact one it rises to the
+    information with L. It cannot exceed log(L + 1), near which it does not rank.
+
+    Args:
+        num_contrastive: Number of contrastive draws L.
+        seed: Seed of the draws.
+        batch_size: Rows in one pass of the network.
+
+    References:
+        Foster, Jankowiak, O'Meara, Teh & Rainforth, AISTATS 2020; van den Oord, Li &
+        Vinyals, 2018 (the bound for any critic).
+    """
+
+    bound: Bound = "lower"
+    caution = (
+        "ContrastiveGain is near its largest value, log(L + 1) = {limit}, at {where}: "
+        "it is too small there and does not rank; raise num_contrastive"
+    )
+
+    @override
+    def bound_on(self, model: Any) -> Bound:
+        return self.bound
+
+    def _limit(self, counted: Tensor) -> int:
+        return self.num_contrastive + 1
+
+    def _terms(self, own: Tensor, others: Tensor) -> Tensor:
+        return torch.cat([own[:, None], others], 1)
+
+
+class InfoNCEGain(_Contrast):
+    r"""InfoNCE bound with a learned ratio or likelihood as its critic.
+
+    .. math::
+        U(\xi) = \frac1K \sum_{i=1}^K \log \frac{e^{f(x_i, \theta_i | \xi)}}
+        {\frac1K \sum_{j=1}^K e^{f(x_i, \theta_j | \xi)}}
+
+    on each block of K simulations, :math:`\theta_i \sim p`, :math:`x_i \sim p(x |
+    \theta_i, \xi)`, with f the model's ``log_ratio``, or else its ``log_likelihood``.
+    It is a lower bound for any f, on simulations that f was not trained on, and does
+    not change where f is off by a function of x. It cannot exceed log K, near which
+    it does not rank. No further draws of the belief are needed.
+
+    The mean over a block is unchanged; as its simulations share each other's
+    parameters, a contribution includes what its own parameters do to the others,
+
+    .. math::
+        1 - \sum_{i=1}^K \frac{e^{f(x_i, \theta_j)}}{\sum_k e^{f(x_i, \theta_k)}}.
+
+    Args:
+        num_contrastive: L = K - 1, at most; blocks are as equal as they can be.
+        batch_size: Rows in one pass of the network.
+
+    Raises:
+        ValueError: If ``num_contrastive`` is below 1.
+
+    References:
+        van den Oord, Li & Vinyals, 2018; Poole et al., ICML 2019 (bounds of mutual
+        information).
+    """
+
+    bound: Bound = "lower"
+    functions = ("log_ratio", "log_likelihood")
+    caution = (
+        "InfoNCEGain is near its largest value, log K = {limit}, at {where}: it is too "
+        "small there and does not rank; raise num_contrastive"
+    )
+
+    def __init__(self, *, num_contrastive: int = 127, batch_size: int = 50_000) -> None:
+        self.num_contrastive = at_least(num_contrastive, 1, "num_contrastive", 100)
+        self.batch_size = batch_size
+
+    def _limit(self, counted: Tensor) -> int:
+        # the smallest block limits; candidates may have lost rows to faults
+        return min(map(len, self._blocks(counted)), default=1)
+
+    def _compared(
+        self, counted: Tensor, simulations: CandidateSimulations, belief: Any
+    ) -> list[tuple[Tensor, Tensor]]:
+        theta = simulations.theta
+        return [(block, theta[block]) for block in self._blocks(counted)]
+
+    def _blocks(self, counted: Tensor) -> tuple[Tensor, ...]:
+        """Return the rows of each block, none larger than K."""
+        rows = torch.nonzero(counted)[:, 0]
+        num_blocks = -(-len(rows) // (self.num_contrastive + 1))
+        return rows.tensor_split(num_blocks) if num_blocks else ()

@@ -1,0 +1,141 @@
+"""What an action tells about a function of the parameters."""
+
+import math
+
+import pytest
+import torch
+from torch.distributions import MultivariateNormal
+
+from sbi_active import DiscreteActions, GaussianNoise, InformationGainDesigner
+from sbi_active.criticism import Effect
+from sbi_active.criticism.effects.augmented import AugmentedSimulator
+from sbi_active.design.target import Quantity, name_of
+from sbi_active.simulation import SimulatorModel
+from tests.linear_gaussian import PRIOR
+
+SIDES = DiscreteActions([0.0, 1.0], names=["side"])
+ONE = MultivariateNormal(torch.zeros(1), torch.eye(1))
+
+
+def one_at_a_time(theta, action):
+    """The first action tells about the first parameter, the second the other."""
+    gain = torch.tensor([8.0, 2.0])
+    both = torch.where(action > 0.5, gain * theta, gain.flip(0) * theta)
+    return both.gather(1, (action > 0.5).long())
+
+
+MODEL = SimulatorModel(
+    one_at_a_time, noise=GaussianNoise(1.0), parameter_names=["mass", "friction"]
+)
+
+
+def select(target, *, actions=SIDES, model=MODEL, belief=PRIOR, **options):
+    designer = InformationGainDesigner(actions, num_samples=400, **options)
+    return designer.select(None, model, belief=belief, target=target, seed=0)
+
+
+@pytest.mark.parametrize("estimator", ["auto", "linear"])
+@pytest.mark.parametrize(("name", "place"), [("mass", 0), ("friction", 1)])
+def test_a_linear_function_of_a_parameter_is_the_parameter(estimator, name, place):
+    by_name = select(name, estimator=estimator)
+    by_value = select(lambda theta: 1 - 3 * theta[:, place], estimator=estimator)
+    assert by_value.action.tolist() == by_name.action.tolist() == [float(place)]
+    assert by_value.estimator == by_name.estimator
+    torch.testing.assert_close(
+        by_value.expected_information_gain,
+        by_name.expected_information_gain,
+        rtol=0,
+        atol=1e-6 if estimator == "linear" else 0.03,  # of the marginal's entropy
+    )
+
+
+def test_a_sum_is_told_by_what_its_terms_tell():
+    """x = a theta + noise: of 5 theta_1 + theta_2 the first side tells far more."""
+    design = select(lambda theta: theta @ torch.tensor([5.0, 1.0]))
+    assert design.action.tolist() == [0.0]
+    # jointly normal: the sum's correlation with either x
+    correlation = [25 / 26 * 4 / 5, 1 / 26 * 64 / 65]
+    sides = [0, 1]
+    exact = [-0.5 * math.log1p(-correlation[k]) for k in sides]
+    gain, error = design.expected_information_gain, design.standard_error
+    for k in sides:
+        assert abs(float(gain[k]) - exact[k]) < 3 * float(error[k]) + 0.15
+
+
+def test_a_function_of_an_effect():
+    drag = Effect(
+        "drag",
+        hook="observation",
+        prior=ONE,
+        null=0.0,
+        apply=lambda x, phi, action, context: x + 6 * phi * action,
+        units="",
+    )
+    model = AugmentedSimulator(MODEL, [drag])
+    belief = MultivariateNormal(torch.zeros(3), torch.eye(3))
+    seen = []
+
+    def loss(theta, effect):
+        seen.append((theta.shape[1], [*effect], effect["drag"].shape[1]))
+        return effect["drag"][:, 0] + 0.0 * theta[:, 0]
+
+    design = select(loss, model=model, belief=belief)
+    assert design.action.tolist() == [1.0]
+    assert all(each == (2, ["drag"], 1) for each in seen)
+    plain = select(lambda theta: theta[:, 2], model=model, belief=belief)
+    assert torch.equal(
+        plain.expected_information_gain, design.expected_information_gain
+    )
+
+
+def test_a_failure_or_none():
+    """The sign of theta: log 2 at most, and next to nothing from a weak action."""
+    model = SimulatorModel(
+        lambda theta, action: action * theta, noise=GaussianNoise(1.0)
+    )
+    design = select(
+        lambda theta: (theta[:, 0] > 0).float(),
+        actions=DiscreteActions([0.1, 100.0]),
+        model=model,
+        belief=ONE,
+    )
+    weak, strong = design.expected_information_gain.tolist()
+    assert abs(weak) < 0.05
+    error = float(design.standard_error[1])
+    assert math.log(2) - 0.3 - 3 * error < strong < math.log(2) + 3 * error
+    assert strong > 3 * error
+
+
+def test_principal_components_stand_for_a_motion():
+    time = torch.linspace(0, 1, 50)
+    quantity = Quantity(lambda theta: theta[:, :1] * time + theta[:, 1:], MODEL, PRIOR)
+    value = quantity(PRIOR.sample((100,)))
+    assert value.shape == (100, 4)
+    # a motion of two parameters has two directions
+    assert (value[:, 2:].abs() < 1e-3).all()
+    assert (value[:, :2].std(0) > 0.1).all()
+
+
+@pytest.mark.parametrize(
+    ("function", "text"),
+    [
+        (lambda theta: theta.mean(), r"of shape \(2000,\) or \(2000, k\)"),
+        (lambda theta: theta[:5], r"got \(5, 2\); return one row"),
+        (lambda theta: theta[:, None], r"got \(2000, 1, 2\)"),
+        (lambda theta: theta[:, 0].log(), r"got NaN or inf in \d+ of 2000 rows"),
+        (lambda theta: theta * torch.tensor([1.0, 0.0]), "in column 1 of 2"),
+    ],
+)
+def test_what_is_no_quantity_is_an_error(function, text):
+    with pytest.raises(ValueError, match=text):
+        select(function)
+
+
+def test_other_estimators_have_no_such_target():
+    def loss(theta):
+        return theta[:, 0]
+
+    with pytest.raises(ValueError, match="'auto' or 'linear' for target='loss'"):
+        select(loss, estimator="nested")
+    assert name_of(loss) == "loss"
+    assert name_of(["mass", "friction"]) == "mass, friction"
