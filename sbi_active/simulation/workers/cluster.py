@@ -106,14 +106,29 @@ class DaskPool(Pool):
 
 
 def _ask_child(simulator: bytes, call: Call, time_limit: float | None) -> Reply:
-    """Run a call in a child of this process; what raises there, here."""
-    # Dask's workers are daemons, to which Python allows no children; those here end
-    # with their parent.
-    current_process()._config.pop("daemon", None)  # pyright: ignore
-    reply = WorkerPool(simulator, 1).ask(call, time_limit)
-    if reply.fault in ("raised", "not loaded"):  # it may need what was set up here
-        return answer(_loaded(simulator), call)
+    """Run a call in a child of this process, once.
+
+    The first one that raises there, before any has an outcome, is tried here too: if
+    that succeeds, the simulator needs what was set up here, and all its calls run here.
+    """
+    place = _place(simulator)
+    if not place.get("is_here", False):
+        # Dask's workers are daemons, to which Python allows no children; those here end
+        # with their parent.
+        current_process()._config.pop("daemon", None)  # pyright: ignore
+        reply = WorkerPool(simulator, 1).ask(call, time_limit)
+        if place or reply.fault not in ("raised", "not loaded"):
+            place.update({} if reply.x is None else {"is_here": False})
+            return reply
+    reply = answer(_loaded(simulator), call)
+    place.setdefault("is_here", reply.x is not None)
     return reply
+
+
+@lru_cache(maxsize=4)
+def _place(simulator: bytes) -> dict[str, bool]:
+    """Return whether calls of a simulator run here, as far as that is known."""
+    return {}
 
 
 @lru_cache(maxsize=4)

@@ -225,24 +225,46 @@ def test_workers_that_the_cluster_gave_up_are_asked_for_again(rows, monkeypatch)
     assert torch.equal(results[0].x, simulate(seeded, theta, action, seed=0).x)
 
 
-def test_rows_at_risk_run_in_a_child():
-    parent = os.getpid()
+class Risky:
+    """Notes the process of each call."""
 
-    def simulator(theta, action):
+    def __init__(self, folder, parent=None):
+        self.folder, self.parent = folder, parent
+
+    def __call__(self, theta, action):
+        with open(self.folder / "calls", "a") as file:
+            file.write(f"{os.getpid()}\n")
         if bool((action == 3).any()):
             os.kill(os.getpid(), signal.SIGKILL)
-        if bool((action == 2).any()) and os.getpid() != parent:
-            raise RuntimeError("only where it was set up")
+        if bool((action == 2).any()) or self.parent not in (None, os.getpid()):
+            raise RuntimeError("no")
         return theta + action
 
-    theta, action = torch.rand(3, 1), torch.tensor([[1.0], [2.0], [3.0]])
+
+def asked(simulator, actions):
+    theta, action = torch.rand(len(actions), 1), torch.tensor(actions)[:, None]
     schedule = Schedule(theta, action, seed=0, has_seeds=False)
-    calls = [schedule._call(np.array([i]), "alone") for i in range(3)]
-    good, falls_back, deadly = (
-        _ask_child(pickled(simulator), call, None) for call in calls
-    )
-    for i, reply in enumerate((good, falls_back)):
-        assert reply.x is not None
-        assert torch.equal(reply.x, theta[[i]] + action[[i]])
-    assert deadly.fault == "worker died"
-    assert "ended by signal 9" in deadly.traceback
+    calls = [schedule._call(np.array([i]), "alone") for i in range(len(actions))]
+    replies = [_ask_child(pickled(simulator), call, None) for call in calls]
+    ran = [int(pid) for pid in (simulator.folder / "calls").read_text().split()]
+    for i, reply in enumerate(replies):
+        assert reply.x is None or torch.equal(reply.x, theta[[i]] + action[[i]])
+    return [reply.fault for reply in replies], [pid == os.getpid() for pid in ran]
+
+
+def test_rows_at_risk_run_in_a_child_and_once(tmp_path):
+    faults, is_here = asked(Risky(tmp_path), [1.0, 2.0, 3.0, 2.0, 1.0])
+    assert faults == [None, "raised", "worker died", "raised", None]
+    assert is_here == [False] * 5
+
+
+def test_of_rows_that_raise_from_the_start_the_first_is_tried_here_too(tmp_path):
+    faults, is_here = asked(Risky(tmp_path), [2.0, 2.0, 1.0, 2.0])
+    assert faults == ["raised", "raised", None, "raised"]
+    assert is_here == [False, True, False, False, False]
+
+
+def test_a_simulator_that_needs_what_was_set_up_here_runs_here(tmp_path):
+    faults, is_here = asked(Risky(tmp_path, os.getpid()), [1.0, 2.0, 1.0])
+    assert faults == [None, "raised", None]
+    assert is_here == [False, True, True, True]
