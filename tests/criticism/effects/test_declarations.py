@@ -24,6 +24,7 @@ from sbi_active.criticism import (
     joint_prior,
 )
 from sbi_active.criticism.effects.declarations import require_nested
+from sbi_active.criticism.effects.table import rows_of
 
 NAN = float("nan")
 PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
@@ -247,3 +248,23 @@ def test_apply_may_return_numpy():
     )
     assert x.dtype == torch.float32
     assert float(x) == pytest.approx(1.5)
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        "| joint | {} drag | damping | half force |",
+        "| joint | {} drag | damping | half force | N | drag | more |",
+        "| joint | {} drag | damping | whole force | N | drag in {} |",
+        "| joint | {} drag | damping | half force ** 2 | N | drag in {} |",
+        "| joint | {} drag | damping | half | N | drag in {} |",
+        "| joint | {} drag | damping | limit force | N | drag in {} |",
+    ],
+)
+def test_a_malformed_row_of_a_table_is_named(row, tmp_path):
+    heading = "| of | effect | changes | prior | unit | sentence |\n|---|\n"
+    (tmp_path / "table.md").write_text(f"Effects.\n\n{heading}{row}\n")
+    with pytest.raises(
+        ValueError, match=r"expected cells of, .* in line 5 of table.md"
+    ):
+        rows_of(tmp_path / "table.md")
