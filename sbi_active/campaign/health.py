@@ -9,14 +9,13 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.campaign.state import FAR, CampaignState, Trial
+from sbi_active.campaign.state import FAR, CampaignState, ModelVersion, Trial
 from sbi_active.diagnostics.beliefs import check_belief
 from sbi_active.diagnostics.check import check_calibration
 from sbi_active.inference.beliefs.belief import UnchangedBelief
@@ -56,36 +55,60 @@ def assess(state: CampaignState, *, alarm: float = 0.05, watch: float = 0.25) ->
         Vovk & Wang, Annals of Statistics 2021 (e-values from p-values); Ville, Etude
         critique de la notion de collectif, 1939.
     """
-    version = state.version
-    trials = [t for t in state.measured if t.version == version.number]
-    surprises = [
-        t.surprise
-        for t in trials
-        if t.surprise is not None and (t.belief_error or 0.0) <= LARGE
-    ]
-    misfits = [version.misfit, *[t.misfit for t in trials]]
-    bets, total = [0.0], 0.0
-    for surprise in surprises:
-        total += log_e_value(surprise)
-        bets.append(total)
-    if max(bets) >= math.log(2 / alarm) or _exceeds(misfits, alarm / 2):
-        return "alarm"
-    if bets[-1] >= math.log(2 / watch) or _exceeds(misfits, watch / 2):
-        return "watch"
-    return "ok"
+    tests = _Tests(state.version)
+    for trial in state.measured:
+        if trial.version == state.version.number:
+            tests.add(trial)
+    return tests.health(alarm, watch)
 
 
-def health_after(state: CampaignState, trial: Trial) -> Health | None:
-    """Return the health when a trial had been used; None if it was not, or unscored."""
-    if trial.index not in state.processed:
-        return None
-    if trial.is_measured and trial.version is None:
-        return None
-    used = state.processed[: state.processed.index(trial.index) + 1]
-    versions = [
-        v for v in state.versions if not v.number or trial.index not in v.trials
-    ]
-    return assess(replace(state, processed=used, versions=versions))
+def health_by_trial(state: CampaignState) -> dict[int, Health]:
+    """Return the health when each trial had been used, without those not scored."""
+    tests = {version.number: _Tests(version) for version in state.versions}
+    given = {version.number: {*version.trials} for version in state.versions}
+    found = {}
+    for index in state.processed:
+        trial = state.trials[index]
+        if trial.is_measured and trial.version in tests:
+            tests[trial.version].add(trial)
+        if not trial.is_measured or trial.version is not None:
+            then = [n for n, trials in given.items() if not n or index not in trials]
+            found[index] = tests[then[-1]].health()
+    return found
+
+
+class _Tests:
+    """The two tests of :func:`assess`, trial by trial.
+
+    Args:
+        version: Model that is tested.
+    """
+
+    def __init__(self, version: ModelVersion) -> None:
+        self._bet = self._largest_bet = 0.0
+        self._num_misfits, self._least = 0, math.inf
+        self._add_misfit(version.misfit)
+
+    def add(self, trial: Trial) -> None:
+        """Take a trial that the model scored."""
+        if trial.surprise is not None and (trial.belief_error or 0.0) <= LARGE:
+            self._bet += log_e_value(trial.surprise)
+            self._largest_bet = max(self._largest_bet, self._bet)
+        self._add_misfit(trial.misfit)
+
+    def _add_misfit(self, misfit: float | None) -> None:
+        if misfit is not None:
+            self._num_misfits += 1
+            level = misfit * self._num_misfits * (self._num_misfits + 1)
+            self._least = min(self._least, level)
+
+    def health(self, alarm: float = 0.05, watch: float = 0.25) -> Health:
+        """Return the health after these trials, by the levels of :func:`assess`."""
+        if self._largest_bet >= math.log(2 / alarm) or self._least < alarm / 2:
+            return "alarm"
+        if self._bet >= math.log(2 / watch) or self._least < watch / 2:
+            return "watch"
+        return "ok"
 
 
 def log_e_value(p: float) -> float:
@@ -102,11 +125,6 @@ def log_e_value(p: float) -> float:
     if p > 1 - 1e-4:  # the expansion at 1, where the formula is 0 / 0
         return math.log(0.5 + (1 - p) / 6)
     return math.log(1 - p + p * log_p) - log_p - 2 * math.log(-log_p)
-
-
-def _exceeds(misfits: Sequence[float | None], level: float) -> bool:
-    known = [m for m in misfits if m is not None]
-    return any(m < level / (t * (t + 1)) for t, m in enumerate(known, 1))
 
 
 def misfit(diagnostics: Diagnostics) -> float | None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.campaign.health import health_after
+from sbi_active.campaign.health import health_by_trial
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.design.drawing import draw, labels_of
 from sbi_active.display.table import within
@@ -302,7 +302,8 @@ def _information(ax: Axes, state: CampaignState) -> None:
     """Draw what each trial was expected to tell and told, and the sum."""
     used = [t for t in state.trials if t.information_gained is not None]
     gained = np.array([t.information_gained for t in used], dtype=float)
-    colors = [BARS[health_after(state, t)] for t in used]
+    healths = health_by_trial(state)
+    colors = [BARS[healths.get(t.index)] for t in used]
     index = [t.index for t in used]
     ax.bar(index, gained, color=colors, alpha=0.7, width=0.7, label="gained")
     expected = [(t.index, *t.expected_gain) for t in state.trials]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sbi_active.actions import ActionSpace
-from sbi_active.campaign.health import health_after
+from sbi_active.campaign.health import health_by_trial
 from sbi_active.campaign.state import CampaignState
 from sbi_active.design.design import action_labels
 from sbi_active.display.notebook import badge, card, table
@@ -60,7 +60,7 @@ def to_dataframe(
     own = (*FIRST, *LAST)
     labels = [_apart(n, "action", own) for n in action_labels(actions)]
     told = [_apart(n, "outcome", (*own, *labels)) for n in numbers or ["x"]]
-    rows = []
+    rows, healths = [], health_by_trial(state)
     for trial in state.trials:
         gain, error = trial.expected_gain
         row = {name: getattr(trial, name, None) for name in own}
@@ -68,7 +68,7 @@ def to_dataframe(
             "trial": trial.index,
             "expected_information": gain,
             "expected_information_error": error,
-            "health": health_after(state, trial),
+            "health": healths.get(trial.index),
             "seconds": sum(trial.seconds.values()),
             "cpu_seconds": sum(trial.cpu_seconds.values()),
         }
