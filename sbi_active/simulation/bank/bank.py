@@ -216,7 +216,7 @@ class Bank:
         Returns:
             None if there is nothing.
         """
-        own = [segment for segment in self._rows.segments() if segment.run == run]
+        own = self._rows.of_run(run)
         if not own:
             return None
         # Copies, since torch takes no column of a table of one row.

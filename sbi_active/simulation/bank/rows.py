@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import NoneType
@@ -98,13 +99,23 @@ class Rows:
                 self._generation = self.store.generation
             if total > len(self._found):
                 with sensible(self.store.path):
-                    kind = row_type(self.header["shapes"])
+                    shapes = self.header["shapes"]
+                    kind, self._x_shape = row_type(shapes), shapes["x"]
                     for number in range(len(self._found) + 1, total + 1):
-                        self._found.append(self._segment(number, kind))
+                        segment = self._segment(number, kind)
+                        self._found.append(segment)
+                        self._of_run[segment.run].append(segment)
             return self._found[:]
+
+    def of_run(self, run: str) -> Sequence[Segment]:
+        """Return the segments of a run as they are on the disk now."""
+        self.segments()
+        return self._of_run.get(run, ())
 
     def _forget(self) -> None:
         self._found: list[Segment] = []
+        self._of_run: defaultdict[str, list[Segment]] = defaultdict(list)
+        self._x_shape: Sequence[int] = ()
         self._last = 0, np.zeros(0)  # the segment whose x was read last
         self._stored = "", 0, np.zeros(0, bool)  # rows of the run that was written last
 
@@ -124,7 +135,7 @@ class Rows:
         if self._last[0] != segment.number:
             content = self.store.body(self._name, segment.number)
             with sensible(self.store.path):
-                shape = len(segment.rows), *self.header["shapes"]["x"]
+                shape = len(segment.rows), *self._x_shape
                 x = np.frombuffer(content, "<f4").reshape(shape)
             self._last = segment.number, x
         return self._last[1]
@@ -162,14 +173,13 @@ class Rows:
 
     def _mask(self, run: str) -> np.ndarray:
         """Return a mask over the rows of a run that are stored."""
-        segments = self.segments()
+        segments = self.of_run(run)
         name, seen, mask = self._stored
         if name != run:
             seen, mask = 0, np.zeros(0, bool)
         for segment in segments[seen:]:
-            if segment.run == run:
-                mask = _grown(mask, segment.rows["index"])
-                mask[segment.rows["index"]] = True
+            mask = _grown(mask, segment.rows["index"])
+            mask[segment.rows["index"]] = True
         self._stored = run, len(segments), mask
         return mask
 
