@@ -6,13 +6,15 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.campaign.options import CampaignOptions
+from sbi_active.campaign.telling import Facts, Status
 from sbi_active.design.design import Design
 from sbi_active.display.notebook import card, facts
 from sbi_active.display.table import number
@@ -21,11 +23,11 @@ from sbi_active.progress import News, is_asked_for
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.workers.meter import Meter
 
-Status = Literal["pending", "ok", "invalid", "missing", "withdrawn"]
-
 #: Ranges of the simulations from the prior beyond all of them at which an outcome is no
 #: longer used: no simulator that is worth refining is that far off.
 FAR = 5.0
+LOST = "its record was lost"  # reason of a trial that a repair gave up
+MOST_LOST = 10_000  # trials that a repair gives up at once; the index is damaged beyond
 
 
 @dataclass(frozen=True)
@@ -180,6 +182,11 @@ UNSCORED: dict[str, Any] = {
 }
 
 
+def tensor_of(listed: Any) -> Tensor:
+    """Return the numbers of :class:`.Facts`, whose None are NaN."""
+    return torch.from_numpy(np.array(listed, np.float64)).float()
+
+
 def _with(value: float | None, unit: str = "") -> str:
     return f"{number(value)} {unit}".strip() if value is not None else ""
 
@@ -248,13 +255,30 @@ class CampaignState:
         """The trials that the belief rests on, in the order of use."""
         return [t for t in self.measured if t.is_explained]
 
-    def record(self, trial: Trial) -> Trial:
-        """Keep a trial at its index, and note where that changes what was used."""
-        if trial.index == len(self.trials):
-            self.trials.append(trial)
-        self.trials[trial.index] = trial
-        self.is_stale |= trial.index in self.processed
-        return trial
+    def record(self, facts: Facts) -> Trial:
+        """Keep a trial as the log has it, and note where that changes what was used.
+
+        Earlier findings stay if the trial tells the same as before.
+        """
+        index, num = facts.index, len(self.trials)
+        action = tensor_of(facts.action)
+        if index > num + MOST_LOST:
+            raise ValueError(f"expected a trial after {num}; got {index}")
+        for gap in range(num, index):  # what a repair of the log gave up
+            lost = torch.full_like(action, torch.nan)
+            self.trials.append(Trial(gap, lost, status="withdrawn", reason=LOST))
+            self.is_stale |= gap in self.processed
+        x = None if facts.x is None else tensor_of(facts.x)
+        known: dict[str, Any] = {**vars(facts), "action": action, "x": x}
+        if index >= num:
+            self.trials.append(Trial(**known))
+        else:
+            before = self.trials[index]
+            same = before.status == "pending" or Facts.of(before).tells == facts.tells
+            known |= {} if same else UNSCORED
+            self.trials[index] = replace(before, **known)
+        self.is_stale |= index in self.processed
+        return self.trials[index]
 
     def examined(self, digest: str) -> None:
         """Note that the current model was compared with the trials.

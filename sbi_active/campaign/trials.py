@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,15 +12,19 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
+from sbi_active.arrays import measured
+from sbi_active.callers import stack_level
 from sbi_active.campaign.display.figures import plot_campaign
 from sbi_active.campaign.display.page import campaign_html, to_dataframe
 from sbi_active.campaign.health import Health, assess, calibration_lost
 from sbi_active.campaign.isolation import guarded, isolated
-from sbi_active.campaign.state import UNSCORED, CampaignState, Status, Trial
+from sbi_active.campaign.state import CampaignState, Trial, tensor_of
 from sbi_active.campaign.storage.simulations import Storage
-from sbi_active.campaign.telling import find_trial, told_trial
+from sbi_active.campaign.telling import Facts, Telling, listed
 from sbi_active.display.figures import legible
 from sbi_active.inference.beliefs.belief import names_of, parameter_dim
+from sbi_active.inference.rounds.condition import action_rows, outcome_rows
+from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed
 
 if TYPE_CHECKING:
@@ -30,10 +33,10 @@ if TYPE_CHECKING:
 
     from sbi_active.criticism import Effect
 
-Numbers = Tensor | np.ndarray | Sequence[float] | float
+LARGEST = torch.finfo(torch.float32).max
 
 
-class CampaignTrials:
+class CampaignTrials(Telling[Trial]):
     """The half of a :class:`.Campaign` that shows and records, and computes nothing.
 
     Attributes:
@@ -242,147 +245,92 @@ class CampaignTrials:
         )
         return legible(figure)
 
-    @guarded
-    @isolated
-    def tell(
-        self,
-        x: Numbers | None = None,
-        *,
-        trial: Trial | int | None = None,
-        action: Numbers | None = None,
-        status: Status = "ok",
-    ) -> Trial:
-        """Record the outcome of a trial and return at once.
+    tell = guarded(isolated(Telling.tell))
+    attach = guarded(Telling.attach)
+    correct = guarded(Telling.correct)
+    withdraw = guarded(Telling.withdraw)
 
-        A trial can be told again: with ``trial=``, another outcome takes the place of
-        the recorded one, and the next :meth:`update` computes everything again, beliefs
-        and scores of the later trials too, as if it had been told at once. Trials
-        behind an adoption are then given to the current model anew, and no longer have
-        scores under the models before it.
+    @property
+    def _trials(self) -> Sequence[Trial]:
+        return self.state.trials
 
-        Args:
-            x: The outcome, shape x_shape; NaN throughout makes the trial "invalid", NaN
-                in part of it says that these numbers were not observed, which tells
-                nothing by itself. Infinite numbers count as NaN, with a warning.
-            trial: The trial or its index; None is the pending one, or a new trial
-                where none is pending and ``action`` is given.
-            action: The executed action where it is not the one asked for.
-            status: "ok", "invalid" (it ran and gave no measurement, which tells about
-                the parameters) or "missing" (a fault unrelated to them).
+    def _outcome(self, x: Any) -> Any:
+        return listed(outcome_told(x, self.x_shape))
 
-        Returns:
-            The recorded trial. Telling the same outcome again changes nothing, with
-            ``trial=`` or, for the last trial while none is pending, without.
-
-        Raises:
-            ValueError: If there is no such trial, shapes do not fit, the action is not
-                finite, or what was told are no real numbers that float32 holds.
-        """
-        told = self._checked(x, trial=trial, action=action, status=status)
-        if any(told is earlier for earlier in self.state.trials):
-            return told
-        again = told.index < len(self.state.trials) and (
-            self.state.trials[told.index].status != "pending"
-        )
-        return self._record("corrected" if again else "told", told)
-
-    @guarded
-    def attach(
-        self,
-        action: Numbers,
-        x: Numbers | None = None,
-        *,
-        status: Status = "ok",
-    ) -> Trial:
-        """Record a trial that was executed anyhow, such as before the campaign.
-
-        A pending trial stays pending.
-
-        Args:
-            action: Executed action, shape (action_dim,).
-            x: Outcome, as in :meth:`tell`.
-            status: Status of the trial, as in :meth:`tell`.
-
-        Raises:
-            ValueError: If :meth:`tell` would refuse the trial.
-        """
-        new = Trial(len(self.state.trials), torch.empty(0))
-        told = self._checked(x, trial=new, action=action, status=status)
-        return self._record("attached", told)
-
-    @guarded
-    def correct(
-        self,
-        trial: Trial | int,
-        x: Numbers | None = None,
-        *,
-        action: Numbers | None = None,
-        status: Status = "ok",
-        reason: str = "",
-    ) -> Trial:
-        """Replace what was told of a trial; the log keeps what was told before.
-
-        The next :meth:`update` recomputes everything that depends on it, as if this had
-        been told at once. :meth:`tell` with ``trial=`` is the same without a reason.
-
-        Args:
-            trial: The trial or its index.
-            x: Outcome, as in :meth:`tell`; None keeps the outcome where there is one.
-            action: Executed action, as in :meth:`tell`.
-            status: Status of the trial, as in :meth:`tell`.
-            reason: Reason that is kept with the trial.
-
-        Raises:
-            ValueError: If :meth:`tell` would refuse the trial, or it was not told yet.
-        """
-        found = find_trial(self.state, trial)
-        if found.status == "pending":
-            raise ValueError(
-                f"expected a trial that was told; got trial {found.index}, which is "
-                "pending; tell(x) first"
+    def _executed(self, action: Any, asked: list[float]) -> list[float]:
+        if action is None:
+            executed = tensor_of(asked)
+        else:
+            executed = _action_told(action, self.actions.action_dim)
+        if not bool(self.actions.contains(executed)):
+            warn(
+                f"SA202 the executed action {executed.tolist()} is not in "
+                f"{self.actions}; it is simulated where it was executed",
+                stacklevel=stack_level(),
             )
-        x = found.x if x is None and status == "ok" else x
-        told = self._checked(x, trial=found, action=action, status=status)
-        return self._record("corrected", replace(told, reason=reason))
+        return listed(executed)
 
-    def _checked(self, x: Any, **options: Any) -> Trial:
-        """Return the record; what is refused is written down as well."""
-        try:
-            return told_trial(
-                self.state,
-                x,
-                x_shape=self._learner.x_shape,
-                actions=self.actions,
-                **options,
-            )
-        except ValueError as error:
-            self._storage.write("refused", x=f"{x!r:.100000}", error=str(error))
-            raise
+    def _refused(self, x: Any, error: ValueError) -> None:
+        self._storage.write("refused", x=f"{x!r:.100000}", error=str(error))
 
-    def _record(self, event: str, trial: Trial) -> Trial:
-        self._storage.write(event, trial)  # on the disk before it counts
-        self.state.record(trial)
+    def _record(self, event: str, facts: Facts) -> Trial:
+        self._storage.write(event, facts)  # on the disk before it counts
+        trial = self.state.record(facts)
         if self.on_trial is not None and trial.status != "withdrawn":
             self.on_trial(trial)
         return trial
 
-    @guarded
-    def withdraw(self, trial: Trial | int, *, reason: str = "") -> Trial:
-        """Take a trial out; it stays in the history, with the status "withdrawn".
 
-        The next :meth:`update` recomputes everything without it, as if it had been
-        "missing". :meth:`tell` with ``trial=`` brings it back.
+def outcome_told(x: Any, x_shape: torch.Size) -> Tensor:
+    """Return the outcome that was told, NaN where not measured, shape x_shape.
 
-        Args:
-            trial: The trial or its index, a pending one too.
-            reason: Reason that is kept with the trial.
+    Infinite numbers, which no sensor measures, count as not measured.
 
-        Returns:
-            The recorded trial.
+    Raises:
+        ValueError: If there is no outcome, or one of another shape, or what was told
+            are no numbers that float32 holds.
+    """
+    if x is None:
+        raise ValueError(
+            "expected the outcome x; got None; tell(x), or tell(status=...) with "
+            "'invalid' or 'missing' where there is none"
+        )
+    tensor = _numbers(x, "x")
+    if tensor.shape != x_shape and tensor.numel() == x_shape.numel() == 1:
+        tensor = tensor.reshape(x_shape)
+    rows = outcome_rows(tensor, x_shape)
+    if len(rows) != 1:
+        raise ValueError(
+            f"expected one outcome of shape {tuple(x_shape)}; got {len(rows)}; tell "
+            "one trial at a time"
+        )
+    infinite = rows[0].isinf()
+    if bool(infinite.any()):
+        warn(
+            f"SA201 {int(infinite.sum())} of {infinite.numel()} told numbers are "
+            "infinite and count as not measured; pass NaN where a sensor gave nothing",
+            stacklevel=stack_level(),
+        )
+    return torch.where(infinite, torch.nan, rows[0])
 
-        Raises:
-            ValueError: If there is no such trial.
-        """
-        found = find_trial(self.state, trial)
-        changes: dict[str, Any] = {"status": "withdrawn", "reason": reason}
-        return self._record("withdrawn", replace(found, **changes, **UNSCORED))
+
+def _action_told(action: Any, action_dim: int) -> Tensor:
+    numbers = _numbers(action, "the action")
+    finite = numbers.isfinite() & (numbers.abs() <= LARGEST)
+    if not bool(finite.all()):
+        raise ValueError(
+            f"expected a finite action of real numbers; got {numbers.tolist()}; pass "
+            "the action that was executed, or status='missing' where it is unknown"
+        )
+    return action_rows(numbers, action_dim, num_rows=1)[0]
+
+
+def _numbers(told: Any, name: str) -> Tensor:
+    """Return numbers apart from what the caller may still change."""
+    listed = isinstance(told, Sequence | np.ndarray)
+    if listed and None in np.array(told, dtype=object).ravel().tolist():
+        raise ValueError(
+            f"expected {name} of real numbers; got {told!r:.80}; pass NaN where a "
+            "sensor gave nothing"
+        )
+    return measured(told, name=name)

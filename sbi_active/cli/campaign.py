@@ -7,19 +7,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from sbi_active.campaign.telling import shaped
 from sbi_active.cli import declare as cli
-from sbi_active.cli.config import CONFIG
-from sbi_active.cli.numbers import numbers_in
 from sbi_active.cli.output import Answer, say
-from sbi_active.cli.record import shaped
-from sbi_active.cli.session import on_campaign
-from sbi_active.cli.summary import (
+from sbi_active.cli.record import (
     answer_of,
     numbers_of,
     place_of,
     sum_up_campaign,
     trial_of,
 )
+from sbi_active.cli.session import on_campaign
 from sbi_active.cli.trusted import absolute, read_declared, write_declared
 
 MANY = 5  # numbers, more than somebody types
@@ -35,7 +33,7 @@ OUTCOME = [
 
 
 @cli.command(
-    *(cli.DIR, CONFIG, cli.A_TASK, cli.OF_TASK, cli.SIMULATOR, *cli.SPACE, cli.EFFECTS),
+    *(cli.DIR, cli.CONFIG, *cli.PROBLEM, cli.EFFECTS),
     cli.option("--names", "of the action's entries", metavar="A,B,..."),
     cli.option("--units", "of the action's entries", metavar="A,B,..."),
     *(cli.METHOD, cli.SEED, cli.OF_CAMPAIGN),
@@ -114,7 +112,7 @@ def _outcome(
         )
     if said:
         return None, said[0]
-    numbers = [*x] if file is None else numbers_in(file)
+    numbers = [*x] if file is None else cli.numbers_in(file)
     shape = [*campaign.x_shape]
     if len(numbers) != math.prod(shape) or all(map(math.isnan, numbers)):
         raise ValueError(

@@ -11,7 +11,6 @@ import click
 from click.core import ParameterSource
 
 from sbi_active.cli import declare as cli
-from sbi_active.cli.config import CONFIG, PROBLEM_FILE, as_json, pairs_of
 from sbi_active.cli.output import Answer
 from sbi_active.cli.session import Session
 
@@ -27,9 +26,8 @@ OF_CAMPAIGN = ("simulator", "effects", "out", "trust")
 
 #: Arguments and options that say what is compared with what.
 CRITICIZE = [
-    cli.argument("trials", "TRIALS.csv", cli.FILE, **PROBLEM_FILE),
-    *(CONFIG, cli.A_TASK, cli.OF_TASK, cli.SIMULATOR, *cli.SPACE, cli.EFFECTS),
-    *(cli.SEED, cli.TRUST, cli.JSON),
+    cli.argument("trials", "TRIALS.csv", cli.FILE, **cli.PROBLEM_FILE),
+    *(cli.CONFIG, *cli.PROBLEM, cli.EFFECTS, cli.SEED, cli.TRUST, cli.JSON),
     cli.option(
         "--columns",
         "trial, time, action, x, input, start, role, index or repeat_of where they are "
@@ -83,7 +81,7 @@ def _answered(trials: Path, given: dict[str, Any]) -> Answer:
         given["out"].mkdir(parents=True, exist_ok=True)
     if trials.is_dir() and has_manifest(trials):
         return _of_campaign(trials, given)
-    settings = {k: as_json(v) for k, v in pairs_of(given["set"]).items()}
+    settings = {k: cli.as_json(v) for k, v in cli.pairs_of(given["set"]).items()}
     known = {*inspect.signature(close_loop).parameters} - {"seed", *NAMED, *RUN}
     if wrong := {*settings} - known:
         raise ValueError(
@@ -146,8 +144,8 @@ def _compared(path: Path, given: dict[str, Any], settings: dict[str, Any]) -> An
     from sbi_active.cli.problem import problem_of, with_generic, with_noise
     from sbi_active.criticism import Trials, close_loop
 
-    columns = {k: v.split(",") for k, v in pairs_of(given["columns"]).items()}
-    units, options = pairs_of(given["units"]), {k: given[k] for k in PROBLEM}
+    columns = {k: v.split(",") for k, v in cli.pairs_of(given["columns"]).items()}
+    units, options = cli.pairs_of(given["units"]), {k: given[k] for k in PROBLEM}
     model, prior, actions, own = problem_of(**options, needs=["prior"])
     how = {"order": given["order"], "inputs": given["inputs"]}
     trials = Trials.from_csv(path, columns=columns or None, units=units, **how)

@@ -1,15 +1,22 @@
-"""The program ``sbi-active``: how commands are declared, and the types of options."""
+"""The program ``sbi-active``: how commands are declared, and the types of options.
+
+The values of options stand in words, in a file of TOML, or in a request of JSON;
+numbers also in tables.
+"""
 
 from __future__ import annotations
 
+import csv
+import io
+import json
+import math
 import re
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
-
-from sbi_active.cli.numbers import number_of
 
 NAME = "sbi-active"
 #: Names of the tasks, as in ``sbi_active.tasks.TASKS``.
@@ -27,6 +34,11 @@ FORMER = {
     "num-workers": "workers.num_workers",
     "time-limit": "workers.time_limit",
 }
+#: What float32 holds with all its digits, beside 0.
+SMALLEST, LARGEST = 2.0**-126, 2.0**128 - 2.0**104
+#: Options that no file and no request sets: where these are, and who is trusted.
+UNWRITTEN = ("config", "trust", "json")
+PROBLEM = "problem.toml"  # options of a folder of recordings
 BOUNDARY = "\0"  # between the words of an option of several; no word has it
 
 
@@ -209,6 +221,160 @@ SPACE = [
     ),
     option("--noise", "standard deviation of x or its entries", NUMBERS, "SD[,SD...]"),
 ]
+PROBLEM = [A_TASK, OF_TASK, SIMULATOR, *SPACE]
 EFFECTS = option(
     "--effects", "each a list of Effect, or gives one", SEVERAL, "MODULE:NAME ..."
 )
+
+
+def take_config(
+    ctx: click.Context, _: click.Parameter, path: Path | None
+) -> Path | None:
+    """Take from a TOML file what the command line leaves out."""
+    if path is None or ctx.resilient_parsing:
+        return path
+    if sys.version_info >= (3, 11):
+        import tomllib
+    else:
+        import tomli as tomllib
+
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except ValueError as error:
+        raise ValueError(
+            f"expected TOML in {path}; got {error}; write options as in "
+            'theta-low = "0,1"'
+        ) from error
+    found = named(ctx.command, values, str(path))
+    ctx.default_map = {k: _beside(path.parent, v) for k, v in found.items()}
+    return path
+
+
+CONFIG = option(
+    "--config",
+    "with options by their names; in a folder of recordings problem.toml",
+    FILE,
+    "FILE.toml",
+    is_eager=True,
+    expose_value=False,
+    callback=take_config,
+)
+
+
+def take_problem(ctx: click.Context, param: click.Parameter, folder: Path) -> Path:
+    """Take from a folder's problem.toml what no other file and no option gives."""
+    path = folder / PROBLEM
+    if ctx.default_map is None and path.is_file():
+        take_config(ctx, param, path)
+    return folder
+
+
+PROBLEM_FILE: Any = {"is_eager": True, "callback": take_problem}
+
+
+def named(
+    command: click.Command, values: Mapping[str, Any], place: str
+) -> dict[str, Any]:
+    """Return values of TOML or JSON by the names of a command's parameters.
+
+    Args:
+        command: The command.
+        values: Values by names, with dashes or without.
+        place: Place where they stand, for the error.
+
+    Raises:
+        ValueError: If a name is none of a parameter.
+    """
+    known = [p.name for p in command.params if p.name and p.name not in UNWRITTEN]
+    found = {name.replace("-", "_"): value for name, value in values.items()}
+    former = {name.replace("-", "_"): now for name, now in FORMER.items()}
+    if "set" in known and (old := [name for name in found if name in former]):
+        settings = [f"{former[name]}={found.pop(name)}" for name in old]
+        found["set"] = [*found.get("set", []), *settings]
+    for name in {*found} - {*known}:
+        raise ValueError(
+            f"expected options among {', '.join(sorted(known)) or 'none'}; got "
+            f"{name!r} in {place}; remove it or write one of these"
+        )
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def pairs_of(texts: Sequence[str]) -> dict[str, str]:
+    """Return the parts of texts NAME=VALUE.
+
+    Raises:
+        ValueError: If one is no such text.
+    """
+    pairs = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        if not (name and value):
+            raise ValueError(f"expected NAME=VALUE; got {text!r}; write, say, target=2")
+        pairs[name] = value
+    return pairs
+
+
+def as_json(text: str) -> Any:
+    """Return what a text is as JSON, or the text itself."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return text
+
+
+def _beside(folder: Path, value: Any) -> Any:
+    """Return what a file says, with the path of programs that lie beside it."""
+    if isinstance(value, list):
+        return [_beside(folder, part) for part in value]
+    file, colon, name = value.partition(":") if isinstance(value, str) else ("", "", "")
+    is_there = file.endswith(".py") and (folder / file).is_file()
+    return f"{folder / file}{colon}{name}" if is_there else value
+
+
+def number_of(cell: str, place: str = "", *, is_outcome: bool = False) -> float:
+    """Return a number as written, which float32 has to hold.
+
+    Args:
+        cell: The number; nan in an outcome.
+        place: Place where it stands, for the error.
+        is_outcome: Whether it may be one that was not measured.
+
+    Raises:
+        ValueError: If it is anything else.
+    """
+    try:
+        value = math.nan if "_" in cell else float(cell)
+    except ValueError:
+        value = math.inf
+    if value == 0 or SMALLEST <= abs(value) <= LARGEST:
+        return value
+    if is_outcome and cell.strip().lower() == "nan":
+        return math.nan
+    raise ValueError(
+        f"expected finite numbers; got {cell!r:.80}{place}; write them with a point, "
+        "as in 1.5 or 2e-3, without a unit, and within the range of float32"
+    )
+
+
+def numbers_in(path: Path) -> list[float]:
+    """Return the numbers of a file; an empty cell of a row was not measured.
+
+    Raises:
+        ValueError: If it is no table of numbers.
+    """
+    try:
+        content = io.StringIO(path.read_text(encoding="utf-8-sig"), newline="")
+        rows = [*csv.reader(content, strict=True)]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(
+            f"expected a table of numbers, as text in UTF-8; got {path} ({error}); "
+            "save it so"
+        ) from error
+    # A heading has no cell that begins like a number: 0.84 m and 0,84;1 are none.
+    begins = re.compile(r"\s*(?:[-+]?\.?\d|[-+]?(?:nan|inf)\b|$)", re.IGNORECASE)
+    first = 1 if rows and not any(map(begins.match, rows[0])) else 0
+    return [
+        number_of(cell.strip() or "nan", f" in row {i} of {path}", is_outcome=True)
+        for i, row in enumerate(rows[first:], start=first + 1)
+        for cell in row
+    ]

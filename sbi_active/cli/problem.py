@@ -18,8 +18,7 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace, BoxActions, DiscreteActions, MixedActions
 from sbi_active.campaign import Campaign, CampaignOptions
-from sbi_active.cli.config import as_json, pairs_of
-from sbi_active.cli.numbers import number_of
+from sbi_active.cli.declare import as_json, number_of, pairs_of
 from sbi_active.cli.output import place_of
 from sbi_active.cli.trusted import (
     absolute,

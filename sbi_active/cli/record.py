@@ -1,51 +1,47 @@
-"""A campaign's trials as its folder sums them up: told and read without torch.
+"""A campaign and its trials as JSON, and as lines for people; told without torch.
 
-A command that has computed leaves a summary in the folder. What was told since is read
-from the log, and :class:`Record` is all that ``tell``, ``correct``, ``withdraw`` and
-``status`` need. What it cannot judge alone is :class:`Unsure`, and the campaign is
-loaded.
+A command that has computed leaves a summary. What was told since is read from the log,
+and :class:`Record` is all that ``tell``, ``correct``, ``withdraw`` and ``status`` need.
+What it cannot judge alone is :class:`Unsure`, and the campaign is loaded.
 """
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import math
-import os
 import struct
-from collections.abc import Iterator, Mapping
-from datetime import datetime, timezone
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
-from sbi_active.cli.numbers import flat
+from sbi_active.campaign.telling import (
+    LOG,
+    STATE,
+    SUMMARY,
+    Facts,
+    Telling,
+    event_of,
+    facts_in,
+    flat,
+)
+from sbi_active.cli.output import Answer
 from sbi_active.cli.trusted import read_declared
-from sbi_active.simulation.bank.sqlite import NAME
 from sbi_active.simulation.bank.store import Store
-
-SUMMARY = "status.json"
-LOG, STATE = "log", "state"  # records of a campaign, see its storage
 
 
 class Unsure(Exception):  # noqa: N818
     """Only the campaign itself can judge what is told."""
 
 
-def sum_up(folder: Path, known: Mapping[str, Any]) -> None:
-    """Leave a summary for the commands to come; call it while nobody else writes.
+@dataclass(frozen=True)
+class Scored(Facts):
+    """A trial with what a campaign has found it to be."""
 
-    Args:
-        folder: Folder of the campaign.
-        known: Facts that :class:`Record` needs.
-    """
-    with _stored(folder) as store:
-        content = {**known, "of": _mark(store)}
-    temporary = folder / f".{os.getpid()}-{SUMMARY}"
-    with contextlib.suppress(OSError):  # as in a folder that is read only
-        with open(temporary, "x", encoding="utf-8") as file:  # follows no link
-            json.dump(content, file)
-        os.replace(temporary, folder / SUMMARY)
+    information_gained: float | None = None
+    surprise: float | None = None
 
 
 def digest(folder: Path) -> str:
@@ -54,28 +50,12 @@ def digest(folder: Path) -> str:
     Args:
         folder: Folder of the campaign.
     """
-    with contextlib.suppress(OSError, ValueError, Unsure), _stored(folder) as store:
-        return str(_mark(store))
+    with contextlib.suppress(OSError, ValueError), _stored(folder) as store:
+        return store.seal(LOG, STATE)
     return ""
 
 
-def _mark(store: Store, num: int | None = None) -> list[Any]:
-    """Return a length of the log, and a checksum of its end and of the state."""
-    num = store.length(LOG) if num is None else num
-    last = store.get(LOG, num) if num else None
-    content = (last or b"") + (store.get(STATE) or b"")
-    return [num, hashlib.sha256(content).hexdigest()]
-
-
-@contextlib.contextmanager
-def _stored(folder: Path) -> Iterator[Store]:
-    if not (folder / NAME).exists():
-        raise Unsure
-    with contextlib.closing(Store(folder, "campaign")) as store:
-        yield store
-
-
-class Record:
+class Record(Telling[Scored]):
     """A campaign's record, known without computing: a part of its interface.
 
     Args:
@@ -83,7 +63,7 @@ class Record:
 
     Attributes:
         directory: Folder of the campaign.
-        x_shape: Shape of an outcome.
+        actions: Names and units of the actions.
 
     Raises:
         Unsure: If there is no summary, or more was done since than told.
@@ -94,120 +74,76 @@ class Record:
         read_declared(folder)
         self.directory = folder
         try:
-            self._summary = json.loads((folder / SUMMARY).read_bytes())
-            self.x_shape: list[int] = self._summary["x_shape"]
-            self._status = self._summary["status"]
-            self._trials: list[dict[str, Any]] = self._status["trials"]
             with _stored(folder) as store:
-                num = self._summary["of"][0]
-                if self._summary["of"] != _mark(store, num):
-                    raise Unsure
-                self._num = store.length(LOG)
-                for number in range(num + 1, self._num + 1):
-                    self._take(json.loads(store.get(LOG, number) or b"{}"))
+                self._known = json.loads(store.get(SUMMARY) or b"{}")
+                self._kept = [Scored(**trial) for trial in self._known["trials"]]
+                self.actions = SimpleNamespace(**self._known["labels"])
+                self._num: int = self._known["lines"]
+                for number in range(self._num + 1, store.length(LOG) + 1):
+                    self._take(store.json(LOG, number) or {})
         except (OSError, ValueError, RecursionError, LookupError, TypeError) as error:
             raise Unsure from error
 
     @property
-    def status(self) -> dict[str, Any]:
-        """Answer of the command of this name.
+    def summary(self) -> dict[str, Any]:
+        """Summary of what was computed.
 
         Raises:
             Unsure: If a trial that the belief has used is another one now.
         """
-        if {*self._status["not_in_belief"]} & {*self._summary["processed"]}:
+        summary = self._known["summary"]
+        if {*summary["not_in_belief"]} & {*self._known["processed"]}:
             raise Unsure
-        return self._status
+        return summary
 
-    def tell(self, x: Any, *, trial: int | None, action: Any, status: str) -> Any:
-        """Record the outcome of the pending trial, or of a new one with an action."""
-        pending = [t["trial"] for t in self._trials if t["status"] == "pending"]
-        index = [*pending, len(self._trials)][0] if trial is None else trial
-        if index == len(self._trials) and action is not None:  # that nobody asked for
-            before = {"index": index, "action": None, "target": None, "reason": ""}
-        elif index in pending:
-            before = self._facts(index)
-        else:
+    @property
+    def x_shape(self) -> Sequence[int]:
+        """Shape of an outcome."""
+        return self._known["x_shape"]
+
+    @property
+    def _trials(self) -> Sequence[Scored]:
+        return self._kept
+
+    def _outcome(self, x: Any) -> Any:
+        return _single(x)
+
+    def _executed(self, action: Any, asked: list[float]) -> list[float]:
+        if action is None:
+            return asked
+        executed, limits = _single(action), self._known["limits"]
+        pairs = zip(limits, executed, strict=False)
+        is_within = all(low <= a <= high for (low, high), a in pairs)
+        if len(limits) != len(executed) or not is_within:
             raise Unsure
-        return self._write("told", self._told(before, x, action, status))
+        return executed
 
-    def correct(
-        self, trial: int, x: Any, *, action: Any, status: str, reason: str
-    ) -> Any:
-        """Replace what was told of a trial."""
-        before = self._facts(trial)
-        told = self._told(before, x, action, status)
-        # One told as before stays as it was scored.
-        if before["status"] == "pending" or told == before:
-            raise Unsure
-        return self._write("corrected", {**told, "reason": reason})
+    def _refused(self, x: Any, error: ValueError) -> None:
+        raise Unsure from error
 
-    def withdraw(self, trial: int, *, reason: str) -> Any:
-        """Take a trial out."""
-        facts = {**self._facts(trial), "status": "withdrawn", "reason": reason}
-        return self._write("withdrawn", facts)
-
-    def _facts(self, index: int) -> dict[str, Any]:
-        """Return a trial as the log has it."""
-        if not 0 <= index < len(self._trials):
-            raise Unsure
-        trial = self._trials[index]
-        kept = {name: trial[name] for name in ("action", "status", "target", "reason")}
-        x = trial["x"] and shaped(_single(trial["x"]), self.x_shape)
-        return {"index": index, **kept, "x": x}
-
-    def _told(
-        self, before: Mapping[str, Any], x: Any, action: Any, status: str
-    ) -> dict[str, Any]:
-        executed = before["action"]
-        if action is not None:
-            executed, limits = _single(action), self._summary["limits"]
-            if len(limits) != len(executed) or not all(
-                low <= a <= high
-                for (low, high), a in zip(limits, executed, strict=True)
-            ):
-                raise Unsure
-        if x is not None:
-            x = _single(x)
-        elif status == "ok":  # the action alone is corrected
-            x = before.get("x")
-            if x is None:
-                raise Unsure
-        elif status == "invalid":
-            x = shaped([None] * math.prod(self.x_shape), self.x_shape)
-        return {**before, "action": executed, "x": x, "status": status}
-
-    def _write(self, event: str, facts: dict[str, Any]) -> dict[str, Any]:
-        time = datetime.now(timezone.utc).isoformat(timespec="seconds")
-        line = {"time": time, "event": event, "trial": facts}
+    def _record(self, event: str, facts: Facts) -> Scored:
+        line = event_of(event, facts)
         with _stored(self.directory) as store, store.writing():
             if store.append(LOG, line) != self._num + 1:  # another process was faster
                 raise Unsure
         self._take(line)
-        return self._trials[facts["index"]]
+        return self._kept[facts.index]
 
     def _take(self, entry: Mapping[str, Any]) -> None:
         """Take a line of the log that was written after the summary."""
-        if entry["event"] not in ("told", "corrected", "withdrawn"):
+        self._num += 1
+        facts, waiting = facts_in(entry), self._known["summary"]["not_in_belief"]
+        if entry["event"] == "refused":
+            return
+        if facts is None or facts.index > len(self._kept):
             raise Unsure
-        facts = dict(entry["trial"])
-        index = facts.pop("index")
-        if facts["x"] is not None:
-            facts["x"] = [math.nan if v is None else v for v in flat(facts["x"])]
-        unknown = {"information_gained": None, "surprise": None}
-        told = {"trial": index, **self._summary["labels"], **unknown, **facts}
-        self._trials[index : index + 1] = [told]
-        waiting = {*self._status["not_in_belief"], index}
-        self._status["not_in_belief"] = sorted(waiting)
+        self._kept[facts.index : facts.index + 1] = [Scored(**vars(facts))]
+        told = [facts.index] * (facts.status != "pending")
+        self._known["summary"]["not_in_belief"] = sorted({*waiting, *told})
 
 
-def shaped(numbers: list[Any], shape: list[int]) -> Any:
-    """Return numbers as nested lists of a shape."""
-    if len(shape) < 2:
-        return numbers if shape else numbers[0]
-    size = math.prod(shape[1:])
-    rows = [numbers[k : k + size] for k in range(0, len(numbers), size)]
-    return [shaped(row, shape[1:]) for row in rows]
+def _stored(folder: Path) -> contextlib.closing[Store]:
+    return contextlib.closing(Store(folder, "campaign"))
 
 
 def _single(x: Any) -> Any:
@@ -215,3 +151,112 @@ def _single(x: Any) -> Any:
     if isinstance(x, list):
         return [_single(part) for part in x]
     return None if x is None or x != x else struct.unpack("f", struct.pack("f", x))[0]
+
+
+def sum_up_campaign(campaign: Any) -> None:
+    """Leave a summary in the folder of a campaign that holds the right to write."""
+    actions = campaign.actions
+    with contextlib.suppress(Exception):  # a belief without moments has no summary
+        is_box = type(actions).__name__ == "BoxActions"
+        limits = [actions.low.tolist(), actions.high.tolist()] if is_box else [[], []]
+        scores = ("information_gained", "surprise")
+        known = {
+            "summary": summary_of(campaign),
+            "trials": [
+                {
+                    **vars(Facts.of(trial)),
+                    **{name: getattr(trial, name) for name in scores},
+                }
+                for trial in campaign.state.trials
+            ],
+            "x_shape": [*campaign.x_shape],
+            "labels": {"names": [*actions.names], "units": [*actions.units]},
+            "limits": [*zip(*limits, strict=True)],
+            "processed": [*campaign.state.processed],
+        }
+        campaign._storage.sum_up(known)
+
+
+def summary_of(campaign: Any) -> dict[str, Any]:
+    """Return the belief and the health of a campaign as JSON."""
+    if isinstance(campaign, Record):
+        return campaign.summary
+    belief = campaign.belief
+    mean, variance = belief.mean.reshape(-1), belief.variance.reshape(-1)
+    names = campaign.parameter_names or [f"theta_{k + 1}" for k in range(len(mean))]
+    diagnostics = getattr(belief, "diagnostics", None)
+    said = [] if diagnostics is None else [*diagnostics.warnings]
+    together = getattr(diagnostics, "combinations", None)
+    return {
+        "method": campaign.state.method,
+        "belief": {
+            "parameters": {
+                name: {"mean": float(m), "sd": float(v) ** 0.5}
+                for name, m, v in zip(names, mean, variance, strict=True)
+            },
+            "trustworthy": None if diagnostics is None else diagnostics.trustworthy,
+            "warnings": said,
+            "codes": [warning.code for warning in said],
+            "combinations": str(together) if together else None,
+        },
+        "health": campaign.health,
+        "not_in_belief": [
+            t.index for t in campaign.history if not campaign.contains(t)
+        ],
+    }
+
+
+def trial_of(campaign: Any, trial: Any) -> dict[str, Any]:
+    """Return a trial as JSON, but for NaN."""
+    facts = Facts.of(trial)
+    x = None if facts.x is None else flat(facts.x)
+    return {
+        "trial": facts.index,
+        "status": facts.status,
+        "action": facts.action,
+        "names": [*campaign.actions.names],
+        "units": [*campaign.actions.units],
+        "x": x and [math.nan if value is None else value for value in x],
+        "information_gained": trial.information_gained,
+        "surprise": trial.surprise,
+        "target": facts.target,
+        "reason": facts.reason,
+    }
+
+
+def answer_of(campaign: Any) -> Answer:
+    """Return the trials, the belief and the health of a campaign or a record."""
+    trials = [trial_of(campaign, trial) for trial in campaign._trials]
+    data = {**summary_of(campaign), "trials": trials}
+    belief = data["belief"]
+    pending = sum(trial["status"] == "pending" for trial in trials)
+    waits = ", one pending" if pending else ""
+    head = f"{data['method']}, {len(trials) - pending} trials{waits}"
+    together = f"; {belief['combinations']}" if belief["combinations"] else ""
+    lines = [f"{head}, health {data['health']}{together}"]
+    for trial in trials:
+        gained, reason = trial["information_gained"], trial["reason"]
+        gain = "" if gained is None else f"  {gained:.2f} nats"
+        why = f"  ({reason})" if reason else ""
+        shown = f"{place_of(trial)}{numbers_of(trial, '  x = ')}{gain}{why}"
+        lines.append(f"{trial['trial']:>4}  {trial['status']:<9} {shown}")
+    for name, entry in belief["parameters"].items():
+        lines.append(f"{name:>12} = {entry['mean']:.4g} +- {entry['sd']:.2g}")
+    lines += [f"note: {w}" for w in belief["warnings"]]
+    if waiting := data["not_in_belief"]:
+        lines.append(f"not in the belief yet: {waiting}; run sbi-active update")
+    return Answer(data, "\n".join(lines))
+
+
+def place_of(trial: Mapping[str, Any]) -> str:
+    """Return a trial's action with names and units."""
+    parts = zip(trial["names"], trial["action"], trial["units"], strict=True)
+    return ", ".join(f"{n} = {v:.6g}{f' {u}' if u else ''}" for n, v, u in parts)
+
+
+def numbers_of(trial: Mapping[str, Any], before: str) -> str:
+    """Return the first numbers of a trial's outcome, nothing where there is none."""
+    x: Sequence[float] | None = trial["x"]
+    if x is None:
+        return ""
+    return f"{before}{', '.join(f'{v:.4g}' for v in x[:4])}{', ...' * (len(x) > 4)}"

@@ -17,12 +17,10 @@ from typing import Any, Literal
 
 import click
 
+from sbi_active.campaign.telling import flat
 from sbi_active.cli import declare as cli
-from sbi_active.cli.config import named
-from sbi_active.cli.numbers import flat
 from sbi_active.cli.output import Answer, as_line, failure, output_to_errors
-from sbi_active.cli.record import Record, Unsure, digest
-from sbi_active.cli.summary import sum_up_campaign
+from sbi_active.cli.record import Record, Unsure, digest, sum_up_campaign
 
 #: What a command works on: trials without torch where these suffice; the campaign as it
 #: is read; one that simulates; one that is mended.
@@ -170,7 +168,7 @@ def _called(
             f'{name!r:.80}; write one of these, as in {{"command": "ask"}}'
         )
     called = cli.program.commands[name]
-    written = named(called, request, "the request")
+    written = cli.named(called, request, "the request")
     if "x" in written:  # numbers of any shape, null for one not measured
         written["x"] = ["nan" if v is None else v for v in flat(written["x"])]
     held = {"default_map": {**given, **written, "folder": session.folder}}

@@ -15,7 +15,7 @@ import click
 
 from sbi_active.cli import declare as cli
 from sbi_active.cli.output import say
-from sbi_active.cli.summary import answer_of, sum_up_campaign
+from sbi_active.cli.record import answer_of, sum_up_campaign
 from sbi_active.cli.trusted import write_declared
 
 MANY_ACTIONS = 50  # that stand for a space without a list, to count simulations
@@ -131,7 +131,7 @@ def time_round(model: Any, prior: Any, actions: Any, options: Any, seed: int) ->
 
 
 @cli.command(
-    *(cli.DIR, cli.A_TASK, cli.OF_TASK, cli.SIMULATOR, *cli.SPACE, cli.SEED),
+    *(cli.DIR, *cli.PROBLEM, cli.SEED),
     cli.option("--rows", "in all, in whole thousands", cli.COUNT, required=True),
     cli.WORKERS,
     group=bank,

@@ -1,9 +1,13 @@
 """A sled's simulator, and the words that make a campaign of it."""
 
+import contextlib
 import json
 import os
 import subprocess
 import sys
+
+from sbi_active.campaign.telling import SUMMARY
+from sbi_active.simulation.bank.store import Store
 
 SIMULATOR = """
 import torch
@@ -28,6 +32,14 @@ def run(words, *, flags=(), env=(), **options):
         env={**os.environ, "OMP_NUM_THREADS": "1", **dict(env)},
         **{"stderr": subprocess.PIPE, "text": True, **options},
     )
+
+
+def forget(folder, content=None):
+    """Have a folder's summary be another one, or none."""
+    with contextlib.closing(Store(folder, "campaign")) as store, store.writing():
+        store.delete(SUMMARY)
+        if content is not None:
+            store.put(SUMMARY, 0, content)
 
 
 def read(text):

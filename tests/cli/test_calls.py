@@ -12,7 +12,7 @@ import torch
 
 from sbi_active import Campaign
 from sbi_active.cli import main
-from tests.cli.sled import BOX, INIT, SIMULATOR, SMALL, read, run
+from tests.cli.sled import BOX, INIT, SIMULATOR, SMALL, forget, read, run
 
 ODD = """
 import ctypes, os, sys, torch
@@ -230,7 +230,7 @@ def test_numbers_that_are_not_finite_are_null(camp, capfd, monkeypatch):
     )
     monkeypatch.setattr(Campaign, "belief", infinite)
     monkeypatch.setattr(Campaign, "parameter_names", ["a", "b"])
-    Path("camp/status.json").unlink()  # what was summed up with another belief
+    forget(Path("camp"))  # what was summed up with another belief
     assert main(["status", "camp", "--json"]) == 0
     assert read(capfd.readouterr().out)["belief"]["parameters"] == {
         "a": {"mean": None, "sd": None},

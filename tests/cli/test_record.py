@@ -10,7 +10,8 @@ import pytest
 
 from sbi_active import Campaign
 from sbi_active.cli import main, record
-from tests.cli.sled import SIMULATOR, SMALL, run
+from sbi_active.cli.problem import open_campaign
+from tests.cli.sled import SIMULATOR, SMALL, forget, run
 
 BOUNDS = ["--theta-low=0.2,0", "--theta-high=1,1"]
 TWO = SIMULATOR.replace("    return ", "    x = ") + (
@@ -90,7 +91,7 @@ def test_the_log_and_the_answers_are_the_campaign_s(camp, series, capsys, monkey
         capsys.readouterr()
         for words in [*series, "status camp", "status camp"]:
             if folder == "other":  # the campaign itself is loaded
-                Path(folder, "status.json").unlink(missing_ok=True)
+                forget(Path(folder))
             words = words.replace("camp", folder, 1).split()
             assert main([*words, "--json"]) == 0
         shown = capsys.readouterr().out.splitlines()
@@ -110,23 +111,33 @@ def test_a_trial_that_somebody_else_told_is_seen(camp, capsys):
 
 @pytest.mark.parametrize("content", ["", "[]", '{"of": 1}', "[" * 99_999])
 def test_a_summary_that_is_none_is_not_asked(camp, content, capsys):
-    (camp / "status.json").write_text(content)
+    forget(camp, content.encode())
     assert main(["tell", "camp", "0.4", "0.8"]) == 0
     assert main(["status", "camp"]) == 0
     assert "not in the belief yet: [1]" in capsys.readouterr().out
 
 
-def test_a_summary_is_never_written_through_a_link(camp, tmp_path):
-    (tmp_path / "mine").write_text("mine")
-    summary = camp / "status.json"
-    content = summary.read_text()
-    summary.unlink()
-    (tmp_path / "kept").write_text(content)
-    summary.symlink_to(tmp_path / "kept")
-    assert main(["tell", "camp", "0.4", "0.8"]) == 0
-    record.sum_up(camp, json.loads(content))
-    assert (tmp_path / "kept").read_text() == content
-    assert not summary.is_symlink()
+def test_what_is_computed_or_given_up_is_summed_up_no_more(camp):
+    assert record.Record(camp).summary
+    shutil.copytree(camp, "broken")
+    damaged = contextlib.closing(record.Store(Path("broken"), "campaign"))
+    with damaged as store, store.writing(), store.reading() as connection:
+        connection.execute("UPDATE records SET body = 'x' WHERE kind = 'state'")
+    Campaign.load("broken", repair=True).close()
+    with open_campaign(camp, simulates=True, trust=True) as campaign:
+        campaign.tell([0.2, 0.4], trial=1)
+        assert record.Record(camp).summary["not_in_belief"] == [1]
+        campaign.update()
+    for folder in ("camp", "broken"):
+        with pytest.raises(record.Unsure):
+            record.Record(Path(folder))
+
+
+def test_what_was_refused_needs_the_campaign_once(camp, capsys):
+    assert main(["tell", "camp", "0.4", "0.8", "--trial", "7"]) == 2
+    assert "expected the index of one of 2 trials" in capsys.readouterr().err
+    assert [e["event"] for e in Campaign.load(camp).events][-1] == "refused"
+    assert record.Record(camp).summary["not_in_belief"] == []
 
 
 def test_one_writer_at_a_time(camp, capsys):

@@ -11,7 +11,7 @@ from sbi_active import (
     SimulatorModel,
     simulate,
 )
-from sbi_active.campaign.telling import outcome_told
+from sbi_active.campaign.trials import outcome_told
 from sbi_active.inference.rounds.condition import outcome_rows
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning, SimulationError, check_simulator
@@ -112,7 +112,7 @@ def test_a_row_without_an_outcome_is_missing():
     ],
 )
 def test_an_outcome_that_float32_cannot_hold_is_refused(x, text):
-    for take in (outcome_rows, lambda x, shape: outcome_told(x, "ok", shape)):
+    for take in (outcome_rows, outcome_told):
         with pytest.raises(ValueError, match=f"expected x {text}"):
             take(x, ONE)
 

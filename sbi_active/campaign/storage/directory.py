@@ -8,27 +8,24 @@ simulator's. ``campaign.toml`` says what the campaign is, for people alone.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
-
 from sbi_active.campaign.options import CampaignOptions
-from sbi_active.campaign.state import CampaignState, ModelVersion, Trial
+from sbi_active.campaign.state import LOST, CampaignState, ModelVersion
 from sbi_active.campaign.storage.codec import NotStorableError, decode, encode
-from sbi_active.campaign.storage.manifest import now, read_manifest
-from sbi_active.campaign.telling import LOST, recorded
+from sbi_active.campaign.storage.manifest import read_manifest
+from sbi_active.campaign.telling import LOG, STATE, SUMMARY, event_of, facts_in
 from sbi_active.messages import Explained
 from sbi_active.simulation.bank.sqlite import CorruptSegmentError, require, sensible
 from sbi_active.simulation.bank.store import Store
 
-LOG, STATE, BELIEF = "log", "state", "belief"
+BELIEF = "belief"
 #: What a state holds beside the settings of the campaign.
 SAVED = ("trials", "processed", "draws", "versions", "is_stale", "batches")
-FACTS = ("index", "action", "x", "status", "target", "reason")
 
 
 class LogChangedError(Explained, ValueError):
@@ -76,6 +73,9 @@ class CampaignDirectory:
         if repair and self.store.problems():
             self._give_up_lines()
             self.store.salvage()
+            with self.store.writing():
+                self.store.delete(SUMMARY)
+            self.store.close()
         self.manifest = read_manifest(self.store)
         numbers = range(1, self.store.length(LOG) + 1)
         self._entries = [self._line(number) for number in numbers]
@@ -87,20 +87,20 @@ class CampaignDirectory:
         for entry in self._changes:
             self.manifest["simulator"] = entry["simulator"]
 
-    def write(self, event: str, trial: Trial | None = None, **entries: Any) -> None:
+    def write(self, event: str, trial: Any = None, **entries: Any) -> None:
         """Add to the log; it is on the disk when this returns.
 
         Args:
             event: Event that is written.
-            trial: The trial as it is afterwards.
+            trial: The trial as it is afterwards, or its facts.
             **entries: JSON data.
         """
-        line = {"line": len(self._entries) + 1, "time": now(), "event": event}
-        if trial is not None:
-            line["trial"] = _facts(trial)
-        with self._writing():
-            self.store.append(LOG, {**line, **entries})
-        self._entries.append({**line, **entries})
+        line = {"line": len(self._entries) + 1, **event_of(event, trial, **entries)}
+        self.acquire()
+        with self.store.writing():
+            if self.store.append(LOG, line) != line["line"]:
+                raise LogChangedError(self.store.path)
+        self._entries.append(line)
 
     @property
     def events(self) -> Sequence[Mapping[str, Any]]:
@@ -152,9 +152,20 @@ class CampaignDirectory:
         encoded = encode(saved, known={})
         with self._writing():
             self.store.put(STATE, 0, encoded)
+            self.store.delete(SUMMARY)  # which is of the state before
             if content is not None:
                 self.store.put(BELIEF, 0, content)
         self._written = belief
+
+    def sum_up(self, known: Mapping[str, Any]) -> None:
+        """Leave what a reader without torch needs, as far as the log goes now.
+
+        Args:
+            known: Facts, as JSON data with NaN.
+        """
+        content = json.dumps({"lines": len(self._entries), **known}).encode()
+        with self._writing():
+            self.store.put(SUMMARY, 0, content)
 
     def restore(self, state: CampaignState) -> bytes | None:
         """Bring a new state to where the log ends.
@@ -260,8 +271,8 @@ class CampaignDirectory:
         require(self.store.path, repair, reason)
         state = CampaignState("asbi", 0, CampaignOptions())
         for entry in self._entries:
-            if "trial" in entry:
-                apply(state, entry)
+            if (facts := facts_in(entry)) is not None:
+                state.record(facts)
         known = [t.index for t in state.trials if t.status != "pending"]
         known = [k for k in known if state.trials[k].reason != LOST]
         self._saved = None
@@ -277,11 +288,9 @@ class CampaignDirectory:
 
 def apply(state: CampaignState, entry: Mapping[str, Any]) -> None:
     """Change a state by a line of the log, as the campaign did when it was written."""
-    event = entry["event"]
-    if "trial" in entry:
-        facts = entry["trial"]
-        told = {name: _numbers(facts[name]) for name in ("action", "x")}
-        state.record(recorded(state, {**facts, **told}))
+    event, facts = entry["event"], facts_in(entry)
+    if facts is not None:
+        state.record(facts)
     elif event == "simulator changed":
         state.is_stale = bool(state.processed)  # until an update is saved
     elif event == "examined":
@@ -294,20 +303,3 @@ def apply(state: CampaignState, entry: Mapping[str, Any]) -> None:
         state.versions.append(ModelVersion(**version))
         state.processed[:] = version["trials"]
         state.is_stale = True
-
-
-def _numbers(listed: Any) -> torch.Tensor | None:
-    if listed is None:
-        return None
-    return torch.from_numpy(np.array(listed, np.float64)).float()  # null is NaN
-
-
-def _facts(trial: Trial) -> dict[str, Any]:
-    """Return the facts of a trial that cannot be computed again, NaN as null."""
-    facts = {name: getattr(trial, name) for name in FACTS}
-    facts["action"] = trial.action.tolist()
-    if trial.x is not None:
-        x: Any = trial.x.numpy().astype(object)
-        x[trial.x.isnan().numpy()] = None
-        facts["x"] = x.tolist()
-    return facts

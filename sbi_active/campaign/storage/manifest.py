@@ -6,7 +6,6 @@ import json
 import platform
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from datetime import datetime, timezone
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 from sbi_active.campaign.state import CampaignState
 from sbi_active.campaign.storage.codec import NotStorableError, encode
 from sbi_active.campaign.storage.drawn import drawn
+from sbi_active.campaign.telling import now
 from sbi_active.simulation.bank.fingerprint import fingerprint
 from sbi_active.simulation.bank.sqlite import NAME, sensible
 from sbi_active.simulation.bank.store import Store
@@ -128,8 +128,3 @@ def read_manifest(store: Store) -> dict[str, Any]:
             f"{store.path}; use the release of sbi-active that wrote it: {release}"
         )
     return manifest
-
-
-def now() -> str:
-    """Return the time, to the second."""
-    return datetime.now(timezone.utc).isoformat(timespec="seconds")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,7 +13,7 @@ from torch.distributions import Distribution
 from sbi_active.campaign.isolation import guarded, isolated
 from sbi_active.campaign.learning.indexed import IndexedSimulator
 from sbi_active.campaign.learning.learner import Learner
-from sbi_active.campaign.state import CampaignState, Trial
+from sbi_active.campaign.state import CampaignState
 from sbi_active.campaign.storage.directory import CampaignDirectory
 from sbi_active.simulation.bank.bank import Bank
 from sbi_active.simulation.bank.sqlite import NAME
@@ -118,7 +118,7 @@ class Storage:
             self._banks[name] = Bank(self._place, simulator=simulator, name=name)
         return self._banks[name]
 
-    def write(self, event: str, trial: Trial | None = None, **entries: Any) -> None:
+    def write(self, event: str, trial: Any = None, **entries: Any) -> None:
         """Write down what happened; it is on the disk when this returns."""
         if self.disk is not None:
             self.disk.write(event, trial, **entries)
@@ -129,6 +129,11 @@ class Storage:
             belief = None if learner.belief is learner.prior else learner.belief
             known = {"simulator": learner.simulator, "prior": self.prior}
             self.disk.save(state, belief, known)
+
+    def sum_up(self, known: Mapping[str, Any]) -> None:
+        """Leave what a reader without torch needs, see :class:`.CampaignDirectory`."""
+        if self.disk is not None:
+            self.disk.sum_up(known)
 
     def close(self) -> None:
         """Let others write."""

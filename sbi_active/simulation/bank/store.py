@@ -9,6 +9,7 @@ of its log alone.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import platform
@@ -176,6 +177,13 @@ class Store:
         """Return the number of records of a series."""
         return self.catalog.get(series, 0)
 
+    def seal(self, *kinds: str) -> str:
+        """Return a text that changes with the last record of each of some kinds."""
+        read = "SELECT max(number), head_digest FROM records WHERE kind = ?"
+        with self.reading() as connection:
+            last = [connection.execute(read, (kind,)).fetchone() for kind in kinds]
+        return hashlib.sha256(repr(last).encode()).hexdigest()
+
     def put(self, kind: str, number: int, head: Any, body: Any = b"") -> None:
         """Write a record in place of another; for use in :meth:`writing`.
 
@@ -185,17 +193,23 @@ class Store:
             head: Bytes, or JSON data.
             body: Bytes.
         """
-        assert self._connection is not None
-        record = sealed(self._id, kind, number, head, body)
-        self._connection.execute(INSERT.format("REPLACE"), record)
-        if kind != CATALOG and number > (catalog := self.catalog).get(kind, -1):
-            self.put(CATALOG, 0, {**catalog, kind: number})
+        self._put(self.catalog, kind, number, head, body)
 
     def append(self, series: str, head: Any, body: Any = b"") -> int:
         """Write the next record of a series, in :meth:`writing`; return its number."""
-        number = self.length(series) + 1
-        self.put(series, number, head, body)
+        catalog = self.catalog
+        number = catalog.get(series, 0) + 1
+        self._put(catalog, series, number, head, body)
         return number
+
+    def _put(
+        self, catalog: dict[str, int], kind: str, number: int, *parts: Any
+    ) -> None:
+        assert self._connection is not None
+        records = [sealed(self._id, kind, number, *parts)]
+        if number > catalog.get(kind, -1):
+            records.append(sealed(self._id, CATALOG, 0, {**catalog, kind: number}))
+        self._connection.executemany(INSERT.format("REPLACE"), records)
 
     def delete(self, *kinds: str) -> None:
         """Remove records; for use in :meth:`writing`."""
@@ -203,7 +217,8 @@ class Store:
         for kind in kinds:
             self._connection.execute("DELETE FROM records WHERE kind = ?", (kind,))
         kept = {k: n for k, n in self.catalog.items() if k not in kinds}
-        self.put(CATALOG, 0, kept)
+        catalog = sealed(self._id, CATALOG, 0, kept)
+        self._connection.execute(INSERT.format("REPLACE"), catalog)
 
     @contextmanager
     def writing(self) -> Iterator[None]:
