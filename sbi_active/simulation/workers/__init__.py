@@ -4,9 +4,9 @@ This package runs rows, handles lost ones and stores them. It does not know what
 means.
 """
 
-from sbi_active.simulation.workers.cluster import DaskPool
 from sbi_active.simulation.workers.pace import Pace, pace_of
 from sbi_active.simulation.workers.pickling import pickled
+from sbi_active.simulation.workers.pools import DaskPool
 from sbi_active.simulation.workers.schedule import Schedule
 from sbi_active.simulation.workers.store import Recorder, RowStore, run_digest
 

@@ -1,18 +1,25 @@
-"""Pools that run calls of a simulator, in this process or in worker processes."""
+"""Pools that run calls of a simulator: here, in worker processes, or on Dask."""
 
 from __future__ import annotations
 
+import hashlib
 import os
 import sys
-import threading
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor
+from concurrent.futures import wait as wait_for
 from functools import lru_cache
-from queue import SimpleQueue
+from multiprocessing import current_process
 from typing import Any
 
+import cloudpickle
+from joblib import effective_n_jobs
+from joblib.parallel import get_active_backend
 from typing_extensions import override
 
+from sbi_active.messages import warn
 from sbi_active.simulation.workers.calls import Call, Reply, answer
 from sbi_active.simulation.workers.processes import Worker
 
@@ -20,46 +27,44 @@ from sbi_active.simulation.workers.processes import Worker
 class Pool(ABC):
     """Runs calls, some at a time, and hands back what came of them in any order.
 
-    Each call is asked for in a thread of its own, which waits for the reply.
-
     Args:
         num_slots: Number of calls at a time.
     """
 
+    #: Seconds between two looks at who is there, where no call ends; None for none.
+    LOOK: float | None = None
+
     def __init__(self, num_slots: int) -> None:
         self.num_slots = num_slots
-        self._done: SimpleQueue[tuple[Call, Reply | BaseException]] = SimpleQueue()
+        self._calls: dict[Future[Reply], Call] = {}
 
-    @abstractmethod
-    def ask(self, call: Call, time_limit: float | None) -> Reply:
-        """Return the reply to a call; threads may ask at the same time.
+    def submit(self, call: Call, time_limit: float | None) -> None:
+        """Take a call.
 
         Args:
             call: The rows.
             time_limit: Seconds after which it is given up; None waits for ever.
         """
+        self._calls[self._begun(call, time_limit)] = call
 
-    def submit(self, call: Call, time_limit: float | None) -> None:
-        """Take a call, with arguments as for :meth:`ask`."""
-        thread = threading.Thread(target=self._put, args=(call, time_limit))
-        thread.daemon = True
-        thread.start()
-
-    def _put(self, call: Call, time_limit: float | None) -> None:
-        try:
-            reply = self.ask(call, time_limit)
-        except BaseException as error:  # collect() raises it
-            reply = error
-        self._done.put((call, reply))
+    @abstractmethod
+    def _begun(self, call: Call, time_limit: float | None) -> Future[Reply]:
+        """Return the reply to come of a call."""
 
     def collect(self) -> tuple[Call, Reply]:
         """Wait until a call has ended, and return it with its reply."""
-        call, reply = self._done.get()
-        if isinstance(reply, BaseException):
-            raise reply
-        return call, reply
+        while not (done := wait_for(self._calls, self.LOOK, FIRST_COMPLETED).done):
+            self._look()
+        future = done.pop()
+        return self._calls.pop(future), self._reply(future)
 
-    def close(self) -> None:  # noqa: B027  # most have nothing to close
+    def _look(self) -> None:  # noqa: B027
+        """See who is there."""
+
+    def _reply(self, future: Future[Reply]) -> Reply:
+        return future.result()
+
+    def close(self) -> None:  # noqa: B027  # one has nothing to close
         """Give up what still runs."""
 
 
@@ -75,12 +80,10 @@ class InProcess(Pool):
         self._simulator = simulator
 
     @override
-    def ask(self, call: Call, time_limit: float | None) -> Reply:
-        return answer(self._simulator, call)
-
-    @override
-    def submit(self, call: Call, time_limit: float | None) -> None:
-        self._done.put((call, self.ask(call, time_limit)))
+    def _begun(self, call: Call, time_limit: float | None) -> Future[Reply]:
+        future: Future[Reply] = Future()
+        future.set_result(answer(self._simulator, call))
+        return future
 
 
 class WorkerPool(Pool):
@@ -97,6 +100,7 @@ class WorkerPool(Pool):
 
     def __init__(self, simulator: bytes, num_workers: int) -> None:
         super().__init__(num_workers)
+        self._threads = ThreadPoolExecutor(num_workers)
         self._simulator = simulator
         environment = tuple(sorted(os.environ.items()))
         self._waiting = waiting_workers(
@@ -106,7 +110,16 @@ class WorkerPool(Pool):
         self._is_closed = False
 
     @override
+    def _begun(self, call: Call, time_limit: float | None) -> Future[Reply]:
+        return self._threads.submit(self.ask, call, time_limit)
+
     def ask(self, call: Call, time_limit: float | None) -> Reply:
+        """Return the reply to a call, for which the thread waits.
+
+        Args:
+            call: The rows.
+            time_limit: Seconds after which it is given up; None waits for ever.
+        """
         reply = None
         while reply is None:
             try:
@@ -125,6 +138,7 @@ class WorkerPool(Pool):
     @override
     def close(self) -> None:
         self._is_closed = True
+        self._threads.shutdown(wait=False)
         for worker in [*self._busy]:
             worker.kill()
 
@@ -140,3 +154,111 @@ def waiting_workers(simulator: bytes, *surroundings: Any) -> list[Worker]:
         *surroundings: Process, folder, path and environment that they belong to.
     """
     return []
+
+
+def configured_client() -> Any:
+    """Return the Dask client that ``joblib.parallel_config`` names, or None."""
+    backend: Any = get_active_backend()[0]
+    is_dask = type(backend).__name__ == "DaskDistributedBackend"
+    return backend.client if is_dask else None
+
+
+class DaskPool(Pool):
+    """Runs calls as futures of a Dask client, each in a child of a Dask worker.
+
+    A call that kills its process, or is killed at its time limit, so costs a child,
+    which is cheap. The call of a Dask worker that is lost otherwise goes to another.
+
+    A ``LocalCluster`` gives up each worker that is not back 15 s after its death
+    (``distributed.deploy.lost-worker-timeout``), for good; those are asked for again.
+
+    Args:
+        simulator: Simulator, pickled; it is sent once to each Dask worker.
+        num_workers: Number of calls at a time; -1 means one a core of the cluster.
+        client: A ``distributed.Client``.
+    """
+
+    #: Seconds between two looks at who is there, where no call ends.
+    LOOK = 0.5
+
+    #: Seconds without any worker until that is said.
+    PATIENCE = 5.0
+
+    def __init__(self, simulator: bytes, num_workers: int, client: Any) -> None:
+        num_workers = effective_n_jobs(-1) if num_workers == -1 else num_workers
+        super().__init__(num_workers)
+        self._executor = client.get_executor(pure=False)
+        self._client = client
+        key = f"simulator-{hashlib.sha256(simulator).hexdigest()}"
+        # A result, not scattered data: what a lost worker held can be made again.
+        self._simulator = client.submit(bytes, simulator, key=key)
+        self._last_seen: float | None = time.monotonic()  # None once it was said
+
+    @override
+    def _begun(self, call: Call, time_limit: float | None) -> Future[Reply]:
+        return self._executor.submit(_ask_child, self._simulator, call, time_limit)
+
+    @override
+    def close(self) -> None:
+        self._executor.shutdown(wait=False)
+
+    @override
+    def _reply(self, future: Future[Reply]) -> Reply:
+        try:
+            return future.result()
+        except Exception as error:  # all Dask workers that had it were lost
+            text = f"worker died: {error!r}"
+            return Reply(fault="worker died", traceback=text)
+
+    @override
+    def _look(self) -> None:
+        """Say that no worker is there, and ask for those that were given up."""
+        from distributed import LocalCluster
+
+        now, cluster = time.monotonic(), self._client.cluster
+        if self._client.nthreads():
+            self._last_seen = now
+        elif self._last_seen is not None and now - self._last_seen >= self.PATIENCE:
+            self._last_seen = None
+            warn(
+                f"SA306 no workers at {self._client.scheduler.address} for "
+                f"{self.PATIENCE:g} s: {len(self._calls)} calls of the simulator "
+                "wait for one; start workers there, or interrupt, which keeps what is "
+                "finished",
+                stacklevel=2,
+            )
+        if isinstance(cluster, LocalCluster):
+            num_wanted = len(cluster.worker_spec)
+            if len(cluster.workers) < num_wanted:
+                cluster.scale(num_wanted)
+
+
+def _ask_child(simulator: bytes, call: Call, time_limit: float | None) -> Reply:
+    """Run a call in a child of this process, once.
+
+    The first one that raises there, before any has an outcome, is tried here too: if
+    that succeeds, the simulator needs what was set up here, and all its calls run here.
+    """
+    place = _place(simulator)
+    if not place.get("is_here", False):
+        # Dask's workers are daemons, to which Python allows no children; those here end
+        # with their parent.
+        current_process()._config.pop("daemon", None)  # pyright: ignore
+        reply = WorkerPool(simulator, 1).ask(call, time_limit)
+        if place or reply.fault not in ("raised", "not loaded"):
+            place.update({} if reply.x is None else {"is_here": False})
+            return reply
+    reply = answer(_loaded(simulator), call)
+    place.setdefault("is_here", reply.x is not None)
+    return reply
+
+
+@lru_cache(maxsize=4)
+def _place(simulator: bytes) -> dict[str, bool]:
+    """Return whether calls of a simulator run here, as far as that is known."""
+    return {}
+
+
+@lru_cache(maxsize=4)
+def _loaded(simulator: bytes) -> Any:
+    return cloudpickle.loads(simulator)

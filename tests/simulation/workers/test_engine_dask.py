@@ -18,7 +18,7 @@ from sbi_active import simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning
 from sbi_active.simulation.workers import DaskPool, Schedule, pickled
-from sbi_active.simulation.workers.cluster import _ask_child
+from sbi_active.simulation.workers.pools import _ask_child
 from sbi_active.simulation.workers.settings import Workers
 
 dask = pytest.importorskip("dask")
