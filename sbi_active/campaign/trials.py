@@ -135,6 +135,11 @@ class CampaignTrials(Telling[Trial]):
         return trial.index in self.state.processed and not self.state.is_stale
 
     @property
+    def not_in_belief(self) -> Sequence[int]:
+        """Indices of trials that were told and the belief takes no account of yet."""
+        return [t.index for t in self.history if not self.contains(t)]
+
+    @property
     def health(self) -> Health:
         """Whether the simulator still explains the trials that the belief contains.
 

@@ -200,9 +200,7 @@ def summary_of(campaign: Any) -> dict[str, Any]:
             "combinations": str(together) if together else None,
         },
         "health": campaign.health,
-        "not_in_belief": [
-            t.index for t in campaign.history if not campaign.contains(t)
-        ],
+        "not_in_belief": campaign.not_in_belief,
     }
 
 

@@ -167,7 +167,7 @@ def _news(campaign: Any, folder: Path) -> str:
     """Return what is being computed, as far as the folder says."""
     from sbi_active.progress import in_words
 
-    late = [t.index for t in campaign.history if not campaign.contains(t)]
+    late = campaign.not_in_belief
     if campaign.pending is not None:
         doing, stage = f"trial {campaign.pending.index} waits for its outcome", ""
     elif late:

@@ -216,7 +216,7 @@ def _trials(
 
 
 def _summary(campaign: Any) -> str:
-    waiting = [t.index for t in campaign.history if not campaign.contains(t)]
+    waiting = campaign.not_in_belief
     late = f"; not in the belief yet: {waiting}" if waiting else ""
     pending = campaign.pending
     asked = "" if pending is None else f"; trial {pending.index} is pending"
