@@ -38,7 +38,7 @@ FORMER = {
 SMALLEST, LARGEST = 2.0**-126, 2.0**128 - 2.0**104
 #: Options that no file and no request sets: where these are, and who is trusted.
 UNWRITTEN = ("config", "trust", "json")
-PROBLEM = "problem.toml"  # options of a folder of recordings
+OF_FOLDER = "problem.toml"  # options of a folder of recordings
 BOUNDARY = "\0"  # between the words of an option of several; no word has it
 
 
@@ -263,7 +263,7 @@ CONFIG = option(
 
 def take_problem(ctx: click.Context, param: click.Parameter, folder: Path) -> Path:
     """Take from a folder's problem.toml what no other file and no option gives."""
-    path = folder / PROBLEM
+    path = folder / OF_FOLDER
     if ctx.default_map is None and path.is_file():
         take_config(ctx, param, path)
     return folder

@@ -207,19 +207,22 @@ def summary_of(campaign: Any) -> dict[str, Any]:
 def trial_of(campaign: Any, trial: Any) -> dict[str, Any]:
     """Return a trial as JSON, but for NaN."""
     facts = Facts.of(trial)
-    x = None if facts.x is None else flat(facts.x)
     return {
         "trial": facts.index,
         "status": facts.status,
-        "action": facts.action,
+        "action": _floats(facts.action),
         "names": [*campaign.actions.names],
         "units": [*campaign.actions.units],
-        "x": x and [math.nan if value is None else value for value in x],
+        "x": None if facts.x is None else _floats(facts.x),
         "information_gained": trial.information_gained,
         "surprise": trial.surprise,
         "target": facts.target,
         "reason": facts.reason,
     }
+
+
+def _floats(listed: Any) -> list[float]:
+    return [math.nan if value is None else value for value in flat(listed)]
 
 
 def answer_of(campaign: Any) -> Answer:

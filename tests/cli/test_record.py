@@ -147,3 +147,20 @@ def test_one_writer_at_a_time(camp, capsys):
         assert main(["tell", "camp", "0.4", "0.8"]) == 2
     assert "expected no other writer" in capsys.readouterr().err
     assert main(["tell", "camp", "0.4", "0.8"]) == 0
+
+
+def test_a_trial_whose_record_was_lost_is_shown(camp, capsys):
+    for words in ("0.4 0.8", "0.5 1 --action 2", "0.6 1.2 --action 2"):
+        assert main(["tell", "camp", *words.split()]) == 0
+    with contextlib.closing(record.Store(camp, "campaign")) as store:
+        last = store.length("log")
+        with store.writing(), store.reading() as connection:
+            read = "UPDATE records SET head = x'00' WHERE kind = 'log' AND number = ?"
+            connection.execute(read, (last - 1,))
+    assert main(["repair", "camp"]) == 0
+    capsys.readouterr()
+    assert main(["status", "camp", "--json"]) == 0
+    third = json.loads(capsys.readouterr().out)["trials"][2]
+    assert (third["status"], third["action"]) == ("withdrawn", [None])
+    assert main(["status", "camp"]) == 0
+    assert "withdrawn action = nan  (its record was lost)" in capsys.readouterr().out
