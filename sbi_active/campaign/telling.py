@@ -311,6 +311,8 @@ def flat(value: Any) -> list[Any]:
     """Return the parts of nested lists."""
     if not isinstance(value, list):
         return [value]
+    if not any(isinstance(item, list) for item in value):  # at once, as of an image
+        return [*value]
     return [part for item in value for part in flat(item)]
 
 
