@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 from sbi_active.campaign.telling import (
     LOG,
@@ -40,8 +40,16 @@ class Unsure(Exception):  # noqa: N818
 class Scored(Facts):
     """A trial with what a campaign has found it to be."""
 
+    SCORES: ClassVar = ("information_gained", "surprise")
+
     information_gained: float | None = None
     surprise: float | None = None
+
+    @classmethod
+    def of(cls, trial: Any) -> Scored:
+        """Return a trial as a summary keeps it."""
+        scores = {name: getattr(trial, name) for name in cls.SCORES}
+        return cls(**vars(Facts.of(trial)), **scores)
 
 
 def digest(folder: Path) -> str:
@@ -159,22 +167,15 @@ def sum_up_campaign(campaign: Any) -> None:
     with contextlib.suppress(Exception):  # a belief without moments has no summary
         is_box = type(actions).__name__ == "BoxActions"
         limits = [actions.low.tolist(), actions.high.tolist()] if is_box else [[], []]
-        scores = ("information_gained", "surprise")
         known = {
             "summary": summary_of(campaign),
-            "trials": [
-                {
-                    **vars(Facts.of(trial)),
-                    **{name: getattr(trial, name) for name in scores},
-                }
-                for trial in campaign.state.trials
-            ],
+            "trials": [vars(Scored.of(trial)) for trial in campaign.state.trials],
             "x_shape": [*campaign.x_shape],
             "labels": {"names": [*actions.names], "units": [*actions.units]},
             "limits": [*zip(*limits, strict=True)],
             "processed": [*campaign.state.processed],
         }
-        campaign._storage.sum_up(known)
+        campaign._storage.disk.sum_up(known)
 
 
 def summary_of(campaign: Any) -> dict[str, Any]:
@@ -206,7 +207,7 @@ def summary_of(campaign: Any) -> dict[str, Any]:
 
 def trial_of(campaign: Any, trial: Any) -> dict[str, Any]:
     """Return a trial as JSON, but for NaN."""
-    facts = Facts.of(trial)
+    facts = Scored.of(trial)
     return {
         "trial": facts.index,
         "status": facts.status,
@@ -214,8 +215,8 @@ def trial_of(campaign: Any, trial: Any) -> dict[str, Any]:
         "names": [*campaign.actions.names],
         "units": [*campaign.actions.units],
         "x": None if facts.x is None else _floats(facts.x),
-        "information_gained": trial.information_gained,
-        "surprise": trial.surprise,
+        "information_gained": facts.information_gained,
+        "surprise": facts.surprise,
         "target": facts.target,
         "reason": facts.reason,
     }

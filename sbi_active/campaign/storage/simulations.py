@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -129,11 +129,6 @@ class Storage:
             belief = None if learner.belief is learner.prior else learner.belief
             known = {"simulator": learner.simulator, "prior": self.prior}
             self.disk.save(state, belief, known)
-
-    def sum_up(self, known: Mapping[str, Any]) -> None:
-        """Leave what a reader without torch needs, see :class:`.CampaignDirectory`."""
-        if self.disk is not None:
-            self.disk.sum_up(known)
 
     def close(self) -> None:
         """Let others write."""
