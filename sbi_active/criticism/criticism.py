@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from numpy.typing import NDArray
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
@@ -36,7 +35,6 @@ from sbi_active.criticism.next_trial.next_action import choose_action
 from sbi_active.criticism.results import (
     Detection,
     Evaluation,
-    ModelKey,
     NextAction,
     Residuals,
     Tracing,
@@ -56,8 +54,6 @@ from sbi_active.simulation import SimulatorModel
 
 if TYPE_CHECKING:
     from sbi_active.criticism.report.report import Report
-
-Array = NDArray[Any]
 
 FEWEST_TRIALS = 4  # to leave one out
 #: Posterior draws that predict held-out trials, of models by linear evidence.
@@ -259,7 +255,7 @@ class Criticism:
         if self._tracing is None:
             tracing = self._traced()
             if tracing.misfit is None:
-                tracing = widened(tracing, self.rivals.seed, self._within)
+                tracing = widened(tracing, self.rivals.seed, self.rivals.within)
             self._tracing = replace(tracing, set_aside=self.set_aside)
         return self._tracing
 
@@ -272,10 +268,6 @@ class Criticism:
             if isinstance(found, Verdict):
                 return traced(found, self._scored, **options)
             return trace(found, detection, **options)
-
-    def _within(self, key: ModelKey, z: Array) -> Array:
-        """Return draws of a model, moved into the bounds of its prior."""
-        return self.rivals.rival(key).coordinates.within(z)
 
     def add(
         self, effects: Sequence[str] | None = None

@@ -181,6 +181,10 @@ class RivalSet:
         gaussian = isinstance(self.model.noise, GaussianNoise | AutocorrelatedNoise)
         return gaussian and self.noise.shape == (1, 1)
 
+    def within(self, key: ModelKey, z: Array) -> Array:
+        """Return draws of a model, (n, d), moved into the bounds of its prior."""
+        return self.rival(key).coordinates.within(z)
+
     def residual_process(self, noise: NoiseGrid | None = None) -> ResidualProcess:
         """Return the noise with a smooth function of the action and time.
 

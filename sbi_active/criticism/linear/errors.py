@@ -18,7 +18,6 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -27,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.criticism.data.measurements import Measurements
+from sbi_active.criticism.linear.mixture import WIDTHS, summed
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.processes import (
     Filters,
@@ -37,13 +37,10 @@ from sbi_active.criticism.linear.processes import (
 )
 from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseGrid
 from sbi_active.criticism.steps.nuisances import is_first_part
-from sbi_active.inference.sampling.truncated import log_inside
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
 
-#: Factors on the scale of an effect's prior, equally likely.
-WIDTHS = (1 / 3, 1.0, 3.0)
 #: Sizes of the process in sensor deviations, a factor apart.
 SMALLEST, LARGEST, FACTOR = 0.3, 40.0, 1.63
 #: Every so many of the sizes is one of what differs from trial to trial, and every so
@@ -51,29 +48,6 @@ SMALLEST, LARGEST, FACTOR = 0.3, 40.0, 1.63
 THINNED = 2
 #: Trajectories below which parts are left out in their place, and how many parts.
 FEWEST, NUM_FOLDS = 6, 8
-
-
-@dataclass(frozen=True)
-class Mixture:
-    """A linear model's posterior, summed over hypotheses of the errors.
-
-    Attributes:
-        log_evidence: Log evidence, nats.
-        mean: Mean of u, shape (d,).
-        cov: Covariance of u, shape (d, d).
-        log_z: Log evidence of each hypothesis times its prior probability, by factor
-            on the scale of effects' priors, shape (h, w).
-    """
-
-    log_evidence: float
-    mean: Array
-    cov: Array
-    log_z: Array
-
-    @property
-    def share(self) -> Array:
-        """Posterior probability of each hypothesis, shape (h,)."""
-        return np.exp(self.log_z - self.log_evidence).sum(1)
 
 
 @dataclass(frozen=True)
@@ -346,58 +320,3 @@ class Errors:
         mean = np.bincount(self.fold, variance, self.num_folds) / count
         weight = 1 / mean[self.fold]
         return weight / weight.mean()
-
-
-def summed(
-    gram: Array,
-    log_weight: Array,
-    model: LinearModel,
-    widths: Sequence[float] = (1.0,),
-) -> Mixture:
-    """Return the posterior of a linear model, summed over hypotheses of the errors.
-
-    Args:
-        gram: Gram matrices of its rows, shape (h, 1 + d, 1 + d).
-        log_weight: Log prior probabilities, with the constants of densities, (h,).
-        model: Linear model with its prior.
-        widths: Factors on the scales of effects' priors, equally likely.
-    """
-    found = [integrated(gram, model, width) for width in widths]
-    log_z = np.stack([f[0] for f in found], 1) + log_weight[:, None]
-    log_z = log_z - np.log(len(widths))
-    total = float(log_sum_exp(log_z.ravel()))
-    p = np.exp(log_z - total).ravel()
-    means = np.stack([f[1] for f in found], 1).reshape(len(p), -1)
-    covs = np.stack([f[2] for f in found], 1).reshape(len(p), *gram[0, 1:, 1:].shape)
-    mean = p @ means
-    off = means - mean
-    cov = np.einsum("h,hij->ij", p, covs) + (p[:, None] * off).T @ off
-    return Mixture(total, mean, cov, log_z)
-
-
-def integrated(
-    gram: Array, model: LinearModel, width: float
-) -> tuple[Array, Array, Array]:
-    """Return evidences less their constants, and posterior moments of u."""
-    sd, off = model.widened(width), model.center - model.u
-    g, b, rr = gram[:, 1:, 1:], gram[:, 1:, 0], gram[:, 0, 0]
-    precision = sd[:, None] * g * sd + np.eye(len(sd))
-    # Columns of very different size, as of what jumps, keep their digits in units of
-    # their own.
-    size = np.sqrt(np.einsum("hii->hi", precision))
-    own = size[:, :, None] * size[:, None]
-    cov = np.linalg.inv(precision / own) / own
-    pull = sd * b + off / sd
-    mean = np.einsum("hij,hj->hi", cov, pull)
-    log_z = -0.5 * (rr + ((off / sd) ** 2).sum() - (pull * mean).sum(1))
-    log_det = np.linalg.slogdet(precision / own)[1] + 2 * np.log(size).sum(1)
-    log_z = log_z - 0.5 * log_det  # and from here on about the prior's center
-    mean, cov = sd * mean - off, sd[:, None] * cov * sd
-    low, high = model.low - model.center, model.high - model.center
-    some = np.isfinite(low) | np.isfinite(high)
-    if some.any():
-        own = np.sqrt(np.einsum("hii->hi", cov))[:, some]
-        inside = log_inside(mean[:, some], own, low[some], high[some])
-        before = log_inside(np.zeros(some.sum()), sd[some], low[some], high[some])
-        log_z = log_z + inside.sum(1) - before.sum()
-    return log_z, mean + model.center, cov

@@ -6,6 +6,7 @@ linearization at the best fit to all.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.linear.errors import Errors, Grams, Posterior
 from sbi_active.criticism.linear.model import LinearModel
+from sbi_active.criticism.results import ModelKey
 from sbi_active.inference.sampling.least_squares import within
 
 Array = NDArray[Any]
@@ -146,6 +148,36 @@ def leave_out(
         refits + model.center,
         fit + model.center,
     )
+
+
+def standard_errors(
+    found: Mapping[ModelKey, Candidate],
+    errors: Errors,
+    use: NDArray[np.bool_] | None = None,
+) -> Callable[[Candidate], Array]:
+    """Return a function of a model's squared errors on left-out parts, (f,), cached.
+
+    Trials count as much as the likeliest model has them vary, the same for all models.
+
+    Args:
+        found: Fitted models.
+        errors: Errors that they share.
+        use: Parts of the trials that tell of it; None takes all.
+    """
+    best = max(found.values(), key=lambda c: c.log_p)
+    posterior = best.posterior
+    if use is not None:
+        posterior = errors.posterior(best.model, best.grams, use)
+    weight = errors.weight(posterior)
+    known: dict[ModelKey, Array] = {}
+
+    def standard(c: Candidate) -> Array:
+        key = c.model.key
+        if key not in known:
+            known[key] = leave_out(c.model, errors, use, weight=weight).standard
+        return known[key]
+
+    return standard
 
 
 def bounded(system: Array, right: Array, low: Array, high: Array) -> Array:

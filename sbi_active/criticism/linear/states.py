@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.linear.errors import WIDTHS, Mixture, summed
 from sbi_active.criticism.linear.left_out import Candidate
+from sbi_active.criticism.linear.mixture import WIDTHS, Mixture, summed
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.results import OUTLIER, SCATTER, UNEXPLAINED, ModelKey
 from sbi_active.inference.sampling.weights import log_sum_exp

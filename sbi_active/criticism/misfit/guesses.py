@@ -22,11 +22,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sbi_active.criticism.linear.errors import summed
 from sbi_active.criticism.linear.left_out import leave_out
+from sbi_active.criticism.linear.mixture import summed
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
-from sbi_active.criticism.misfit.rule import predicts_better
+from sbi_active.criticism.misfit.scored import predicts_better
 from sbi_active.criticism.results import ModelKey
 from sbi_active.inference.sampling.weights import log_sum_exp
 

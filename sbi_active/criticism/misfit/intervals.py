@@ -25,8 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from sbi_active.criticism.linear.errors import WIDTHS, Errors, Posterior, summed
+from sbi_active.criticism.linear.errors import Errors, Posterior
 from sbi_active.criticism.linear.left_out import LeftOut
+from sbi_active.criticism.linear.mixture import WIDTHS, summed
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.processes import Filter, Processes, alike
 from sbi_active.inference.sampling.eigen import eigh

@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.evidence.fit import Fit
-from sbi_active.criticism.evidence.rival_set import NUM_DRAWS, RivalSet
-from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
+from sbi_active.criticism.misfit.draws import bends, keep_draws
 from sbi_active.criticism.misfit.guesses import guess_residual
 from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.results import (
@@ -25,7 +23,6 @@ from sbi_active.criticism.results import (
     ModelKey,
     Tracing,
 )
-from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.criticism.steps.equivalence import equivalent_effects
 from sbi_active.criticism.steps.influence import is_left_to_chance, withdrawn
@@ -38,9 +35,6 @@ from sbi_active.criticism.steps.tracing import (
 )
 from sbi_active.criticism.under_misfit import Misfit as Found
 from sbi_active.criticism.under_misfit import ModelError
-from sbi_active.inference.engine import WeightedDraws
-from sbi_active.inference.sampling.eigen import eigh
-from sbi_active.seeding import derive_seed
 
 Array = NDArray[Any]
 
@@ -168,33 +162,6 @@ def _tail(found: Verdict, key: ModelKey) -> float:
     return found.states.chi_square(key)[1] if known else float("nan")
 
 
-def bends(search: Search, key: ModelKey, *, num: int = 16, most: float = 0.5) -> bool:
-    """Return whether the simulator leaves a linear model where its posterior lies.
-
-    A normal posterior is then another one than the simulator's.
-
-    Args:
-        search: Search that has fitted the model.
-        key: Key of the model.
-        num: Number of posterior draws that are simulated.
-        most: Standard deviation over the draws of the log density ratio of simulator
-            and linear model up to which a model counts as linear, nats. With half, more
-            models are sampled.
-    """
-    c = search.found[key]
-    m, rng = c.model, np.random.default_rng(derive_seed(search.rivals.seed, "bends"))
-    use = np.ones(search.errors.num_folds, bool)
-    own = search.errors.posterior(m, c.grams, use, process=False)
-    values, vectors = eigh(own.cov)
-    spread = vectors * np.sqrt(np.maximum(values, 0))
-    u = own.mean + rng.standard_normal((num, len(m.u))) @ spread.T
-    u = np.clip(u, m.low, m.high)
-    residual = search.rivals.rival(key).residual(u)[0]
-    linear = search.unit * (m.residual + (u - m.u) @ m.jacobian.T)
-    log_p = search.sensor.noise.log_likelihood
-    return not (log_p(residual) - log_p(linear)).std() < most  # NaN: not simulated
-
-
 def _record(found: Verdict, key: ModelKey) -> Evidence:
     """Return the record of a model that may fit, and keep its draws.
 
@@ -242,107 +209,6 @@ def _record_misfit(misfit: Verdict, key: ModelKey) -> Evidence:
         best=model.u,
         shown=shown,
     )
-
-
-def keep_draws(
-    rivals: RivalSet,
-    key: ModelKey,
-    model: LinearModel,
-    center: Array,
-    cov: Array,
-    log_z: float,
-    *,
-    best: Array | None = None,
-    shown: Array | None = None,
-    louder: Array | None = None,
-    chi_square: float | None = None,
-    unit: Array | None = None,
-) -> Evidence:
-    """Return a linear model's record, and keep its draws as its posterior sample.
-
-    Args:
-        rivals: Rivals that keep them.
-        key: Key of the model, with an error or with effects on the noise.
-        model: Fitted model of its effects on the prediction.
-        center: Center of its posterior, shape (d,).
-        cov: Covariance of its posterior, shape (d, d).
-        log_z: Log evidence of the model, nats.
-        best: Point from which other trials are predicted, shape (d,); None takes the
-            draws.
-        shown: Covariance of the draws that intervals are of, shape (d, d); None takes
-            that of those which predict.
-        louder: Draws of effects on the noise, natural values, shape (n, k).
-        chi_square: Chi-square with these effects; None takes the fitted model's.
-        unit: Unit of the model's residuals, shape (N,), where draws are to be weighed
-            by the simulator; None leaves them.
-    """
-
-    def linear(u: Array) -> Array:
-        return unit * (model.residual + (u - model.u) @ model.jacobian.T)
-
-    if key in rivals.fits:
-        return rivals.fits[key].evidence
-    before = rivals.simulator.num_simulations if key.effects else 0
-    rival = rivals.rival(key)
-    u, at, mode = _drawn(rivals, model, center, cov), best, model.u
-    if louder is not None:
-        u, mode = _with_louder(rival, model, u, louder), None
-    equal = np.full(NUM_DRAWS, 1 / NUM_DRAWS)
-    sample = WeightedDraws(
-        u=u,
-        weight=equal,
-        log_evidence=log_z,
-        standard_error=0.0,
-        effective_sample_size=float(NUM_DRAWS),
-        method="linear",
-    )
-    own = sum(rival.coordinates.joint.sizes)
-    if shown is not None:
-        u = _drawn(rivals, model, center, shown)
-    evidence = Evidence(
-        key=key,
-        log_evidence=log_z,
-        standard_error=0.0,
-        effective_sample_size=float(NUM_DRAWS),
-        engine="linear",
-        num_simulations=rivals.simulator.num_simulations - before,
-        names=rivals.names_of(rival),
-        draws=rival.coordinates.to_z(u)[:, :own],
-        best_chi_square=model.chi_square[0] if chi_square is None else chi_square,
-        best=None if at is None else rival.coordinates.to_z(at[None])[0, :own],
-    )
-    weighs = None if unit is None else linear
-    rivals.fits[key] = Fit(rival, sample, evidence, at, mode, weighs)
-    return evidence
-
-
-def _with_louder(rival: Rival, model: LinearModel, u: Array, phi: Array) -> Array:
-    """Return draws of a model with draws of effects on the noise, shape (n, d).
-
-    Args:
-        rival: Rival with these effects.
-        model: Model without them.
-        u: Draws of its coordinates, shape (n, d').
-        phi: Draws of theirs, natural values, shape (m, k), repeated as needed.
-    """
-    c, noisy = rival.coordinates, np.zeros(rival.dim, dtype=bool)
-    for effect in rival.effects:
-        noisy[rival.columns()[effect.name]] = effect.hook == "noise"
-    drawn = np.empty((len(u), rival.dim))
-    drawn[:, ~noisy] = u
-    z = c.to_z(np.where(noisy, 0.0, drawn))
-    z[:, noisy] = phi[np.arange(len(u)) % len(phi)]
-    drawn[:, noisy] = c.from_z(z)[:, noisy]
-    return np.clip(drawn, c.low, c.high)
-
-
-def _drawn(rivals: RivalSet, model: LinearModel, center: Array, cov: Array) -> Array:
-    """Return draws of a model's coordinates within their bounds, (NUM_DRAWS, d)."""
-    rng = np.random.default_rng(derive_seed(rivals.seed, "linear", str(model.key)))
-    values, vectors = eigh(cov)
-    root = vectors * np.sqrt(np.clip(values, 0, None))
-    u = center + rng.normal(size=(NUM_DRAWS, len(cov))) @ root.T
-    return np.clip(u, model.low, model.high)
 
 
 def _weights(misfit: Verdict) -> dict[ModelKey, float]:

@@ -20,13 +20,14 @@ from sbi_active.criticism.contradictions import OutlyingTrial
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.errors import Posterior
-from sbi_active.criticism.linear.left_out import Candidate, leave_out
+from sbi_active.criticism.linear.left_out import Candidate, standard_errors
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.states import States
 from sbi_active.criticism.misfit.guesses import gained_by_guesses
 from sbi_active.criticism.misfit.intervals import covariances
-from sbi_active.criticism.misfit.rule import Choice, Rule, Scored
+from sbi_active.criticism.misfit.rule import Choice, Rule
+from sbi_active.criticism.misfit.scored import Scored
 from sbi_active.criticism.misfit.weights import weights_by_error
 from sbi_active.criticism.results import (
     OUTLIER,
@@ -136,7 +137,7 @@ class Verdict:
     @cached_property
     def standard(self) -> Callable[[Candidate], Array]:
         """Function from a model to its squared errors on left-out parts, (f,)."""
-        return standard_errors(self.search)
+        return standard_errors(self.search.found, self.search.errors)
 
     @cached_property
     def choice(self) -> Choice:
@@ -313,11 +314,11 @@ class Verdict:
 
     def selected_without(self, fold: int) -> ModelKey:
         """Return the effects that are chosen without one part of the trials."""
-        use = np.ones(self.search.errors.num_folds, bool)
-        use[fold] = False
+        search = self.search
+        use = np.arange(search.errors.num_folds) != fold
         if self._log_bayes_factor(use) < THRESHOLD and not self.detection.by_chi_square:
             return ModelKey()
-        standard = standard_errors(self.search, use)
+        standard = standard_errors(search.found, search.errors, use)
         return self._settled(partial(self._scored, use=use, standard=standard)).key
 
     def outlying(self) -> tuple[OutlyingTrial, ...]:
@@ -353,34 +354,6 @@ class Verdict:
             if kind_of(other, self.rivals, self.equivalent) != own:
                 return False
         return True
-
-
-def standard_errors(
-    search: Search, use: NDArray[np.bool_] | None = None
-) -> Callable[[Candidate], Array]:
-    """Return a function of a model's squared errors on left-out parts, (f,), cached.
-
-    Trials count as much as the likeliest model has them vary, the same for all models.
-
-    Args:
-        search: The models.
-        use: Parts of the trials that tell of it; None takes all.
-    """
-    errors = search.errors
-    best = max(search.found.values(), key=lambda c: c.log_p)
-    posterior = best.posterior
-    if use is not None:
-        posterior = errors.posterior(best.model, best.grams, use)
-    weight = errors.weight(posterior)
-    known: dict[ModelKey, Array] = {}
-
-    def standard(c: Candidate) -> Array:
-        key = c.model.key
-        if key not in known:
-            known[key] = leave_out(c.model, errors, use, weight=weight).standard
-        return known[key]
-
-    return standard
 
 
 def without(trials: Trials, outlying: Sequence[OutlyingTrial]) -> Trials:

@@ -8,8 +8,9 @@ from scipy.stats import multivariate_normal, norm
 
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.linear.errors import WIDTHS, Errors, integrated
+from sbi_active.criticism.linear.errors import Errors
 from sbi_active.criticism.linear.left_out import leave_out
+from sbi_active.criticism.linear.mixture import WIDTHS, integrated
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.misfit.intervals import shared_process
 from sbi_active.criticism.results import ModelKey

@@ -7,7 +7,7 @@ from scipy.stats import multivariate_normal
 
 from sbi_active import SimulatorModel
 from sbi_active.criticism import Criticism, Trials
-from sbi_active.criticism.linear.errors import summed
+from sbi_active.criticism.linear.mixture import summed
 from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit.guesses import (
     MARGIN,

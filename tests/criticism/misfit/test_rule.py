@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from sbi_active.criticism.misfit.rule import Rule, Scored, predicts_better
+from sbi_active.criticism.misfit.rule import Rule
+from sbi_active.criticism.misfit.scored import Scored, predicts_better
 from sbi_active.criticism.results import ModelKey
 
 choose, starts = Rule().choose, Rule().starts
