@@ -157,12 +157,11 @@ def _inseparable(report: Contents, chosen: NextAction) -> Iterator[str]:
 
 def _tests(report: Contents) -> Iterator[str]:
     """Yield each severe test, with how far a free residual's prediction is there."""
-    for test in report.severe_tests:
-        where = "at" if test.is_permitted else "beyond the permitted range at"
+    for test, where in zip(report.severe_tests, report.tests, strict=True):
         yield (
-            f"the verdict is put to the test most {where} "
-            f"{report.setting(test.action)}, where its prediction and that of a free "
-            f"residual differ by {number(test.difference)} of its standard deviations"
+            f"the verdict is put to the test most {where}, where its prediction and "
+            f"that of a free residual differ by {number(test.difference)} of its "
+            "standard deviations"
         )
 
 
@@ -171,28 +170,21 @@ def _record(report: Contents) -> Section:
     spent = sum(e.num_simulations for e in evidences.values())
     moved = sorted(name for name, e in evidences.items() if e.engine == "smc")
     linear = [name for name, e in evidences.items() if e.engine == "linear"]
-    beside = " with a residual process in each" * (report.tracing.misfit is not None)
-    told = [
-        (True, f"evidence cost {spent:,} simulated trials"),
-        (linear, f"evidence by linearized models{beside}"),
-        (
-            len(moved) + len(linear) < len(evidences),
-            "evidence by least squares and importance sampling",
-        ),
-        (
-            moved,
-            "evidence by sequential Monte Carlo, where that did not serve: "
-            f"{', '.join(moved)}",
-        ),
-        (
-            detection.null_cross_check is not None,
+    told = [f"evidence cost {spent:,} simulated trials"]
+    if linear:
+        process = " with a residual process in each" if report.tracing.misfit else ""
+        told.append(f"evidence by linearized models{process}")
+    if len(moved) + len(linear) < len(evidences):
+        told.append("evidence by least squares and importance sampling")
+    if moved:
+        why = "evidence by sequential Monte Carlo, where that did not serve"
+        told.append(f"{why}: {', '.join(moved)}")
+    if detection.null_cross_check is not None:
+        told.append(
             f"log evidence of the bare model {detection.null_log_evidence:.2f}, "
-            f"from other starts {detection.null_cross_check or 0:.2f}",
-        ),
-        (
-            report.digest,
-            "hash of noise, effects and priors, declared before the data: "
-            f"{report.digest}",
-        ),
-    ]
-    return Section("Record", items=[said for holds, said in told if holds])
+            f"from other starts {detection.null_cross_check:.2f}"
+        )
+    if report.digest:
+        declared = "hash of noise, effects and priors, declared before the data"
+        told.append(f"{declared}: {report.digest}")
+    return Section("Record", items=told)
