@@ -60,22 +60,18 @@ def _sections(report: Contents) -> Iterator[Section]:
 
 def next_action(report: Contents) -> Section:
     """Return the action that tells most, and what no permitted action tells."""
-    chosen, title = report.next_action, "Next action"
+    chosen, title, misfit = report.next_action, "Next action", report.tracing.misfit
     tests = [*_tests(report)]
-    text = [_tried(report)] if report.tracing.chosen else []
+    tried = [_tried(report)] if report.tracing.chosen else []
     if chosen is None:
         none = "None was asked for: there is no set of permitted actions."
-        return Section(title, [none, *text], items=tests)
-    misfit = report.tracing.misfit
-    is_between = misfit is not None and len(chosen.separates) > 1
-    told = [
-        (True, _told(report, chosen)),
-        (is_between, _by_error(misfit) if misfit else ""),
-        (report.tracing.chosen, _tried(report)),
-        (tests, SEVERE),
-    ]
+        return Section(title, [none, *tried], items=tests)
+    text = [_told(report, chosen)]
+    if misfit is not None and len(chosen.separates) > 1:
+        text.append(_by_error(misfit))
+    text += [*tried, *[SEVERE] * bool(tests)]
     items = (*_by_range(report, chosen), *_inseparable(report, chosen), *tests)
-    return Section(title, [said for holds, said in told if holds], items=items)
+    return Section(title, text, items=items)
 
 
 def _told(report: Contents, chosen: NextAction) -> str:
