@@ -148,17 +148,14 @@ def _require_inputs(
     found: Mapping[str, tuple[str, ...]], names: Sequence[str], source: str
 ) -> None:
     """Raise if a table of inputs lacks them or their times, or holds more."""
-    for key, column in ((TIME, TIME), ("input", "input_*")):
-        if not found[key]:
-            raise ValueError(
-                f"expected columns {TRIAL}, {TIME}, input_* in a table of inputs; got "
-                f"{', '.join(names)} in {source}; add {column}"
-            )
+    needed = {TIME: TIME, "input": "input_*"}
+    absent = [column for key, column in needed.items() if not found[key]]
     others = [n for key in ("action", "x", "start", *OPTIONAL) for n in found[key]]
-    if others:
+    if absent or others:
+        remedy = f"add {absent[0]}" if absent else "move them to the table of trials"
         raise ValueError(
             f"expected columns {TRIAL}, {TIME}, input_* in a table of inputs; got "
-            f"{', '.join(others)} in {source}; move them to the table of trials"
+            f"{', '.join(names if absent else others)} in {source}; {remedy}"
         )
 
 

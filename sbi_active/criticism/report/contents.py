@@ -13,8 +13,9 @@ from scipy.stats import spearmanr
 from torch.distributions import Distribution
 
 from sbi_active.criticism.contradictions import SevereTest
+from sbi_active.criticism.data.units import split
 from sbi_active.criticism.report.predicted import TestedTrial
-from sbi_active.criticism.report.words import TOLD, called, parted, setting
+from sbi_active.criticism.report.words import TOLD, called, setting
 from sbi_active.criticism.results import (
     NONE,
     UNEXPLAINED,
@@ -247,7 +248,7 @@ class Contents:
         labels: Sequence[str] = self.channel_names or ()
         if len(labels) != num:
             labels = [f"channel {c}" for c in range(num)]
-        return [*map(parted, labels)]
+        return [*map(split, labels)]
 
     def setting(self, action: Array) -> str:
         """Return an action in words: a label is the name of its trial."""

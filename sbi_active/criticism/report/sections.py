@@ -6,11 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from sbi_active.criticism.data.units import split
 from sbi_active.criticism.report import errors, models
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.predicted import predicted_section
 from sbi_active.criticism.report.summary import first_paragraph, verdict_line
-from sbi_active.criticism.report.words import TOLD, listed, number, parted, probability
+from sbi_active.criticism.report.words import TOLD, listed, number, probability
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, NextAction
 from sbi_active.criticism.under_misfit import Misfit
 from sbi_active.display.page import Page, Section
@@ -116,7 +117,7 @@ def _tried(report: Contents) -> str:
     action = np.unique(report.residuals.action, axis=0)
     if len(action) == 1:
         return f"No other action was tried than {report.setting(action[0])}."
-    entries = [*zip(map(parted, report.action_labels), action.T, strict=True)]
+    entries = [*zip(map(split, report.action_labels), action.T, strict=True)]
     ranges = [
         f"{name} from {column.min():.4g} to {column.max():.4g} {unit}".rstrip()
         for (name, unit), column in entries[: TOLD.entries]
