@@ -56,11 +56,11 @@ def kept(mask: Any, x: Tensor) -> Tensor:
             f"expected a mask of shape {tuple(x.shape)}, that of x; got "
             f"{tuple(keep.shape)}; give one an entry of x"
         )
-    if not bool(((keep == 0) | (keep == 1) | keep.isnan()).all()):
-        wrong = float(keep[(keep != 0) & (keep != 1) & ~keep.isnan()][0])
+    known = (keep == 0) | (keep == 1) | keep.isnan()
+    if not bool(known.all()):
         raise ValueError(
-            f"expected a mask of True and False, or 1 and 0; got {wrong:g}; pass "
-            "True where x is a measurement"
+            "expected a mask of True and False, or 1 and 0; got "
+            f"{float(keep[~known][0]):g}; pass True where x is a measurement"
         )
     return keep == 1
 
@@ -210,23 +210,21 @@ def start_states(start: Any, num: int) -> Tensor | dict[str, Tensor] | None:
     """
     if start is None:
         return None
-    if isinstance(start, Mapping):
-        return {
-            str(name): _starts(value, (num,), str(name))
-            for name, value in start.items()
-        }
-    value = measured(start, name="start")
-    return _starts(value[:, None] if value.ndim == 1 else value, (num, -1), "start")
+    if not isinstance(start, Mapping):
+        value = measured(start, name="start")
+        return _starts(value[:, None] if value.ndim == 1 else value, num, 2, "start")
+    named = {str(name): value for name, value in start.items()}
+    return {name: _starts(value, num, 1, name) for name, value in named.items()}
 
 
-def _starts(start: Any, shape: tuple[int, ...], name: str) -> Tensor:
+def _starts(start: Any, num: int, ndim: int, name: str) -> Tensor:
     value = measured(start, name=name)
-    if len(shape) != value.ndim or len(value) != shape[0]:
+    if value.ndim != ndim or len(value) != num:
         raise ValueError(
-            f"expected start states of shape ({shape[0]}, d), or {{name: "
-            f"({shape[0]},)}}; got {tuple(value.shape)} of {name!r}; give one a trial"
+            f"expected start states of shape ({num}, d), or {{name: ({num},)}}; got "
+            f"{tuple(value.shape)} of {name!r}; give one a trial"
         )
-    lost = ~value.reshape(len(value), -1).isfinite().all(-1)
+    lost = ~value.reshape(num, -1).isfinite().all(-1)
     if bool(lost.any()):
         raise ValueError(
             f"expected finite start states; got {name!r} without a number in trials "

@@ -82,20 +82,16 @@ def _named_series(inputs: Any, names: Sequence[str]) -> dict[str, Tensor]:
             list, called "input", or "input 1" to "input c".
         names: Names of the trials.
     """
-    if isinstance(inputs, Mapping):
-        if not inputs or not all(isinstance(name, str) for name in inputs):
-            raise ValueError(
-                f"expected inputs as {{name: series}}; got {[*inputs]}; name each input"
-            )
-        return {name: _series(name, value, names) for name, value in inputs.items()}
-    value = padded(inputs)
-    if value.ndim == 3 and value.shape[-1] > 1:
-        return {
-            f"input {j + 1}": _series(f"input {j + 1}", part, names)
-            for j, part in enumerate(value.unbind(-1))
-        }
-    value = value[..., 0] if value.ndim == 3 else value
-    return {"input": _series("input", value, names)}
+    if not isinstance(inputs, Mapping):
+        value = padded(inputs)
+        inputs = {"input": value}
+        if value.ndim == 3 and value.shape[-1] > 1:
+            inputs = {f"input {j + 1}": c for j, c in enumerate(value.unbind(-1))}
+    elif not inputs or not all(isinstance(name, str) for name in inputs):
+        raise ValueError(
+            f"expected inputs as {{name: series}}; got {[*inputs]}; name each input"
+        )
+    return {name: _series(name, value, names) for name, value in inputs.items()}
 
 
 def _on_one_grid(

@@ -60,27 +60,20 @@ class Measurements:
         """
         x = trials.x.double().numpy()
         num, length = x.shape[:2]
-        times = trials.sample_times
-        if times is not None:
-            stamps = times.double().numpy()
-        elif model_times is not None:
-            stamps = model_times
-        else:
+        stamps = model_times
+        if trials.sample_times is not None:
+            stamps = trials.sample_times.double().numpy()
+        has_time = is_sequence or stamps is not None
+        if stamps is None:
             stamps = np.arange(length, dtype=float)
-        has_time = is_sequence or times is not None or model_times is not None
-        stamps = np.broadcast_to(stamps, (num, length))
         # (trial, channel, time), where x without a time axis has one "time" a channel.
         channels = x.reshape(num, length, -1).transpose(0, 2, 1)
         places = np.arange(x.size).reshape(num, length, -1).transpose(0, 2, 1)
-        if has_time:
-            time = np.broadcast_to(stamps[:, None], channels.shape)
-            channel = np.broadcast_to(
-                np.arange(channels.shape[1])[None, :, None], channels.shape
-            )
-        else:
-            time = np.zeros(channels.shape)
-            channel = places - places.reshape(num, -1).min(1)[:, None, None]
-        trial = np.broadcast_to(np.arange(num)[:, None, None], channels.shape)
+        trial, channel, _ = np.indices(channels.shape)
+        stamps = np.broadcast_to(stamps, (num, length))
+        time = np.broadcast_to(stamps[:, None], channels.shape)
+        if not has_time:
+            time, channel = np.zeros(channels.shape), places % (x.size // num)
         keep = np.isfinite(channels) & np.isfinite(time)
         gap = np.full(int(keep.sum()), np.inf)
         if has_time:

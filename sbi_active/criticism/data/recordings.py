@@ -6,11 +6,12 @@ import re
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
-from sbi_active.criticism.data.table import TrialTable, read_table
-from sbi_active.criticism.data.table_columns import TRIAL
+from sbi_active.criticism.data.table import read_table
+from sbi_active.criticism.data.table_columns import TRIAL, as_list
 from sbi_active.criticism.data.table_rows import read_csv
 from sbi_active.criticism.data.units import TIME, split
 
@@ -26,8 +27,8 @@ def read_trials(
     columns: Told | None = None,
     units: Mapping[str, str] | None = None,
     inputs: str | Path | pd.DataFrame | None = None,
-) -> TrialTable:
-    """Read trials from a CSV file, or from the recordings in a folder.
+) -> dict[str, Any]:
+    """Return the arguments of ``Trials`` that a CSV file or a folder of such holds.
 
     A folder's trials are those of its ``trials.csv``, or else of all its files
     ``*.csv``, by name with numbers in their order. A file with times and without a
@@ -46,15 +47,20 @@ def read_trials(
             files have different columns.
     """
     path = Path(path)
-    if not path.is_dir():
-        return read_table(path, columns=columns, units=units, inputs=inputs)
-    paths = find_recordings(path)
-    if paths[0].name == TABLE:
+    paths = find_recordings(path) if path.is_dir() else [path]
+    if paths[0] in (path, path / TABLE):
         return read_table(paths[0], columns=columns, units=units, inputs=inputs)
-    frames, told = [], columns
+    frames, told, header = [], columns, None
     for file in paths:
         frame = read_csv(file)
-        _require_same_columns(frame, file, frames, paths[0])
+        own = [name for name in frame.columns if name != TRIAL]
+        header = header or own
+        if sorted(own) != sorted(header):
+            raise ValueError(
+                f"expected the same columns in each recording; got {', '.join(header)} "
+                f"in {paths[0]} and {', '.join(own)} in {file}; rename or convert "
+                f"them, or write one table {TABLE} of all trials"
+            )
         frame, told = _named(frame, file.stem, columns)
         if inputs is None:  # by itself, so that what is wrong is said with the file
             with warnings.catch_warnings():
@@ -88,21 +94,6 @@ def find_recordings(folder: Path) -> list[Path]:
     return found
 
 
-def _require_same_columns(
-    frame: pd.DataFrame, file: Path, frames: Sequence[pd.DataFrame], first: Path
-) -> None:
-    if not frames:
-        return
-    header = [name for name in frames[0].columns if name != TRIAL]
-    own = [name for name in frame.columns if name != TRIAL]
-    if sorted(own) != sorted(header):
-        raise ValueError(
-            f"expected the same columns in each recording; got {', '.join(header)} in "
-            f"{first} and {', '.join(own)} in {file}; rename or convert them, or write "
-            f"one table {TABLE} of all trials"
-        )
-
-
 def _named(
     frame: pd.DataFrame, file: str, columns: Told | None
 ) -> tuple[pd.DataFrame, Told | None]:
@@ -112,18 +103,15 @@ def _named(
     """
     if columns is None:
         names = [split(name)[0] for name in frame.columns]
-        is_long, parts = TIME in names, [TRIAL] if TRIAL in names else []
+        is_long, parts = TIME in names, [name for name in [TRIAL] if name in names]
     else:
-        is_long = TIME in columns
-        told = columns.get(TRIAL, ())
-        parts = [told] if isinstance(told, str) else [*told]
-        parts = [name for name in parts if name in frame.columns]
+        told = as_list(columns.get(TRIAL, ()))
+        is_long, parts = TIME in columns, [n for n in told if n in frame.columns]
     if not is_long:
         return frame, columns
-    words = [frame[name].astype(str).str.strip() for name in parts]
     name = pd.Series(file, index=frame.index)
-    for word in words:
-        name = name + " " + word
+    for part in parts:
+        name = name + " " + frame[part].astype(str).str.strip()
     frame = frame.drop(columns=parts).assign(**{TRIAL: name})
     return frame, None if columns is None else {**columns, TRIAL: TRIAL}
 

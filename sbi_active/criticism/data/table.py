@@ -10,7 +10,6 @@ become SI.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,13 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from sbi_active.callers import stack_level
-from sbi_active.criticism.data.table_columns import Columns, bare, find_columns
-from sbi_active.criticism.data.table_rows import InputRows, Rows, read_frame
+from sbi_active.criticism.data.table_columns import (
+    Columns,
+    as_list,
+    bare,
+    find_columns,
+)
+from sbi_active.criticism.data.table_rows import Rows, read_frame
 from sbi_active.messages import ChangedWarning, warn
 
 Array = NDArray[Any]
@@ -31,19 +35,6 @@ GAP, WITHIN = 1.7, 1.0
 SHOWN = 5  # places that a message lists
 
 
-@dataclass(frozen=True, kw_only=True)
-class TrialTable:
-    """A table of trials.
-
-    Attributes:
-        arguments: Arguments of :class:`.Trials`, by name.
-        columns: Columns of the table, by their role.
-    """
-
-    arguments: dict[str, Any]
-    columns: Columns
-
-
 def read_table(
     table: str | Path | pd.DataFrame,
     *,
@@ -51,8 +42,8 @@ def read_table(
     units: Mapping[str, str] | None = None,
     inputs: str | Path | pd.DataFrame | None = None,
     source: str = "",
-) -> TrialTable:
-    """Read trials from a CSV file or a data frame.
+) -> dict[str, Any]:
+    """Return the arguments of ``Trials`` that a CSV file or a data frame holds.
 
     Warns of cells without a number, and of trials whose numbers are so much larger than
     the others' that they may be in another unit.
@@ -73,12 +64,11 @@ def read_table(
             says where.
     """
     frame, own_name = read_frame(table, "the table")
-    source = source or own_name
-    beside, names = None, set()
+    source, beside = source or own_name, None
     if inputs is not None:
         beside, names = _inputs_beside(inputs, columns or {}, units or {})
-        if columns is not None and "input" in columns:
-            columns = {key: columns[key] for key in columns if key != "input"}
+        if columns is not None:
+            columns = {key: name for key, name in columns.items() if key != "input"}
         own = _names(frame)
         units = {k: u for k, u in (units or {}).items() if k in own or k not in names}
     found = find_columns(
@@ -99,36 +89,30 @@ def read_table(
             f"and more in {beside.source}; keep one"
         )
     _note_converted(found, source)
-    rows = _TrialRows(frame, found, source)
-    return TrialTable(arguments=rows.trials(beside), columns=found)
+    return _TrialRows(frame, found, source).trials(beside)
 
 
 def _inputs_beside(
     table: str | Path | pd.DataFrame,
     columns: Mapping[str, str | Sequence[str]],
     units: Mapping[str, str],
-) -> tuple[InputRows, set[str]]:
-    """Return the inputs of a table of their own, and the names of its columns."""
+) -> tuple[Rows, set[str]]:
+    """Return the rows of a table of inputs, and the names of its columns."""
     frame, source = read_frame(table, "the table of inputs")
-    names = _names(frame)
-    told = {}
+    names, told = _names(frame), None
     if "input" in columns:  # what else is said holds for it where it has such columns
-        told = {key: columns[key] for key in ("trial", "time") if key in columns}
-        told = {
-            key: value
-            for key, value in told.items()
-            if names >= ({value} if isinstance(value, str) else {*value})
-        }
-        told = {"trial": (), "time": "time", **told, "input": columns["input"]}
+        told = {"trial": (), "time": "time", "input": columns["input"]}
+        for key in {"trial", "time"} & {*columns}:
+            if names.issuperset(as_list(columns[key])):
+                told[key] = columns[key]
     found = find_columns(
         [*frame.columns],
-        columns=told or None,
+        columns=told,
         units={name: unit for name, unit in units.items() if name in names},
         source=source,
         of_inputs=True,
     )
-    rows = Rows(frame, found, source)
-    return rows.inputs(rows.time()), names
+    return Rows(frame, found, source), names
 
 
 def _note_converted(found: Columns, source: str) -> None:
@@ -151,32 +135,32 @@ def _names(frame: pd.DataFrame) -> set[str]:
 class _TrialRows(Rows):
     """The rows of a table of trials."""
 
-    def trials(self, beside: InputRows | None = None) -> dict[str, Any]:
+    def trials(self, beside: Rows | None = None) -> dict[str, Any]:
         """Return the arguments of the trials.
 
         Args:
-            beside: Inputs that stand in another table.
+            beside: Rows of another table in which their inputs stand.
         """
         columns, optional, first = self.columns, self.columns.optional, self.first
-        time = self.time()
+        is_long, members, time = columns.time is not None, self.members, self.time
         action = np.empty((len(first), 0))
         if columns.action:
             action = np.stack([self.constant(c) for c in columns.action], 1)
         x = np.stack([self.numbers(c, empty=True) for c in columns.x], 1)
-        inputs = None if beside is None else beside.of(self.names)
-        members = self.members
+        inputs = {} if beside is None else beside.inputs(self.names)
         if columns.input:
-            inputs = self.inputs(time)
+            inputs = self.inputs(self.names)
             filled: Array = np.asarray(np.isfinite(x).any(1))
-            inputs.note_empty(filled)
+            given: Array = np.asarray(np.isfinite(self.input_values).any(1))
+            self._note_without_input(np.flatnonzero(filled & ~given))
             # Inputs may come more often than x: then a row without x is no sample.
-            only = np.isfinite(inputs.values).any(1) & ~filled
+            only = given & ~filled
             members = [at[~only[at]] if filled[at].any() else at for at in members]
         samples = [np.column_stack([time[at], x[at]]) for at in members]
         index = np.arange(len(first), dtype=float)
         if "index" in optional:
             index = self.constant(optional["index"])
-        if columns.time is not None or "index" not in optional:
+        if is_long or "index" not in optional:
             self._require_distinct(action, samples)
         for t in np.flatnonzero(pd.Series(index).duplicated()):
             one = first[np.flatnonzero(index == index[t])[0]]
@@ -185,18 +169,19 @@ class _TrialRows(Rows):
                 f"and {first[t] + 1} of {self.source}; remove one, or give each its "
                 "own index where both were executed"
             )
-        found: dict[str, Any] = {"action": action, "x": x, "index": index}
-        if columns.trial:
-            found["names"] = self.names
-        if not columns.action:
-            found["action"] = None
-        if inputs is not None:
-            found |= inputs.arguments()
-        if columns.start:
-            found["start"] = {columns.short(c): self.constant(c) for c in columns.start}
-        if columns.time is not None:
-            each = [s[:, 1] if len(columns.x) == 1 else s[:, 1:] for s in samples]
-            found |= {"x": each, "sample_times": [s[:, 0] for s in samples]}
+        found = inputs | {
+            "action": action if columns.action else None,
+            "x": x,
+            "index": index,
+            "names": self.names if columns.trial else None,
+            "start": {columns.short(c): self.constant(c) for c in columns.start}
+            or None,
+            "action_labels": [*map(columns.label, columns.action)] or None,
+            "channel_labels": [*map(columns.label, columns.x)],
+        }
+        if is_long:
+            found["x"] = [s[:, 1] if len(columns.x) == 1 else s[:, 1:] for s in samples]
+            found["sample_times"] = [s[:, 0] for s in samples]
         if "role" in optional:
             words = self.constant(optional["role"], self.words(optional["role"]))
             found["role"] = [self._role(t, word) for t, word in enumerate(words)]
@@ -212,9 +197,6 @@ class _TrialRows(Rows):
             self._note_scales([np.diff(s[:, 0]) for s in samples], columns.time)
             for j, column in enumerate(columns.x, 1):
                 self._note_scales([np.abs(s[:, j]) for s in samples], column)
-        if columns.action:
-            found["action_labels"] = [columns.label(c) for c in columns.action]
-        found["channel_labels"] = [columns.label(c) for c in columns.x]
         return found
 
     def _require_distinct(self, action: Array, samples: list[Array]) -> None:
@@ -254,6 +236,16 @@ class _TrialRows(Rows):
                 "first trial of this action"
             )
         return [place[value] if value >= 0 else -1 for value in repeated]
+
+    def _note_without_input(self, lost: Array) -> None:
+        """Warn of rows with a measurement in which no input stands."""
+        if len(lost):
+            warn(
+                f"SA209 {len(lost)} rows of {self.source} have a measurement and no "
+                f"input, the first in {self.place(lost[0])}; there the input before "
+                "holds",
+                stacklevel=stack_level(),
+            )
 
     def _note_empty(self, x: Array, rows: Array) -> None:
         """Warn of what counts as not measured."""

@@ -87,9 +87,16 @@ def find_columns(
             f"expected each column once; got {', '.join(twice)} more than once in "
             f"{source}; remove or rename one"
         )
-    found = (
-        _by_name(names, source) if columns is None else _as_told(names, columns, source)
-    )
+    if columns is None:
+        found, one = _by_name(names, source), "one column"
+    else:
+        found, one = _as_told(names, columns, source), "one column for"
+    for key in (TIME, *OPTIONAL, *[TRIAL] * (columns is None)):
+        if len(found[key]) > 1:
+            raise ValueError(
+                f"expected {one} {key}; got {', '.join(found[key])} in "
+                f"{source}; keep one"
+            )
     if of_inputs:
         _require_inputs(found, names, source)
     elif bool(found[TRIAL]) != bool(found[TIME]):
@@ -129,11 +136,7 @@ def find_columns(
             f"{time} of {source}; convert them"
         )
     return Columns(
-        action=found["action"],
-        x=found["x"],
-        input=found["input"],
-        start=found["start"],
-        trial=found[TRIAL],
+        **{key: found[key] for key in (*PREFIXES, TRIAL)},
         time=time,
         optional={key: found[key][0] for key in OPTIONAL if found[key]},
         units={column: unit for column, (_, unit) in converted.items()},
@@ -145,17 +148,14 @@ def _require_inputs(
     found: Mapping[str, tuple[str, ...]], names: Sequence[str], source: str
 ) -> None:
     """Raise if a table of inputs lacks them or their times, or holds more."""
-    for key, column in ((TIME, TIME), ("input", "input_*")):
-        if not found[key]:
-            raise ValueError(
-                f"expected columns {TRIAL}, {TIME}, input_* in a table of inputs; got "
-                f"{', '.join(names)} in {source}; add {column}"
-            )
+    needed = {TIME: TIME, "input": "input_*"}
+    absent = [column for key, column in needed.items() if not found[key]]
     others = [n for key in ("action", "x", "start", *OPTIONAL) for n in found[key]]
-    if others:
+    if absent or others:
+        remedy = f"add {absent[0]}" if absent else "move them to the table of trials"
         raise ValueError(
             f"expected columns {TRIAL}, {TIME}, input_* in a table of inputs; got "
-            f"{', '.join(others)} in {source}; move them to the table of trials"
+            f"{', '.join(names if absent else others)} in {source}; {remedy}"
         )
 
 
@@ -167,12 +167,6 @@ def _by_name(names: Sequence[str], source: str) -> dict[str, tuple[str, ...]]:
         for kind, prefix in PREFIXES.items():
             key = kind if word.startswith(prefix) else key
         found[key].append(name)
-    for key in (TRIAL, TIME, *OPTIONAL):
-        if len(found[key]) > 1:
-            raise ValueError(
-                f"expected one column {key}; got {', '.join(found[key])} in {source}; "
-                "keep one"
-            )
     unknown = found.pop("")
     if unknown and (found["input"] or (found["action"] and found["x"])):
         every = ", ".join(f"{prefix}*" for prefix in PREFIXES.values())
@@ -196,15 +190,11 @@ def _as_told(
     of = {bare(name): name for name in names} | {name: name for name in names}
     found: dict[str, tuple[str, ...]] = dict.fromkeys(KEYS, ())
     for key, value in columns.items():
-        told = [value] if isinstance(value, str) else [*value]
+        told = as_list(value)
         for name in [name for name in told if name not in of]:
             raise ValueError(
                 f"expected a column {name} for {key}; got {', '.join(names)} in "
                 f"{source}; {did_you_mean(name, names, 'correct the name')}"
-            )
-        if key in (TIME, *OPTIONAL) and len(told) > 1:
-            raise ValueError(
-                f"expected one column for {key}; got {', '.join(told)}; keep one"
             )
         found[key] = tuple(of[name] for name in told)
     return found
@@ -237,6 +227,11 @@ def _units(
                 f"{source}; convert one and merge them"
             )
     return found
+
+
+def as_list(value: str | Sequence[str]) -> list[str]:
+    """Return a name, or several, as a list."""
+    return [value] if isinstance(value, str) else [*value]
 
 
 def bare(name: str) -> str:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from sbi_active.callers import stack_level
 from sbi_active.criticism.data.table_columns import PREFIXES, Columns
-from sbi_active.messages import warn
 
 Array = NDArray[Any]
 
@@ -28,77 +26,6 @@ def read_frame(table: str | Path | pd.DataFrame, name: str) -> tuple[pd.DataFram
     frame = table if is_frame else read_csv(Path(table))
     frame = frame.set_axis([str(c).strip() for c in frame.columns], axis=1)
     return frame, name if is_frame else str(table)
-
-
-@dataclass(frozen=True, kw_only=True)
-class InputRows:
-    """The rows of a table that hold inputs.
-
-    Attributes:
-        names: Names of the inputs, each with its label.
-        values: Values of the inputs, shape (n, c), NaN where a cell is empty.
-        time: Times in s, shape (n,).
-        members: Rows of each trial.
-        trials: Names of the trials; one empty name where all share the series.
-        place: Function that returns the name of a row in messages.
-        source: Name of the table in messages.
-    """
-
-    names: dict[str, str]
-    values: Array
-    time: Array
-    members: Sequence[Array]
-    trials: Sequence[str]
-    place: Callable[[Any], str]
-    source: str
-
-    def arguments(self) -> dict[str, Any]:
-        """Return the inputs as arguments of ``Trials``."""
-        has = np.isfinite(self.values)
-        found, times = {}, {}
-        for j, name in enumerate(self.names):
-            rows = [at[has[at, j]] for at in self.members]
-            found[name] = [self.values[at, j] for at in rows]
-            times[name] = [self.time[at] for at in rows]
-        return {
-            "inputs": found,
-            "input_times": times,
-            "input_labels": [*self.names.values()],
-        }
-
-    def note_empty(self, measured: Array) -> None:
-        """Warn of rows with a measurement in which no input stands.
-
-        Args:
-            measured: Mask of the rows that have one, shape (n,), bool.
-        """
-        lost = np.flatnonzero(measured & ~np.isfinite(self.values).any(1))
-        if len(lost):
-            warn(
-                f"SA209 {len(lost)} rows of {self.source} have a measurement and no "
-                f"input, the first in {self.place(lost[0])}; there the input before "
-                "holds",
-                stacklevel=stack_level(),
-            )
-
-    def of(self, trials: Sequence[str]) -> InputRows:
-        """Return the rows of some trials, in their order.
-
-        Raises:
-            ValueError: If one of them has none.
-        """
-        place = {name: i for i, name in enumerate(self.trials)}
-        if [*place] == [""]:
-            place = dict.fromkeys(trials, 0)
-        for name in trials:
-            if name not in place:
-                raise ValueError(
-                    f"expected inputs of each trial; got none of trial {name} in "
-                    f"{self.source}, whose trials are {', '.join(self.trials)}; add "
-                    "its rows, or leave the trial out"
-                )
-        members = [self.members[place[name]] for name in trials]
-        return replace(self, members=members, trials=[*trials])
 
 
 class Rows:
@@ -135,6 +62,7 @@ class Rows:
         self.members = [np.flatnonzero(self.code == t) for t in range(num)]
         self.first = np.array([at[0] for at in self.members])
 
+    @cached_property
     def time(self) -> Array:
         """Return the time of each row in s, in order within a trial; 0 without one."""
         if self.columns.time is None:
@@ -149,22 +77,39 @@ class Rows:
         self._require_order(time, self.columns.time)
         return time
 
-    def inputs(self, time: Array) -> InputRows:
-        """Return the rows of inputs.
+    @cached_property
+    def input_values(self) -> Array:
+        """Values of the inputs, shape (n, c), NaN where a cell is empty."""
+        return np.stack([self.numbers(c, empty=True) for c in self.columns.input], 1)
+
+    def inputs(self, trials: Sequence[str]) -> dict[str, Any]:
+        """Return the inputs of trials, as arguments of ``Trials``.
 
         Args:
-            time: Time of each row.
+            trials: Names of the trials; those without rows share the one series of a
+                table that names none.
+
+        Raises:
+            ValueError: If a trial has no rows.
         """
-        columns = self.columns
-        return InputRows(
-            names={columns.short(c): columns.label(c) for c in columns.input},
-            values=np.stack([self.numbers(c, empty=True) for c in columns.input], 1),
-            time=time,
-            members=self.members,
-            trials=self.names,
-            place=self.place,
-            source=self.source,
-        )
+        time, place = self.time, {name: i for i, name in enumerate(self.names)}
+        if self.names == [""]:
+            place = dict.fromkeys(trials, 0)
+        for name in trials:
+            if name not in place:
+                raise ValueError(
+                    f"expected inputs of each trial; got none of trial {name} in "
+                    f"{self.source}, whose trials are {', '.join(self.names)}; add "
+                    "its rows, or leave the trial out"
+                )
+        members = [self.members[place[name]] for name in trials]
+        series, times, columns = {}, {}, self.columns
+        for column, values in zip(columns.input, self.input_values.T, strict=True):
+            name, has = columns.short(column), np.isfinite(values)
+            series[name] = [values[at[has[at]]] for at in members]
+            times[name] = [time[at[has[at]]] for at in members]
+        labels = [columns.label(column) for column in columns.input]
+        return {"inputs": series, "input_times": times, "input_labels": labels}
 
     def place(self, i: Any) -> str:
         """Return the name of a row in messages."""
@@ -307,10 +252,10 @@ def read_csv(path: Path) -> pd.DataFrame:
             f"expected a CSV file; got none at {path}; check the path"
         )
     try:
-        _require_commas(path)
         with path.open(encoding="utf-8-sig", newline="") as file:
             # A "#" within a cell is a part of it: only whole lines are comments.
             lines = [line for line in file if not line.lstrip().startswith("#")]
+        _require_commas(lines, path)
         table = pd.read_csv(
             io.StringIO("".join(lines)), header=None, dtype=str, keep_default_na=False
         )
@@ -334,11 +279,9 @@ def read_csv(path: Path) -> pd.DataFrame:
     return table.iloc[1:].set_axis(header, axis=1).reset_index(drop=True)
 
 
-def _require_commas(path: Path) -> None:
+def _require_commas(lines: Sequence[str], path: Path) -> None:
     """Raise if the header's cells are parted by something else."""
-    with path.open(encoding="utf-8-sig") as file:
-        lines = (line.strip() for line in file)
-        header = next((line for line in lines if line and line[0] != "#"), "")
+    header = next((line.strip() for line in lines if line.strip()), "")
     found = re.search(r"[;\t]", header)
     if found and "," not in header:
         options = f"sep={found.group()!r}" + (", decimal=','" * (found.group() == ";"))

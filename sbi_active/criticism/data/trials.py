@@ -241,8 +241,8 @@ class Trials:
         Raises:
             ValueError: If the table is not understood; the text says where.
         """
-        table = read_trials(path, columns=columns, units=units, inputs=inputs)
-        return cls(**table.arguments, order=order, input_hold=input_hold)
+        found = read_trials(path, columns=columns, units=units, inputs=inputs)
+        return cls(**found, order=order, input_hold=input_hold)
 
     @classmethod
     def from_dataframe(
@@ -268,8 +268,8 @@ class Trials:
             >>> trials.x.shape, trials.channel_labels
             (torch.Size([2, 2]), ('h [m]',))
         """
-        table = read_table(frame, columns=columns, units=units, inputs=inputs)
-        return cls(**table.arguments, order=order, input_hold=input_hold)
+        found = read_table(frame, columns=columns, units=units, inputs=inputs)
+        return cls(**found, order=order, input_hold=input_hold)
 
     def __len__(self) -> int:
         return len(self.x)

@@ -57,7 +57,7 @@ def to_si(unit: str) -> tuple[float, str] | None:
 
 
 def split(column: str) -> tuple[str, str]:
-    """Return a column's name without its unit, and the unit; "" if there is none.
+    """Return the name in a column or a label, and the unit; "" if there is none.
 
     Example:
         >>> split("angle [deg]"), split("time_ms"), split("x_height")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,9 +36,6 @@ from sbi_active.criticism.steps.detection import REFUTED, TOO_SMALL
 from sbi_active.messages import Message
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.signatures import parameters_of
-
-#: A condition, and the sentence that is said where it holds.
-Row = tuple[object, str]
 
 #: Families of effects that blame an instrument, beside those on what is observed.
 INSTRUMENTS = ["sensor", "geometry"]
@@ -84,7 +81,7 @@ def cautions(
         trials: The measured trials.
         designed: Actions were chosen for their information.
     """
-    rows = [
+    found = [
         *_of_trials(report, trials.fit, designed=designed),
         *_of_outcomes(report),
         *_of_evidence(report),
@@ -92,71 +89,61 @@ def cautions(
         *_of_verdict(report),
         *_of_phi(report),
     ]
-    found = dict.fromkeys(sentence for holds, sentence in rows if holds)
-    return (*map(Message, found),)
+    return (*map(Message, dict.fromkeys(found)),)
 
 
-def _of_trials(report: Contents, trials: Trials, *, designed: bool) -> list[Row]:
+def _of_trials(report: Contents, trials: Trials, *, designed: bool) -> Iterator[str]:
     num = int(trials.valid.sum())
-    estimated = report.residuals.noise == "estimated" and report.tracing.misfit is None
-    in_order = trials.order == "known" and not trials.action_is_label
-    growth = report.growth if trials.order == "known" else None
-    grown = f"{growth or 0:.2g} times from the first third to the last"
-    return [
-        (estimated, "SA501 noise undeclared: what differs by repeat passes for noise"),
-        (num < FEW_TRIALS, f"SA502 fewer than {FEW_TRIALS} trials ({num})"),
-        (
-            in_order and _aliased(trials),
-            "SA503 drift aliased with the order of actions, which were sorted",
-        ),
-        (designed, "SA504 actions chosen for information and not for deployment"),
-        (
-            growth,
-            f"SA529 residuals grow from trial to trial, {grown}: a parameter may "
-            'differ by trial; declare it as an effect of scope "trial", or what drifts',
-        ),
-    ]
+    if report.residuals.noise == "estimated" and report.tracing.misfit is None:
+        yield "SA501 noise undeclared: what differs by repeat passes for noise"
+    if num < FEW_TRIALS:
+        yield f"SA502 fewer than {FEW_TRIALS} trials ({num})"
+    is_ordered = trials.order == "known"
+    if is_ordered and not trials.action_is_label and _aliased(trials):
+        yield "SA503 drift aliased with the order of actions, which were sorted"
+    if designed:
+        yield "SA504 actions chosen for information and not for deployment"
+    if is_ordered and (growth := report.growth):
+        yield (
+            f"SA529 residuals grow from trial to trial, {growth:.2g} times from the "
+            "first third to the last: a parameter may differ by trial; declare it as "
+            'an effect of scope "trial", or what drifts'
+        )
 
 
-def _of_outcomes(report: Contents) -> list[Row]:
+def _of_outcomes(report: Contents) -> Iterator[str]:
     own = report.residuals
     if report.residuals_after is not None and report.tracing.chosen:
         own = report.residuals_after
+    kinds = [
+        "gave no measurement where the model is sure of one",
+        "gave a measurement where the model is sure of none",
+    ]
     disagreeing = [
         f"trial{'s' * (len(which) > 1)} "
         f"{', '.join(called(own.names, i) for i in which)} {what}"
-        for which, what in zip(
-            surprising_outcomes(own),
-            [
-                "gave no measurement where the model is sure of one",
-                "gave a measurement where the model is sure of none",
-            ],
-            strict=True,
-        )
+        for which, what in zip(surprising_outcomes(own), kinds, strict=True)
         if which
     ]
-    rough = np.zeros(1) if own.roughness is None else own.roughness[own.roughness > 0]
-    strays = f"{rough.min():.2g} to {rough.max():.2g}"
-    correlation = _correlation(own)
-    remedy = "sample_times"
-    if own.times is not None:
-        remedy = "GaussianNoise or AutocorrelatedNoise"
-    return [
-        (disagreeing, f"SA505 outcomes that disagree: {' and '.join(disagreeing)}"),
-        (
-            own.roughness is not None,
-            f"SA506 the simulator jumps: x strays by {strays} from a smooth function "
-            "of the parameters, which counts as an error beside the noise",
-        ),
-        (
-            correlation,
+    if disagreeing:
+        yield f"SA505 outcomes that disagree: {' and '.join(disagreeing)}"
+    if own.roughness is not None:
+        rough = own.roughness[own.roughness > 0]
+        yield (
+            f"SA506 the simulator jumps: x strays by {rough.min():.2g} to "
+            f"{rough.max():.2g} from a smooth function of the parameters, which "
+            "counts as an error beside the noise"
+        )
+    if correlation := _correlation(own):
+        is_timed = own.times is not None
+        remedy = "GaussianNoise or AutocorrelatedNoise" if is_timed else "sample_times"
+        yield (
             "SA507 independent errors forced on a trajectory: neighboring residuals "
-            f"correlate by {correlation:.2f}; declare {remedy}",
-        ),
-    ]
+            f"correlate by {correlation:.2f}; declare {remedy}"
+        )
 
 
-def _of_evidence(report: Contents) -> list[Row]:
+def _of_evidence(report: Contents) -> Iterator[str]:
     tracing, detection = report.tracing, report.detection
     matter = {NONE, tracing.model}
     matter |= {n for n, p in tracing.probabilities.items() if p > LIMITS.negligible}
@@ -170,112 +157,102 @@ def _of_evidence(report: Contents) -> list[Row]:
             or e.standard_error > LIMITS.uncertain
         )
     ]
-    remains = tracing.chosen and tracing.misfit is None
+    if weak:
+        yield f"SA508 evidence uncertain of {', '.join(weak)}"
+    if detection.alarm and not detection.by_evidence:
+        yield "SA509 the alarm rests on the chi-square alone: a cause is a suggestion"
+    told = tracing.evidences.get(tracing.verdict) if tracing.chosen else None
+    if told and tracing.misfit is None and detection.refutes(told, REFUTED):
+        yield (
+            f"SA510 {tracing.verdict} explains the most, and not all: its chi-square "
+            f"has p < {REFUTED:g}, so that something else is missing too"
+        )
     check = detection.null_cross_check
     apart = 0.0 if check is None else abs(check - detection.null_log_evidence)
-    small = abs(detection.least_chi_square / detection.degrees_of_freedom) ** 0.5
-    return [
-        (weak, f"SA508 evidence uncertain of {', '.join(weak)}"),
-        (
-            detection.alarm and not detection.by_evidence,
-            "SA509 the alarm rests on the chi-square alone: a cause is a suggestion",
-        ),
-        (
-            remains and detection.refutes(tracing.evidences[tracing.verdict], REFUTED),
-            f"SA510 {tracing.verdict} explains the most, and not all: its chi-square "
-            f"has p < {REFUTED:g}, so that something else is missing too",
-        ),
-        (
-            apart > LIMITS.disagreement,
+    if apart > LIMITS.disagreement:
+        yield (
             f"SA511 two estimates of the bare model's evidence differ by {apart:.1f} "
-            "nats",
-        ),
-        (
-            detection.lower_p_value <= TOO_SMALL,
+            "nats"
+        )
+    if detection.lower_p_value <= TOO_SMALL:
+        small = abs(detection.least_chi_square / detection.degrees_of_freedom) ** 0.5
+        yield (
             "SA523 residuals are far smaller than the declared noise allows, "
             f"{small:.2g} of its standard deviation: declare the error of the "
-            "measurement in the unit of x",
-        ),
-    ]
-
-
-def _of_misses(report: Contents) -> list[Row]:
-    """Return rows of trials far off, and of parameters at bounds, one each."""
-    evaluation, tracing = report.evaluation, report.tracing
-    rows: list[Row] = [
-        (
-            True,
-            f"SA513 trial {trial.name} is far outside what the other trials show, "
-            f"{trial.times:.3g} times their error: it is set aside; check its record",
+            "measurement in the unit of x"
         )
-        for trial in tracing.set_aside
-    ]
+
+
+def _of_misses(report: Contents) -> Iterator[str]:
+    """Yield sentences on trials far off, and on parameters at bounds, one each."""
+    evaluation, tracing = report.evaluation, report.tracing
+    for trial in tracing.set_aside:
+        yield (
+            f"SA513 trial {trial.name} is far outside what the other trials show, "
+            f"{trial.times:.3g} times their error: it is set aside; check its record"
+        )
     for trial in () if evaluation is None else evaluation.missed:
         how = f"missed by {number(trial.size)} {trial.unit}"
         if math.isinf(trial.size):
             how = "measured where the model is sure of no measurement"
-        sentence = (
+        yield (
             f"SA514 held-out trial {trial.name} is far outside what the verdict's "
             f"model predicts, {how}: check its record and its unit"
         )
-        rows.append((True, sentence))
     for p in tracing.bounds.parameters:
         where = "in the bare model" if p.model == NONE else f"with {p.model}"
         moved = f" with the bound moved the best fit has {p.beyond:.3g};"
-        sentence = (
+        yield (
             f"SA103 {p.name} is at a bound of its prior {where}, the {p.side} one "
             f"({p.bound:.6g});{'' if math.isnan(p.beyond) else moved} move the bound, "
             "or say why"
         )
-        rows.append((True, sentence))
-    return rows
 
 
-def _of_verdict(report: Contents) -> list[Row]:
+def _of_verdict(report: Contents) -> Iterator[str]:
     tracing, verdict = report.tracing, report.verdict
-    before = after = 0.0
-    if report.evaluation is not None:
-        rmse = report.before_after.set_index("metric").loc["rmse"]
-        before, after = float(rmse["before"]), float(rmse["after"])
-    is_bare = verdict == UNEXPLAINED and not tracing.chosen
-    code, why = _withdrawn(tracing)
-    p = tracing.probabilities.get(tracing.instead_of)
-    share = "" if p is None else f" (probability {p:.2g})"
-    rests_on_one = len(tracing.needed) == 1 and not tracing.instead_of
-    return [
-        (
-            tracing.chosen and report.evaluation is not None and after >= before,
-            f"SA512 {ModelKey(tracing.chosen)} does not lower the error on {NO_PART}: "
-            f"RMSE {before:.3g} before and {after:.3g} after",
-        ),
-        (
-            verdict == OUTLIER,
+    if tracing.chosen and report.evaluation is not None:
+        before, after = report.rmse
+        if after >= before:
+            yield f"SA512 {_no_better(str(ModelKey(tracing.chosen)), before, after)}"
+    if verdict == OUTLIER:
+        yield (
             f"SA521 {suspects_in_words(tracing)} does not agree with the others: check "
-            "its record, then correct, withdraw or repeat it",
-        ),
-        (tracing.instead_of, f"{code} {tracing.instead_of}{share} is not named, {why}"),
-        (
-            rests_on_one,
-            f"SA522 {verdict} {rests(tracing) if rests_on_one else ''}: without it the "
-            "Bayes factor against the bare model is below 20",
-        ),
-        (not tracing.robust, "SA517 not robust to its prior"),
-        (
-            is_bare and not tracing.bounds.replaces,
+            "its record, then correct, withdraw or repeat it"
+        )
+    if tracing.instead_of:
+        code, why = _withdrawn(tracing)
+        p = tracing.probabilities.get(tracing.instead_of)
+        share = "" if p is None else f" (probability {p:.2g})"
+        yield f"{code} {tracing.instead_of}{share} is not named, {why}"
+    elif len(tracing.needed) == 1:
+        yield (
+            f"SA522 {verdict} {rests(tracing)}: without it the Bayes factor against "
+            "the bare model is below 20"
+        )
+    if not tracing.robust:
+        yield "SA517 not robust to its prior"
+    if verdict == UNEXPLAINED and not tracing.chosen and not tracing.bounds.replaces:
+        yield (
             "SA518 no declared effect explains the data, and what stands in its place "
-            "does not extrapolate",
-        ),
-        (
-            _may_be_force(report),
+            "does not extrapolate"
+        )
+    if _may_be_force(report):
+        yield (
             "SA530 what is left may be a force: add those of force_effects to the "
-            "effects",
-        ),
-        (
-            verdict == SCATTER,
-            "SA519 scatter is larger than the declared noise, which is no cause",
-        ),
-        (report.exploratory, "SA520 exploratory: changed after the data were seen"),
-    ]
+            "effects"
+        )
+    if verdict == SCATTER:
+        yield "SA519 scatter is larger than the declared noise, which is no cause"
+    if report.exploratory:
+        yield "SA520 exploratory: changed after the data were seen"
+
+
+def _no_better(which: str, before: float, after: float, on: str = NO_PART) -> str:
+    return (
+        f"{which} does not lower the error on {on}: RMSE {before:.3g} before and "
+        f"{after:.3g} after"
+    )
 
 
 def _withdrawn(tracing: Tracing) -> tuple[str, str]:
@@ -283,10 +260,8 @@ def _withdrawn(tracing: Tracing) -> tuple[str, str]:
     if tracing.bounds.replaces:
         return "SA103", f"since {narrow_prior(tracing)}"
     if tracing.refuted:
-        before, after = tracing.refuted
         where = tracing.refuted_on or NO_PART
-        rmse = f"RMSE {before:.3g} before and {after:.3g} after"
-        return "SA512", f"since it does not lower the error on {where}: {rmse}"
+        return "SA512", f"since {_no_better('it', *tracing.refuted, where)}"
     which = f"it {rests(tracing)}, and " if tracing.needed else ""
     return "SA521", (
         f"since {which}{suspects_in_words(tracing)} may as well have a gross error: "
@@ -294,36 +269,29 @@ def _withdrawn(tracing: Tracing) -> tuple[str, str]:
     )
 
 
-def _of_phi(report: Contents) -> list[Row]:
+def _of_phi(report: Contents) -> Iterator[str]:
     edge = _at_edge(report.tracing, getattr(report.prior, "effects", ()))
-    names = ", ".join(effect.name for effect, _ in edge)
-    rows: list[Row] = [
-        (
-            edge,
+    if edge:
+        names = ", ".join(effect.name for effect, _ in edge)
+        yield (
             f"SA515 phi at its prior's edge ({names}): it is stronger than declared, "
-            "or stands in for another",
+            "or stands in for another"
         )
-    ]
     for effect, phi in edge:
         size = f"{number(float(phi[np.argmax(np.abs(phi))]))} {effect.units}".strip()
-        rows.append(
-            (
-                effect.hook == "observation" or effect.family in INSTRUMENTS,
-                f"SA516 {effect.name} of {size} is more than an instrument gets wrong",
-            )
-        )
-    return rows
+        if effect.hook == "observation" or effect.family in INSTRUMENTS:
+            yield f"SA516 {effect.name} of {size} is more than an instrument gets wrong"
 
 
 def _aliased(trials: Trials) -> bool:
     """Return whether an entry of the action goes with the order of execution."""
     order = rankdata(trials.index.numpy())
-    for value in trials.action.numpy().T:
-        ranks = rankdata(value)
-        varies = len(ranks) > 2 and ranks.std() > 0
-        if varies and abs(np.corrcoef(order, ranks)[0, 1]) > LIMITS.aliased:
-            return True
-    return False
+    return any(
+        len(value) > 2
+        and np.ptp(value) > 0
+        and abs(np.corrcoef(order, rankdata(value))[0, 1]) > LIMITS.aliased
+        for value in trials.action.numpy().T
+    )
 
 
 def _may_be_force(report: Contents) -> bool:
@@ -339,19 +307,15 @@ def _may_be_force(report: Contents) -> bool:
 def _correlation(own: Residuals) -> float:
     """Return that of neighbors in x's first axis; 0 where it is no reason to warn."""
     z = own.refitted
-    takes_none = own.times is None or own.correlation == 0.0
-    first, second = z[:, :-1].ravel(), z[:, 1:].ravel()
-    both = np.isfinite(first) & np.isfinite(second)
-    first, second = first[both], second[both]
-    varies = len(first) > 2 and first.std() > 0 and second.std() > 0
-    if not (takes_none and z.shape[1] >= LIMITS.long and varies):
+    is_declared = own.times is not None and own.correlation != 0.0
+    pairs = np.stack([z[:, :-1].ravel(), z[:, 1:].ravel()])
+    pairs = pairs[:, np.isfinite(pairs).all(0)]
+    num = pairs.shape[1]
+    if is_declared or z.shape[1] < LIMITS.long or num < 3 or not pairs.std(1).all():
         return 0.0
-    found = float(np.corrcoef(first, second)[0, 1])
-    return (
-        found
-        if found > max(LIMITS.correlated, LIMITS.significant / np.sqrt(len(first)))
-        else 0.0
-    )
+    found = float(np.corrcoef(pairs)[0, 1])
+    least = max(LIMITS.correlated, LIMITS.significant / np.sqrt(num))
+    return found if found > least else 0.0
 
 
 def _at_edge(tracing: Tracing, effects: Sequence[Effect]) -> list[tuple[Effect, Array]]:
@@ -361,20 +325,19 @@ def _at_edge(tracing: Tracing, effects: Sequence[Effect]) -> list[tuple[Effect, 
         return []
     found = []
     for effect in effects:
-        if effect.name not in tracing.chosen:
-            continue
-        columns = [evidence.names.index(name) for name in effect.phi_names]
-        phi = evidence.draws[:, columns]
-        if _is_extreme(effect, phi):
-            found.append((effect, phi.mean(0)))
+        if effect.name in tracing.chosen:
+            columns = [evidence.names.index(name) for name in effect.phi_names]
+            phi = evidence.draws[:, columns].mean(0)
+            if _is_extreme(effect, phi):
+                found.append((effect, phi))
     return found
 
 
-def _is_extreme(effect: Effect, phi: Array) -> bool:
-    """Return whether phi lies further from the null than almost all of its prior."""
+def _is_extreme(effect: Effect, mean: Array) -> bool:
+    """Return whether phi is further from the null than almost all of its prior."""
     with forked_generators(0, "edge"):
         draws = effect.sample(2_000).numpy()
-    mean, null = phi.mean(0), effect.null_phi(1).numpy()[0]
+    null = effect.null_phi(1).numpy()[0]
     finite = np.isfinite(null)
     center = np.where(finite, null, 0.0)
     distance, own = np.abs(draws - center), np.abs(mean - center)

@@ -13,8 +13,9 @@ from scipy.stats import spearmanr
 from torch.distributions import Distribution
 
 from sbi_active.criticism.contradictions import SevereTest
+from sbi_active.criticism.data.units import split
 from sbi_active.criticism.report.predicted import TestedTrial
-from sbi_active.criticism.report.words import TOLD, called, parted, setting
+from sbi_active.criticism.report.words import TOLD, called, setting
 from sbi_active.criticism.results import (
     NONE,
     UNEXPLAINED,
@@ -139,22 +140,24 @@ class Contents:
         return table.loc[:, columns]
 
     @property
+    def rmse(self) -> tuple[float, float]:
+        """Root mean square error before and after, where trials were scored."""
+        before, after = self.before_after.set_index("metric").loc["rmse"].iloc[:2]
+        return float(before), float(after)
+
+    @property
     def parameters(self) -> pd.DataFrame:
         """Columns parameter, before, before_sd, after, after_sd; phi has no before.
 
         Values are means and deviations of posteriors. A model that misses the trials
         has its best fit, with a deviation that includes the misfit.
         """
-        evidences = self.tracing.evidences
-        before, after = evidences[NONE], evidences.get(self.tracing.model)
-        rows = {
-            name: [*_moments(before, i), np.nan, np.nan]
-            for i, name in enumerate(before.names)
-        }
-        if after is not None and self.tracing.model != NONE:
-            for i, name in enumerate(after.names):
-                row = rows.setdefault(name, [np.nan] * 4)
-                row[2:] = _moments(after, i)
+        evidences, missing = self.tracing.evidences, [np.nan, np.nan]
+        bare = evidences[NONE]
+        rows = {n: _moments(bare, i) + missing for i, n in enumerate(bare.names)}
+        after = evidences.get(self.tracing.model, bare)
+        for i, name in enumerate(() if after is bare else after.names):
+            rows[name] = rows.get(name, 2 * missing)[:2] + _moments(after, i)
         names = ["before", "before_sd", "after", "after_sd"]
         table = pd.DataFrame.from_dict(rows, orient="index", columns=pd.Index(names))
         return table.rename_axis("parameter").reset_index()
@@ -219,20 +222,33 @@ class Contents:
         """Combinations of parameters that the verdict's model knows, and does not."""
         evidences = self.tracing.evidences
         evidence = evidences.get(self.tracing.model, evidences[NONE])
-        with forked_generators(0, "report"):
-            prior = self.prior.sample(torch.Size([TOLD.prior_draws])).double().numpy()
+        prior = self.prior_draws("report")
         dim = prior.shape[1]
         draws = evidence.draws[:, :dim]  # beyond these there may be those of errors
         if draws.shape[1] < dim:
             return Combinations()
         return combinations_of_draws(draws, prior, evidence.names[:dim])
 
+    def prior_draws(self, stream: str) -> Array:
+        """Return draws of the prior, shape (m, dim), the same for a stream."""
+        with forked_generators(0, stream):
+            return self.prior.sample(torch.Size([TOLD.prior_draws])).double().numpy()
+
+    @property
+    def tests(self) -> list[str]:
+        """Actions of the severe tests, in words."""
+        return [
+            f"{'at' if test.is_permitted else 'beyond the permitted range at'} "
+            f"{self.setting(test.action)}"
+            for test in self.severe_tests
+        ]
+
     def channels(self, num: int) -> list[tuple[str, str]]:
         """Return name and unit of each of some channels."""
         labels: Sequence[str] = self.channel_names or ()
         if len(labels) != num:
             labels = [f"channel {c}" for c in range(num)]
-        return [*map(parted, labels)]
+        return [*map(split, labels)]
 
     def setting(self, action: Array) -> str:
         """Return an action in words: a label is the name of its trial."""

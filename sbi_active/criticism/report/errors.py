@@ -22,8 +22,8 @@ def residuals(report: Contents) -> Section:
     models = [("bare model", report.residuals)]
     if report.residuals_after is not None:
         models.append((f"with {added(report)}", report.residuals_after))
-    made = _by_prediction if report.tracing.misfit is None else _by_sensor
-    told, table = made(report, models)
+    by = _by_prediction if report.tracing.misfit is None else _by_sensor
+    told, table = by(report, models)
     before, detection = report.residuals, report.detection
     noise = {
         "declared": "The noise is declared.",
@@ -33,7 +33,7 @@ def residuals(report: Contents) -> Section:
     p = detection.p_value
     least = f"p {f'= {p:.2g}' if p >= TOLD.smallest_p else f'< {TOLD.smallest_p:g}'}"
     text = [
-        *told,
+        told,
         f"{noise} Chi-square of the bare model "
         f"{detection.chi_square:.1f} on {detection.degrees_of_freedom:.1f} degrees of "
         f"freedom, {least}; log Bayes factor against it "
@@ -47,7 +47,7 @@ def residuals(report: Contents) -> Section:
 
 def _by_prediction(
     report: Contents, models: list[tuple[str, Residuals]]
-) -> tuple[list[str], Table]:
+) -> tuple[str, Table]:
     rows = [[name, *_sizes(z.refitted), *_sizes(z.prequential)] for name, z in models]
     header = ["residuals [sd]", "refitted", "beyond 2", "predicted", "beyond 2"]
     told = (
@@ -55,12 +55,12 @@ def _by_prediction(
         "root mean square of about 1, and 5 % beyond 2, where the model holds. "
         "Refitted to all trials, and each trial predicted from those before it."
     )
-    return [told], Table(header, rows)
+    return told, Table(header, rows)
 
 
 def _by_sensor(
     report: Contents, models: list[tuple[str, Residuals]]
-) -> tuple[list[str], Table]:
+) -> tuple[str, Table]:
     assert report.sensor is not None
     rows = []
     for name, found in models:
@@ -69,10 +69,8 @@ def _by_sensor(
         rows.append([name, size, number(float(root_mean_square(left / report.sensor)))])
     header = ["residuals", "in units of x", "in deviations of the sensor"]
     sensor = sizes(report, report.sensor)
-    told = (
-        f"Root mean square of what each model leaves; the sensor's error is {sensor}."
-    )
-    return [told], Table(header, rows)
+    told = "Root mean square of what each model leaves; the sensor's error is"
+    return f"{told} {sensor}.", Table(header, rows)
 
 
 def by_trial(report: Contents) -> Section:

@@ -120,23 +120,17 @@ def plot_probabilities(tracing: Tracing, *, at_most: int = 14) -> Figure:
     Returns:
         The figure.
     """
-    kept = [
-        (name, p)
+    kept = {
+        name: p
         for name, p in tracing.probabilities.items()
         if p >= 0.01 or not tracing.has_several(name)
-    ]
-    order = sorted(kept, key=lambda item: -item[1])[:at_most]
-    names = [name for name, _ in order][::-1]
-    values = [p for _, p in order][::-1]
+    }
+    names = sorted(kept, key=kept.__getitem__, reverse=True)[:at_most][::-1]
+    values = [kept[name] for name in names]
+    colors = [AFTER if n in tracing.credible_set else "#aab3ba" for n in names]
     figure, axes = _subplots(1, 1, width=6.0, height=0.5 + 0.26 * len(names))
     ax = axes[0, 0]
-    inside = [name in tracing.credible_set for name in names]
-    ax.barh(
-        names,
-        values,
-        height=0.65,
-        color=[AFTER if i else "#aab3ba" for i in inside],
-    )
+    ax.barh(names, values, height=0.65, color=colors)
     for y, value in enumerate(values):
         text = f"{value:.2f}" if value >= 0.005 else "< 0.01"
         ax.text(value + 0.01, y, text, va="center", fontsize=8, color="#333333")
@@ -163,10 +157,10 @@ def plot_before_after(evaluation: Evaluation) -> Figure:
     for ax, name in zip(axes[0], metrics, strict=True):
         pairs = np.stack([evaluation.before[name], evaluation.after[name]])
         ax.plot([0, 1], pairs, color=FAINT, lw=0.8, alpha=0.7, zorder=1)
-        for x, values, color in ((0, pairs[0], BEFORE), (1, pairs[1], AFTER)):
-            ax.plot(np.full(len(values), x), values, ".", ms=5, color=color, alpha=0.6)
         total = evaluation.table[evaluation.table["metric"] == name]
-        for x, when in ((0, "before"), (1, "after")):
+        for x, (when, color) in enumerate((("before", BEFORE), ("after", AFTER))):
+            places = np.full(pairs.shape[1], x)
+            ax.plot(places, pairs[x], ".", ms=5, color=color, alpha=0.6)
             ax.plot([x] * len(total), total[when], "k_", ms=22, mew=2, zorder=3)
         positive = pairs[np.isfinite(pairs) & (pairs > 0)]
         if name in ("rmse", "energy score"):

@@ -12,12 +12,11 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-import torch
 
 from sbi_active.criticism.report.contents import Contents
-from sbi_active.criticism.report.words import TOLD, listed, number, stated
+from sbi_active.criticism.report.summary import not_told_from
+from sbi_active.criticism.report.words import listed, number, stated
 from sbi_active.criticism.results import NONE, OUTLIER, ModelKey
-from sbi_active.seeding import forked_generators
 
 Decision = Literal[
     "SHIP",
@@ -121,13 +120,13 @@ def _conditions(report: Contents) -> Iterator[Gate]:
             "one trial does not agree with the others; check and repeat it",
             {"trials": [tracing.trial_names.get(i, i) for i in tracing.outliers][:1]},
         )
-    rmse = scored.table.set_index("metric").loc["rmse"]
-    errors = {name: float(rmse[name]) for name in ("before", "after")}
+    before, after = report.rmse
+    errors = {"before": before, "after": after}
     if report.verdict != NONE:
         yield from _wrong(report, errors)
     missed = [trial.name for trial in scored.missed]
-    after = scored.after["coverage"] if report.verdict == NONE else np.ones(1)
-    uncovered = np.isnan(scored.p_value) and np.mean(after) < GATE.covered
+    inside = scored.after["coverage"] if report.verdict == NONE else np.ones(1)
+    uncovered = np.isnan(scored.p_value) and np.mean(inside) < GATE.covered
     if missed or scored.p_value < GATE.level or uncovered:
         which = f"trials {listed(missed)}" if missed else f"the {num} scored trials"
         yield Gate(
@@ -194,13 +193,12 @@ def _wrong(report: Contents, errors: dict[str, float]) -> Iterator[Gate]:
             {"effects": effects, "before": before, "after": after},
         )
         return
-    same = frozenset().union(*[g for g in tracing.equivalent if g & {*effects}])
-    others = sorted(same - {*effects})
+    others = not_told_from(tracing, effects)
     where = _residuals(report)
     if effects and not tracing.beside:
         told = f"the simulator lacks {report.verdict}"
-        told += f", or {', '.join(others)}, which no permitted action tells from it"
-        told = told if others else f"the simulator lacks {report.verdict}"
+        if others:
+            told += f", or {', '.join(others)}, which no permitted action tells from it"
         change = f"{number(errors['before'])} to {number(errors['after'])}"
         reason = f"{told}; with it the error goes from {change}; add it and ask again"
     else:
@@ -223,8 +221,7 @@ def _residuals(report: Contents) -> dict[str, Any]:
 def _open(report: Contents) -> list[str]:
     """Return the parameters that the trials hardly tell."""
     evidence = report.tracing.evidences[NONE]
-    with forked_generators(0, "gate"):
-        prior = report.prior.sample(torch.Size([TOLD.prior_draws])).double().numpy()
+    prior = report.prior_draws("gate")
     dim = min(prior.shape[1], evidence.draws.shape[1])
     width = evidence.draws[:, :dim].std(0) / prior[:, :dim].std(0)
     return [n for n, w in zip(evidence.names, width, strict=False) if w > GATE.open]

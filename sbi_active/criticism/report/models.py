@@ -19,7 +19,7 @@ from sbi_active.criticism.report.words import (
     probability,
     with_error,
 )
-from sbi_active.criticism.results import NONE, UNEXPLAINED, Tracing
+from sbi_active.criticism.results import NONE, UNEXPLAINED, Estimate
 from sbi_active.criticism.under_misfit import Misfit
 from sbi_active.display.page import Section
 from sbi_active.display.table import Table
@@ -44,7 +44,7 @@ def effects(report: Contents) -> Section:
     has_sets = has_p and any(map(tracing.has_several, tracing.probabilities))
     header = ["model", *["P"] * has_p, *["P in any set"] * has_sets]
     header += ["phi", "log BF", "ESS", *["90 % set"] * has_p]
-    phi = {e.name: _phi(tracing, e.name) for e in tracing.estimates}
+    phi = {e.name: _phi(e) for e in tracing.estimates}
     null = tracing.evidences[NONE].log_evidence
     rows, left_out = [], 0
     for name, p in tracing.probabilities.items():
@@ -68,9 +68,8 @@ def effects(report: Contents) -> Section:
     return Section("Effects", [*text], table=table, picture=picture)
 
 
-def _phi(tracing: Tracing, name: str) -> str:
+def _phi(e: Estimate) -> str:
     """Return the strength of an effect if it alone is added."""
-    e = next(e for e in tracing.estimates if e.name == name)
     pairs = zip(e.mean, e.sd, strict=True)
     told = ", ".join(estimated(m, sd, e.effective_sample_size) for m, sd in pairs)
     return f"{told} {e.units}".strip()

@@ -86,30 +86,24 @@ class TestedTrial:
 
     def in_words(self) -> tuple[str, str]:
         """Return what was predicted and what was measured, in units of x."""
-        own = self.registered
-        x = np.ravel(self.x)[own.position]
-        if len(x) == 1:
-            half = own.limit * own.sd[0]
-            low, high = own.mean[0] - half, own.mean[0] + half
-            told = f"{x[0]:.4g}" if self.is_measured else "nothing"
-            return f"{low:.4g} to {high:.4g}", told + self._beside_bare()
+        own, is_one = self.registered, len(self.registered.mean) == 1
         half = own.limit * float(np.sqrt(np.mean(own.sd**2)))
         predicted = f"within {half:.3g} of its course"
+        if is_one:
+            predicted = f"{own.mean[0] - half:.4g} to {own.mean[0] + half:.4g}"
         if not self.is_measured:
             return predicted, "nothing"
-        return predicted, f"{self._off(own.mean):.3g} off" + self._beside_bare()
+        measured = f"{self._off(own.mean):.3g} off"
+        if is_one:
+            measured = f"{np.ravel(self.x)[own.position][0]:.4g}"
+        if not np.array_equal(own.mean, own.bare):
+            measured += f" (bare model: {self._off(own.bare):.3g} off)"
+        return predicted, measured
 
     def _off(self, predicted: Array) -> float:
         """Return the root mean square by which a prediction missed, units of x."""
         x = np.ravel(self.x)[self.registered.position]
         return float(np.sqrt(np.nanmean((x - predicted) ** 2)))
-
-    def _beside_bare(self) -> str:
-        """Return by how much the bare model missed, where the verdict is another."""
-        own = self.registered
-        if np.array_equal(own.mean, own.bare) or not self.is_measured:
-            return ""
-        return f" (bare model: {self._off(own.bare):.3g} off)"
 
 
 def predicted_section(

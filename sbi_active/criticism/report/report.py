@@ -23,9 +23,10 @@ from sbi_active.criticism.report.summary import (
     sentences,
     verdict_line,
 )
+from sbi_active.criticism.report.words import number
 from sbi_active.display.figures import legible
 from sbi_active.display.notebook import card, items, table
-from sbi_active.display.table import Table, number
+from sbi_active.display.table import Table
 from sbi_active.messages import Message
 
 #: Parts of the reasons of a verdict where every model misses, in :meth:`to_dict`.
@@ -46,12 +47,8 @@ class Report(Contents):
         return f"Report({verdict_line(self)!r})"
 
     def _repr_html_(self) -> str:
-        scored = self.before_after
-        numbers = scored[["before", "after", "ratio"]].to_numpy(dtype=float)
-        errors = [
-            (name, *map(number, row))
-            for name, row in zip(scored["metric"], numbers, strict=True)
-        ]
+        scored = self.before_after[["metric", "before", "after", "ratio"]]
+        errors = [(n, *map(number, row)) for n, *row in scored.itertuples(index=False)]
         shares = self.probabilities if self.has_probabilities else {}
         likely = sorted(shares.items(), key=lambda item: -item[1])[:5]
         return card(
@@ -133,17 +130,13 @@ class Report(Contents):
         """
         directory = Path(directory)
         directory.mkdir(parents=True, exist_ok=True)
-        (directory / "report.txt").write_text(
-            f"{self}\n", encoding="utf-8", errors="replace"
-        )
-        (directory / "report.md").write_text(
-            self.to_markdown(), encoding="utf-8", errors="replace"
-        )
-        path = directory / "report.html"
-        path.write_text(self.to_html(), encoding="utf-8", errors="replace")
+        texts = {"txt": f"{self}\n", "md": self.to_markdown(), "html": self.to_html()}
+        for ending, text in texts.items():
+            path = directory / f"report.{ending}"
+            path.write_text(text, encoding="utf-8", errors="replace")
         for name, figure in figures(self).items():
             legible(figure).savefig(directory / f"{name}.png", dpi=150)
-        return path
+        return directory / "report.html"
 
 
 def build_report(

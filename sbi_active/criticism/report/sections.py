@@ -6,11 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from sbi_active.criticism.data.units import split
 from sbi_active.criticism.report import errors, models
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.predicted import predicted_section
 from sbi_active.criticism.report.summary import first_paragraph, verdict_line
-from sbi_active.criticism.report.words import TOLD, listed, number, parted, probability
+from sbi_active.criticism.report.words import TOLD, listed, number, probability
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED, NextAction
 from sbi_active.criticism.under_misfit import Misfit
 from sbi_active.display.page import Page, Section
@@ -60,22 +61,18 @@ def _sections(report: Contents) -> Iterator[Section]:
 
 def next_action(report: Contents) -> Section:
     """Return the action that tells most, and what no permitted action tells."""
-    chosen, title = report.next_action, "Next action"
+    chosen, title, misfit = report.next_action, "Next action", report.tracing.misfit
     tests = [*_tests(report)]
-    text = [_tried(report)] if report.tracing.chosen else []
+    tried = [_tried(report)] if report.tracing.chosen else []
     if chosen is None:
         none = "None was asked for: there is no set of permitted actions."
-        return Section(title, [none, *text], items=tests)
-    misfit = report.tracing.misfit
-    is_between = misfit is not None and len(chosen.separates) > 1
-    told = [
-        (True, _told(report, chosen)),
-        (is_between, _by_error(misfit) if misfit else ""),
-        (report.tracing.chosen, _tried(report)),
-        (tests, SEVERE),
-    ]
+        return Section(title, [none, *tried], items=tests)
+    text = [_told(report, chosen)]
+    if misfit is not None and len(chosen.separates) > 1:
+        text.append(_by_error(misfit))
+    text += [*tried, *[SEVERE] * bool(tests)]
     items = (*_by_range(report, chosen), *_inseparable(report, chosen), *tests)
-    return Section(title, [said for holds, said in told if holds], items=items)
+    return Section(title, text, items=items)
 
 
 def _told(report: Contents, chosen: NextAction) -> str:
@@ -120,7 +117,7 @@ def _tried(report: Contents) -> str:
     action = np.unique(report.residuals.action, axis=0)
     if len(action) == 1:
         return f"No other action was tried than {report.setting(action[0])}."
-    entries = [*zip(map(parted, report.action_labels), action.T, strict=True)]
+    entries = [*zip(map(split, report.action_labels), action.T, strict=True)]
     ranges = [
         f"{name} from {column.min():.4g} to {column.max():.4g} {unit}".rstrip()
         for (name, unit), column in entries[: TOLD.entries]
@@ -157,12 +154,11 @@ def _inseparable(report: Contents, chosen: NextAction) -> Iterator[str]:
 
 def _tests(report: Contents) -> Iterator[str]:
     """Yield each severe test, with how far a free residual's prediction is there."""
-    for test in report.severe_tests:
-        where = "at" if test.is_permitted else "beyond the permitted range at"
+    for test, where in zip(report.severe_tests, report.tests, strict=True):
         yield (
-            f"the verdict is put to the test most {where} "
-            f"{report.setting(test.action)}, where its prediction and that of a free "
-            f"residual differ by {number(test.difference)} of its standard deviations"
+            f"the verdict is put to the test most {where}, where its prediction and "
+            f"that of a free residual differ by {number(test.difference)} of its "
+            "standard deviations"
         )
 
 
@@ -171,28 +167,21 @@ def _record(report: Contents) -> Section:
     spent = sum(e.num_simulations for e in evidences.values())
     moved = sorted(name for name, e in evidences.items() if e.engine == "smc")
     linear = [name for name, e in evidences.items() if e.engine == "linear"]
-    beside = " with a residual process in each" * (report.tracing.misfit is not None)
-    told = [
-        (True, f"evidence cost {spent:,} simulated trials"),
-        (linear, f"evidence by linearized models{beside}"),
-        (
-            len(moved) + len(linear) < len(evidences),
-            "evidence by least squares and importance sampling",
-        ),
-        (
-            moved,
-            "evidence by sequential Monte Carlo, where that did not serve: "
-            f"{', '.join(moved)}",
-        ),
-        (
-            detection.null_cross_check is not None,
+    told = [f"evidence cost {spent:,} simulated trials"]
+    if linear:
+        process = " with a residual process in each" if report.tracing.misfit else ""
+        told.append(f"evidence by linearized models{process}")
+    if len(moved) + len(linear) < len(evidences):
+        told.append("evidence by least squares and importance sampling")
+    if moved:
+        why = "evidence by sequential Monte Carlo, where that did not serve"
+        told.append(f"{why}: {', '.join(moved)}")
+    if detection.null_cross_check is not None:
+        told.append(
             f"log evidence of the bare model {detection.null_log_evidence:.2f}, "
-            f"from other starts {detection.null_cross_check or 0:.2f}",
-        ),
-        (
-            report.digest,
-            "hash of noise, effects and priors, declared before the data: "
-            f"{report.digest}",
-        ),
-    ]
-    return Section("Record", items=[said for holds, said in told if holds])
+            f"from other starts {detection.null_cross_check:.2f}"
+        )
+    if report.digest:
+        declared = "hash of noise, effects and priors, declared before the data"
+        told.append(f"{declared}: {report.digest}")
+    return Section("Record", items=told)

@@ -6,7 +6,7 @@ trials that had no part in the verdict, what is left, and what to measure next.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Sequence
 
 from sbi_active.criticism.contradictions import MissedTrial, OutlyingTrial
 from sbi_active.criticism.forces.library import COUPLING, FAMILY
@@ -41,9 +41,7 @@ def verdict_line(report: Contents) -> str:
     is_likelier = report.verdict == NONE and likeliest != NONE
     share = stated(tracing.probabilities[likeliest])
     needs_none = report.verdict != NONE and bounds.p_value > LEVEL
-    named = {*tracing.chosen} or {report.verdict}
-    groups = [group for group in tracing.equivalent if group & named]
-    same = sorted(frozenset().union(*groups) - named)
+    same = not_told_from(tracing, tracing.chosen or [report.verdict])
     missed = () if report.evaluation is None else report.evaluation.missed
     clauses = [
         (True, _verdict(report)),
@@ -62,6 +60,12 @@ def verdict_line(report: Contents) -> str:
         (missed, _counted(missed, "held-out trial", "far outside it")),
     ]
     return "Verdict: " + "".join(text for holds, text in clauses if holds)
+
+
+def not_told_from(tracing: Tracing, names: Collection[str]) -> list[str]:
+    """Return the other names that no permitted action tells from some."""
+    groups = [group for group in tracing.equivalent if not group.isdisjoint(names)]
+    return sorted(frozenset().union(*groups).difference(names))
 
 
 def first_paragraph(report: Contents) -> str:
@@ -130,17 +134,17 @@ def _errors(report: Contents) -> str:
         return _left_out_errors(report, misfit)
     if report.evaluation is None:
         return "No trial was scored."
-    rmse = report.before_after.set_index("metric").loc["rmse"]
+    before, after = map(number, report.rmse)
     if report.verdict == NONE:
-        return f"Its RMSE on {NO_PART} is {number(rmse['before'])}."
+        return f"Its RMSE on {NO_PART} is {before}."
     folds = report.evaluation.scheme != "held out"
     withdrawn = folds and (tracing.refuted or tracing.bounds.replaces)
     model = tracing.instead_of if withdrawn else added(report)
-    change = f"from {number(rmse['before'])} to {number(rmse['after'])}"
-    if rmse["interval"] is not None:
-        low, high = map(number, rmse["interval"])
-        ratio = number(rmse["ratio"])
-        change += f" (ratio {ratio}, 90 % interval {low} to {high})"
+    change = f"from {before} to {after}"
+    ratio, interval = report.before_after.set_index("metric").loc["rmse"].iloc[2:]
+    if interval is not None:
+        low, high = map(number, interval)
+        change += f" (ratio {number(ratio)}, 90 % interval {low} to {high})"
     return f"With {model}, the RMSE on {NO_PART} goes {change}."
 
 
@@ -197,7 +201,7 @@ def _next(report: Contents) -> str:
         told = f", to tell {listed(names)} apart" if names else ""
         return f"Measure next at {report.setting(plan.action)}{told}."
     if report.severe_tests:
-        return f"Measure next {', or '.join(_tests(report))}: this tests the verdict."
+        return f"Measure next {', or '.join(report.tests)}: this tests the verdict."
     if report.verdict == NONE:
         return "Nothing asks for another trial." if plan else "No trial was planned."
     return {
@@ -205,12 +209,6 @@ def _next(report: Contents) -> str:
         SCATTER: "Measure next an action again, to see how large the scatter is.",
         OUTLIER: f"Check and repeat {suspects_in_words(report.tracing)} next.",
     }.get(report.verdict, "Measure next at actions that were not tried.")
-
-
-def _tests(report: Contents) -> Iterator[str]:
-    for test in report.severe_tests:
-        where = "at" if test.is_permitted else "beyond the permitted range at"
-        yield f"{where} {report.setting(test.action)}"
 
 
 def _verdict(report: Contents) -> str:

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.criticism.data.units import split
+
 
 @dataclass(frozen=True, kw_only=True)
 class Told:
@@ -125,12 +127,6 @@ def called(names: Sequence[str], position: int) -> str:
     return names[position] if names else str(position)
 
 
-def parted(label: str) -> tuple[str, str]:
-    """Return the name and the unit of a label such as "speed [m/s]"."""
-    name, _, unit = label.partition(" [")
-    return name, unit.removesuffix("]")
-
-
 def setting(labels: Sequence[str], action: NDArray[np.float64]) -> str:
     """Return an action in words, each entry with its name and unit.
 
@@ -140,5 +136,5 @@ def setting(labels: Sequence[str], action: NDArray[np.float64]) -> str:
     """
     return ", ".join(
         f"{name} = {value:.4g} {unit}".rstrip()
-        for (name, unit), value in zip(map(parted, labels), action, strict=True)
+        for (name, unit), value in zip(map(split, labels), action, strict=True)
     )

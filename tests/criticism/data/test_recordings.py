@@ -57,6 +57,16 @@ def test_one_table_goes_before_others():
     assert len(Trials.from_csv("runs")) == 2
 
 
+def test_recordings_whose_trials_stand_in_a_column_of_another_name():
+    columns = {"trial": "ball", "time": "t", "x": "h", "action": "u"}
+    for name, height in (("a.csv", 5), ("b.csv", 7)):
+        rows = [f"{ball},0,1,{height + ball}" for ball in (1, 2)]
+        write(name, *rows, header="ball,t,u,h")
+    trials = Trials.from_csv("runs", columns=columns)
+    assert trials.names == ("a 1", "a 2", "b 1", "b 2")
+    assert trials.x[:, 0].tolist() == [6, 7, 8, 9]
+
+
 def test_what_is_wrong_is_said_with_its_file_and_row():
     write("a.csv", "0,1,5", "100,1,6")
     write("b.csv", "0,1,5.5", "100,1,5 m")
