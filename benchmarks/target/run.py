@@ -16,10 +16,11 @@ each trial the posterior is normal around its mode, the regulator is that of the
 and its cost on the true machine is compared with that of the right regulator. Costs are
 the same within 1 % of the latter.
 
-Before any row, the sensor was chosen among three on up to eight other machines: an
-eighth of it, with which two trials tell everything, and 2.5 times as rough, with which
-the gains were still open after six. No trial drives the cart with the pole on it, which
-would tell most about either. Rows are added to result.csv beside this file, and those
+Before any row, the sensor was chosen among three on other machines: an eighth of it
+(three machines: two trials told everything), this one (eight machines, and the pair
+"two against four" was seen to do well there), and 2.5 times as rough (one machine: the
+gains were open after six). No trial drives the cart with the pole on it, which would
+tell most about either, and helps ``target=``. Rows are added to result.csv beside this file, and those
 that are there are not run again.
 """
 
