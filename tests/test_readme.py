@@ -244,7 +244,7 @@ def test_question_recordings(run, capsys):
     assert log.report.verdict == "rail friction loss"
     printed = capsys.readouterr().out
     assert (
-        "('rail [m]', 'swing [rad]')\nVerdict: rail friction loss (P > .99" in printed
+        "('rail [m]', 'swing [rad]')\nVerdict: rail friction loss (P = 0.99" in printed
     )
     assert list(read.frame.columns) == ["time", "angle", "motor"]
     assert read.frame.time.iloc[-1] == pytest.approx(0.99)

@@ -207,7 +207,7 @@ class Store:
     ) -> None:
         assert self._connection is not None
         records = [sealed(self._id, kind, number, *parts)]
-        if number > catalog.get(kind, -1):
+        if kind != CATALOG and number > catalog.get(kind, -1):
             records.append(sealed(self._id, CATALOG, 0, {**catalog, kind: number}))
         self._connection.executemany(INSERT.format("REPLACE"), records)
 
