@@ -20,8 +20,8 @@ Before any row, the sensor was chosen among three on other machines: an eighth o
 (three machines: two trials told everything), this one (eight machines, and the pair
 "two against four" was seen to do well there), and 2.5 times as rough (one machine: the
 gains were open after six). No trial drives the cart with the pole on it, which would
-tell most about either, and helps ``target=``. Rows are added to result.csv beside this file, and those
-that are there are not run again.
+tell most about either, and helps ``target=``. Rows are added to result.csv beside this
+file, and those that are there are not run again.
 """
 
 from __future__ import annotations
