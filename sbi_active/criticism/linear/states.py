@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.linear.left_out import Candidate
 from sbi_active.criticism.linear.mixture import WIDTHS, Mixture, summed
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.results import OUTLIER, SCATTER, UNEXPLAINED, ModelKey
@@ -39,15 +38,14 @@ class States:
 
     Attributes:
         search: Search that fits the models.
-        chance: Probability of each state that is not the sensor's alone; with half or
-            twice of it an error has to speak for one of them by .7 nats more or less.
+        chance: Probability of each state that is not the sensor's alone.
         fewest: Trials below which none can be told to have a gross error: two that
             agree outvote one.
         num_louder: Draws of effects on the noise, over which their evidence is a mean.
     """
 
     search: Search
-    chance: float = 0.1
+    chance: float
     fewest: int = 3
     num_louder: int = 200
     _known: dict[ModelKey, Mixture] = field(default_factory=dict)
@@ -69,33 +67,35 @@ class States:
         rest = 1 - np.exp([*states.values()]).sum()
         return {key: float(np.log(rest)), **states}
 
+    def joint(
+        self,
+        key: ModelKey,
+        use: NDArray[np.bool_] | None = None,
+        factor: float = 1.0,
+    ) -> dict[ModelKey, float]:
+        """Return a model in each state, and the log evidence of both, nats.
+
+        Args:
+            key: Effects on the prediction.
+            use: Parts of the trials that count, shape (f,); None takes all. Of some,
+                smooth functions of the action are no state.
+            factor: Factor on the scales of effects' priors.
+        """
+        return {
+            own: p + self.mixture(own, use, factor).log_evidence
+            for own, p in self.keys(key).items()
+        }
+
     def share(self, key: ModelKey) -> dict[ModelKey, float]:
         """Return a model in each state, and the state's probability given the model."""
-        log_p = {k: p + self.mixture(k).log_evidence for k, p in self.keys(key).items()}
+        log_p = self.joint(key)
         total = log_sum_exp(np.array([*log_p.values()]))
         return {k: float(np.exp(p - total)) for k, p in log_p.items()}
 
     def likeliest(self, key: ModelKey) -> ModelKey:
         """Return a model in its most probable state."""
-        share = self.share(key)
-        return max(share, key=share.__getitem__)
-
-    def log_p(
-        self, c: Candidate, use: NDArray[np.bool_] | None = None, factor: float = 1.0
-    ) -> float:
-        """Return a model's log posterior probability, unnormalized, nats.
-
-        Args:
-            c: The model.
-            use: Parts of the trials that count, shape (f,); None takes all. Of some,
-                smooth functions of the action are no state.
-            factor: Factor on the scales of effects' priors.
-        """
-        parts = [
-            p + self.mixture(key, use, factor).log_evidence
-            for key, p in self.keys(c.model.key).items()
-        ]
-        return c.log_prior + log_sum_exp(np.array(parts))
+        log_p = self.joint(key)
+        return max(log_p, key=log_p.__getitem__)
 
     def log_evidence(self, key: ModelKey) -> float:
         """Return the log evidence of a model in one state, nats."""

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.draws import bends, keep_draws
 from sbi_active.criticism.misfit.guesses import guess_residual
 from sbi_active.criticism.misfit.verdict import Verdict
@@ -69,8 +68,8 @@ def traced(
     rivals, key = found.rivals, found.key
     if found.is_missed:
         return _beside_misfit(found, held_out)
-    is_missed = key.error == UNEXPLAINED  # by an error whose size is not declared
-    chosen = () if is_missed else key.effects
+    is_unexplained = key.error == UNEXPLAINED  # with an error of no declared size
+    chosen = () if is_unexplained else key.effects
     shown = [k for k, p in found.choice.probabilities.items() if p >= SHOWN]
     keys = [*found.states.keys(ModelKey()), *shown[:MOST_SHOWN], key]
     keys += [ModelKey((name,)) for name in rivals.effects]
@@ -97,8 +96,8 @@ def traced(
         estimates=_estimates(found, evidences),
         evidences=evidences,
         robust=found.is_robust(),
-        guesses=_guesses(found) if is_missed else (),
-        beside=key.effects if is_missed else (),
+        guesses=_guesses(found) if is_unexplained else (),
+        beside=key.effects if is_unexplained else (),
         outliers=found.outliers,
         needed=found.states.needed(effects, THRESHOLD) if chosen else (),
         p_value=_tail(found, effects),
@@ -302,26 +301,14 @@ def _estimates(found: Verdict, evidences: dict[str, Evidence]) -> tuple[Estimate
 
 def _aliases(misfit: Verdict) -> tuple[frozenset[str], ...]:
     """Return pairs of effects that fit the trials nearly alike and about as well."""
-    found = misfit.search.found
-    return alike(
-        misfit.search,
-        {n: found[ModelKey((n,))].posterior.log_process for n in misfit.search.names},
-    )
-
-
-def alike(search: Search, log_z: dict[str, float]) -> tuple[frozenset[str], ...]:
-    """Return pairs of effects that fit the trials nearly alike and about as well.
-
-    Args:
-        search: Search that has fitted them alone.
-        log_z: Log evidence of each effect alone, by name.
-    """
+    found = {n: misfit.search.found[ModelKey((n,))] for n in misfit.search.names}
+    log_z = {n: c.posterior.log_process for n, c in found.items()}
     best = max(log_z.values(), default=-np.inf)
     likely = [n for n, value in log_z.items() if value > best - THRESHOLD]
     pairs = []
     for i, a in enumerate(likely):
         for b in likely[i + 1 :]:
-            one, two = (search.found[ModelKey((n,))].model.residual for n in (a, b))
+            one, two = (found[n].model.residual for n in (a, b))
             if np.mean((one - two) ** 2) < CLOSE**2:
                 pairs.append(frozenset({a, b}))
     return (*pairs,)

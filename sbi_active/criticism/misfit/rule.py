@@ -5,20 +5,25 @@ r"""Model selection and effect attribution under misspecification.
    from the others may hold most of a mean square. Without a time axis, where a trial
    is too few numbers to be sure of anything, it has to be within a fifth. Errors below
    the sensor's are no better than it. What is more probable than all of these by ten
-   nats is admitted as well. The most probable of them by the shared evidence is the
-   top, where each effect beyond the second has to gain a Bayes factor of 100, and
-   without a time axis the second one of five: several imitate one that is not there.
+   nats is admitted as well, and where one effect or none leaves the sensor's error,
+   such models and the bare one: evidence decides there. The most probable of them by
+   the shared evidence is the top, where each effect beyond the second has to gain a
+   Bayes factor of 100, and without a time axis the second one of five: several imitate
+   one that is not there.
 2. Another effect may *stand in the place* of one of a set if with it there a new trial
    is not predicted worse with a probability of .9: left-out trials do not tell close
    relatives apart, and evidence beside something undeclared does so for no good reason.
    An effect of the top *helps* if it, or what may stand in its place, is more likely
    there than not, and it predicts a left-out trial better with a probability of .8, or
-   the error is twice as large without it; others are dropped, those first without
-   which it is smallest. Relatives share the probability of a further effect: where the
+   the error is twice as large without it, or the top leaves the sensor's error: along a
+   trajectory with no other effect, since several imitate much. Others are dropped,
+   those first without which it is smallest. Relatives share the probability of a
+   further effect: where the
    sets with it, or with what may stand in its place, are together more probable than
    the top, the likeliest of them is tried as the top, and counts where it adds to what
    helps.
-3. It is *named* as the cause if by that evidence it is more likely there than not, with
+3. A single effect that leaves the sensor's error is *named*. Any other is named as the
+   cause if by that evidence it is more likely there than not, with
    what no action tells from it; if the model gains a Bayes factor of 100 by it; if no
    elementary formula in its place, asked without a time axis, gains two nats more;
    and if the error beyond the sensor's at least halves by it: u is at most a quarter of
@@ -92,6 +97,9 @@ class Rule:
         decisive: Bayes factor that each effect beyond the second has to gain, and that
             an effect has to gain to be named.
         second_untimed: Bayes factor that the second has to gain without a time axis.
+        chance: Probability of each state of the error that is not the sensor's alone: a
+            process, a larger one, a gross error. With half or twice of it the trials
+            have to speak for one by .7 nats more or less.
         passes: Tail probability of a chi-square from which a model fits to the sensor.
         remaining: Share of the excess error that an effect may leave to be named: a
             quarter of the mean square is half of the error. On tuning seeds of
@@ -112,6 +120,7 @@ class Rule:
     needed: float = 2.0
     decisive: float = 100.0
     second_untimed: float = 5.0
+    chance: float = 0.1
     passes: float = 0.01
     remaining: float = 0.25
     formula: float = 2.0

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from sbi_active.criticism.results import OUTLIER, UNEXPLAINED
+
 Array = NDArray[Any]
 
 
@@ -22,8 +24,8 @@ class Scored:
             of what is expected of it, (f,): trials to which a fit can but extrapolate
             tell little of a model.
         fitted: Mean squared residual of the fit, in sensor variances.
-        fits: Whether the most probable state of the error beside the model is that of
-            the sensor or of a declared effect, with or without one gross error.
+        state: Most probable state of the error beside the model: None for that of the
+            sensor or of a declared effect, or a catch-all.
         beside: Unnormalized log posterior probability beside a residual process, or a
             parameter that differs from trial to trial; NaN takes ``log_p``.
     """
@@ -31,7 +33,7 @@ class Scored:
     log_p: float
     square: Array
     fitted: float
-    fits: bool = False
+    state: str | None = UNEXPLAINED
     beside: float = np.nan
 
     @property
@@ -41,9 +43,13 @@ class Scored:
 
     def gain(self, other: Scored) -> float:
         """Return the nats that it gains over another model beside a process."""
-        own = np.array([[m.log_p, m.beside] for m in (self, other)])
-        gain = float(own[0, 1] - own[1, 1])
-        return float(own[0, 0] - own[1, 0]) if np.isnan(gain) else gain
+        gain = self.beside - other.beside
+        return self.log_p - other.log_p if np.isnan(gain) else gain
+
+    @property
+    def fits(self) -> bool:
+        """Whether it leaves the sensor's error, with or without one gross error."""
+        return self.state in (None, OUTLIER)
 
     @property
     def excess(self) -> float:

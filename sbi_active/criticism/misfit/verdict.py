@@ -39,6 +39,7 @@ from sbi_active.criticism.results import (
 from sbi_active.criticism.steps.detection import LEVEL, THRESHOLD
 from sbi_active.criticism.steps.missed_trials import outlying_trials
 from sbi_active.criticism.steps.tracing import RESCALED, kind_of, log_bayes_factor
+from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed
 
 Array = NDArray[Any]
@@ -94,7 +95,8 @@ class Verdict:
     rule: Rule
 
     def __post_init__(self) -> None:
-        self.rivals, self.states = self.search.rivals, States(self.search)
+        self.rivals = self.search.rivals
+        self.states = States(self.search, self.rule.chance)
 
     @cached_property
     def detection(self) -> Detection:
@@ -159,15 +161,16 @@ class Verdict:
         standard: Callable[[Candidate], Array] | None = None,
     ) -> Scored:
         """Return what the rule needs of a model."""
-        log_p = self.states.log_p(c, use, factor)
-        fits = self.states.likeliest(c.model.key).error in (None, OUTLIER)
+        joint = self.states.joint(c.model.key, use, factor)
+        log_p = c.log_prior + log_sum_exp(np.array([*joint.values()]))
+        state = max(joint, key=joint.__getitem__).error
         beside = c.posterior
         if use is not None or factor != 1:
             errors = self.search.errors
             beside = errors.posterior(c.model, c.grams, use, factor=factor)
         square = (standard or self.standard)(c)
         log_beside = c.log_prior + beside.log_process
-        return Scored(log_p, square, c.model.rms**2, fits, log_beside)
+        return Scored(log_p, square, c.model.rms**2, state, log_beside)
 
     def _settled(
         self,
@@ -192,10 +195,11 @@ class Verdict:
             if not missing:
                 given = scored, search.names, self.equivalent
                 choice = self.rule.choose(*given, timed=timed, guessed=guessed)
-                gain = scored[choice.key].gain(scored[ModelKey()])
+                bare = scored[ModelKey()]
+                gain = scored[choice.key].gain(bare)
                 # Numbers that scatter each for itself may follow anything a little.
-                scatters = self.states.likeliest(ModelKey()).error == SCATTER
-                if timed or not scatters or gain >= np.log(self.rule.decisive):
+                scatters = bare.state == SCATTER and not timed
+                if not scatters or gain >= np.log(self.rule.decisive):
                     return choice
                 return replace(choice, key=ModelKey(), named=(), support={}, instead={})
             for key in missing:

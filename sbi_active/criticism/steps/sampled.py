@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.results import (
-    CATCH_ALLS,
     OUTLIER,
     UNEXPLAINED,
     Detection,
@@ -37,11 +36,6 @@ class Sampled:
 
     rivals: RivalSet
     equivalent: Sequence[frozenset[str]] = ()
-
-    @property
-    def catch_alls(self) -> tuple[str, ...]:
-        """Catch-alls that are compared after an alarm."""
-        return CATCH_ALLS
 
     def detected(self) -> Detection:
         """Return whether the bare model misses the trials."""

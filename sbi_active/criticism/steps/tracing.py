@@ -79,9 +79,8 @@ def trace(
     probability; then, of the effects, the most probable of the most probable families.
     Where known noise refutes that (its chi-square has p < .001), the residual process
     is tried beside it: then "unexplained" is the process alone or with these effects,
-    half and half. Of what several effects of a trajectory explain, it has the share
-    that they may imitate. Effects that rest on one trial are named only if that trial
-    has hardly a gross error.
+    half and half. Effects that rest on one trial are named only if that trial has
+    hardly a gross error.
 
     Args:
         found: The models' evidence.
@@ -92,8 +91,7 @@ def trace(
     """
     rivals, equivalent = found.rivals, found.equivalent
     # Without an alarm there is no trial to set aside.
-    every = found.catch_alls
-    catch_alls = every if detection.alarm else tuple(n for n in every if n != OUTLIER)
+    catch_alls = tuple(n for n in CATCH_ALLS if detection.alarm or n != OUTLIER)
     prior = log_priors(rivals.library, catch_alls)
     keys = [ModelKey.of(name) for name in (NONE, *catch_alls, *rivals.effects)]
     log_prior = {key: prior[str(key)] for key in keys}
