@@ -10,22 +10,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain, combinations, count
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import torch
-from sbi.utils import BoxUniform
 from torch import Tensor
 
+from benchmarks.criticism.problem import Problem
 from benchmarks.criticism.refit import residual_sum_of_squares
 from benchmarks.criticism.worlds import World
-from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.criticism import (
     Context,
-    Criticism,
     Effect,
-    Report,
     Trials,
-    close_loop,
 )
 from sbi_active.criticism.data import Role
 from sbi_active.seeding import derive_seed, forked_generators, row_normals, row_seeds
@@ -38,36 +34,6 @@ NUM_LOOKED, FEWEST_OUTCOMES = 8, 4
 MISMATCH = 3.0  # residual of a number that is there in one outcome alone
 #: Lambda that a model must leave for data to tell that it lacks something.
 SUPPORTED = 25.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class Problem:
-    """What the loop is given.
-
-    Attributes:
-        model: The bare simulator.
-        prior: Of theta.
-        trials: Measured ones, held-out ones included.
-        effects: The declared library.
-        actions: The permitted ones.
-    """
-
-    model: SimulatorModel
-    prior: BoxUniform
-    trials: Trials
-    effects: list[Effect]
-    actions: DiscreteActions | None = None
-
-    def criticism(self, seed: int) -> Criticism:
-        """Return the loop, step by step."""
-        given = {"effects": self.effects, "actions": self.actions, "seed": seed}
-        return Criticism(self.model, self.prior, self.trials, **given)
-
-    def report(self, seed: int, **options: Any) -> Report:
-        """Return the report of the loop in one call."""
-        given = {"effects": self.effects, "actions": self.actions, "seed": seed}
-        given |= options
-        return close_loop(self.model, self.prior, self.trials, **given)
 
 
 @dataclass(frozen=True, kw_only=True)

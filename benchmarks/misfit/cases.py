@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Uniform
 
-from benchmarks.criticism.cases import Problem
+from benchmarks.criticism.problem import Problem
 from benchmarks.misfit.discrepancies import Discrepancy, draw_discrepancy
 from benchmarks.misfit.machines import GROUPS, LAYOUTS, Machine, get_machine
 from benchmarks.misfit.machines.machine import is_positive, scale_of

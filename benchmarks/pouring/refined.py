@@ -25,23 +25,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.pouring import around
-from benchmarks.pouring.around import (
-    NUM_JUDGED,
-    Campaign,
-    Pours,
-    Reference,
-    belief_of,
-    box_around,
-    density,
-    nearest,
-    pour_around,
-)
+from benchmarks.pouring.around import NUM_JUDGED, density, nearest
 from benchmarks.pouring.bank import Rows, read_parts
 from benchmarks.pouring.bank import read as read_bank
 from benchmarks.pouring.grid_belief import GridBelief
 from benchmarks.pouring.learned import PARTS
 from benchmarks.pouring.power import best_power
+from benchmarks.pouring.reference import (
+    Campaign,
+    Pours,
+    Reference,
+    ReferenceSettings,
+    belief_of,
+    box_around,
+    pour_around,
+    run,
+)
 from benchmarks.rows import column
 from sbi_active.display.table import Table
 from sbi_active.tasks.pouring import images_of
@@ -183,7 +182,7 @@ def summarize(rows: list[dict[str, str]]) -> str:
 
 
 @dataclass(frozen=True)
-class Settings(around.Settings):
+class Settings(ReferenceSettings):
     """What is run.
 
     Args:
@@ -202,4 +201,4 @@ def main(arguments: Settings) -> None:
         assert arguments.bank is not None
         return row_of(own, known, arguments.bank, arguments.pours)
 
-    around.run(arguments, "refined.csv", made, summarize)
+    run(arguments, "refined.csv", made, summarize)
