@@ -146,7 +146,7 @@ class States:
                 # Errors of their own are scatter; what differs by trial is not.
                 own = slice(errors.num_processes, None)
                 gram, log_p = gram[own], log_p[own]
-                if use is None or not len(log_p):
+                if use is None:  # it is a function of all trials
                     smooth = self.search.smooth(c.model)
                     gram = np.concatenate([gram, smooth[0]])
                     log_p = np.concatenate([log_p, smooth[1]])
