@@ -15,7 +15,7 @@ jumps, the draws of the prior are led to the posterior so.
 
 A parameter that another can stand in for leaves a curved ridge, on which a normal
 approximation at a mode has few of its draws, and a few components fitted to draws have
-not many more: there narrow proposals lie along the ridge.
+not many more: there narrow proposals lie along the ridge (:mod:`.ridges`).
 
 References:
     Cornuet, Marin, Mira & Robert, Scand. J. Stat. 2012 (adaptive multiple importance
@@ -24,7 +24,7 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import numpy as np
@@ -32,20 +32,18 @@ from numpy.typing import NDArray
 
 from sbi_active.inference.engine.pool import Pool
 from sbi_active.inference.engine.potential import Density, Potential
+from sbi_active.inference.engine.ridges import Ridge, along_ridges
 from sbi_active.inference.engine.search import Found
 from sbi_active.inference.engine.settings import Settings
 from sbi_active.inference.sampling.gaussian_mixture import fitted_normals
-from sbi_active.inference.sampling.least_squares import descend, floored
 from sbi_active.inference.sampling.student_mixture import (
     Defended,
     Proposal,
     StudentMixture,
-    lower_factors,
 )
 from sbi_active.inference.sampling.weights import (
     effective_sample_size,
     largest_power,
-    log_sum_exp,
     normalized,
     systematic,
 )
@@ -53,67 +51,6 @@ from sbi_active.inference.sampling.weights import (
 Array = NDArray[Any]
 
 SHRINKS, LEAST = 0.8, 1e-10  # of powers that are tried in turn, and the least of them
-
-
-def along_ridges(
-    potential: Potential,
-    found: Found,
-    points: Array,
-    rng: np.random.Generator,
-    settings: Settings,
-) -> StudentMixture | None:
-    """Return narrow t distributions along the ridges; None if nothing is likely.
-
-    Draws of the normal approximations, and points, are brought back to the ridge by
-    steps that a prior around each damps, so that they move across it and not along.
-    Each has the curvature of its place, and along the ridge the width that the points
-    leave between them.
-
-    Args:
-        potential: Log density.
-        found: Modes of it.
-        points: Places that are known to be likely, shape (k, dim).
-        rng: Source of the draws.
-        settings: Number of places, and how far they may spread.
-    """
-    c, own = potential.coordinates, settings
-    drawn = found.guess.sample(own.num_ridge, rng)
-    u = np.concatenate([found.modes, points, drawn])
-    u = np.clip(u, c.low, c.high)
-    best, step = found.modes[:1], potential.step
-    whiten = potential.whitener(best)
-    u, _ = descend(
-        potential, u, whiten, step, own.returning, center=u.copy(), secant=True
-    )
-    target = potential.log_prior(u) + potential.log_likelihood(u)
-    if not np.isfinite(target.max()):
-        return None
-    u = u[target >= target.max() - 0.5 * own.search.negligible]
-    precision = floored(potential)
-    slopes = potential.jacobian(best, whiten, step)[1][0] / np.sqrt(precision)
-    known = int((np.linalg.svd(slopes, compute_uv=False) > 1).sum())
-    num_open = max(int(potential.searched.sum()) - known, 1)
-    width = min(own.reach * own.num_ridge ** (-1 / num_open), 1.0)
-    _, jac = potential.jacobian(u, whiten, step)
-    local = np.einsum("nij,nik->njk", jac, jac) + np.diag(precision / width**2)
-    factors = own.laplace_wider * lower_factors(np.linalg.inv(local))
-    return StudentMixture(u, factors, np.full(len(u), 1 / len(u)))
-
-
-def reweighted(mixture: StudentMixture, u: Array, weight: Array) -> StudentMixture:
-    """Return a mixture with the weights that its components' draws deserve.
-
-    Args:
-        mixture: Components.
-        u: Draws, shape (n, dim).
-        weight: Weights of the draws, which sum to 1, shape (n,).
-    """
-    parts = mixture.log_parts(u)
-    share = np.exp(parts - log_sum_exp(parts, axis=0))
-    # Tempered weights: few draws must not shrink the next proposal to a point.
-    flat = np.sqrt(weight)
-    own = share @ (flat / flat.sum())
-    return replace(mixture, weights=0.5 * own / own.sum() + 0.5 / len(own))
 
 
 def importance_sample(
@@ -183,7 +120,7 @@ def importance_sample(
                 kept = proposal
             best, latched = max(best, efficiency), 0.0
             pool.restart()
-            proposal = fits.again(power)
+            proposal = fits.again(power, efficiency)
         floor = float(pool.log_likelihood.max()) - own.negligible / power
         pool.add(proposal, proposal.sample(size, rng), potential, floor)
     return fits.is_rough
@@ -196,7 +133,10 @@ class _Fits:
     Attributes:
         num_full: Number of those to the whole likelihood.
         num_tempered: Number of those to a power of it.
-        ridge: The last one along ridges.
+        ridge: Places along ridges, of the last proposal there.
+        is_along: Whether the last proposal was along ridges.
+        efficiency: Share of the draws that were effective of the last proposal along
+            ridges, and of the last other one.
     """
 
     pool: Pool
@@ -207,7 +147,9 @@ class _Fits:
     rng: np.random.Generator
     num_full: int = 0
     num_tempered: int = 0
-    ridge: StudentMixture | None = None
+    ridge: Ridge | None = None
+    is_along: bool = True
+    efficiency: dict[bool, float] = field(default_factory=dict)
 
     @property
     def num(self) -> int:
@@ -223,8 +165,13 @@ class _Fits:
         """Return the largest power of the new likelihood that leaves enough draws."""
         return _largest_power(*self._logs(), self.settings.fewest)
 
-    def again(self, power: float) -> Proposal:
-        """Return a proposal for a power of the likelihood, fitted to all draws."""
+    def again(self, power: float, efficiency: float) -> Proposal:
+        """Return a proposal for a power of the likelihood, fitted to all draws.
+
+        Args:
+            power: Power of the likelihood.
+            efficiency: Share of the last proposal's draws that were effective.
+        """
         pool, own, rng, is_rough = self.pool, self.settings, self.rng, self.is_rough
         self.num_full += power == 1
         self.num_tempered += power < 1
@@ -232,19 +179,27 @@ class _Fits:
         weight = normalized(log_rest + power * log_new)
         share = own.share_if_rough if is_rough else own.share_of_wide
         proposal = defended(pool, weight, self.num_components, share, own, rng)
-        if self.found is not None and self.num <= own.num_ridged:
-            # Where few draws count, they may lie across a ridge.
+        before, self.is_along = self.is_along, False
+        self.efficiency[before] = efficiency
+        # Where few draws count, they may lie across a ridge.
+        is_first = self.num <= own.num_ridged
+        if self.found is not None and (is_first or self._is_better_along):
             full = normalized(pool.log_mixture_weight)
             if self.ridge is not None:
-                self.ridge = reweighted(self.ridge, pool.u, full)
+                self.ridge = self.ridge.grown(pool.u, full, rng)
             elif power < 1:
                 some = pool.u[np.unique(systematic(full, own.num_ridge, 0.5))]
                 # What was searched has residuals.
                 searched = cast(Potential, self.potential)
                 self.ridge = along_ridges(searched, self.found, some, rng, own)
             if self.ridge is not None:
-                return self.ridge
+                self.is_along = True
+                return self.ridge.mixture
         return proposal
+
+    @property
+    def _is_better_along(self) -> bool:
+        return self.efficiency[True] > self.efficiency.get(False, np.inf)
 
     def _logs(self) -> tuple[Array, Array]:
         """Return log weights without the new likelihood, and that, shapes (n,)."""

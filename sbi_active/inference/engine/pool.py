@@ -134,7 +134,10 @@ class Pool:
         u, log_likelihood = u[counts], log_likelihood[counts]
         own = np.log(len(drawn)) + proposal.log_prob(self.u)
         self.log_mixture = np.logaddexp(self.log_mixture, own)
-        self.proposals.append((len(drawn), proposal))
+        num = len(drawn)
+        if self.proposals and self.proposals[-1][1] is proposal:
+            num += self.proposals.pop()[0]
+        self.proposals.append((num, proposal))
         log_mixture = np.full(len(u), -np.inf)
         for num, each in self.proposals if len(u) else []:
             log_mixture = np.logaddexp(log_mixture, np.log(num) + each.log_prob(u))

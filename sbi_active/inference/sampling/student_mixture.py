@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -17,6 +18,8 @@ Array = NDArray[Any]
 
 #: Degrees of freedom: tails above any Gaussian's, and a covariance that exists.
 FREEDOM = 5.0
+#: Numbers of an array that are computed at a time.
+BLOCK = 100_000
 
 
 class Proposal(Protocol):
@@ -116,19 +119,27 @@ class StudentMixture(Proposal):
 
     @override
     def log_prob(self, z: Array) -> Array:
-        return log_sum_exp(self.log_parts(z), axis=0)
+        # Hundreds of components by thousands of draws are more than a cache holds.
+        blocks = np.array_split(z, 1 + self.means.size * len(z) // BLOCK)
+        parts = [log_sum_exp(self.log_parts(block), axis=0) for block in blocks]
+        return np.concatenate(parts)
 
     def log_parts(self, z: Array) -> Array:
         """Return log of weight times density of each component, shape (k, n)."""
         apart = (z - self.means[:, None]).transpose(0, 2, 1)
-        step = np.linalg.inv(self.factors) @ apart  # (k, d, n)
-        log_volume = np.linalg.slogdet(self.factors)[1] - np.log(self.weights)
-        log_volume = log_volume[:, None]
+        inverse, log_volume = self._inverted
+        step, log_volume = inverse @ apart, log_volume[:, None]  # (k, d, n)
         if self.left is not None and self.right is not None:
             scale = np.where(step > 0, self.right[..., None], self.left[..., None])
             step, log_volume = step / scale, log_volume + np.log(scale).sum(1)
         square = (step**2).sum(1)
         return log_student(square, log_volume, z.shape[1], self.freedom)
+
+    @cached_property
+    def _inverted(self) -> tuple[Array, Array]:
+        """Inverses of the factors, and their log determinants over the weights."""
+        log_volume = np.linalg.slogdet(self.factors)[1] - np.log(self.weights)
+        return np.linalg.inv(self.factors), log_volume
 
 
 @dataclass(frozen=True)
