@@ -26,6 +26,7 @@ from sbi_active.criticism.linear.fits import best_fit, polished
 from sbi_active.criticism.linear.model import (
     LinearModel,
     at_null,
+    centered,
     chords,
     enlarged,
     linearize,
@@ -202,7 +203,8 @@ def fitted(
             fit, unit = _settled(some, u[free], linear.unit, own)
             linear = linear.around(fit, free, unit, own.tried)
         else:
-            fit = linearize(some, u[free], linear.unit, own.step)
+            fit = linearize(some, u[free], linear.unit)
+            fit = centered(some, fit, linear.unit)
             linear = linear.around(fit, free, linear.unit)
     draws = draw(sweeps=own.sampler.many)
     return Fitted(**vars(linear), errors=errors, draws=draws, aliases=aliases)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.criticism.linear.model import LinearModel, linearize
+from sbi_active.criticism.linear.model import LinearModel, centered, linearize
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.sampling.least_squares import descend
 
@@ -98,7 +98,7 @@ def polished(rival: Rival, u: Array, unit: Array, settings: FitSettings) -> Line
         unit: Standard deviation of each number's error, shape (N,).
         settings: Settings of what is spent.
     """
-    model = linearize(rival, u, unit, rival.step)
+    model = linearize(rival, u, unit)
     for _ in range(settings.rounds - 1):
         scale = max(model.rms, 1.0)
         if model.promised < settings.worth * scale**2:
@@ -108,8 +108,8 @@ def polished(rival: Rival, u: Array, unit: Array, settings: FitSettings) -> Line
         new, _ = along_secants(rival, start, unit * scale, settings.secant, known)
         if (new[0] == model.u).all():
             break
-        model = linearize(rival, new[0], unit, rival.step)
-    return model
+        model = linearize(rival, new[0], unit)
+    return centered(rival, model, unit)
 
 
 def along_secants(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -103,17 +103,32 @@ class LinearModel:
         return np.where(self.scaled, width * self.sd, self.sd)
 
 
-def linearize(rival: Rival, u: Array, unit: Array, step: float | Array) -> LinearModel:
-    """Return a rival linearized at one point.
+def linearize(rival: Rival, u: Array, unit: Array) -> LinearModel:
+    """Return a rival linearized at one point, by steps to one side.
 
     Args:
         rival: Rival with effects that change the prediction.
         u: Point of linearization, shape (d,).
         unit: Standard deviation of the sensor, shape (N,).
-        step: Step of finite differences, one or one a coordinate, shape (d,).
     """
-    r, jacobian = rival.jacobian(u[None], lambda residual: residual / unit, step)
+    r, jacobian = rival.jacobian(u[None], lambda residual: residual / unit, rival.step)
     return with_prior(rival, u, r[0], jacobian[0])
+
+
+def centered(rival: Rival, model: LinearModel, unit: Array) -> LinearModel:
+    """Return a linearized rival with derivatives from both sides.
+
+    From one side the curvature of a response is taken for a slope: of two parameters
+    that only their product tells, it would tell each.
+
+    Args:
+        rival: Rival that is linearized.
+        model: Rival linearized by steps to one side.
+        unit: Standard deviation of the sensor, shape (N,).
+    """
+    at, step = model.u[None], -rival.step
+    _, jacobian = rival.jacobian(at, lambda residual: residual / unit, step)
+    return replace(model, jacobian=(model.jacobian + jacobian[0]) / 2)
 
 
 def with_prior(rival: Rival, u: Array, residual: Array, jacobian: Array) -> LinearModel:

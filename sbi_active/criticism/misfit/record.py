@@ -46,6 +46,9 @@ COUNTS, MOST_COUNTED = 0.05, 6
 #: Root mean square difference of two effects' fits, in sensor deviations, below which
 #: they are nearly the same.
 CLOSE = 1.0
+#: Effective draws from which a sample of the simulator's own posterior is taken, and not
+#: that of a linear model. Half and twice say little else: it is some hundreds or a few.
+FEWEST_DRAWS = 50.0
 
 
 def traced(
@@ -172,9 +175,11 @@ def _record(found: Verdict, key: ModelKey) -> Evidence:
     model = search.model(effects)
     if key not in rivals.fits and _is_sampled(found, key):
         fit = rivals.fit(key)
-        evidence = replace(fit.evidence, log_evidence=own.log_evidence)
-        rivals.fits[key] = replace(fit, evidence=evidence)
-        return evidence
+        if fit.evidence.effective_sample_size >= FEWEST_DRAWS:
+            evidence = replace(fit.evidence, log_evidence=own.log_evidence)
+            rivals.fits[key] = replace(fit, evidence=evidence)
+            return evidence
+        del rivals.fits[key]  # a few draws would claim to know what is open
     at = own
     if key.effects and found.key == ModelKey(key.effects, OUTLIER):
         at = states.mixture(found.key)
@@ -187,7 +192,9 @@ def _record(found: Verdict, key: ModelKey) -> Evidence:
 
 def _is_sampled(found: Verdict, key: ModelKey) -> bool:
     states, search = found.states, found.search
-    if found.rivals.measurements.is_sequence or key not in search.found:
+    if key not in search.found:
+        return False
+    if found.rivals.measurements.is_sequence and key not in (ModelKey(), found.key):
         return False
     others = [*search.found, *states.keys(ModelKey())]
     least = max(map(states.log_evidence, others)) - THRESHOLD

@@ -196,7 +196,8 @@ class Rival:
         Args:
             u: Coordinates, shape (n, dim).
             whiten: Whitener, which maps (..., N) to (..., N).
-            step: Step in u, one or one a coordinate, shape (dim,).
+            step: Step in u, one or one a coordinate, shape (dim,). Where it would
+                leave the bounds, it is taken to the other side.
 
         Returns:
             Shapes (n, N) and (n, N, dim).
@@ -204,7 +205,8 @@ class Rival:
         c = self.coordinates
         step = np.broadcast_to(step, (self.dim,))
         groups = [g for g in c.groups() if self.searched[g > 0].any()]
-        sign = np.where(u + step > c.high, -1.0, 1.0)
+        leaves = (u + step > c.high) | (u + step < c.low)
+        sign = np.where(leaves, -1.0, 1.0)
         stack = [u, *[u + step * sign * g for g in groups]]
         all_r = whiten(self.residual(np.concatenate(stack))[0])
         r = all_r.reshape(len(stack), *u.shape[:1], -1)

@@ -107,6 +107,32 @@ def test_parameters_that_are_known_together_alone_are_not_identifiable():
     assert "drag" in gate.reason
 
 
+def test_trajectories_that_tell_a_product_alone_are_not_identifiable():
+    """Slopes from one side told both factors to a seventh, and the gate shipped."""
+    times = torch.linspace(0.1, 2.0, 20)
+
+    def swing(theta, xi):
+        rate = (theta[:, :1] * theta[:, 1:]).sqrt()
+        return xi * torch.cos(rate * times.to(theta))
+
+    model = SimulatorModel(
+        swing,
+        noise=GaussianNoise(1e-3),
+        parameter_names=["stiffness", "factor"],
+        sample_times=times,
+    )
+    prior = BoxUniform(torch.tensor([1.0, 0.5]), torch.tensor([20.0, 2.0]))
+    gen, xi = torch.Generator().manual_seed(0), torch.linspace(0.5, 1.5, 8)[:, None]
+    x = swing(torch.tensor([[9.0, 1.1]]).expand(8, -1), xi)
+    x = x + 1e-3 * torch.randn(x.shape, generator=gen)
+    report = close_loop(model, prior, Trials(xi, x, sample_times=times), plan=False)
+    assert report.gate.decision == "NOT_IDENTIFIABLE"
+    assert "stiffness * factor = 9.89" in str(report.combinations)
+    factor = report.tracing.evidences["none"].draws[:, 1]
+    # Its density falls with 1 / factor from .5 to 2.
+    assert factor.std() == pytest.approx(0.427, rel=0.12)
+
+
 def test_few_trials_are_not_enough():
     gate = decided(lambda xi, fits: 0.7 * xi, fitted=3, held_out=1)
     assert gate.decision == "NOT_ENOUGH_DATA"
