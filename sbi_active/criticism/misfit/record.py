@@ -46,8 +46,8 @@ COUNTS, MOST_COUNTED = 0.05, 6
 #: Root mean square difference of two effects' fits, in sensor deviations, below which
 #: they are nearly the same.
 CLOSE = 1.0
-#: Effective draws from which a sample of the simulator's own posterior is taken, and not
-#: that of a linear model. Half and twice say little else: it is some hundreds or a few.
+#: Effective draws from which a sample of the simulator's own posterior is taken, and
+#: not a linear model's. Half and twice say little else: it is some hundreds or a few.
 FEWEST_DRAWS = 50.0
 
 
