@@ -2,7 +2,6 @@
 
 import warnings
 
-import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
@@ -17,7 +16,6 @@ from sbi_active import (
 )
 from sbi_active.inference import SeqBED_LFIRE, refine
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
-from sbi_active.inference.sampling.weights import normalized
 from tests.campaign.test_corrections import OPTIONS, RATIOS
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
@@ -46,12 +44,11 @@ def trained(make):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("x", SIZES)
 @pytest.mark.parametrize(
-    ("make", "simulator"),
+    ("make", "simulator", "x"),
     [
-        *[(make, None) for make in (ASBI, ALHI, SeqBED, SeqBED_LFIRE)],
-        (ASBI, MODEL),
+        *[(make, None, -3e38) for make in (ASBI, ALHI, SeqBED, SeqBED_LFIRE)],
+        *[(ASBI, MODEL, x) for x in SIZES],
     ],
 )
 def test_updates_give_a_belief_to_go_on_from(make, simulator, x):
@@ -98,11 +95,3 @@ def test_refinement_says_that_it_is_not_to_be_trusted(model, x):
         )
     assert belief.diagnostics.trustworthy is False
     assert bool(belief.sample((50,)).isfinite().all())
-
-
-def test_weights_of_any_size_sum_to_one():
-    ordinary = np.log(np.arange(1.0, 6.0))
-    assert np.allclose(normalized(ordinary), np.arange(1, 6) / 15)
-    assert normalized(-1e30 + np.zeros(4)).tolist() == [0.25] * 4
-    assert normalized(np.full(4, -np.inf)).tolist() == [0.25] * 4
-    assert normalized(np.array([0.0, -np.inf])).tolist() == [1.0, 0.0]

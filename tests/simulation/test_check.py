@@ -3,12 +3,8 @@
 import sys
 
 import pytest
-import torch
-from sbi.utils import BoxUniform
 
-from sbi_active import DiscreteActions
 from sbi_active.cli import main
-from sbi_active.simulation import check_simulator
 
 HEAD = "import numpy as np\nimport torch\nfrom sbi_active import *\n"
 SPACE = ["--theta-low=0,-1", "--theta-high=1,1", "--actions", "0.5:2:4"]
@@ -68,11 +64,6 @@ def fn(theta, action):
     return theta * action + torch.randn_like(theta)
 
 simulator = SimulatorModel(fn, noise=GaussianNoise(1.0))
-"""
-FALLS_OFF = """
-def simulator(theta, action):
-    x = theta * action + torch.randn_like(theta)
-    return torch.where(action > 1.2, torch.nan, x)
 """
 SOME_RAISE = """
 def row(theta, action, rng):
@@ -174,43 +165,7 @@ def test_warnings_do_not_fail(check, text, expected):
     assert line.startswith("warning: ")
 
 
-def test_lost_rows_are_told_by_action(check):
-    status, printed = check(FALLS_OFF)
-    assert status == 0
-    assert "rows: 32 ok, 32 invalid, 0 missing" in printed
-    assert "action 2: 100% without a measurement" in printed
-    assert "action 1.5: 100% without a measurement" in printed
-    assert "action 1:" not in printed
-
-
 def test_files_named_like_other_modules_are_refused(tmp_path, capsys):
     (tmp_path / "json.py").write_text(HEAD + CLEAN)
     assert main(["check", f"{tmp_path}/json.py:simulator", *SPACE]) == 2
     assert "expected a file whose name no other module has" in capsys.readouterr().err
-
-
-def test_slow_simulators_get_fewer_rows():
-    calls = []
-
-    def simulator(theta, action):
-        calls.append(len(theta))
-        return theta * action + torch.randn_like(theta)
-
-    prior = BoxUniform(torch.zeros(1), torch.ones(1))
-    report = check_simulator(
-        simulator, prior, DiscreteActions([1.0, 2.0]), max_seconds=0, num_rows=500
-    )
-    assert report.is_ready
-    assert max(calls) == report.num_rows == 16
-    assert report.minutes is None
-
-
-def test_every_entry_of_a_large_grid_is_varied():
-    def simulator(theta, action):
-        return theta * action[:, :1] + torch.randn_like(theta)
-
-    prior = BoxUniform(torch.zeros(1), torch.ones(1))
-    axis = torch.linspace(1.0, 2.0, 60)
-    grid = DiscreteActions(torch.cartesian_prod(axis, axis))
-    report = check_simulator(simulator, prior, grid, num_rows=32)
-    assert report.idle_actions == ("action_2",)

@@ -30,13 +30,6 @@ def test_rows_that_repeat_are_simulated_once():
     assert sums.asked == [[0, 1, 3]]
 
 
-def test_another_label_has_values_of_its_own():
-    cache, sums = RowCache(), Sums()
-    cache.get("a", ROWS[:1], sums.of(ROWS))
-    assert cache.get("b", ROWS[:1], sums.of(ROWS + 1)) == [5.0]
-    assert cache.get("a", ROWS[:1], sums.of(ROWS + 1)) == [3.0]
-
-
 def test_beyond_its_size_all_is_forgotten_after_it_is_returned():
     cache, asked = RowCache(most=3), []
     first, second = np.zeros((1, 2)), np.ones((1, 2))

@@ -14,23 +14,6 @@ from sbi_active.messages import RenamedWarning
 from sbi_active.migration.described import options_from
 from sbi_active.simulation import Workers
 
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"num_workers": 0},
-        {"num_workers": -2},
-        {"time_limit": 0.0},
-        {"time_limit": float("nan")},
-        {"num_retries": -1},
-    ],
-)
-def test_what_makes_no_sense_is_refused_where_it_is_said(wrong):
-    (name,) = wrong
-    with pytest.raises(ValueError, match=f"expected {name}"):
-        Workers(**wrong)
-
-
 ROWS = torch.ones(1, 1), torch.ones(1, 1)
 
 

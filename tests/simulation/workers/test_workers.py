@@ -15,7 +15,6 @@ import torch
 from sbi_active import simulate
 from sbi_active.simulation import MissingRowsWarning, Workers
 from sbi_active.simulation.workers.pools import waiting_workers
-from sbi_active.simulation.workers.processes import Worker
 
 # A worker cannot import a test module.
 cloudpickle.register_pickle_by_value(sys.modules[__name__])
@@ -76,19 +75,6 @@ def test_workers_are_kept_for_the_same_simulator(monkeypatch):
     monkeypatch.setenv("SOME_SETTING", "new")
     assert not workers_of(other_pids) & other
     assert are_gone(other)
-
-
-def test_workers_that_wait_too_long_end(monkeypatch):
-    monkeypatch.setattr(Worker, "PATIENCE", 0.3)
-    pids = workers_of(pids_of_rows)
-    assert any(map(is_alive, pids))
-    assert are_gone(pids)
-    again = workers_of(pids_of_rows)
-    assert not again & pids
-    time.sleep(0.15)
-    assert workers_of(pids_of_rows) == again  # which starts the time anew
-    time.sleep(0.2)
-    assert all(map(is_alive, again))
 
 
 def test_a_worker_that_dies_while_it_waits_costs_no_row():
