@@ -44,16 +44,6 @@ def model(request):
     return SimulatorModel(fn, noise=GaussianNoise(0.1), batched=batched)
 
 
-def test_mean_and_density_of_batches_and_rows(model):
-    mean = model.mean(THETA, ACTION)
-    assert mean[:, 0].tolist() == pytest.approx([5.0, 2.0, 0.5])
-    x = mean + 0.1
-    expected = 3 * [-0.5 - np.log(0.1 * np.sqrt(2 * np.pi))]
-    assert model.log_prob(x, THETA, ACTION).tolist() == pytest.approx(expected, 1e-5)
-    assert model.is_batched == (model.fn is line)
-    assert model.is_deterministic(THETA, ACTION)
-
-
 def test_effects_are_numbers_or_one_a_row(model):
     assert model.effect_names == ("drag", "tilt")
     mean = model.mean(THETA, ACTION)

@@ -13,7 +13,6 @@ from sbi_active import (
     SimulatorModel,
     simulate,
 )
-from sbi_active.criticism import Trials
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning
 
@@ -151,13 +150,3 @@ def test_noise_keeps_the_values_that_were_declared():
     assert noise.sd.tolist() == [1.0, 1.0]
     for kept in (noise.times, model.sample_times, model.noise.times):
         assert kept.tolist() == [0.0, 1.0, 2.0]
-
-
-def test_trials_keep_the_numbers_that_were_measured():
-    action, x = np.arange(4.0)[:, None], torch.ones(4, 2, dtype=torch.float64)
-    trials = Trials(action, x, sample_times=(times := np.arange(2.0)))
-    for given in (action, x, times):
-        given += 5
-    assert trials.action.flatten().tolist() == [0.0, 1.0, 2.0, 3.0]
-    assert trials.x.unique().tolist() == [1.0]
-    assert trials.sample_times.tolist() == [0.0, 1.0]

@@ -43,12 +43,6 @@ def test_a_list_of_actions_is_taken(make):
     assert Criticism(MODEL, PRIOR, trials, actions=actions).actions.action_dim == 1
 
 
-@pytest.mark.parametrize("actions", ["fast", None, 3.0, {1.0, 2.0}])
-def test_what_is_no_list_of_actions_is_refused(actions):
-    with pytest.raises(TypeError, match="expected an action space or a list of"):
-        Campaign(MODEL, PRIOR, actions)
-
-
 def test_a_function_of_one_row_says_so():
     def row(theta, action, rng):
         return theta * action + rng.normal()

@@ -38,22 +38,6 @@ def same(a, b):
     ) and torch.equal(a.status, b.status)
 
 
-def test_rows_come_back_as_they_went_in(bank):
-    theta, action = draw(500)
-    stored = simulate(simulator, theta, action, seed=3, store=bank)
-    reader = Bank(bank.path)
-    assert same(reader.read(), simulate(simulator, theta, action, seed=3))
-    assert len(reader) == 500
-    assert reader.counts == stored.counts
-    assert 20 < reader.counts["invalid"] < 80
-    column = reader.columns("index", "seed", "log_proposal")
-    assert column["index"].tolist() == list(range(500))
-    assert (column["seed"] == 3).all()
-    assert column["log_proposal"].isnan().all()
-    assert reader.header["shapes"] == {"theta": [2], "action": [1], "x": [3]}
-    assert reader.verify() == []
-
-
 def test_what_is_stored_is_not_simulated_again(tmp_path):
     calls = []
 
@@ -177,6 +161,14 @@ def test_readers_go_on_while_another_process_writes(bank):
     assert lengths == sorted(lengths)
     assert len({*lengths}) > 5  # the reader did see the bank grow
     assert len(bank) == 600
+
+
+def test_shapes_set_by_another_writer_hold(bank):
+    late = Bank(bank.path, simulator=simulator)
+    bank.append(Simulations(*draw(3), torch.rand(3, 3)), seed=0)
+    bank.close()
+    with late, pytest.raises(ValueError, match=r"'x': \[3\]}, as in the bank"):
+        late.append(Simulations(*draw(3), torch.rand(3, 4)), seed=1)
 
 
 def test_the_lock_goes_with_its_process(bank):

@@ -3,7 +3,6 @@ import os
 import resource
 import shutil
 import subprocess
-import warnings
 
 import pytest
 import torch
@@ -172,15 +171,3 @@ def test_a_folder_that_cannot_be_written(small_disk):
         OSError, match="a folder that can be made for a bank; got 'Read"
     ):
         Bank(small_disk / "new", simulator=simulator)
-
-
-def test_rows_from_elsewhere_are_noticed(bank):
-    box = torch.distributions.Uniform(torch.zeros(2), 0.5 * torch.ones(2))
-    half = torch.distributions.Independent(box, 1)
-    with pytest.warns(UserWarning, match="rows have density 0 under the proposal 'h'"):
-        bank.append(rows(), seed=7, proposal=half, label="h")
-    inside = rows()
-    inside.theta.mul_(0.5)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        bank.append(inside, seed=8, proposal=half, label="h")

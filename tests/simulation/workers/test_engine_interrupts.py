@@ -106,10 +106,3 @@ def test_slow_rows_are_cut_into_parts_of_a_second():
     assert len(sizes) <= 25
     sizes = sizes_of(lambda n: 1.0 * n, 30, Pace())
     assert max(sizes) <= 4
-
-
-@pytest.mark.parametrize("seconds", [0.05, 3.0])
-def test_a_simulator_as_slow_for_few_rows_is_hardly_cut(seconds):
-    pace = Pace()
-    assert len(sizes_of(lambda n: seconds + 1e-7 * n, 5_000, pace)) <= 5
-    assert sizes_of(lambda n: seconds + 1e-7 * n, 5_000, pace) == [5_000]

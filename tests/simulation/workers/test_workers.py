@@ -88,16 +88,6 @@ def test_a_worker_that_dies_while_it_waits_costs_no_row():
     assert min(pids) not in again
 
 
-def test_a_forked_child_leaves_them_alone():
-    pids = workers_of(pids_of_rows)
-    child = os.fork()
-    if child == 0:
-        waiting_workers.cache_clear()
-        os._exit(0)
-    assert os.waitpid(child, 0)[1] == 0
-    assert workers_of(pids_of_rows) == pids
-
-
 def test_what_a_worker_started_ends_with_it(tmp_path):
     def simulator(theta, action, seeds):
         child = subprocess.Popen(["sleep", "60"])
