@@ -1,7 +1,5 @@
 """Outcomes as far away as float32 reaches, told to the trainers themselves."""
 
-import warnings
-
 import pytest
 import torch
 from sbi.utils import BoxUniform
@@ -14,7 +12,7 @@ from sbi_active import (
     SeqBED,
     SimulatorModel,
 )
-from sbi_active.inference import SeqBED_LFIRE, refine
+from sbi_active.inference import SeqBED_LFIRE
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from tests.campaign.test_corrections import OPTIONS, RATIOS
 
@@ -22,11 +20,6 @@ PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
 MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise(0.1))
 SETTINGS = RefinementOptions(num_histories=300, num_effective=25)
 SIZES = (1e15, -3e38)
-
-
-JUMPS = SimulatorModel(
-    lambda theta, action: (7 * theta).floor() * action, noise=GaussianNoise(0.1)
-)
 
 
 def trained(make):
@@ -78,20 +71,3 @@ def test_what_the_network_cannot_say_changes_nothing(x):
     assert belief.diagnostics.trustworthy is False
     theta = torch.tensor([[0.2], [0.7]])
     assert torch.equal(belief.log_prob(theta), PRIOR.log_prob(theta))
-
-
-@pytest.mark.parametrize("x", SIZES)
-@pytest.mark.parametrize("model", [MODEL, JUMPS])
-def test_refinement_says_that_it_is_not_to_be_trusted(model, x):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        belief = refine(
-            model,
-            PRIOR,
-            torch.tensor([[1.0], [1.0]]),
-            torch.tensor([[x], [0.6]]),
-            settings=SETTINGS,
-            seed=0,
-        )
-    assert belief.diagnostics.trustworthy is False
-    assert bool(belief.sample((50,)).isfinite().all())

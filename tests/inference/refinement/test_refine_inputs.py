@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from sbi_active.inference import refine
-from sbi_active.tasks import get_task
 from sbi_active.tasks.numerical.exact import ExactPosterior
 from tests.inference.refinement.refined_worlds import BOX, numerical, observe
 
@@ -49,42 +48,6 @@ def test_deterministic_simulator_is_refused():
             torch.ones(1, 1),
             seed=0,
         )
-
-
-def counted(simulator):
-    """Return a simulator that counts its rows, and the count."""
-    count = [0]
-
-    def wrapped(theta, action):
-        count[0] += len(theta)
-        return simulator(theta, action)
-
-    return wrapped, count
-
-
-def test_past_histories_are_used_first():
-    """The belief of four trials from that of three: fewer rows, the same posterior."""
-    task = get_task("numerical")
-    action = torch.tensor([[-5.0], [5.0], [-5.0], [4.0]])
-    x = torch.stack([task.real_system(a, seed=i) for i, a in enumerate(action)])
-    exact = task.reference(action, x)
-    theta = exact.sample(4_000, seed=0)
-    rows, divergences = [], []
-    for reuse in (True, False):
-        past = None
-        for t in (3, 4):
-            simulator, count = counted(task.simulator)
-            belief = refine(
-                simulator, task.prior, action[:t], x[:t],
-                past=past if reuse else None, seed=t,
-            )  # fmt: skip
-            past = belief.histories
-            assert belief.diagnostics.num_simulations == count[0]
-        rows.append(count[0])
-        difference = exact.log_prob(theta) - belief.log_prob(theta.float())
-        divergences.append(float(difference.mean()))
-    assert rows[0] < 0.6 * rows[1]
-    assert max(divergences) < 0.08
 
 
 def test_a_lack_of_memory_is_said(monkeypatch):
