@@ -81,14 +81,12 @@ def campaign(prior: Distribution, method: str = "asbi", **options) -> Campaign:
 
 
 NETWORKS = {True: "each round", False: "on demand"}
-MODES = Normal(torch.tensor([[-1.0, 0.6], [0.0, 0.5]]), 0.3 * torch.ones(2, 2))
 
 
 @pytest.mark.parametrize(
     "prior",
     [
         independent(Cauchy(0 * TWO, TWO)),
-        independent(MixtureSameFamily(Categorical(torch.ones(2, 2)), MODES)),
         TransformedDistribution(
             independent(Normal(0 * TWO, TWO)),
             [ExpTransform(), AffineTransform(0.2, 1.0)],
@@ -101,7 +99,6 @@ MODES = Normal(torch.tensor([[-1.0, 0.6], [0.0, 0.5]]), 0.3 * torch.ones(2, 2))
     ],
     ids=[
         "Cauchy",
-        "mixture",
         "shifted log-normal",
         "mixture of bounds",
         "angle",

@@ -1,4 +1,3 @@
-import pytest
 import torch
 
 from sbi_active.inference import MixtureDensity
@@ -16,20 +15,6 @@ def network(dim=3, condition_dim=4, n=200, **settings):
     for p in net.parameters():  # far from the start, so that nothing is trivial
         torch.nn.init.normal_(p, 0.0, 0.3)
     return net, theta
-
-
-def test_shapes_follow_sbi():
-    net, theta = network()
-    condition = torch.randn(7, 4)
-    assert net.sample(torch.Size([5, 2]), condition).shape == (5, 2, 7, 3)
-    assert net.log_prob(theta[:7], condition).shape == (1, 7)
-    assert net.log_prob(theta[:14].reshape(2, 7, 3), condition).shape == (2, 7)
-    assert net.loss(theta[:7], condition).shape == (7,)
-    pairs = torch.randn(2, 7, 4)
-    both = net.log_prob(theta[:14].reshape(2, 7, 3), pairs)
-    assert torch.allclose(both[1], net.log_prob(theta[7:14], pairs[1])[0], atol=1e-5)
-    with pytest.raises(ValueError, match="condition"):
-        net.log_prob(theta[:7], torch.randn(7, 5))
 
 
 def test_faithful_settings_condition_on_nothing_but_z_scores():
@@ -65,18 +50,3 @@ def test_faithful_settings_condition_on_nothing_but_z_scores():
     ]
     for name, value in states[0].items():
         assert torch.equal(value, states[1][name])
-
-
-def test_a_loss_that_is_not_finite_is_told():
-    theta, condition = torch.randn(60, 1), torch.randn(60, 2)
-    net = MixtureDensity(hidden_features=(8,))(theta, condition)
-    with pytest.raises(RuntimeError, match="expected a finite loss"):
-        train_mixture_density(
-            net,
-            torch.optim.Adam(net.parameters(), lr=1e-3),
-            theta * torch.nan,
-            condition,
-            train_rows=torch.arange(40),
-            held_out_rows=torch.arange(40, 60),
-            budget=TrainingBudget(num_iterations=10, batch_size=20),
-        )
