@@ -31,6 +31,15 @@ RAISES = """
 def simulator(theta, action):
     raise RuntimeError("no model file")
 """
+FLAT = """
+def simulator(theta, action):
+    x = theta * action + torch.randn_like(theta)
+    return x if len(x) > 1 else x[:, :1]
+"""
+NOTHING = """
+def simulator(theta, action):
+    return torch.full((len(theta), 2), torch.nan)
+"""
 MIXED = """
 def simulator(theta, action, seeds):
     noise = torch.randn(len(theta), 2, generator=torch.Generator().manual_seed(1))
@@ -110,6 +119,11 @@ def test_a_clean_simulator_is_ready(check, text):
             "expected x with one row a parameter set, shape (16, ...); got (1, 2)",
         ),
         (RAISES, "RuntimeError: no model file"),
+        (
+            FLAT,
+            "expected x of one shape; got (2,) a row from 16 rows and (1,) from one",
+        ),
+        (NOTHING, "no row has a measurement"),
         (MIXED, "rows permuted with their seeds do not give permuted x"),
         (NO_PARAMETER, "no parameter changes x"),
     ],
