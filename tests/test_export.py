@@ -126,22 +126,6 @@ def test_a_belief_predicts_outcomes_at_actions(campaign):
     assert not {"observed_data", "log_likelihood"} & {*bare.groups()}
 
 
-def test_a_plain_function_has_no_log_likelihood():
-    def simulator(theta, action):
-        return theta * action + 0.2 * torch.randn_like(theta)
-
-    c = Campaign(
-        simulator, PRIOR, DiscreteActions([1.0]), method="nsbi", options=OPTIONS
-    )
-    c.ask()
-    c.tell([0.5, 0.4])
-    c.update()
-    data = to_inference_data(c, num_samples=20)
-    assert "log_likelihood" not in data.groups()
-    assert data.posterior_predictive.x.shape == (4, 5, 1, 2)
-    assert [*data.posterior.parameter.values] == ["theta_1", "theta_2"]
-
-
 @pytest.fixture(scope="module")
 def report():
     model = SimulatorModel(
@@ -204,13 +188,3 @@ def test_rows_of_a_benchmark_and_a_tree(campaign, tmp_path):
         assert again["posterior"]["theta"].dims == ("chain", "draw", "parameter")
         assert again["constant_data"]["action"].attrs == {}
         assert (again["observed_data"]["x"] == tree["observed_data"]["x"]).all()
-
-
-def test_what_is_returned_is_a_copy(campaign):
-    data, again = (to_inference_data(campaign, num_samples=40) for _ in range(2))
-    assert (data.posterior.theta.values == again.posterior.theta.values).all()
-    data.observed_data.x.values[:] = 7.0
-    data.constant_data.action.values[:] = 7.0
-    assert campaign.history[0].x is not None
-    assert not bool((campaign.history[0].x == 7.0).any())
-    assert not bool((campaign.history[0].action == 7.0).any())

@@ -47,13 +47,6 @@ def test_steps_tell_how_long_the_rest_will_take(caplog, capsys):
     assert "of about 1" in shown  # s in all
 
 
-def test_steps_of_an_unknown_number_are_counted(caplog):
-    caplog.set_level(logging.INFO, "sbi_active")
-    with stage("sets", count=lambda: (7, None)):
-        time.sleep(3 * SOON)
-    assert "so far; 7 done" in lines(caplog)[0]
-
-
 def loop(**options):
     def slow(theta, action):
         time.sleep(0.001)
@@ -75,9 +68,3 @@ def test_the_closed_loop_tells_of_its_stages(caplog, capsys):
         assert "error before and after, a verdict without each trial" in told
     assert "of 6 done, about" in said
     assert "of about" in shown
-
-
-def test_the_closed_loop_is_silent_by_default(caplog, capsys):
-    loop(evaluate=False)
-    assert capsys.readouterr().err == ""
-    assert lines(caplog) == []

@@ -8,33 +8,6 @@ TOOLS = DiscreteActions([0.0, 1.0, 2.0], names=["tool"])
 MIXED = MixedActions(BOX, TOOLS)
 
 
-def test_values_become_rows_with_names_and_units():
-    actions = DiscreteActions([1.0, 2.0, 3.0])
-    assert actions.values.shape == (3, 1)
-    assert actions.names == ["action"]
-    pairs = DiscreteActions([[0.0, 1.0], [2.0, 3.0]], units=["m", "m/s"])
-    assert (pairs.action_dim, pairs.units) == (2, ["m", "m/s"])
-    assert MIXED.names == ["speed", "angle", "tool"]
-    assert MIXED.units == ["m/s", "", ""]
-    assert MIXED.action_dim == 3
-    nested = MixedActions(TOOLS, MixedActions(BoxActions(0.0, 1.0), TOOLS))
-    assert nested.names == ["action_1", "action_2", "action_3"]  # not unique
-    assert len(nested.parts()) == 3
-    assert BOX.parts() == [BOX]
-    inside = actions.contains(torch.tensor([[2.0], [0.25], [3.0]]))
-    assert inside.tolist() == [True, False, True]
-
-
-def test_samples_are_uniform_and_seeded():
-    actions = DiscreteActions(torch.arange(4.0))
-    draws = actions.sample((40_000,), seed=0)
-    assert draws.shape == (40_000, 1)
-    assert torch.equal(draws, actions.sample((40_000,), seed=0))
-    share = torch.bincount(draws[:, 0].long()) / 40_000
-    assert ((share - 0.25).abs() < 4 * (0.25 * 0.75 / 40_000) ** 0.5).all()
-    assert actions.sample((2, 3)).shape == (2, 3, 1)
-
-
 def test_box_samples_are_uniform_and_seeded():
     draws = BOX.sample((20_000,), seed=0)
     assert draws.shape == (20_000, 2)
@@ -46,15 +19,6 @@ def test_box_samples_are_uniform_and_seeded():
         distance = (share**moment).mean(0) - 1 / (moment + 1)
         assert (distance.abs() < 4 * error).all()
     assert BOX.sample((2, 3)).shape == (2, 3, 2)
-
-
-def test_a_box_contains_its_edges_and_has_no_end():
-    inside = BOX.contains(torch.tensor([[2.0, -1.0], [2.01, 0.0], [1.0, 1.1]]))
-    assert inside.tolist() == [True, False, False]
-    assert BOX.contains(torch.zeros(4, 5, 2)).shape == (4, 5)
-    assert BOX.listed() is None
-    assert TOOLS.listed().tolist() == [[0.0], [1.0], [2.0]]
-    assert BoxActions(0.0, 1.0).action_dim == 1
 
 
 def test_mixed_samples_are_those_of_independent_parts():

@@ -34,20 +34,6 @@ def test_a_chirp_sweeps_its_frequencies():
     assert one.shape == (201,)
 
 
-def test_a_step_is_on_for_its_length():
-    space = SignalActions(
-        step(begin=0.5),
-        [0.1, 0.1],
-        [1.0, 1.0],
-        input_times=TIMES,
-        names=["height", "on"],
-    )
-    u = space.inputs(torch.tensor([[0.5, 0.25]]))["input"][0]
-    assert set(u.tolist()) == {0.0, 0.5}
-    assert float(u.sum()) == pytest.approx(0.5 * 25)
-    assert space.names == ["height", "on"]
-
-
 def test_a_multisine_has_low_peaks():
     waveform = multisine([1, 2, 3, 4, 5, 6, 7, 8])
     space = SignalActions(waveform, [0.1] * 8, [1.0] * 8, input_times=TIMES)

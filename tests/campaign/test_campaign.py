@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import Independent, Normal
 
 from sbi_active import (
     Campaign,
@@ -41,27 +40,6 @@ def test_ask_tell_update():
     assert trial.num_simulations == 300 + trial.design.num_simulations + spent
 
 
-def test_three_rounds_narrow_the_belief():
-    c, seen = campaign("asbi"), []
-    c.run(
-        lambda action: 0.7 * action + 0.1 * torch.randn(1),
-        num_rounds=3,
-        on_round=seen.append,
-    )
-    assert [t.index for t in seen] == [0, 1, 2]
-    assert seen[0].action.tolist() == [3.0]
-    # Noise .1 at an action of 3, and two further trials.
-    assert float((c.belief.sample((4_000,)) - 0.7).abs().median()) < 0.06
-    assert c.belief.diagnostics.num_simulations > 0
-
-
-def test_without_refinement_beliefs_are_chained():
-    c = campaign("asbi", refine=False, estimator="posterior")
-    c.run(lambda action: 0.7 * action, num_rounds=2)
-    assert c.belief.label == "chained approximation"
-    assert c.history[0].design.bound == "lower"
-
-
 def test_same_seed_same_campaign_whatever_the_global_generator():
     found = []
     for state in (1, 2):
@@ -71,12 +49,6 @@ def test_same_seed_same_campaign_whatever_the_global_generator():
         c.run(lambda action: 0.4 * action, num_rounds=2)
         found.append((float(c.belief.mean), [t.action.item() for t in c.history]))
     assert found[0] == found[1]
-
-
-def test_nsbi_draws_actions_at_random():
-    seeds = ({"seed": s} for s in range(12))
-    chosen = {float(campaign("nsbi", given=given).ask().action) for given in seeds}
-    assert len(chosen) == 3
 
 
 def run(mode, method):
@@ -131,14 +103,6 @@ def test_executed_actions_that_were_not_asked_for():
     c.update()
     assert c.state.processed == [0, 1, 2]  # in order
     assert abs(float(c.belief.mean) - 0.5) < 0.1
-
-
-def test_missing_trials_are_ignored():
-    c = campaign()
-    c.ask()
-    assert c.tell(status="missing").x is None
-    assert c.update() is PRIOR
-    assert c.ask().index == 1
 
 
 def test_an_error_of_the_real_system_leaves_the_trial_pending():
@@ -196,31 +160,6 @@ def test_other_errors():
     with pytest.raises(ValueError, match="expected action of shape"):
         c.tell([1.0], action=[1.0, 2.0])
     assert c.pending is not None
-
-
-def box(low, high, dtype=torch.float32):
-    return BoxUniform(*(torch.tensor(bound, dtype=dtype) for bound in (low, high)))
-
-
-@pytest.mark.parametrize(
-    ("prior", "text"),
-    [
-        (box([0.0, 1.0], [1.0, 1.0]), "got length within [1, 1]"),
-        (
-            Independent(Normal(torch.full((2,), 5.0), torch.tensor([1.0, 1e-9])), 1),
-            "got length within [5, 5]",
-        ),
-        (box([0.0, 1.0], [1.0, 0.0]), "expected a prior with draws in its support"),
-    ],
-)
-def test_priors_without_width(prior, text):
-    model = SimulatorModel(
-        lambda theta, action: theta[:, :1] * action,
-        noise=GaussianNoise(0.1),
-        parameter_names=["mass", "length"],
-    )
-    with pytest.raises(ValueError, match=re.escape(text)):
-        Campaign(model, prior, DiscreteActions([1.0]), options=OPTIONS)
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e20])

@@ -45,24 +45,6 @@ def test_surprise_and_log_score_are_those_of_the_predictive():
     assert score([60.0]).surprise == pytest.approx(1 / 2_001)
 
 
-def test_a_failure_is_as_surprising_as_it_is_rare():
-    def falls_off(theta, action):
-        return torch.where(theta > 1.2816, torch.nan, simulator(theta, action))
-
-    found = score([math.nan], falls_off)
-    # One in ten fails; binomial error of 2,000.
-    assert found.surprise == pytest.approx(0.1, abs=4 * math.sqrt(0.09 / 2_000))
-    assert found.log_score == pytest.approx(math.log(0.1), abs=0.3)
-    assert score([0.0], falls_off).surprise > 0.5
-    assert score([math.nan]).surprise == pytest.approx(1 / 2_001)
-
-
-def test_a_measurement_where_simulations_never_have_one():
-    found = score([1.0], lambda t, a: torch.full_like(t, torch.nan))
-    assert found.surprise == pytest.approx(1 / 2_001)
-    assert found.log_score == -math.inf
-
-
 def test_the_e_value_has_mean_one_and_is_continuous_at_one():
     mean, _ = quad(lambda p: math.exp(log_e_value(p)), 1e-12, 1, limit=400)
     assert mean == pytest.approx(1 - 1 / math.log(1e12), abs=0.01)

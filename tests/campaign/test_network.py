@@ -22,30 +22,6 @@ def one_round(c):
     return c.history[-1]
 
 
-def test_each_round_has_a_network_that_notes_and_diagnostics_ask():
-    c = campaign("asbi", network="each round")
-    trial = one_round(c)
-    assert trial.network_used_by == ("notes", "start", "diagnostics")
-    assert {"simulation", "training"} < {*trial.cpu_seconds}
-    assert "chained_loss" in c.belief.diagnostics.figures
-    c.posterior  # noqa: B018 # of the next round, which is trained once
-    assert "training" not in c.ask().cpu_seconds
-    assert c.ask().network_used_by == ("posterior", "notes")
-
-
-def test_on_demand_a_round_with_declared_noise_trains_none():
-    c = campaign("asbi")
-    for _ in range(2):
-        trial = one_round(c)
-        assert trial.network_used_by == ()
-        assert {*trial.cpu_seconds} == {"design", "scoring", "update"}
-        refined = c.belief.diagnostics.num_simulations
-        assert trial.num_simulations == trial.design.num_simulations + 200 + refined
-    # Noise .1 at the action 3, twice: deviation .024.
-    assert float(c.belief.mean) == pytest.approx(0.7, abs=0.03)
-    assert float(c.belief.variance.sqrt()) == pytest.approx(0.024, abs=0.008)
-
-
 def test_asking_for_the_posterior_trains_it_and_changes_nothing_else():
     asked, other = campaign("asbi"), campaign("asbi")
     ahead = asked.posterior  # before any trial

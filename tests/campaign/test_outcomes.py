@@ -6,7 +6,6 @@ import time
 import pytest
 import torch
 
-from sbi_active import RefinementOptions
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import Workers
 from tests.campaign.problem import campaign, noisy
@@ -31,42 +30,6 @@ def test_each_kind_of_outcome_counts():
     assert mean == pytest.approx(0.62, abs=0.05)
     c.tell(status="missing", action=[1.0])
     assert float(c.update().mean) == mean
-
-
-def test_a_campaign_of_invalid_trials_alone():
-    # Of an edge between 200 simulations the share is .94 to .98 by seed.
-    many = RefinementOptions(num_histories=800, num_effective=25)
-    c = campaign(simulator=falls_off, refinement=many)
-    for action in (2.0, 1.0):
-        assert c.tell([torch.nan], action=[action]).status == "invalid"
-        c.update()
-    draws = c.belief.sample((2_000,))
-    assert float((draws > 0.8).float().mean()) > 0.97
-    assert float(draws.mean()) == pytest.approx(0.9, abs=0.02)
-
-
-@pytest.mark.parametrize("refined", [True, False])
-def test_a_partly_observed_outcome_counts(refined):
-    def two(theta, action):
-        x = torch.cat([theta * action, theta], 1)
-        x = x + 0.1 * torch.randn_like(x)
-        lost = torch.rand(len(x), 1) < torch.tensor([0.0, 0.4])
-        return torch.where(lost, torch.nan, x)
-
-    c = campaign(simulator=two, refine=refined, num_simulations=500)
-    trial = c.tell([0.6, torch.nan], action=[2.0])
-    assert trial.status == "ok"
-    # Deviation .1 / 2 by the first number alone; the network is a small one.
-    assert float(c.update().mean) == pytest.approx(0.3, abs=0.03 if refined else 0.2)
-
-
-def test_an_outcome_the_network_never_saw_is_said():
-    c = campaign(simulator=noisy, refine=False)
-    c.tell(status="invalid", action=[1.0])
-    with pytest.warns(UserWarning, match="has never seen an outcome like"):
-        belief = c.update()
-    assert c.history[0].information_gained == pytest.approx(0, abs=1e-6)
-    assert belief.label == "unchanged"
 
 
 class Faulty:

@@ -7,7 +7,6 @@ from sbi_active import Campaign, CampaignOptions, GaussianNoise, SimulatorModel
 from sbi_active.actions import SignalActions
 from sbi_active.actions.waveforms import step
 from sbi_active.campaign.options import CampaignDetails
-from sbi_active.criticism import Criticism, Trials
 from tests.campaign.sizes import REFINEMENT
 
 GRID = torch.linspace(0, 1, 51)
@@ -73,23 +72,3 @@ def test_a_campaign_asks_for_signals_and_learns():
     assert bool(((mean - TRUTH[0]).abs() < 4 * sd + 0.01).all())
     assert bool((sd < torch.tensor([0.1, 0.02])).all())
     assert campaign.health == "ok"
-
-
-def test_recorded_inputs_take_the_place_of_the_signals():
-    action = SPACE.sample((6,), seed=1)
-    commanded = SPACE.inputs(action)["voltage"]
-    measured = 0.8 * commanded  # by a voltmeter
-    keywords = {"sample_times": TIMES, "input_times": GRID}
-    x = speed(
-        TRUTH.expand(6, -1),
-        None,
-        inputs={"voltage": measured},
-        times=TIMES.expand(6, -1),
-    )
-    trials = Trials(action, x, inputs={"voltage": measured}, **keywords)
-    loop = Criticism(MODEL, PRIOR, trials, actions=SPACE)
-    assert loop.trace().verdict == "none"
-    posterior = loop.rivals.fit().evidence.draws
-    assert abs(posterior[:, 0].mean() - 3.0) < 0.05
-    assert loop.actions is SPACE
-    assert loop.equivalent() == ()

@@ -142,14 +142,6 @@ def test_no_simulation_beyond_the_budget():
     assert torch.allclose(mean, truth[0], atol=0.15)
 
 
-def test_a_pool_tells_of_all_parameters():
-    model = SimulatorModel(slide, noise=GaussianNoise(0.05))
-    c = Campaign(model, PRIOR, DiscreteActions([0.5]), options={"max_simulations": 300})
-    with pytest.raises(ValueError, match="'theta' with max_simulations"):
-        c.ask(target=lambda theta: theta[:, 0])
-    assert c.pending is None
-
-
 def test_it_goes_on_where_it_was_left(tmp_path):
     model = SimulatorModel(slide, noise=GaussianNoise(0.05))
     actions = DiscreteActions([0.5, 1.0])

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import pytest
 import torch
 
 from sbi_active import Campaign, StopRules
@@ -71,14 +70,6 @@ def test_where_nothing_is_open_the_trial_is_for_the_parameters():
     tell(c, shift=0.0, actions=(2.0, -2.0) * 6)
     assert c.health == "ok"
     assert c.ask().target == "theta"
-
-
-def test_random_actions_stay_random():
-    c = campaign(method="nsbi")
-    tell(c, actions=(2.0, -2.0, 2.0))
-    assert c.ask().target == "random"
-    with pytest.raises(ValueError, match="expected target 'auto' or 'theta', since"):
-        campaign(method="nsbi").ask(target="model")
 
 
 def run(c, slope=0.5, shift=0.0, num_rounds=6):

@@ -1,12 +1,9 @@
-from pathlib import Path
-
 import pytest
 import torch
 
 from sbi_active import Bank
 from sbi_active.cli import main, simulators
 from sbi_active.tasks import get_task
-from tests.simulation.bank.filled import remove
 
 MODULE = """
 import torch
@@ -68,25 +65,3 @@ def test_inspect_shows_what_a_bank_holds(robot, capsys):
     assert f"rows: {counts}; on disk: 0.0" in printed
     assert "checksums: ok" in printed
     assert "drawn from: prior" in printed
-
-
-def test_inspect_names_a_damaged_file(capsys):
-    build("bank", 300, task="numerical")
-    remove(Path("bank"), 1)
-    path = Path("bank", "store.db")
-    assert main(["bank", "inspect", "bank"]) == 1
-    printed = capsys.readouterr().out
-    assert "checksums: NOT ok" in printed
-    assert str(path) in printed
-
-
-def test_another_simulator_is_refused(robot, capsys):
-    build("bank", 10, task="numerical")
-    names = {k: f"{robot}:{k}" for k in ("simulator", "prior", "actions")}
-    assert build("bank", 20, **names) == 2
-    assert "expected the simulator of the bank bank; got another" in (
-        capsys.readouterr().err
-    )
-    assert build("bank", 20, task="numerical", option="variant=sinh") == 2
-    assert main(["bank", "inspect", "nowhere"]) == 2
-    assert "got no nowhere/store.db" in capsys.readouterr().err

@@ -18,7 +18,6 @@ ODD = """
 import ctypes, os, sys, torch
 print("imported")
 NUMBER = 3.0
-listed = [1, 2]
 
 
 def loud(theta, action):
@@ -36,10 +35,6 @@ def stopped(theta, action):
     raise KeyboardInterrupt
 
 
-def left(theta, action):
-    sys.exit(3)
-
-
 def short(theta, action):
     return theta[:1, :1]
 
@@ -50,40 +45,29 @@ def effects():
 FILES = {
     "odd.py": ODD.encode(),
     "divides.py": b"1 / 0",
-    "leaves.py": b"raise SystemExit(3)",
     "halves.py": b"def f(:",
     "bom.csv": b"\xef\xbb\xbf0.84\n",
     "named.csv": b"x_height\n0.84\n",
     "unit.csv": b"0.84 m\n",
     "semicolon.csv": b"0,84;1\n",
     "empty.csv": b"",
-    "utf16.csv": "0.84\n".encode("utf-16"),
     "nul.csv": b"0.8\x004\n",
-    "heading.csv": b"distance\n\n",
-    "quote.csv": b'"0.84\n',
     "nan.csv": b"x\nnan\n",
     "two.csv": b"0.1,0.2\n",
     "seed.toml": b'seed = "x"',
-    "date.toml": b"noise = 2026-01-01",
-    "table.toml": b"[noise]\na = 1",
-    "flag.toml": b"noise = true",
     "list.toml": b"method = [1, 2]",
     "trust.toml": b"trust = true",
     "half.toml": b"seed = ",
-    "bytes.toml": b"\xff\xfe",
     "noize.toml": b"noize = 0.1",
 }
 OF = ["init", "new", *BOX, *SMALL, "--simulator"]
 SLED, ASK = [*OF, "sled.py:slide"], ["--actions", "1,2"]
-CHECK = ["check", "sled.py:slide", *BOX]
 
 #: What has to be told apart by its exit status, and a part of the error's text.
 CALLS = [
     # Numbers.
     (0, "", "tell camp 1e-20 --json"),
     (0, "", "correct camp 0 -2e-1 --json"),
-    (0, "", "correct camp 0 --action 2 --json"),
-    (0, "", "tell camp --missing --json"),
     *(
         (2, "expected", ["tell", "camp", x])
         for x in ("", "nan", "inf", "1e39", "1e-50", "0,84", "1_000", "0.84 m", "0x1")
@@ -93,11 +77,7 @@ CALLS = [
         for a in ("", "inf", "1,2")
     ),
     (2, "expected the index of", "tell camp 1 --trial 99 --action 1"),
-    (2, "expected 1 numbers", "tell camp 1 2"),
     (2, "got several; write one", "tell camp 1 --file bom.csv"),
-    (2, "got several; write one", "tell camp --invalid --missing"),
-    (2, "expected the index of", "tell camp 1 --trial -1"),
-    (2, "expected the index of", "correct camp 7 0.1"),
     (2, "expected 1 numbers", "correct camp 0 --reason typo"),
     (0, "", ["withdraw", "camp", "0", "--reason", "\n\x1b[31m", "--json"]),
     # Files.
@@ -113,28 +93,20 @@ CALLS = [
     (2, "", ["status", "a\0b"]),
     (2, "choose another folder", [*INIT, "sled.py:slide"]),
     (2, "No such file", "report camp --out no/such/folder/page.html"),
-    (0, "", "report camp --json"),
     (0, "", "repair camp --json"),
     (2, "expected --simulator or --task", "criticize bom.csv"),
     # A campaign has its own of these.
     (2, "for a campaign", "criticize camp --noise 0.1"),
-    (2, "for a campaign", "criticize camp --task numerical"),
     (2, "Not a directory", "criticize camp --out bom.csv/report"),  # said at once
     (2, "no_such_module", "criticize camp --effects no_such_module:effects"),
     (1, "no library", "criticize camp --effects odd.py:effects"),
-    (2, "expected a list of Effect", "criticize camp --effects odd.py:listed"),
     # Spaces.
     *(
         (2, text, [*SLED, "--actions", *spec.split()])
         for text, spec in (
             ("at most 100000 actions", "1:2:1000000000"),
-            ("at most 100000 actions", "1:2:1000 1:2:1000"),
             ("write, say, 0:5:11", "1:2:0"),
-            ("write, say, 0:5:11", "1:2:3:4"),
-            ("expected", "2:1"),
-            ("", "nan:1"),
             ("expected finite numbers", "1,,2"),
-            ("No module named 'a'", "a:b"),
             ("expected a ActionSpace", "odd.py:NUMBER"),
         )
     ),
@@ -144,12 +116,9 @@ CALLS = [
         for text, words in (
             ("expected finite", "--noise nan"),
             ("expected --noise > 0", "--noise -1"),
-            ("names and units, one an entry", "--names a,b"),
             ("expected a Distribution", "--prior odd.py:NUMBER"),
             ("low below high", "--theta-low 1,1"),
-            ("expected num_simulations", "--num-simulations 0"),
             ("expected num_workers", "--set workers.num_workers=0"),
-            ("expected time_limit", "--set workers.time_limit=-1"),
             ("is not a valid integer", "--seed 1.5"),
         )
     ),
@@ -164,22 +133,15 @@ CALLS = [
         (2, text, [*OF, name, *ASK])
         for text, name in (
             ("expected MODULE:NAME", "sled"),
-            ("expected MODULE:NAME", ":slide"),
             ("under 'none' in 'sled'", "sled.py:none"),
-            ("expected a file; got none", "none.py:fn"),
             ("expected a function", "odd.py:NUMBER"),
             ("got ZeroDivisionError", "divides.py:f"),
-            ("got SystemExit", "leaves.py:f"),
             ("got SyntaxError", "halves.py:f"),
             ("one row a parameter set", "odd.py:short"),
         )
     ),
     (1, "by zero", [*OF, "odd.py:broken", *ASK]),
-    (1, "", [*OF, "odd.py:left", *ASK]),
     (130, "interrupted", [*OF, "odd.py:stopped", *ASK]),
-    (1, "", "check odd.py:broken --theta-low 0 --theta-high 1 --actions 1,2"),
-    (2, "at most 100000 actions", [*CHECK, "--actions", "1:2:1000000000"]),
-    (2, "got no nowhere/store.db", "bank inspect nowhere"),
     (2, "expected what 'numerical' needs", "run numerical --out o --option target=2"),
     (2, "expected NAME=VALUE", "run numerical --out o --option variant"),
 ]
@@ -276,7 +238,7 @@ def test_a_locale_that_is_not_utf8(camp):
         ["tell", "new", "0.3", "--action", "1"],
         ["correct", "new", "0", "0.4", "--reason", "µ", "--json"],
     ):
-        process = run(words, stdout=subprocess.PIPE, env=env, flags=["-O"])
+        process = run(words, stdout=subprocess.PIPE, env=env)
         shown, error = process.communicate()
         assert process.returncode == 0, error
     answer = read(shown)

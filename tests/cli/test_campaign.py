@@ -7,7 +7,7 @@ import arviz as az
 import pytest
 
 from sbi_active.cli import main, problem
-from tests.cli.sled import SIMULATOR, SMALL, read
+from tests.cli.sled import SMALL, read
 
 CONFIG = """
 simulator = "sled.py:slide"
@@ -55,17 +55,6 @@ def test_options_of_a_file(camp, capsys):
     assert (told["names"], told["units"]) == (["speed"], ["m/s"])
 
 
-def test_another_place_of_the_simulator(camp, made, capsys):
-    Path("sled.py").unlink()
-    Path("camp/command.json").unlink()
-    assert main(["update", "camp"]) == 2
-    assert "as in --simulator" in capsys.readouterr().err
-    words = ["--simulator", f"{made / 'sled.py'}:slide"]
-    # Its noise was in the file, so that it is another one, and told to be.
-    assert main(["update", "camp", *words]) == 2
-    assert "simulator_changed=True" in capsys.readouterr().err
-
-
 TAPE = """
 from torch.distributions import Normal
 from sbi_active.criticism import Effect
@@ -109,15 +98,3 @@ def test_a_missing_effect_is_found_and_adopted(capsys, monkeypatch, tmp_path):
     page = (tmp_path / "camp" / "report.html").read_text()
     assert "tape slipped" in page
     assert "http" not in page.replace("http-equiv", "")
-
-
-def test_another_simulator_is_taken_by_the_command_line(camp, made, capsys):
-    assert main(["update", "camp"]) == 0
-    text = SIMULATOR.replace("2 * 9.81", "G").replace("\n\n\n", "\n\nG = 19.0\n\n", 1)
-    Path("other").mkdir()
-    Path("other/sled.py").write_text(text)
-    del sys.modules["sled"]
-    words = ["update", "camp", "--simulator", "other/sled.py:slide"]
-    assert main(words) == 2
-    assert "simulator_changed=True" in capsys.readouterr().err
-    assert main([*words, "--simulator-changed"]) == 0

@@ -1,8 +1,6 @@
 """``sbi-active criticize``: from a file to a report."""
 
 import functools
-import json
-import math
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -66,19 +64,6 @@ def test_a_file_gives_a_report(capsys):
         assert file.read().strip() in printed
 
 
-def test_a_held_out_row_in_another_unit_is_named(capsys):
-    measure(last=100.0)
-    options = [*OPTIONS, "--effects", "my_robot:effects", "--out", "found"]
-    assert run("--simulator", "my_robot:distance", *options, "--json") == 0
-    found = json.loads(capsys.readouterr().out)
-    first = found["line"]
-    assert "SA514" in [code for code, _ in found["warnings"]]
-    assert first.startswith("Verdict: drag (P")  # whatever that row says
-    assert "held-out trial 10 is far outside it" in first
-    page = Path("found/report.html").read_text()
-    assert page.count("eld-out trial 10 is far outside") >= 3
-
-
 SLIDE = """
 import torch
 from torch.distributions import HalfNormal
@@ -100,7 +85,6 @@ effects = [
                **value, "drag": phi.clamp(min=1e-6)})
 ]
 """
-COLUMNS = ["trial=push", "time=time_ms", "x=x_place", "action=action_speed"]
 
 
 def film(module="my_slide"):
@@ -136,15 +120,6 @@ def compared(monkeypatch):
     return calls
 
 
-def test_a_task_brings_prior_noise_and_actions(compared):
-    rows = [f"{a},{-3 * math.exp(3 - a) + a},fit" for a in (0, 3, 1, 4, 2)]
-    write([*rows, "5,4.6,held out"], "action_xi,x_y,role")
-    assert run("--task", "numerical") == 0
-    assert compared[0].trials.role == ["fit"] * 5 + ["held out"]
-    assert compared[0].actions.action_dim == 1
-    assert compared[0].simulator.noise is not None
-
-
 @pytest.mark.parametrize(
     ("rows", "options", "message"),
     [
@@ -158,37 +133,6 @@ def test_what_cannot_be_compared(rows, options, message, capsys):
     write(rows)
     assert run("--simulator", "my_robot:distance", *options) == 2
     assert message in capsys.readouterr().err
-
-
-def test_what_a_table_of_samples_needs_of_a_simulator(capsys):
-    film("my_other_slide")
-    with open("my_other_slide.py", "a") as file:
-        file.write("\ndef fixed(theta, action):\n    return theta * action\n")
-    command = ["criticize", "trials.csv", "--columns", *COLUMNS]
-    options = [*OPTIONS[:2], "--noise", "0.003"]
-    assert main([*command, "--simulator", "my_other_slide.py:fixed", *options]) == 2
-    assert "a simulator that takes times=, shape (n, k)" in capsys.readouterr().err
-
-
-def test_units_that_are_not_the_task_s(capsys):
-    rows = ["0,1,1,5", "0,2,1,5", "1,1,1,4", "1,2,1,4.5"]
-    write(rows, "trial,time,action_area_per_mass[cm^2/g],x_h[m]")
-    assert main(["criticize", "trials.csv", "--task", "ball_drops"]) == 2
-    printed = capsys.readouterr().err
-    assert "expected actions in m^2/kg; got area_per_mass [cm^2/g]" in printed
-
-
-def test_pairs_that_are_none(capsys):
-    write(["1,2", "2,3"])
-    assert run("--task", "numerical", "--columns", "x") == 2
-    assert "expected NAME=VALUE; got 'x'" in capsys.readouterr().err
-
-
-def test_notes_on_a_table_are_printed(capsys):
-    rows = [f"{a},{-3 * math.exp(3 - a) + a}" for a in (0, 3, 1)]
-    write([*rows, "4,"], "action_xi,x_y")
-    assert run("--task", "numerical", "--noise", "0") == 2
-    assert "note: 1 of 4 cells of column x_y" in capsys.readouterr().err
 
 
 MOTOR = """
@@ -283,26 +227,3 @@ def test_a_problem_in_python_and_options_in_another_file(compared):
 PROBLEM_PY = """
 simulator = place
 """
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda d: [p.unlink() for p in d.glob("*.csv")], "expected recordings in"),
-        (lambda d: (d / "problem.toml").unlink(), "expected --simulator or --task"),
-        (
-            lambda d: (d / "problem.toml").write_text('simulater = "a:b"'),
-            "got 'simulater' in",
-        ),
-        (
-            lambda d: (d / "push 2.csv").write_text("time_ms,action_speed\n1,2\n"),
-            "same columns in each recording; got time_ms",
-        ),
-    ],
-)
-def test_a_folder_that_is_not_understood(capsys, change, message):
-    folder, _ = folder_of_films()
-    (folder / "problem.toml").write_text(PROBLEM)
-    change(folder)
-    assert main(["criticize", str(folder)]) == 2
-    assert message in capsys.readouterr().err

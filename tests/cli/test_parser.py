@@ -47,16 +47,10 @@ def test_nothing_heavy_is_imported(arguments, status, text):
     [
         ("", "Missing command."),
         ("run numerica --out d", "is not one of 'numerical'"),
-        ("run numerical --method abc", "'abc' is not one of 'asbi'"),
-        ("run numerical", "Missing option '--out'"),
         ("run numerical --out d --rounds 0", "Invalid value for '--rounds': 0"),
-        ("check --task numerical --rows 1.5", "Invalid value for '--rows': '1.5'"),
         ("correct c 0 --reason --json", "'--reason' requires an argument"),
-        ("serve", "Missing argument 'DIR'"),
         ("run numerical --out d --set sized=3", "expected a setting among"),
-        ("run numerical --out d --set details.sized=3", "expected a setting among"),
         ("run numerical --out d --set stop=3 seed", "expected NAME=VALUE; got 'seed'"),
-        ("run numerical --out d --set num_simulations=no", "num_simulations"),
     ],
 )
 def test_a_slip_is_named(line, text, capsys):
@@ -68,9 +62,7 @@ def test_a_slip_is_named(line, text, capsys):
     ("line", "kind", "text"),
     [
         ("fly camp", "NoSuchCommand", "No such command 'fly'"),
-        ("status", "MissingParameter", "Missing argument 'DIR'"),
         ("tell camp --faster", "NoSuchOption", "No such option '--faster'"),
-        ("withdraw camp one", "BadParameter", "'one' is not a valid integer"),
         ("status nowhere", "ValueError", "expected a campaign; got no nowhere"),
         ("status \ud800", "UnicodeEncodeError", "surrogates not allowed"),
     ],
@@ -82,25 +74,6 @@ def test_a_slip_is_json_as_well(line, kind, text, capfd):
     assert (error["type"], error["status"]) == (kind, 2)
     assert text in error["message"]
     assert shown.err.startswith("sbi-active: ")
-
-
-@pytest.mark.parametrize(
-    ("raised", "status", "text"),
-    [
-        (KeyboardInterrupt, 130, "interrupted"),
-        (RuntimeError("odd"), 1, "odd"),
-        (OSError("full"), 2, "full"),
-    ],
-)
-def test_statuses_of_errors(raised, status, text, capsys, monkeypatch):
-    def fail(*_, **__):
-        raise raised
-
-    monkeypatch.setattr("sbi_active.cli.problem.open_campaign", fail)
-    assert main(["update", "camp", "--json"]) == status
-    shown = capsys.readouterr()
-    assert read(shown.out)["error"]["status"] == status
-    assert text in shown.err
 
 
 def test_names_are_those_of_the_library():
@@ -121,20 +94,3 @@ def test_a_shell_completes(line, offered):
     env["COMP_CWORD"] = str(line.count(" "))
     shown, _ = run([], env=env, stdout=subprocess.PIPE).communicate()
     assert [row.partition(",")[2] for row in shown.splitlines()] == [offered]
-
-
-def test_the_words_for_a_shell_are_printed(capsys, monkeypatch):
-    monkeypatch.setenv("_SBI_ACTIVE_COMPLETE", "zsh_source")
-    assert main([]) == 0
-    assert "_SBI_ACTIVE_COMPLETE" in capsys.readouterr().out
-
-
-def test_of_an_option_given_twice_the_last_counts_but_pairs_add_up(capsys):
-    words = ["check", "--task", "numerical", "--actions", "1:2", "--actions=a:b", "--x"]
-    assert main(words) == 2
-    assert "No such option '--x'" in capsys.readouterr().err
-    options = "--option variant=sinh --option sized=3 --actions 1:2 --actions=1:2:0"
-    assert main(["check", "--task", "numerical", *options.split()]) == 2
-    assert "{'variant': 'sinh', 'sized': 3}" in capsys.readouterr().err
-    assert main(["check", "--task", "numerical", *options.split()[4:]]) == 2
-    assert "got '1:2:0'" in capsys.readouterr().err

@@ -1,5 +1,3 @@
-import sys
-
 import pandas as pd
 import pytest
 from matplotlib import image
@@ -44,15 +42,3 @@ def test_run_writes_table_and_figure(tmp_path, capsys):
 def test_bad_names_list_the_valid_ones(arguments, text, tmp_path, capsys):
     assert main([*arguments, "--out", str(tmp_path)]) == 2
     assert text in capsys.readouterr().err
-
-
-def test_what_a_task_needs_is_named(monkeypatch, tmp_path, capsys):
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-    assert main(["run", "box_collision", "--out", str(tmp_path)]) == 2
-    assert "pip install 'sbi-active[mujoco]'" in capsys.readouterr().err
-
-
-def test_data_elsewhere_are_named_by_an_option(tmp_path, capsys):
-    arguments = ["run", "servo_pendulum", "--option", f"data={tmp_path}"]
-    assert main([*arguments, "--out", str(tmp_path)]) == 2
-    assert "set --option data=" in capsys.readouterr().err

@@ -73,21 +73,6 @@ def test_reading_imports_nothing(mine, words):
     assert not {"sled", "mine"} & {*sys.modules}
 
 
-def test_what_is_read_of_a_prior_that_is_a_program(mine, capsys):
-    capsys.readouterr()
-    assert main(["status", "camp", "--json"]) == 0
-    (first, second) = json.loads(capsys.readouterr().out)["belief"][
-        "parameters"
-    ].values()
-    assert first == {
-        "mean": pytest.approx(0.6),
-        "sd": pytest.approx(0.8 / 12**0.5),
-    }
-    assert second["mean"] == pytest.approx(0.5)
-    assert main(["export", "camp", "--netcdf", "out.nc"]) == 2  # no density of draws
-    assert not mine.exists()
-
-
 @pytest.mark.parametrize(
     ("how", "command"),
     [

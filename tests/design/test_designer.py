@@ -1,8 +1,7 @@
 import pytest
 import torch
 
-from sbi_active import DiscreteActions, InformationGainDesigner, RandomDesigner
-from sbi_active.design.elimination import Race
+from sbi_active import DiscreteActions, InformationGainDesigner
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.tasks.numerical.exact import ExactPosterior
 from sbi_active.tasks.numerical.task import NumericalTask
@@ -57,39 +56,6 @@ def test_the_choice_and_the_report_use_separate_simulations():
         for seed in range(4)
     ]
     assert min(best) > exact
-
-
-def test_paired_errors_are_smaller_where_candidates_are_alike():
-    close = DiscreteActions([1.9, 2.0])
-
-    def common_noise(theta, action):
-        generator = torch.Generator().manual_seed(0)
-        return action * theta + torch.randn(theta.shape, generator=generator)
-
-    def two_seeds(theta, action):  # the designer checks that x depends on the seed
-        return common_noise(theta, action) + 1e-3 * torch.randn_like(theta)
-
-    designer = InformationGainDesigner(close, num_samples=1_024, estimator="posterior")
-    design = designer.select(ExactModel(), two_seeds, seed=0)
-    other = 1 - design.index
-    paired = design.difference_standard_error
-    assert paired[design.index] == 0
-    assert paired[other] < 0.5 * design.standard_error[other]
-
-
-def test_probability_best_follows_the_central_limit():
-    generator = torch.Generator().manual_seed(1)
-    noise = torch.randn(2, 400, generator=generator, dtype=torch.float64)
-    noise = (noise - noise.mean(1, keepdim=True)) / noise.std(1, keepdim=True)
-    difference = 2 / 400**0.5  # two standard errors of one mean
-    contributions = noise + torch.tensor([[0.0], [difference]])
-    variance = float((noise[1] - noise[0]).var())
-    expected = torch.distributions.Normal(0, variance**0.5).cdf(torch.tensor(2.0))
-    race = Race.run([*contributions], 0)
-    assert race.leader == 1
-    assert float(race.probability_best[1]) == pytest.approx(
-        float(expected), abs=4 * (0.25 / 1_000) ** 0.5
-    )
 
 
 def test_named_parameters_are_the_target():
@@ -211,14 +177,6 @@ def test_leading_actions_get_more_simulations():
     assert small.num_simulations <= 45
 
 
-def test_equal_actions_stop_where_nothing_is_lost():
-    equal = DiscreteActions(torch.full((3,), 1.0))
-    designer = InformationGainDesigner(equal, num_samples=40_000, estimator="posterior")
-    design = designer.select(ExactModel(), simulator, seed=0)
-    assert design.stopped == "difference negligible"
-    assert design.num_simulations == 60_000
-
-
 class Exact(torch.distributions.Distribution):
     """The numerical task's exact posterior as a belief."""
 
@@ -259,17 +217,6 @@ def test_regret_on_the_numerical_task(variant, trials):
     assert sum(errors) / len(errors) <= 0.15
 
 
-def test_random_designs_are_uniform_and_seeded():
-    designer = RandomDesigner(ACTIONS)
-    chosen = torch.stack([designer.select(seed=s).action for s in range(800)])
-    share = (chosen == VALUES).double().mean(0)
-    assert ((share - 0.25).abs() < 4 * (0.25 * 0.75 / 800) ** 0.5).all()
-    design = designer.select(seed=3)
-    assert torch.equal(design.action, designer.select(seed=3).action)
-    assert design.expected_information_gain.isnan().all()
-    assert design.num_simulations == 0
-
-
 def test_errors():
     with pytest.raises(ValueError, match="expected num_samples >= 8"):
         InformationGainDesigner(ACTIONS, num_samples=2)
@@ -288,9 +235,3 @@ def test_errors():
         InformationGainDesigner(ACTIONS, estimator="knn")
     with pytest.raises(ValueError, match="expected a budget >= 32"):
         designer.select(ExactModel(), simulator, budget=31)
-
-
-def test_without_elimination_all_actions_get_the_same():
-    designer = InformationGainDesigner(ACTIONS, estimator="posterior", eliminate=False)
-    every = designer.select(ExactModel(), simulator, budget=800, seed=0)
-    assert every.num_samples.tolist() == [200] * 4

@@ -1,11 +1,9 @@
 """Batches and pending trials against the linear-Gaussian closed form."""
 
-import pytest
 import torch
 
 from sbi_active import (
     AutocorrelatedNoise,
-    BoxActions,
     DiscreteActions,
     GaussianNoise,
     InformationGainDesigner,
@@ -33,16 +31,6 @@ def joint(*actions):
 
 
 MODEL = SimulatorModel(along, noise=GaussianNoise(1.0))
-
-
-class Likelihood:
-    """The exact likelihood of one outcome."""
-
-    exact_likelihood = True
-
-    def log_likelihood(self, x, theta, action):
-        normal = torch.distributions.Normal(along(theta, action), 1.0)
-        return normal.log_prob(x).sum(1)
 
 
 def select(
@@ -91,30 +79,6 @@ def test_pending_trials_count_as_known():
     assert float(third.expected_information_gain.max()) < 1.0  # both directions known
 
 
-def test_a_repeat_tells_half_a_bit_more():
-    """Noise of pending trials is their own: the same action again is no copy."""
-    only = DiscreteActions([0.0])
-    design = select(only, pending=torch.tensor([[0.0]]))
-    exact = joint(0.0, 0.0) - joint(0.0)
-    gain, error = design.expected_information_gain[0], design.standard_error[0]
-    assert abs(float(gain) - exact) < 4 * float(error) + 0.05
-
-
-@pytest.mark.parametrize("model", [None, Likelihood()])
-def test_undeclared_noise_and_likelihoods_have_joint_information(model):
-    def plain(theta, action):
-        return along(theta, action) + torch.randn(len(theta), 1)
-
-    estimator = "likelihood" if model is not None else "auto"
-    design = select(
-        model=model, simulator=plain, estimator=estimator, pending=torch.tensor([0.0])
-    )
-    assert design.action.tolist() == [1.0]
-    given = torch.tensor([joint(0.0, float(a)) - joint(0.0) for a in ANGLES.values])
-    distance = (design.expected_information_gain - given).abs()
-    assert (distance < 4 * design.standard_error + 0.2).all()
-
-
 def test_joint_noise_keeps_its_time_axis():
     def constant(theta, action):
         return along(theta, action)[:, :, None].expand(-1, 3, 1)
@@ -128,12 +92,3 @@ def test_joint_noise_keeps_its_time_axis():
     exact = 0.5 * float(logdet[0] - logdet[1])
     gain = float(design.expected_information_gain[design.index])
     assert abs(gain - exact) < 4 * float(design.standard_error[design.index]) + 0.1
-
-
-def test_a_batch_in_a_continuous_space():
-    design = select(BoxActions(0.0, 1.0), num_actions=2, num_samples=400)
-    assert design.action.shape == (2, 1)
-    first, second = design.action[:, 0].tolist()
-    grid = torch.linspace(0, 1, 101).tolist()
-    assert joint(0.0) - joint(first) < 0.1
-    assert max(joint(first, b) for b in grid) - joint(first, second) < 0.1

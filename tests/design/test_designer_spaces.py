@@ -38,31 +38,6 @@ def test_regret_on_the_numerical_task():
     assert design.name == "xi"
 
 
-def bumps(action):
-    """Known information with two optima in the first tool, the best in the second."""
-    x = action[:, 0]
-    first = 1.5 * torch.exp(-50 * (x - 0.2) ** 2) + 1.2 * torch.exp(
-        -50 * (x - 0.8) ** 2
-    )
-    second = 2.0 * torch.exp(-50 * (x - 0.55) ** 2)
-    return 0.1 + torch.where(action[:, 1] == 7.0, second, first)
-
-
-def test_the_best_category_and_place_of_a_known_function():
-    def mean(theta, action):
-        return theta * torch.expm1(2 * bumps(action)).sqrt()[:, None]
-
-    model = SimulatorModel(mean, noise=GaussianNoise(1.0))
-    prior = torch.distributions.MultivariateNormal(torch.zeros(1), torch.eye(1))
-    space = MixedActions(BoxActions(0.0, 1.0), DiscreteActions([3.0, 7.0]))
-    for seed in range(1):
-        design = InformationGainDesigner(space, num_samples=800).select(
-            None, model, belief=prior, seed=seed
-        )
-        assert float(design.action[1]) == 7.0
-        assert 2.1 - float(bumps(design.action[None])) < 0.05
-
-
 def test_which_search():
     lists = MixedActions(DiscreteActions([1.0, 2.0]), DiscreteActions([0.0, 1.0]))
     designer = InformationGainDesigner(lists, num_samples=100)

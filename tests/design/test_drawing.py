@@ -65,13 +65,6 @@ def test_two_entries_make_a_map_with_every_candidate_and_the_chosen_one():
     assert [a.get_ylabel() for a in ax.figure.axes][1:] == ["EIG (lower bound) [nats]"]
 
 
-def test_all_of_a_batch_are_marked():
-    made = design(BOX)
-    ax = design(BOX, action=made.candidates[[1, 4]]).plot()
-    chosen = [line.get_xydata()[0] for line in ax.lines]
-    np.testing.assert_allclose(chosen, made.candidates[[1, 4]])
-
-
 @pytest.mark.parametrize("own", [BoxActions(0.0, 1.0, names=["speed"]), BOX])
 def test_each_category_has_a_panel(own):
     made = design(MixedActions(own, TOOLS))
@@ -107,11 +100,3 @@ def test_more_entries_are_bars_in_order_with_the_chosen_one(dim):
     assert widths[-1] == pytest.approx(float(made.expected_information_gain.max()))
     assert widths[0] == pytest.approx(float(made.expected_information_gain.min()))
     assert ax.get_title() == "red: chosen; 15 further candidates"
-
-
-def test_it_is_drawn_where_it_is_told_to():
-    figure, axes = plt.subplots(1, 2)
-    made = design(MixedActions(BOX, TOOLS))
-    assert made.plot(axes[1]) is axes[1]
-    assert not axes[0].child_axes
-    figure.savefig("panels.png")

@@ -6,7 +6,6 @@ import pytest
 import torch
 from torch.distributions import MultivariateNormal, Normal
 
-from sbi_active import GaussianNoise, StudentTNoise
 from sbi_active.design import LikelihoodGain
 from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.design.outcomes import (
@@ -31,25 +30,6 @@ def simulated(action, theta, seed, noise=None, missing=None):
     mean = action[:, None] * theta
     x = mean + torch.randn(mean.shape, generator=generator)
     return CandidateSimulations(theta, action, x, mean, noise, missing=missing)
-
-
-def test_a_row_is_missing_where_any_of_its_outcomes_is():
-    theta, action = torch.zeros(3, 1), torch.tensor([[1.0], [2.0]])
-    lost = torch.tensor([[True, False, False], [False, False, False]])
-    both = simulated(action, theta, 0, missing=lost)
-    joint = join_outcomes(both, simulated(action, theta, 1, missing=lost.flip(1)))
-    assert joint.missing.tolist() == [[True, False, True], [False, False, True]]
-
-
-@pytest.mark.parametrize("noise", [GaussianNoise(2.0), StudentTNoise(2.0, 3.0)])
-def test_the_noise_of_joint_outcomes_is_independent(noise):
-    theta, action = torch.zeros(4, 1), torch.tensor([[1.0], [2.0]])
-    joint = join_outcomes(
-        simulated(action, theta, 0, noise), simulated(action, theta, 1, noise)
-    )
-    x, mean = joint.x[0], joint.mean[0]
-    parts = [noise.log_prob(x[:, k], mean[:, k]) for k in range(3)]
-    assert torch.allclose(joint.noise.log_prob(x, mean), sum(parts))
 
 
 def test_what_an_action_tells_beyond_others_has_a_closed_form():

@@ -16,11 +16,6 @@ from sbi_active import (
 )
 from sbi_active.design import EntropyGain, NestedGain, PosteriorGain
 from sbi_active.design.estimators.base import CandidateSimulations, standard_error
-from sbi_active.design.estimators.presence import (
-    presence_information,
-    presence_notes,
-    random_presence,
-)
 from sbi_active.simulation import SimulatorModel
 from tests.design.fragile import ACTIONS, NOISE, PRIOR, Fragile
 
@@ -115,28 +110,6 @@ def test_missing_rows_are_dropped_and_not_invalid():
         assert ((mean - world.exact()["counted"]).abs() > 6 * error).any()
 
 
-def test_what_validity_alone_tells():
-    for world in (LUCKY, LUCKIER):
-        rows = world.simulations(2_000, 0)
-        assert random_presence(rows).all()
-        gain = presence_information(rows)
-        error = gain.std(1) / gain.shape[1] ** 0.5
-        exact = world.exact()["validity"]
-        assert ((gain.mean(1) - exact).abs() < 3 * error).all()
-    # what a replicate's validity tells is a blunter bound: I(v'; v) < I(theta; v) / 2
-    pair = rows.x[..., 0].isfinite(), rows.replicate[..., 0].isfinite()
-    shared = torch.zeros(len(ACTIONS)).double()
-    for v in (pair[0], ~pair[0]):
-        for w in (pair[1], ~pair[1]):
-            p, q, joint = (m.double().mean(1) for m in (v, w, v & w))
-            shared += joint * (joint / (p * q)).log()
-    assert (shared < 0.5 * exact).all()
-    assert "random given the parameters at 4 of 4 actions" in presence_notes(rows)[0]
-    certain = CERTAIN.simulations(2_000, 0)
-    assert not random_presence(certain).any()
-    assert presence_notes(certain) == []
-
-
 def test_the_designer_tells_luck_from_a_function_of_the_parameters():
     designer = InformationGainDesigner(DiscreteActions(ACTIONS), num_samples=1_500)
 
@@ -154,27 +127,3 @@ def test_the_designer_tells_luck_from_a_function_of_the_parameters():
     share = torch.distributions.Normal(0.0, 1.0).cdf(-0.3 * (ACTIONS[:, 0] - 2))
     error = (share * (1 - share) / (certain.num_samples)).sqrt()
     assert ((certain.probability_valid - share).abs() < 4 * error).all()
-
-
-def test_partly_observed_numbers_are_said_to_be_left_out():
-    torch.manual_seed(0)
-    theta = PRIOR.sample((400,))
-    mean = theta.expand(1, 400, 1).repeat(1, 1, 2)
-    mean[0, :100, 1] = torch.nan
-    x = mean + torch.randn_like(mean)
-    rows = CandidateSimulations(theta, torch.zeros(1, 1), x, mean, NOISE)
-    assert "25% of an action's outcomes are partly" in EntropyGain().remarks(rows)[0]
-    assert "25% of the outcomes are partly" in EntropyGain().problems(rows)[0]
-    assert "25% of the outcomes are partly" in NestedGain().problems(rows)[0]
-    valid, counted = rows.num_valid()
-    assert (valid.tolist(), counted.tolist()) == ([400], [400])
-
-
-def test_few_measurements_are_said_to_make_a_bound():
-    rows = CERTAIN.simulations(100, 0)
-    assert int(rows.complete[3].sum()) < 8
-    note = "too few complete outcomes at 1 of 4 actions: only which"
-    assert any(text.startswith(note) for text in NestedGain().remarks(rows))
-    gain = NestedGain()(None, rows, PRIOR)
-    assert torch.allclose(gain[3], presence_information(rows)[3])
-    assert NestedGain().remarks(CERTAIN.simulations(1_000, 0)) == []

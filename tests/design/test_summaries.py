@@ -10,10 +10,8 @@ from sbi_active import (
     GaussianNoise,
     InformationGainDesigner,
     SimulatorModel,
-    StudentTNoise,
 )
 from sbi_active.design.outcomes import LinearSummaries
-from sbi_active.design.sampler import CandidateSampler
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.noise.whitening import whitened
 
@@ -63,35 +61,3 @@ def test_differences_of_outcomes_keep_their_length_in_the_noise(noise):
         torch.cdist(short, short), torch.cdist(whole, whole), rtol=1e-4, atol=1e-2
     )
     assert summaries.left_out < 1e-3
-
-
-def test_what_is_left_out_is_said():
-    # Each draw bends a number of its own: no few directions have them all.
-    summaries = LinearSummaries(GaussianNoise(1.0), num_kept=4)
-    mean = torch.eye(100).repeat(3, 1)
-    summaries(torch.zeros(1), mean)
-    assert summaries.left_out == pytest.approx(0.48, abs=0.03)
-
-
-def test_an_outcome_that_lacks_numbers_has_no_summary():
-    summaries = LinearSummaries(GaussianNoise(1.0))
-    mean = torch.randn(50, NUM, generator=torch.Generator().manual_seed(0))
-    mean[3], mean[7, 5] = torch.nan, torch.nan
-    short = summaries(torch.zeros(1), mean)
-    lost = short.isnan().all(1)
-    assert torch.nonzero(lost)[:, 0].tolist() == [3, 7]
-    assert bool(short[~lost].isfinite().all())
-
-
-@pytest.mark.parametrize("noise", [StudentTNoise(1.0, df=4.0), None])
-def test_other_noise_keeps_all_numbers(noise):
-    def noisy(theta, action):
-        return line(theta, action) + torch.randn(len(theta), NUM)
-
-    model = noisy if noise is None else SimulatorModel(line, noise=noise)
-    sampler = CandidateSampler(
-        model, BELIEF, torch.tensor([[1.0]]), seed=0, most_numbers=200
-    )
-    assert sampler.summaries is None
-    drawn = sampler.draw(8, torch.tensor([0]), replicates=False)
-    assert drawn.x.shape == (1, 8, NUM)

@@ -9,7 +9,6 @@ from torch.distributions import MultivariateNormal
 from sbi_active import DiscreteActions, GaussianNoise, InformationGainDesigner
 from sbi_active.criticism import Effect
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
-from sbi_active.design.target import Quantity, name_of
 from sbi_active.simulation import SimulatorModel
 from tests.linear_gaussian import PRIOR
 
@@ -47,19 +46,6 @@ def test_a_linear_function_of_a_parameter_is_the_parameter(estimator, name, plac
         rtol=0,
         atol=1e-6 if estimator == "linear" else 0.03,  # of the marginal's entropy
     )
-
-
-def test_a_sum_is_told_by_what_its_terms_tell():
-    """x = a theta + noise: of 5 theta_1 + theta_2 the first side tells far more."""
-    design = select(lambda theta: theta @ torch.tensor([5.0, 1.0]))
-    assert design.action.tolist() == [0.0]
-    # jointly normal: the sum's correlation with either x
-    correlation = [25 / 26 * 4 / 5, 1 / 26 * 64 / 65]
-    sides = [0, 1]
-    exact = [-0.5 * math.log1p(-correlation[k]) for k in sides]
-    gain, error = design.expected_information_gain, design.standard_error
-    for k in sides:
-        assert abs(float(gain[k]) - exact[k]) < 3 * float(error[k]) + 0.15
 
 
 def test_a_function_of_an_effect():
@@ -106,16 +92,6 @@ def test_a_failure_or_none():
     assert strong > 3 * error
 
 
-def test_principal_components_stand_for_a_motion():
-    time = torch.linspace(0, 1, 50)
-    quantity = Quantity(lambda theta: theta[:, :1] * time + theta[:, 1:], MODEL, PRIOR)
-    value = quantity(PRIOR.sample((100,)))
-    assert value.shape == (100, 4)
-    # a motion of two parameters has two directions
-    assert (value[:, 2:].abs() < 1e-3).all()
-    assert (value[:, :2].std(0) > 0.1).all()
-
-
 @pytest.mark.parametrize(
     ("function", "text"),
     [
@@ -129,13 +105,3 @@ def test_principal_components_stand_for_a_motion():
 def test_what_is_no_quantity_is_an_error(function, text):
     with pytest.raises(ValueError, match=text):
         select(function)
-
-
-def test_other_estimators_have_no_such_target():
-    def loss(theta):
-        return theta[:, 0]
-
-    with pytest.raises(ValueError, match="'auto' or 'linear' for target='loss'"):
-        select(loss, estimator="nested")
-    assert name_of(loss) == "loss"
-    assert name_of(["mass", "friction"]) == "mass, friction"

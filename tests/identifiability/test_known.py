@@ -44,7 +44,6 @@ def posterior(fn, prior, truth, *, sd=0.01, seed=0):
 #: Outcome, prior, truth, what is known of it, what is not.
 OPEN = {
     "product": (lambda a, b: a * b, [POSITIVE] * 2, [0.5, 0.7], ["a * b"], ["a / b"]),
-    "ratio": (lambda a, b: a / b, [POSITIVE] * 2, [0.5, 0.7], ["a / b"], ["a * b"]),
     "sum": (lambda a, b: a + b, [CENTERED] * 2, [0.5, -0.2], ["a + b"], ["a - b"]),
     "shift": (
         lambda a, b: a * (b + 0.5),
@@ -52,13 +51,6 @@ OPEN = {
         [0.5, 0.7],
         ["a * (b + 0.5)"],
         ["a / (b + 0.5)"],
-    ),
-    "power": (
-        lambda a, b: a**2 * b,
-        [(0.5, 2.0)] * 2,
-        [1.2, 1.0],
-        ["a^2 * b"],
-        ["a^2 / b"],
     ),
     "no effect": (lambda a, b: a + 0 * b, [CENTERED] * 2, [0.5, -0.2], [], ["b"]),
     "three": (

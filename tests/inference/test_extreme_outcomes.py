@@ -1,8 +1,5 @@
 """Outcomes as far away as float32 reaches, told to the trainers themselves."""
 
-import warnings
-
-import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
@@ -15,20 +12,14 @@ from sbi_active import (
     SeqBED,
     SimulatorModel,
 )
-from sbi_active.inference import SeqBED_LFIRE, refine
+from sbi_active.inference import SeqBED_LFIRE
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
-from sbi_active.inference.sampling.weights import normalized
 from tests.campaign.test_corrections import OPTIONS, RATIOS
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
 MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise(0.1))
 SETTINGS = RefinementOptions(num_histories=300, num_effective=25)
 SIZES = (1e15, -3e38)
-
-
-JUMPS = SimulatorModel(
-    lambda theta, action: (7 * theta).floor() * action, noise=GaussianNoise(0.1)
-)
 
 
 def trained(make):
@@ -46,12 +37,11 @@ def trained(make):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("x", SIZES)
 @pytest.mark.parametrize(
-    ("make", "simulator"),
+    ("make", "simulator", "x"),
     [
-        *[(make, None) for make in (ASBI, ALHI, SeqBED, SeqBED_LFIRE)],
-        (ASBI, MODEL),
+        *[(make, None, -3e38) for make in (ASBI, ALHI, SeqBED, SeqBED_LFIRE)],
+        *[(ASBI, MODEL, x) for x in SIZES],
     ],
 )
 def test_updates_give_a_belief_to_go_on_from(make, simulator, x):
@@ -81,28 +71,3 @@ def test_what_the_network_cannot_say_changes_nothing(x):
     assert belief.diagnostics.trustworthy is False
     theta = torch.tensor([[0.2], [0.7]])
     assert torch.equal(belief.log_prob(theta), PRIOR.log_prob(theta))
-
-
-@pytest.mark.parametrize("x", SIZES)
-@pytest.mark.parametrize("model", [MODEL, JUMPS])
-def test_refinement_says_that_it_is_not_to_be_trusted(model, x):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        belief = refine(
-            model,
-            PRIOR,
-            torch.tensor([[1.0], [1.0]]),
-            torch.tensor([[x], [0.6]]),
-            settings=SETTINGS,
-            seed=0,
-        )
-    assert belief.diagnostics.trustworthy is False
-    assert bool(belief.sample((50,)).isfinite().all())
-
-
-def test_weights_of_any_size_sum_to_one():
-    ordinary = np.log(np.arange(1.0, 6.0))
-    assert np.allclose(normalized(ordinary), np.arange(1, 6) / 15)
-    assert normalized(-1e30 + np.zeros(4)).tolist() == [0.25] * 4
-    assert normalized(np.full(4, -np.inf)).tolist() == [0.25] * 4
-    assert normalized(np.array([0.0, -np.inf])).tolist() == [1.0, 0.0]

@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.robots.models import ARM, PENDULUM, TIMES
-from sbi_active import BoxActions
+from benchmarks.robots.models import PENDULUM, TIMES
 from sbi_active.criticism import AugmentedSimulator, Effect, Trials
 from sbi_active.criticism.effects.effect import UnderKey
 from sbi_active.mujoco import from_mjcf, mjcf_effects
-from sbi_active.mujoco.effects.changes import PowerForce
 from tests.mujoco.machines import BALL
 from tests.mujoco.test_robot import pendulum
 
@@ -41,28 +39,6 @@ def run(robot, effect, phi, angle=1.0):
     action = torch.full((len(phi), 1), angle, dtype=torch.float64)
     phi = torch.tensor(phi, dtype=torch.float64)[:, None]
     return model.evaluate(theta, {effect.name: phi}, action).numpy()
-
-
-def test_a_joint_has_what_a_plain_one_lacks(effects):
-    joint = {n.removeprefix("hinge ") for n in effects if n.startswith("hinge ")}
-    assert joint >= {
-        "friction loss",
-        "quadratic damping",
-        "cubic damping",
-        "stiffness",
-        "quadratic stiffness",
-        "cubic stiffness",
-        "armature",
-        "zero offset",
-        "backlash",
-        "series elasticity",
-        "sensor bias",
-        "sensor gain",
-        "sensor delay",
-        "sensor lag",
-        "sensor quantum",
-    }
-    assert {"bob payload", "gravity tilt y", "medium density"} <= {*effects}
 
 
 def test_parameters_and_what_changes_nothing_are_left_out(effects):
@@ -108,26 +84,6 @@ def test_fields_are_those_of_the_mjcf(robot, effects):
         assert x == pytest.approx(native(**{attribute: 0.07}).numpy(), abs=1e-12)
 
 
-def test_a_compliant_servo_hangs_lower_behind_its_encoder():
-    robot = from_mjcf(
-        ARM,
-        {"shoulder.damping": (0.05, 0.2)},
-        sensors=["shoulder", "elbow"],
-        actions=BoxActions([-0.3], [0.3], names=["shoulder servo"]),
-        times=np.arange(0.1, 3, 0.1),
-        noise=0.001,
-    )
-    (effect,) = mjcf_effects(robot, include=["elbow series elasticity"])
-    model = AugmentedSimulator(robot.simulator, [effect])
-    theta = torch.full((2, 1), 0.1, dtype=torch.float64)
-    action = torch.zeros(2, 1, dtype=torch.float64)
-    x = model.evaluate(theta, {effect.name: torch.tensor([[0.0], [0.05]])}, action)
-    assert x.isfinite().all()
-    # At rest the encoder sees the load alone: that of a link that hangs a little lower.
-    assert (x[1, -1] - x[0, -1]).abs().max() < 0.05
-    assert (x[1] - x[0]).abs().max() > 1e-4
-
-
 def test_contacts_are_offered_where_something_touches():
     robot = from_mjcf(
         BALL, {"ball.mass": (0.05, 0.2)}, times=np.arange(0.02, 0.8, 0.02)
@@ -143,14 +99,6 @@ def test_contacts_are_offered_where_something_touches():
     assert bounce[1] > bounce[0] + 0.01
 
 
-def test_patterns_choose_and_unknown_ones_are_said(robot):
-    names = [e.name for e in mjcf_effects(robot, include=["*damping", "bob*"])]
-    assert {"hinge quadratic damping", "bob payload"} <= {*names}
-    assert not [n for n in mjcf_effects(robot, exclude=["hinge*"]) if "hinge" in n.name]
-    with pytest.raises(ValueError, match="did you mean 'hinge friction loss'"):
-        mjcf_effects(robot, include=["hinge frictionloss"])
-
-
 @pytest.mark.parametrize("what", ["backlash", "series elasticity"])
 def test_transmissions_grow_from_nothing_without_a_jump(robot, effects, what):
     effect = effects[f"hinge {what}"]
@@ -161,34 +109,6 @@ def test_transmissions_grow_from_nothing_without_a_jump(robot, effects, what):
     assert moved[2] == pytest.approx(2 * moved[1], rel=1e-6)
     assert np.abs(x[4] - x[3]).max() < 0.05 * moved[3]
     assert moved[3] > 1e-4
-
-
-def test_two_transmissions_and_a_force_together():
-    robot = from_mjcf(
-        ARM,
-        {"shoulder.damping": (0.05, 0.2)},
-        sensors=["shoulder", "elbow"],
-        actions=BoxActions([-0.3], [0.3], names=["shoulder servo"]),
-        times=np.arange(0.1, 1, 0.1),
-        noise=0.001,
-    )
-    found = mjcf_effects(
-        robot, include=["elbow series elasticity", "shoulder backlash"]
-    )
-    # A torque on the shoulder, the first joint: with the inserted ones it is elsewhere.
-    pull = under("force", PowerForce(((0, 0, 1.0),), "stiffness", 1))
-    model = AugmentedSimulator(robot.simulator, [*found, pull])
-    theta = torch.full((1, 1), 0.1, dtype=torch.float64)
-    action = torch.zeros(1, 1, dtype=torch.float64)
-    phi = {e.name: torch.full((1, 1), 2 * e.apply.key.least).double() for e in found}
-    rest = {"force": torch.full((1, 1), 2.0, dtype=torch.float64)}
-    bare = model.evaluate(theta, {}, action)
-    pulled = model.evaluate(theta, rest, action) - bare
-    both = model.evaluate(theta, {**phi, **rest}, action)
-    given = model.evaluate(theta, phi, action)
-    assert both.isfinite().all()
-    assert (given - bare).abs().max() > 1e-4
-    assert (both - given - pulled).abs().max() < 0.3 * pulled.abs().max()
 
 
 def thrown(start):

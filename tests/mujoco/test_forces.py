@@ -31,18 +31,6 @@ def cart():
     return robot, Trials(torch.zeros(3, 1), x, sample_times=times)
 
 
-def test_forms_are_on_the_joints_of_the_model_in_their_units(cart):
-    robot, trials = cart
-    found = {e.name: e for e in force_effects(robot, trials=trials, seed=1)}
-    assert found["sign v of rail"].units.endswith(" N")
-    assert found["sin 2q of hinge"].units.endswith(" N m")
-    assert found["q of hinge on rail"].family == "coupling with rail"
-    force = found["sin 2q of hinge"].apply.key
-    q, v = np.array([[0.0, np.pi / 4]]), np.zeros((1, 2))
-    applied = force(q, v, 0.0, np.array([[1.0, 0.0]]))
-    assert applied[0] == pytest.approx([0.0, force.size])
-
-
 def test_the_force_of_nominal_motion_is_inertia_times_acceleration(cart):
     """The cart with its pole, where the pole's inertia is the smaller part."""
     robot, trials = cart

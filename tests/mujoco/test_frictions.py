@@ -46,25 +46,6 @@ def test_a_friction_that_follows_nothing_is_that_of_the_field(robot, effects):
     assert both == pytest.approx(field, abs=1e-9)
 
 
-def test_a_joint_is_held_where_friction_is_large_and_slides_where_it_is_not(
-    robot, effects
-):
-    # Gravity's torque at .5 rad is about 1.2 N m to either side.
-    x = run(robot, [[0.0, 9.0]], [0.8, -0.8], [by_position(effects)])
-    assert np.abs(x[0] - 0.8).max() < 0.1
-    assert np.abs(x[1] + 0.8).max() > 0.5
-
-
-def test_rows_do_not_depend_on_each_other(robot, effects):
-    one = by_position(effects)
-    angles, phi = [0.9, -0.4, 0.9], [0.05, 0.3]
-    together = run(robot, [phi], angles, [one])
-    apart = [run(robot, [phi], [angle], [one])[0] for angle in angles]
-    assert (together == np.stack(apart)).all()
-    plain = run(robot, [], angles, [])
-    assert (run(robot, [[0.0] * 2], angles, [one]) == plain).all()
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_no_draw_of_any_friction_feeds_energy(robot, effects, seed):
     rng = np.random.default_rng(seed)
@@ -95,7 +76,3 @@ def test_friction_by_load_grows_with_the_force_of_the_motor():
     held = run(robot, [[0.25]], [2.0, 4.0], [effect])
     # A quarter of the push is lost, however large it is.
     assert held / free == pytest.approx(0.75, abs=0.01)
-
-
-def by_position(effects):
-    return effects["hinge friction loss by position"]

@@ -57,20 +57,6 @@ def test_limits_are_those_of_the_motion_itself():
     assert np.allclose(high, shoulder.max(1).values, atol=2e-3)
 
 
-@pytest.mark.parametrize(
-    ("limit", "kept"),
-    [
-        ({"velocity": {"shoulder": 3.0}}, [True, False]),
-        ({"torque": {"shoulder servo": 12.0}}, [True, False]),
-        ({"velocity": {"shoulder": 100.0}}, [True, True]),
-        ({"velocity": {"shoulder": [-3.0, 3.0]}}, [True, False]),
-    ],
-)
-def test_each_kind_of_limit_refuses(limit, kept):
-    limits = MotionLimits(arm(), position={}, num_draws=2, **limit)
-    assert limits(torch.tensor([[0.1, 1.0], [1.5, 4.0]])).tolist() == kept
-
-
 def test_ranges_of_the_mjcf_are_the_default():
     limited = ARM.replace('axis="0 1 0" damping', 'axis="0 1 0" range="-20 20" damping')
     limited = "<mujoco>" + limited.split(">", 1)[1]
@@ -93,19 +79,6 @@ def test_a_state_that_diverges_is_refused():
     action = torch.tensor([[0.0], [1.0]])
     assert np.isnan(limits.extremes(action)["hinge"][0]).tolist() == [False, True]
     assert limits(action).tolist() == [True, False]
-
-
-@pytest.mark.parametrize(
-    ("limit", "message"),
-    [
-        ({}, "expected limits of positions, velocities or torques; got none"),
-        ({"position": {"sholder": (-1.0, 1.0)}}, "shoulder"),
-        ({"position": {"shoulder": (1.0, -1.0)}}, "limits of shoulder that leave room"),
-    ],
-)
-def test_limits_that_cannot_be(limit, message):
-    with pytest.raises(ValueError, match=message):
-        MotionLimits(arm(), **limit)
 
 
 def test_a_designer_proposes_within_the_limits_and_chooses_the_payload():

@@ -144,11 +144,3 @@ def test_angles_that_wrap_or_are_degrees_are_said():
 def test_a_log_that_is_no_log_is_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         read_logs(encoder_log(**changes))
-
-
-def test_a_file_of_a_log_keeps_its_cells(tmp_path):
-    frame = pd.DataFrame(encoder_log())
-    path = tmp_path / "log.csv"
-    path.write_text("# a comment\n" + frame.to_csv(index=False), encoding="utf-8-sig")
-    trials = read_logs(path)
-    assert trials.x[0].tolist() == pytest.approx(frame["angle"].tolist())

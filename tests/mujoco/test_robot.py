@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.robots.models import ARM, CART_POLE, PENDULUM, SPRING_MASS, TIMES
+from benchmarks.robots.models import ARM, PENDULUM, SPRING_MASS, TIMES
 from sbi_active import BoxActions
 from sbi_active.actions.signals import SignalActions
 from sbi_active.actions.waveforms import step
@@ -48,16 +48,6 @@ def test_a_pendulum_moves_as_one_stepped_by_hand():
             angles.append(data.qpos[0])
             mujoco.mj_step(model, data)
         assert x[row].numpy() == pytest.approx(np.array(angles)[10::10], abs=1e-12)
-
-
-def test_parts_are_named_and_have_units():
-    robot = pendulum()
-    assert robot.simulator.parameter_names == ["hinge.damping", "bob.mass"]
-    assert robot.prior.units == ("N m s/rad", "kg")
-    assert robot.prior.names == ("hinge.damping", "bob.mass")
-    assert robot.simulator.channel_names == ["hinge [rad]"]
-    assert robot.actions is RELEASE
-    assert robot.trials is None
 
 
 def test_rows_do_not_depend_on_batches_workers_or_threads():
@@ -205,39 +195,3 @@ def test_what_does_not_fit_is_said(change, message):
 def test_a_parameter_that_changes_nothing_is_said_at_once():
     with pytest.warns(UserWarning, match="bob.com_y change nothing that is read"):
         pendulum(parameters={"hinge.damping": (0, 0.1), "bob.com_y": (-0.1, 0.1)})
-
-
-def test_models_with_and_without_a_payload_share_their_parameters():
-    loaded = SPRING_MASS.replace(
-        "</body>",
-        '<geom type="sphere" size=".05" mass="1" contype="0" conaffinity="0"/></body>',
-    )
-    robot = from_mjcf(
-        [SPRING_MASS, loaded],
-        {"slide.damping": (0.1, 1.0)},
-        sensors=["position"],
-        actions=BoxActions([1.0, 0.0], [2.0, 1.0], names=["push", "model"]),
-        times=TIMES,
-        noise=0.01,
-    )
-    theta = torch.full((2, 1), 0.3, dtype=torch.float64)
-    x = robot.simulator.mean(theta, torch.tensor([[2.0, 0.0], [2.0, 1.0]]).double())
-    assert x[0].max() == pytest.approx(0.2, rel=0.15)  # the same at rest, and later
-    assert x[1].argmax() > x[0].argmax()
-    with pytest.raises(ValueError, match="same joints"):
-        from_mjcf([SPRING_MASS, CART_POLE], {"cart.mass": (0.5, 2)}, sensors=["slide"])
-
-
-def test_a_center_of_mass_moves_where_the_model_has_room_for_it():
-    ball = """<mujoco><option timestep="0.01"/><worldbody><body name="ball">
-      <joint name="hinge" axis="0 1 0" pos="0 0 .3"/><geom size=".1" mass="1"/>
-      </body></worldbody></mujoco>"""
-    given = {"sensors": ["hinge"], "times": TIMES, "start": {"hinge": 0.0}}
-    robot = from_mjcf(ball, {"ball.com_x": (-0.1, 0.1)}, noise=0.01, **given)
-    theta = torch.tensor([[0.05], [0.0]], dtype=torch.float64)
-    x = robot.simulator.mean(theta, torch.zeros(2, 1).double())
-    assert (x[1] == 0).all()
-    assert x[0].abs().max() > 0.2  # it swings around where it hangs, .165 rad away
-    sliding = ball.replace('axis="0 1 0" pos="0 0 .3"', 'type="slide" axis="1 0 0"')
-    with pytest.raises(ValueError, match="compiles as simple"):
-        from_mjcf(sliding, {"ball.com_x": (-0.1, 0.1)}, noise=0.01, **given)

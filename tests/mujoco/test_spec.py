@@ -59,14 +59,3 @@ def test_textures_are_left_out_and_materials_keep_their_colors(path):
     assert model.mat_rgba.tolist() == [[1.0, 0.0, 0.0, 1.0]]
     with pytest.raises(ValueError, match="missing.png"):
         mujoco.MjSpec.from_file(str(path)).compile()
-
-
-def test_the_spec_of_a_user_keeps_its_textures():
-    text = BLOCK.replace('type="2d" file="missing.png"', 'builtin="flat" width="8"')
-    text = text.replace('type="mesh" mesh="block"', 'size="1"')
-    spec = mujoco.MjSpec.from_string(
-        text.replace('<mesh name="block" file="block.obj"/>', "")
-    )
-    assert Source(spec).compile().ntex == 0
-    assert len(spec.textures) == 1
-    assert spec.compile().ntex == 1

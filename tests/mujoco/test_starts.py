@@ -6,8 +6,6 @@ import pytest
 import torch
 
 from sbi_active import BoxActions
-from sbi_active.actions.signals import SignalActions
-from sbi_active.actions.waveforms import step
 from sbi_active.mujoco import from_mjcf
 from tests.mujoco.machines import held_arm
 
@@ -117,18 +115,3 @@ def test_an_action_sets_one_thing_where_joint_and_actuator_share_a_name(name):
     actions = BoxActions([0.1], [0.3], names=["hinge position"])
     x = held(name, start="home", actions=actions)
     assert x == pytest.approx(by_hand(key=True, qpos=0.2), abs=1e-12)
-
-
-def test_a_name_that_a_signal_drives_is_no_start_of_its_joint():
-    grid = np.arange(0, 1, 0.02)
-    signal = step("hinge", length=1.0)
-    played = SignalActions(signal, [-1.0, 0.1], [1.0, 0.5], input_times=grid)
-    for name, message in (("hinge", "'hinge position'"), ("hinge position", None)):
-        actions = BoxActions([0.1], [0.3], names=[name])
-        given = {"inputs": played, "actions": actions, "noise": 0.01}
-        arm = held_arm("hinge"), {"hinge.damping": (0.0, 1.0)}
-        if message:
-            with pytest.raises(ValueError, match=message):
-                from_mjcf(*arm, **given)
-        else:
-            assert from_mjcf(*arm, **given).actions.names[-1] == name

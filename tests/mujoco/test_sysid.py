@@ -1,7 +1,5 @@
 """The data and parameters of mujoco.sysid, and beliefs for it."""
 
-import pickle
-
 import mujoco
 import mujoco.rollout
 import numpy as np
@@ -12,13 +10,11 @@ from mujoco import sysid
 from sbi.utils import BoxUniform
 
 from benchmarks.robots.models import SPRING_MASS
-from sbi_active import GaussianNoise
 from sbi_active.mujoco import (
     belief_to_parameters,
     from_sysid,
     randomization,
 )
-from sbi_active.simulation import check_simulator, simulate
 
 if not hasattr(sysid, "Parameter"):
     pytest.skip(
@@ -144,53 +140,6 @@ def test_a_transform_acts_on_what_is_predicted():
         assert own == pytest.approx(residual, abs=1e-6)
 
 
-def test_any_residual_is_a_deterministic_simulator():
-    group = sequences()
-    params = parameters()
-    residual_fn = sysid.build_residual_fn(models_sequences=[group])
-    robot = from_sysid(residual_fn, params, noise=GaussianNoise(0.1))
-    found, *_ = residual_fn(np.array([1.3, 0.9]), params.copy())
-    theta = torch.tensor([[1.3, 0.9]], dtype=torch.float64).expand(2, -1)
-    x = robot.simulator.mean(theta, robot.actions.listed().double())
-    assert x[1].numpy() == pytest.approx(-np.asarray(found[1]).reshape(-1))
-    assert robot.trials is not None
-    assert (robot.trials.x == 0).all()
-    with pytest.raises(ValueError, match="noise of residuals"):
-        from_sysid(residual_fn, params)
-
-
-def test_it_goes_to_other_processes_with_its_modifiers():
-    robot = from_sysid(sequences(), parameters(), noise=0.01)
-    theta = robot.prior.sample((6,))
-    action = robot.actions.sample((6,))
-    x = simulate(robot.simulator, theta, action, seed=0).x
-    other = simulate(robot.simulator, theta, action, seed=0, workers=2, batch_size=2)
-    assert (other.x == x).all()
-    again = pickle.loads(pickle.dumps(robot.simulator.fn.machines[0]))
-    assert again.model.nq == 1
-
-
-def test_what_no_trial_determines_is_named_and_the_payload_does():
-    """Mass and gear of a cart without a spring: only their ratio shows."""
-    params = parameters()
-    bare = from_sysid(sequences(spring=False), params, noise=0.001)
-    text = str(check_simulator(bare.simulator, bare.prior, bare.actions, num_rows=64))
-    assert "mass" in text
-    assert "gear" in text
-    report = check_simulator(bare.simulator, bare.prior, bare.actions, num_rows=64)
-    (found,) = report.undetermined
-    assert set(found.parameters) == {"mass", "gear"}
-    both = [
-        sequences(spring=False),
-        sequences(payload(SPRING_MASS), "payload", spring=False),
-    ]
-    loaded = from_sysid(both, params, noise=0.001)
-    report = check_simulator(
-        loaded.simulator, loaded.prior, loaded.actions, num_rows=64
-    )
-    assert not report.undetermined
-
-
 def test_a_belief_comes_back_as_parameters(tmp_path):
     params = parameters()
     belief = BoxUniform(torch.tensor([0.9, 1.0]), torch.tensor([1.1, 1.4]))
@@ -224,27 +173,3 @@ def test_randomization_keeps_what_parameters_have_in_common():
         randomization(line, [95], names=["a", "b"])
     with pytest.raises(ValueError, match="names"):
         randomization(line)
-
-
-def test_bad_logs_and_parameters_are_said():
-    group = sequences()
-    group.control[1].data[4] = np.nan
-    with pytest.raises(ValueError, match="finite controls in sequence 'bare 1'"):
-        from_sysid(group, parameters())
-    group = sequences()
-    group.control[0].data[:] *= 9
-    with pytest.raises(ValueError, match="ctrlrange"):
-        from_sysid(group, parameters())
-    params = parameters()
-    for name in params.keys():  # noqa: SIM118
-        params[name].frozen = True
-    with pytest.raises(ValueError, match="not frozen"):
-        from_sysid(sequences(), params)
-    other = sequences()
-    other.sensordata[1] = sysid.TimeSeries.slice_by_name(
-        other.sensordata[1], ["position"]
-    )
-    with pytest.raises(ValueError, match="same signals in all sequences"):
-        from_sysid(other, parameters())
-    with pytest.raises(TypeError, match="expected ModelSequences"):
-        from_sysid([SPRING_MASS], parameters())

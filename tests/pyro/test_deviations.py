@@ -48,14 +48,3 @@ def test_a_channel_has_its_marginal_with_a_share_of_what_it_says_alone(x):
         tails = mass(torch.from_numpy(np.exp(alone[c])) * prior.exp())
         wanted = (1 - SHARE) * exact + SHARE * tails
         assert float((mass(got[:, c].exp()) - wanted).abs().sum()) < 0.1
-
-
-def test_coordinates_are_monotone_and_their_seed_decides():
-    target = torch.tensor([0.4, 2.9], dtype=torch.float64)
-    _, one = coordinates(target)
-    _, same = coordinates(target)
-    _, other = coordinates(target, 1)
-    y = torch.linspace(-5, 5, 50, dtype=torch.float64)[:, None].expand(-1, 2)
-    assert (one(y).diff(dim=0) >= 0).all()
-    assert torch.equal(one(y), same(y))
-    assert not torch.equal(one(y), other(y))

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from sbi_active import (
-    AutocorrelatedNoise,
     GaussianNoise,
     SimulatorModel,
 )
@@ -43,16 +42,6 @@ def model(request):
     batched = request.param == "batched"
     fn = line if batched else line_row
     return SimulatorModel(fn, noise=GaussianNoise(0.1), batched=batched)
-
-
-def test_mean_and_density_of_batches_and_rows(model):
-    mean = model.mean(THETA, ACTION)
-    assert mean[:, 0].tolist() == pytest.approx([5.0, 2.0, 0.5])
-    x = mean + 0.1
-    expected = 3 * [-0.5 - np.log(0.1 * np.sqrt(2 * np.pi))]
-    assert model.log_prob(x, THETA, ACTION).tolist() == pytest.approx(expected, 1e-5)
-    assert model.is_batched == (model.fn is line)
-    assert model.is_deterministic(THETA, ACTION)
 
 
 def test_effects_are_numbers_or_one_a_row(model):
@@ -95,15 +84,6 @@ def test_rows_depend_on_their_seeds_alone(model):
     assert not torch.equal(model(THETA, ACTION), first)
 
 
-def test_own_randomness_and_noise_are_independent():
-    num = 20_000
-    model = SimulatorModel(noisy, noise=GaussianNoise(1.0))
-    zero = torch.zeros(num, 2)
-    x = model(zero, zero[:, :1], row_seeds(0, num)).double()
-    # Variance 2, where the same numbers twice would give 4.
-    assert ((x.var(0) / 2 - 1).abs() < 4 * (2 / num) ** 0.5).all()
-
-
 def test_a_random_function_has_no_mean():
     with pytest.raises(ValueError, match="expected a simulator with a noise model"):
         SimulatorModel(noisy).mean(THETA, ACTION)
@@ -117,49 +97,6 @@ def test_a_random_function_has_no_mean():
             model.mean(THETA, ACTION)
         with pytest.raises(ValueError, match="so that noise would count twice"):
             model.log_prob(THETA, THETA, ACTION)
-
-
-def test_determinism_is_looked_up_once_and_leaves_the_generator_alone():
-    calls = []
-
-    def fn(theta, action):
-        calls.append(len(theta))
-        torch.rand(3)
-        return theta
-
-    model = SimulatorModel(fn, noise=GaussianNoise(1.0))
-    theta, action = torch.zeros(20, 1), torch.zeros(20, 1)
-    model.mean(theta, action)
-    model.mean(theta, action)
-    assert calls == [8, 8, 20, 20]
-    torch.manual_seed(1)
-    expected = torch.rand(1)
-    torch.manual_seed(1)
-    SimulatorModel(fn).is_deterministic(theta, action)
-    assert torch.equal(torch.rand(1), expected)
-
-
-def test_invalid_rows_stay_so_and_are_no_randomness():
-    model = SimulatorModel(
-        lambda t, a: torch.where(t > 0, t, torch.nan), noise=GaussianNoise(1.0)
-    )
-    assert model.is_deterministic(THETA, ACTION)
-    x = model(THETA, ACTION, SEEDS)
-    assert torch.equal(x.isnan(), THETA <= 0)
-    assert torch.equal(model.log_prob(x, THETA, ACTION).isfinite(), torch.ones(3) > 0)
-
-
-def test_sample_times_reach_the_noise():
-    times = torch.tensor([0.0, 0.3, 1.0])
-    noise = AutocorrelatedNoise(1.0, 0.5)
-    model = SimulatorModel(
-        lambda t, a: torch.zeros(len(t), 3), noise=noise, sample_times=times
-    )
-    x = torch.randn(3, 3)
-    expected = noise.log_prob(x, torch.zeros(3, 3), times=times)
-    assert torch.equal(model.log_prob(x, THETA, ACTION), expected)
-    assert torch.equal(model.noise.log_prob(x, torch.zeros(3, 3)), expected)
-    assert noise.times is None
 
 
 def setup():
@@ -214,19 +151,6 @@ def test_bad_input(run, text):
         model = SimulatorModel(fn, batched=batched, parameter_names=["a", "b"])
         with pytest.raises(ValueError, match=text):
             run(model)
-
-
-def test_one_name_is_that_of_a_trajectory_s_only_channel():
-    def force(theta, action):
-        return theta[:, :1] * action[:, :1] * torch.linspace(0, 1, 5)
-
-    model = SimulatorModel(force, channel_names=["force"], noise=0.1)
-    assert model(THETA, ACTION).shape == (len(THETA), 5)
-    with pytest.raises(ValueError, match="expected 1 channels, force; got x of"):
-        SimulatorModel(
-            lambda theta, action: force(theta, action)[..., None].expand(-1, -1, 2),
-            channel_names=["force"],
-        )(THETA, ACTION)
 
 
 @pytest.mark.parametrize(

@@ -1,19 +1,7 @@
 import pytest
 import torch
 
-from sbi_active import simulate
 from sbi_active.simulation.simulator import require_noise
-
-
-def global_generator(theta, action):
-    return theta * action + torch.randn_like(theta)
-
-
-def test_deterministic_simulators_are_told():
-    theta = torch.rand(40, 1)
-    with pytest.raises(ValueError, match="got identical x from two seeds"):
-        simulate(lambda t, a: t * a, theta, theta, seed=0, check_noise=True)
-    simulate(global_generator, theta, theta, seed=0, check_noise=True)
 
 
 def test_counts_that_are_equal_by_chance_prove_no_missing_noise():

@@ -11,13 +11,9 @@ from sbi_active import (
     SimulatorModel,
     simulate,
 )
-from sbi_active.campaign.trials import outcome_told
-from sbi_active.inference.rounds.condition import outcome_rows
-from sbi_active.seeding import row_normals
-from sbi_active.simulation import MissingRowsWarning, SimulationError, check_simulator
+from sbi_active.simulation import MissingRowsWarning, SimulationError
 
 THETA = torch.arange(4.0)[:, None]
-ONE = torch.Size([1])
 
 
 def x_of(function, **options):
@@ -102,44 +98,6 @@ def test_a_row_without_an_outcome_is_missing():
             simulate(simulator, THETA, THETA, seed=0)
 
 
-@pytest.mark.parametrize(
-    ("x", "text"),
-    [
-        *((x, r"within \+-3.4e38") for x in (1e39, [1e39], np.float64(-1e39))),
-        (torch.tensor([1e39], dtype=torch.float64), r"within \+-3.4e38"),
-        *((x, "of real numbers") for x in (1j, [1j], np.array([1 + 0j]))),
-        (torch.tensor([1j]), "of real numbers"),
-    ],
-)
-def test_an_outcome_that_float32_cannot_hold_is_refused(x, text):
-    for take in (outcome_rows, outcome_told):
-        with pytest.raises(ValueError, match=f"expected x {text}"):
-            take(x, ONE)
-
-
-@pytest.mark.parametrize("name", ["theta", "action"])
-def test_complex_parameters_and_actions_are_refused(name):
-    rows = {"theta": THETA, "action": THETA}
-    rows[name] = rows[name] + 1j
-    with pytest.raises(ValueError, match=f"expected {name} of real numbers"):
-        simulate(lambda t, a: t, **rows, seed=0)
-
-
-@pytest.mark.parametrize("lost", [torch.nan, torch.inf])
-@pytest.mark.parametrize("mixes", [False, True])
-def test_the_check_of_rows_without_a_measurement(lost, mixes):
-    def simulator(theta, action, seeds):
-        x = theta + row_normals(seeds, 1).float()
-        x = x + x[:1] if mixes else x  # the order of rows matters
-        return torch.where(theta > 0.8, lost, x)
-
-    prior = BoxUniform(torch.zeros(1), torch.ones(1))
-    report = check_simulator(simulator, prior, DiscreteActions([1.0]), num_rows=64)
-    assert report.counts["invalid"] > 0
-    assert report.rows_are_independent is not mixes
-    assert not report.is_deterministic
-
-
 def pairs(theta, action):
     """Return (n, n), where (n, 1) was meant: a number for each pair of rows."""
     return theta[:, 0] * action + torch.randn(len(theta), len(theta))
@@ -150,17 +108,6 @@ def test_a_number_for_each_pair_of_rows_is_refused_at_once(wrap):
     prior = BoxUniform(torch.zeros(2), torch.ones(2))
     with pytest.raises(ValueError, match="index both alike"):
         Campaign(wrap(pairs), prior, DiscreteActions([1.0, 2.0]))
-
-
-def test_x_may_be_as_wide_as_it_is_long():
-    def wide(theta, action):
-        return theta[:, :1] * action + torch.randn(len(theta), 16)
-
-    model = SimulatorModel(wide)
-    for num_rows in (16, 4, 16, 1, 300):
-        assert model(torch.ones(num_rows, 1), torch.ones(num_rows, 1)).shape[1] == 16
-    prior = BoxUniform(torch.zeros(1), torch.ones(1))
-    assert Campaign(wide, prior, DiscreteActions([1.0, 2.0])).x_shape == (16,)
 
 
 def test_one_number_a_row_needs_no_axis():

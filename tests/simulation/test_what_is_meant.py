@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import Independent, LogNormal
 
 from sbi_active import (
     Campaign,
-    CampaignOptions,
     GaussianNoise,
     InformationGainDesigner,
     RandomDesigner,
@@ -43,28 +41,6 @@ def test_a_list_of_actions_is_taken(make):
     assert check_simulator(MODEL, PRIOR, actions, num_rows=16).is_ready
     trials = Trials([1.0, 2.0, 3.0], [0.5, 1.0, 1.5])
     assert Criticism(MODEL, PRIOR, trials, actions=actions).actions.action_dim == 1
-
-
-@pytest.mark.parametrize("actions", ["fast", None, 3.0, {1.0, 2.0}])
-def test_what_is_no_list_of_actions_is_refused(actions):
-    with pytest.raises(TypeError, match="expected an action space or a list of"):
-        Campaign(MODEL, PRIOR, actions)
-
-
-def test_options_are_taken_from_a_dict():
-    campaign = Campaign(MODEL, PRIOR, ACTIONS, options={"num_simulations": 300})
-    assert campaign.state.options == CampaignOptions(num_simulations=300)
-    with pytest.raises(TypeError, match="did you mean 'num_simulations'"):
-        Campaign(MODEL, PRIOR, ACTIONS, options={"simulations": 300})
-    with pytest.raises(TypeError, match="pass CampaignOptions"):
-        Campaign(MODEL, PRIOR, ACTIONS, options=300)
-
-
-def test_a_batch_of_densities_is_no_prior():
-    batch = LogNormal(torch.zeros(1), torch.ones(1))
-    with pytest.raises(ValueError, match=r"pass .*Independent\(LogNormal\(\.\.\.\), 1"):
-        Campaign(MODEL, batch, ACTIONS)
-    assert Campaign(MODEL, Independent(batch, 1), ACTIONS).belief is not None
 
 
 def test_a_function_of_one_row_says_so():

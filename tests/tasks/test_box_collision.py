@@ -1,5 +1,3 @@
-import sys
-
 import pytest
 import torch
 
@@ -19,23 +17,6 @@ def rows(num, seed=0):
     theta = torch.rand(num, 3, generator=generator)
     action = 0.5 * torch.randint(41, (num, 1), generator=generator).float()
     return theta, action
-
-
-def test_momentum_passes_to_the_cube(task):
-    """A light, slippery cube leaves faster than the pusher, never twice as fast."""
-    from sbi_active.tasks.box_collision.scene import Scene  # pyright: ignore
-
-    scene = Scene(edge=50.0)
-    scene.prepare([0.0, 0.0, 0.1], 2.0)
-    momentum = 2.0  # kg m/s, of the 1 kg pusher
-    lost = 9.81 * 0.25  # N: the pusher's own friction .25 on the table
-    for _ in range(100):
-        scene.mujoco.mj_step(scene.model, scene.data, 1)
-    velocity = scene.data.qvel
-    total = velocity[0] + 0.1 * 3.375 * velocity[6]
-    assert 1.0 < velocity[6] < 4.0
-    # Friction takes momentum for .25 s at the most; contact friction is elastic-free.
-    assert momentum - lost * 0.25 - 1e-3 < total < momentum
 
 
 def test_early_exit_keeps_the_outcome():
@@ -93,34 +74,3 @@ def test_the_paper_s_code_for_what_left_the_table():
     theta, action = rows(4)
     with pytest.raises(ValueError, match="expected a simulator with noise"):
         simulate(task.simulator, theta, action, seed=0, check_noise=True)
-
-
-class Point:
-    def __init__(self, *theta):
-        self.theta = torch.tensor(theta)
-
-    def sample(self, shape):
-        return self.theta.expand(*shape, 3)
-
-
-def test_reproduction_error_counts_the_code_of_a_fall():
-    task = get_task("box_collision", target=2)
-    table = task.reproduction_table(Point(0.2, 0.2, 0.2))
-    assert table == {3.0: 0.0, 5.0: 0.0, 7.0: 0.0}  # both fall from 5 m/s on
-    stays = Point(0.8, 0.8, 0.8)
-    x = task.simulator.mean(stays.sample((1,)), torch.full((1, 1), 5.0))
-    distance = float((x + 1).norm())
-    error = task.reproduction_error(stays, 5.0, num_samples=2)
-    assert error == pytest.approx(distance)
-
-
-def test_theta_outside_the_box_is_refused(task):
-    theta = torch.tensor([[0.5, 0.5, 0.5], [0.5, 1.5, 0.5]])
-    with pytest.raises(ValueError, match=r"expected theta within \[0, 1\].*in row 1"):
-        task.simulator(theta, torch.ones(2, 1))
-
-
-def test_missing_mujoco_says_how_to_install_it(monkeypatch):
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(ImportError, match=r"pip install 'sbi-active\[mujoco\]'"):
-        get_task("box_collision")

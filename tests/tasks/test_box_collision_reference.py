@@ -74,15 +74,3 @@ def test_agrees_with_a_grid(speeds):
     error = sd / reference.effective_sample_size**0.5 + sd / 4000**0.5
     assert bool(((draws.mean(0) - mean).abs() < 4 * error).all())
     assert reference.num_simulations <= 24_000 + 1 * len(speeds)
-
-
-def test_goes_on_from_fewer_trials():
-    action, x = trials(3.0, 5.0, 4.0)
-    first = BoxCollisionReference(MODEL, action[:2], x[:2], num_effective=300)
-    spent = first.num_simulations
-    both = BoxCollisionReference(MODEL, action, x, num_effective=300, past=first)
-    alone = BoxCollisionReference(MODEL, action, x, num_effective=300, seed=1)
-    assert both.num_simulations < alone.num_simulations
-    assert first.num_simulations == spent
-    error = math.hypot(both.log_evidence_se, alone.log_evidence_se)
-    assert abs(both.log_evidence - alone.log_evidence) < 4 * error

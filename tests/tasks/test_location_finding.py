@@ -1,17 +1,12 @@
 """Location finding: the model and the task."""
 
-import math
-
-import pytest
 import torch
 from torch import Tensor
 from torch.distributions import Normal
 
 from sbi_active.tasks import get_task  # pyright: ignore
 from sbi_active.tasks.location_finding.model import (  # pyright: ignore
-    BACKGROUND,
     NOISE_SD,
-    SOFTENING,
     mean,
 )
 
@@ -19,15 +14,6 @@ from sbi_active.tasks.location_finding.model import (  # pyright: ignore
 def normal(*shape: int, seed: int) -> Tensor:
     generator = torch.Generator().manual_seed(seed)
     return torch.randn(shape, generator=generator, dtype=torch.float64)
-
-
-def test_mean_is_the_formula_row_by_row():
-    theta, action = normal(20, 4, seed=0), normal(20, 2, seed=1)
-    for row, xi, value in zip(theta, action, mean(theta, action), strict=True):
-        first, second = (float((row[k : k + 2] - xi).norm()) for k in (0, 2))
-        signal = BACKGROUND + 1 / (SOFTENING + first**2) + 1 / (SOFTENING + second**2)
-        assert float(value) == pytest.approx(math.log(signal), rel=1e-12)
-    assert (BACKGROUND, SOFTENING, NOISE_SD) == (0.1, 1e-4, 0.5)
 
 
 def test_log_likelihood_is_a_normal_s():

@@ -121,29 +121,6 @@ def test_samples_follow_the_density(history: str, variant: str) -> None:
     assert abs(product.mean() - covariance) < 4 * product.std() / len(theta) ** 0.5
 
 
-@each_variant
-def test_no_trials_give_the_prior(variant: str) -> None:
-    prior = ExactPosterior(torch.zeros(0, 1), torch.zeros(0, 1), variant=variant)
-    assert prior.log_evidence == pytest.approx(0, abs=1e-9)
-    expected = torch.tensor([-np.log(100), -np.log(100), -torch.inf, -torch.inf])
-    log_prob = prior.log_prob([[0.0, 0.0], [5.0, -5.0], [5.1, 0.0], [0.0, -5.1]])
-    torch.testing.assert_close(log_prob, expected.double())
-    theta = prior.sample(4000, seed=0)
-    assert theta.shape == (4000, 2)
-    assert theta.dtype == torch.float64
-    for draws in theta.T:
-        assert stats.kstest(draws, stats.uniform(-5, 10).cdf)[1] > 1e-3
-
-
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_samples_where_the_data_leave_the_box(sign: float) -> None:
-    posterior = ExactPosterior([0.0, 5.0], [0.0, sign * 600.0])
-    # theta_2 piles up at the edge, its density falling at the rate xi |residual|
-    rate = 5 * (600 - 25)
-    distance = 5 - sign * posterior.sample(4000, seed=0)[:, 1]
-    assert stats.kstest(distance, stats.expon(scale=1 / rate).cdf)[1] > 1e-3
-
-
 # Predictive and gain
 
 
@@ -186,12 +163,3 @@ def test_greedy_campaigns_at_the_reference_values() -> None:
 
 
 # Errors
-
-
-def test_gain_of_a_gaussian_posterior() -> None:
-    posterior = posterior_of("repeated")  # far inside the box, so a plain Gaussian
-    design = np.stack([np.exp(3 - posterior.action), posterior.action], 1)
-    new = np.stack([np.exp(3 - ACTIONS), ACTIONS], 1)
-    variance = np.einsum("ai,ij,aj->a", new, np.linalg.inv(design.T @ design), new)
-    gain = posterior.expected_information_gain(ACTIONS).numpy()
-    assert gain == pytest.approx(0.5 * np.log1p(variance), abs=1e-5)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.integrate import solve_ivp
-from scipy.stats import kstest
 from torch import Tensor
 
 from sbi_active.tasks.oscillator import reference as reference_module
@@ -25,8 +24,6 @@ from sbi_active.tasks.oscillator.model import (
     mean,
 )
 from sbi_active.tasks.oscillator.reference import OscillatorReference
-
-LOG_VOLUME = float((PRIOR_HIGH - PRIOR_LOW).double().log().sum())
 
 
 def uniform(n: int, low: Tensor, high: Tensor, seed: int) -> Tensor:
@@ -116,38 +113,6 @@ def test_evidence_matches_sampling_from_the_prior():
     assert abs(wrong.log_evidence - expected) > 4 * error
 
 
-def test_samples_follow_log_prob(posterior):
-    """Moments of draws against self-normalised moments of the density."""
-    theta = posterior.sample(10_000, seed=2)
-    assert bool(posterior.log_prob(theta).isfinite().all())
-    # an independent self-normalised sampler: a widened copy of the draws
-    center, factor = theta.mean(0), torch.linalg.cholesky(2.0 * torch.cov(theta.T))
-    generator = torch.Generator().manual_seed(3)
-    z = torch.randn(200_000, 4, generator=generator, dtype=torch.float64)
-    proposed = center + z @ factor.T
-    weight = (posterior.log_prob(proposed) + 0.5 * z.square().sum(-1)).softmax(0)
-    effective = 1 / weight.square().sum()
-    assert effective > 2_000
-    for power in (1, 2):
-        direct = ((theta - center) / theta.std(0)) ** power
-        other = ((proposed - center) / theta.std(0)) ** power
-        expected = weight @ other
-        spread = weight @ (other - expected).square()
-        error = (direct.var(0) / len(direct) + spread / effective).sqrt()
-        assert bool(((direct.mean(0) - expected).abs() < 4 * error + 0.005).all())
-
-
-def test_no_trials_give_the_prior():
-    prior = OscillatorReference(torch.zeros(0, 2), torch.zeros(0, 6))
-    theta = prior.sample(2_000, seed=0)
-    torch.testing.assert_close(
-        prior.log_prob(theta), torch.full((2_000,), -LOG_VOLUME).double()
-    )
-    unit = ((theta - PRIOR_LOW) / (PRIOR_HIGH - PRIOR_LOW)).numpy()
-    assert min(kstest(column, "uniform").pvalue for column in unit.T) > 1e-3
-    assert prior.log_evidence == 0
-
-
 # ------------------------------------------------------- the information gain
 
 
@@ -186,27 +151,3 @@ def test_linear_gaussian_limit(monkeypatch):
     )
     exact = float(marginal.log_prob(x))
     assert abs(posterior.log_evidence - exact) < 4 * posterior.log_evidence_se
-
-
-def test_gain_lies_between_contrastive_bounds():
-    """sPCE below, sNMC above (Foster et al. 2020), from the prior alone."""
-    action = ACTIONS[[2, 9, 16]].double()
-    prior = OscillatorReference([], [])
-    gain, error = prior.expected_information_gain(action)
-    n, m = 400, 6_000
-    contrast = uniform(m, PRIOR_LOW, PRIOR_HIGH, 20)
-    truth = uniform(n, PRIOR_LOW, PRIOR_HIGH, 21)
-    noise = torch.randn(
-        n, 6, generator=torch.Generator().manual_seed(22), dtype=torch.float64
-    )
-    for k, xi in enumerate(action):
-        x = mean(truth, xi[None]) + NOISE_SD * noise
-        distance = torch.cdist(x, mean(contrast, xi[None])) / NOISE_SD
-        log_other = -0.5 * distance.square()
-        log_self = -0.5 * noise.square().sum(-1)
-        everyone = torch.cat([log_self[:, None], log_other], 1)
-        lower = log_self - everyone.logsumexp(-1) + math.log(m + 1)
-        upper = log_self - log_other.logsumexp(-1) + math.log(m)
-        slack = 4 * math.hypot(float(upper.std()) / math.sqrt(n), float(error[k]))
-        assert float(upper.mean() - lower.mean()) < 1.0
-        assert lower.mean() - slack < gain[k] < upper.mean() + slack

@@ -5,8 +5,6 @@ from sbi_active.tasks import get_task  # pyright: ignore
 
 pytest.importorskip("pybullet")
 
-CONTEXT = None  # no effect here looks at it
-
 
 @pytest.fixture(scope="module")
 def task():
@@ -36,19 +34,3 @@ def test_every_effect_vanishes_at_its_null_and_not_elsewhere(task):
         assert not torch.equal(pours(task, **{name: value}), x), name
         column = torch.tensor([[0.0], [value]])
         assert torch.equal(pours(task, **{name: column})[0], x[0]), name
-
-
-def test_the_camera_shifts_and_stretches(task):
-    effects = {effect.name: effect for effect in task.effects()}
-    assert len(effects) == 9
-    x = pours(task)
-    action = torch.zeros(2, 3)
-    gain, offset = effects["camera gain"], effects["camera offset"]
-    assert torch.allclose(
-        gain.apply(x, torch.full((2, 1), 0.1), action, CONTEXT), 1.1 * x
-    )
-    assert torch.equal(offset.apply(x, torch.zeros(2, 1), action, CONTEXT), x)
-    moved = offset.apply(x, torch.full((2, 1), 0.006), action, CONTEXT)
-    pictures, before = moved.reshape(2, 150, 150), x.reshape(2, 150, 150)
-    assert torch.allclose(pictures[:, :, 3:], before[:, :, :-3], atol=1e-5)
-    assert float(pictures[:, :, :3].abs().max()) == 0

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from sbi_active.tasks import get_task  # noqa: F401  # pyright: ignore
-from sbi_active.tasks.pouring import ImagePCA, mesh_coverage
+from sbi_active.tasks.pouring import ImagePCA
 from sbi_active.tasks.pouring.raster import height_image, rotations
 
 HALF = np.array([0.002, 0.002, 0.0025])
@@ -18,17 +18,6 @@ def tumbled(num, seed=0, spread=0.15):
     turns = rng.standard_normal((num, 4))
     poses[:, 3:] = turns / np.linalg.norm(turns, axis=1, keepdims=True)
     return poses
-
-
-def test_an_upright_box_covers_its_own_pixels():
-    pose = np.array([[0.0, 0.02, 0.0025, 0, 0, 0, 1.0]])
-    image = height_image(pose, HALF[None])
-    assert image.shape == (150, 150)
-    covered = np.argwhere(image > 0)
-    assert len(covered) == 4  # 4 x 4 mm of 2 mm pixels
-    assert covered[:, 0].tolist() == [74, 74, 75, 75]  # x first, then y
-    assert covered[:, 1].min() == 84
-    assert image.max() == pytest.approx(5.0, abs=1e-3)  # mm
 
 
 def test_agrees_with_points_sampled_on_the_boxes():
@@ -62,19 +51,6 @@ def images(num, seed=0):
         [torch.outer(a, b) for a, b in zip(blobs, blobs[::-1], strict=True)]
     )
     return (weight @ basis.reshape(3, -1)).float(), weight
-
-
-def test_coverage_counts_areas():
-    image = torch.zeros(150, 150)
-    image[:38, :50] = 5.0  # the first of 4 x 3 areas
-    found = mesh_coverage(image.reshape(1, -1))[0].reshape(3, 4, 3)
-    assert found.shape == (3, 4, 3)
-    assert found[0, 0, 0] == 1.0
-    assert found[0].sum() == 1.0
-    assert found[1:, 0, 0].min() > 0.95
-    empty = mesh_coverage(torch.zeros(2, 22_500))
-    assert empty.shape == (2, 36)
-    assert float(empty.abs().max()) == 0.0
 
 
 def test_principal_components_tell_what_varies():

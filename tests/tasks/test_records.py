@@ -1,14 +1,13 @@
 """Records of one input and one output, and the two machines that have them."""
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 
 from sbi_active.tasks import ball_and_hoop, cascaded_tanks  # pyright: ignore
 from sbi_active.tasks.ball_and_hoop import spin  # pyright: ignore
 from sbi_active.tasks.cascaded_tanks import levels, start_levels  # pyright: ignore
-from sbi_active.tasks.records import Record, cut, read_record  # pyright: ignore
+from sbi_active.tasks.records import Record, cut  # pyright: ignore
 from sbi_active.tasks.stepping import lagged  # pyright: ignore
 
 HOOP = torch.tensor([[7.3, 0.8, 0.0]], dtype=torch.float64)
@@ -36,42 +35,6 @@ def run(name, num=1, **effects):
     fn, theta, _, step, bounds = MACHINES[name]
     pieces = cut(record(step, bounds), 120, every=4, slope=6 * (name == "tanks"))
     return fn(theta.expand(num * len(pieces), -1), **pieces.rows(num), **effects)
-
-
-def test_pieces_meet_at_their_ends():
-    made = record(0.1, (-1, 1), 241)
-    pieces = cut(made, 80, every=8)
-    assert pieces.voltage.shape == (3, 80)
-    assert pieces.output.shape == (3, 10)
-    assert pieces.times.tolist() == pytest.approx(np.arange(1, 11) * 0.8)
-    assert pieces.output[:-1, -1].tolist() == pieces.start[1:].tolist()
-    assert pieces.begin.tolist() == pytest.approx([0.0, 8.0, 16.0])
-    assert pieces.output[1, 0] == made.output[88]
-    assert pieces.rows(2)["inputs"]["voltage"].shape == (6, 80)
-
-
-def write(path, **columns):
-    pd.DataFrame(columns).to_csv(path, index=False)
-    return path
-
-
-def test_a_record_is_read_or_refused_with_the_reason(tmp_path):
-    time, u = np.arange(5) * 0.1, np.ones(5)
-    path = write(tmp_path / "a.csv", time_s=time, u=u, y=2 * u)
-    one = read_record(path, voltage="u", output="y")
-    assert one.name == "a"
-    assert one.step == pytest.approx(0.1)
-    assert len(one.part(1, 3)) == 2
-    with pytest.raises(ValueError, match="expected columns time_s, u, z .* got no z"):
-        read_record(path, voltage="u", output="z")
-    with pytest.raises(FileNotFoundError, match="expected a record in .*b.csv"):
-        read_record(tmp_path / "b.csv", voltage="u", output="y")
-    write(path, time_s=time, u=u, y=[1, 2, np.nan, 4, 5])
-    with pytest.raises(ValueError, match="expected finite y in a.csv; got nan in samp"):
-        read_record(path, voltage="u", output="y")
-    write(path, time_s=[0, 0.1, 0.3, 0.4, 0.5], u=u, y=u)
-    with pytest.raises(ValueError, match="expected a constant rate in a.csv"):
-        read_record(path, voltage="u", output="y")
 
 
 @pytest.mark.parametrize("name", [*MACHINES])
@@ -118,15 +81,6 @@ def test_a_lag_is_exact_for_a_step_and_has_a_slope_below_a_step():
     assert (drive - x)[1, 1] == pytest.approx(1e-3)
 
 
-def test_overflow_keeps_levels_at_their_rims():
-    full = {"inputs": {"voltage": torch.full((1, 300), 6.0)}}
-    rows = {"action": torch.tensor([[0.0, 5.0, 0.0]]), "times": torch.tensor([1_200.0])}
-    high = levels(TANKS, **rows, **full)
-    kept = levels(TANKS, **rows, **full, overflow=1.0)
-    assert high > 20
-    assert float(kept) == pytest.approx(10.0, abs=0.01)
-
-
 def test_tanks_keep_their_water():
     """What is pumped less what flows out is what is there, both areas alike."""
     theta = torch.tensor([[0.05, 0.05, 1e-9, 0.04]], dtype=torch.float64)
@@ -141,11 +95,3 @@ def test_tanks_keep_their_water():
     for _ in range(40_000):
         upper += 0.01 * (0.08 - 0.05 * upper**0.5)
     assert float(out) == pytest.approx(1.0 + 400 * 0.08 - (upper - 4.0), rel=1e-4)
-
-
-def test_a_delay_of_whole_steps_shifts_the_command():
-    made = record(0.1, (-1, 1), 241)
-    late = Record("late", 0.1, np.roll(made.voltage, 3), made.output)
-    late.voltage[:3] = made.voltage[0]
-    x = spin(HOOP, **cut(made, 240).rows(1), delay=0.3)
-    torch.testing.assert_close(x, spin(HOOP, **cut(late, 240).rows(1)))

@@ -77,16 +77,6 @@ def test_a_free_pendulum_keeps_its_energy_without_friction_alone():
     assert np.array_equal(motor, free)  # no torque while the motor is off
 
 
-def test_dry_friction_holds_what_it_can_hold():
-    weight = 0.49 * 9.81 * 0.1
-    fall = ServoPendulumTask(data=recordings((100.0, "fall", 0.5)))
-    held = every_trial(fall, coulomb=1.01 * weight * math.sin(0.52))
-    assert np.array_equal(held, np.full_like(held, 0.5))
-    slides = every_trial(fall, coulomb=0.5 * weight * math.sin(0.52))[0]
-    assert slides[-1] == slides[-5]  # at rest before the end
-    assert abs(slides[-1]) < 0.3
-
-
 def test_effects_vanish_at_zero(task):
     bare = every_trial(task)
     assert [e.name for e in task.effects()] == [
@@ -98,17 +88,6 @@ def test_effects_vanish_at_zero(task):
     for keyword in ("coulomb", "load", "torque", "viscous"):
         assert np.array_equal(every_trial(task, **{keyword: 0.0}), bare)
         assert np.abs(every_trial(task, **{keyword: 0.05}) - bare).max() > 0.01
-
-
-def test_the_real_system_replays(task):
-    assert torch.equal(task.real_system(task.actions.values[1]), torch.zeros(30))
-    other = task.with_truth([0.45, 5.0, 0.0045, 0.0015, -0.02])
-    x = other.real_system(task.actions.values[1], seed=0)
-    assert x.shape == (30,)
-    assert float(x.abs().max()) > 0.1
-    trials = task.trials([0, 2], [1])
-    assert trials.role == ["fit", "fit", "held out"]
-    assert trials.index.tolist() == [0, 2, 1]
 
 
 # Reading what was recorded
@@ -154,19 +133,6 @@ def test_reading_interpolates_and_finds_when_the_motor_is_off(folder):
 
 
 # The closed loop
-
-
-def test_viscous_friction_is_back_emf_until_the_motor_is_off(task):
-    kt, resistance = THETA[0, 0], THETA[0, 1]
-    b = 0.01
-    more = kt + b * resistance / kt  # the same torque a volt, more back-EMF
-    other = THETA.clone()
-    other[0, 0], other[0, 1] = more, resistance * more / kt
-    viscous, electric = every_trial(task, viscous=b), every_trial(task, other)
-    off = task.recordings.motor_off
-    assert off.tolist() == [False, True, False, True]
-    assert np.abs(viscous - electric)[~off].max() < 1e-9
-    assert np.abs(viscous - electric)[off].max() > 0.1
 
 
 def edited(folder, name, change):

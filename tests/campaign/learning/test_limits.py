@@ -1,9 +1,8 @@
 """What a campaign may do, and what it costs."""
 
 import pytest
-import torch
 
-from sbi_active import Campaign, DiscreteActions, SimulatorModel
+from sbi_active import Campaign, DiscreteActions
 from sbi_active.campaign.options import CampaignDetails
 from tests.campaign import problem
 from tests.campaign.learning import test_revision as revised
@@ -32,10 +31,6 @@ def measured(action):
     return 0.7 * action
 
 
-def test_without_limits_the_fastest_action_tells_most():
-    assert campaign().ask().action.tolist() == [3.0]
-
-
 @pytest.mark.parametrize("method", ["asbi", "nsbi"])
 def test_a_constraint_is_kept_by_designed_and_random_actions(method):
     c = campaign(method, limits={"constraint": below(1.5)})
@@ -61,43 +56,9 @@ def test_a_constraint_is_kept_by_actions_about_the_model(constraint, side):
     assert side * float(trial.action) > 0
 
 
-def test_information_is_weighed_against_its_cost():
-    dear = torch.tensor([1.0, 1.0, 1.0, 10.0])
-    trial = campaign(limits={"cost": dear}).ask()
-    assert float(trial.action) == 2.0
-    assert trial.design.cost.tolist() == dear.tolist()
-    gain = trial.design.expected_information_gain
-    assert torch.equal(trial.design.utility, gain / dear)
-
-
 def test_no_action_comes_twice_without_repeats():
     c = campaign("nsbi", repeat=False)
     c.run(measured, num_rounds=4)
     assert sorted(float(t.action) for t in c.history) == pytest.approx([0.1, 1, 2, 3])
     with pytest.raises(ValueError, match="expected a permitted action; got none of 4"):
         c.ask()
-
-
-@pytest.mark.parametrize("method", ["asbi", "nsbi"])
-def test_actions_that_hardly_give_a_measurement_are_left_out(method):
-    def breaks(theta, action):
-        return torch.where(action > 2.5, torch.nan, action * theta)
-
-    model = SimulatorModel(breaks, noise=MODEL.noise)
-    c = campaign(method, simulator=model, min_probability_valid=0.5)
-    assert float(c.ask().action) <= 2.5
-    assert float(c.pending.design.probability_valid[-1]) == 0.0
-
-
-@pytest.mark.parametrize(
-    ("limits", "message"),
-    [
-        ({"cost": torch.ones(3)}, "cost"),
-        ({"cost": lambda action: 0 * action[:, 0]}, "positive"),
-        ({"constraint": lambda action: torch.tensor(True)}, "expected a constraint"),
-        ({"constraint": below(0.0)}, "got none of 4"),
-    ],
-)
-def test_wrong_limits_are_an_error_at_once(limits, message):
-    with pytest.raises(ValueError, match=message):
-        campaign(limits=limits)

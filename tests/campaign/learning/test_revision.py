@@ -71,34 +71,6 @@ def test_a_hidden_bias_alarms_and_is_adopted(adopted):
     assert c.health == "ok"
 
 
-def test_trials_are_scored_before_they_are_used(adopted):
-    c, *_ = adopted
-    scores = [t.surprise for t in c.history]
-    assert all(0 < s <= 1 for s in scores)
-    assert min(scores) < 0.01
-    assert all(t.version == 0 for t in c.history)
-    assert all(t.log_score is not None for t in c.history)
-
-
-def test_the_lineage_is_in_the_state(adopted):
-    c, _, _, report = adopted
-    first, second = c.state.versions
-    assert (first.number, first.effects, first.examined) == (0, (), (report.digest,))
-    assert (second.number, second.effects, second.num_trials) == (1, ("bias",), 5)
-    assert second.digest == report.digest
-    assert second.misfit > 0.01
-
-
-def test_the_report_says_how_actions_were_chosen():
-    c = Campaign(MODEL, PRIOR, ACTIONS, options=OPTIONS)
-    tell(c, actions=(1.0, -2.0, 2.0))
-    report = c.criticize([BIAS], evaluate=False)
-    assert any("chosen for information" in w for w in report.warnings)
-    assert not report.exploratory
-    assert not c.criticize([BIAS], evaluate=False).exploratory
-    assert c.criticize(LIBRARY, evaluate=False).exploratory  # another library
-
-
 def test_a_campaign_goes_on_after_an_adoption(adopted):
     c, *_ = adopted
     trial = c.ask()
@@ -118,31 +90,6 @@ def test_a_report_of_another_model_is_refused(adopted):
     with pytest.raises(ValueError, match="expected a report of the current model, ver"):
         c.adopt(report)
     assert len(c.state.versions) == 2
-
-
-@pytest.mark.slow
-def test_a_failed_adoption_changes_nothing(monkeypatch):
-    c = campaign()
-    tell(c)
-    report = c.criticize(LIBRARY, evaluate=False)
-    belief = c.belief
-
-    def fails(*arguments, **options):
-        raise RuntimeError("out of licenses")
-
-    monkeypatch.setattr("sbi_active.campaign.learning.learner.Learner.infer", fails)
-    with pytest.raises(RuntimeError, match="licenses"):
-        c.adopt(report)
-    assert c.belief is belief
-    assert c.simulator is MODEL
-    assert len(c.state.versions) == 1
-
-
-def test_too_few_trials_to_compare():
-    c = campaign()
-    tell(c, actions=(1.0,))
-    with pytest.raises(ValueError, match="expected at least two trials to compare; g"):
-        c.criticize(LIBRARY)
 
 
 def test_every_second_trial_may_go_where_none_was():

@@ -1,7 +1,5 @@
 """The estimator that is chosen by checks, and what is said of its estimate."""
 
-import math
-
 import pytest
 import torch
 from torch.distributions import Distribution
@@ -91,15 +89,6 @@ def test_an_estimate_near_its_limit_is_said_to_be(estimator, text):
     assert disagreements(estimator, model, near, PRIOR, gain) == []
 
 
-def test_a_limit_is_that_of_the_rows_that_are_left():
-    """Missing rows make blocks smaller."""
-    estimator = InfoNCEGain(num_contrastive=63)
-    gain = torch.full((1, 64), math.log(16) - 0.5)
-    assert estimator.cautions(gain) == []
-    gain[:, 16:] = torch.nan
-    assert "log K = 2.8 nats" in estimator.cautions(gain)[0]
-
-
 def test_a_ratio_whose_normalization_is_off_is_noticed():
     simulations = rows()
     for offset, expected in ((0.0, 0), (1.0, 1)):
@@ -109,12 +98,6 @@ def test_a_ratio_whose_normalization_is_off_is_noticed():
         assert len(notes) == expected
     assert "InfoNCEGain is" in notes[0]
     assert "nats below" in notes[0]
-
-
-def test_a_bound_that_has_reached_its_limit_contradicts_nothing():
-    simulations = rows(FAR)
-    gain = RatioGain()(ExactRatio(), simulations, PRIOR)
-    assert disagreements(RatioGain(), ExactRatio(), simulations, PRIOR, gain) == []
 
 
 def test_a_former_name_is_taken_for_one_version():

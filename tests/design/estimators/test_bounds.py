@@ -17,7 +17,6 @@ from tests.design.fragile import Fragile, log_normal
 from tests.linear_gaussian import (
     PRIOR,
     ExactLikelihood,
-    ExactLikelihoodAndPosterior,
     ExactRatio,
     information,
 )
@@ -54,32 +53,6 @@ def test_the_closed_form(name):
     assert (error < 0.1).all()
 
 
-def test_what_contrastive_draws_share_is_in_the_error():
-    """Five draws move all evidences alike; without that the error is too small."""
-    estimator = LikelihoodGain(num_contrastive=5)
-    gains, errors, apart = [], [], []
-    for seed in range(40):
-        simulations = rows(n=512, seed=seed)
-        gain = estimator(ExactLikelihood(), simulations, PRIOR)[1]
-        gains.append(gain.mean())
-        errors.append(standard_error(gain))
-        apart.append(standard_error(estimate_alone(estimator, simulations)))
-    deviation = torch.stack(gains).std()
-    assert 0.6 < float(deviation / torch.stack(errors).mean()) < 1.4
-    assert float(deviation / torch.stack(apart).mean()) > 1.5
-
-
-def estimate_alone(estimator, simulations):
-    """Contributions of one action that leave out what the draws share."""
-    model, action = ExactLikelihood(), simulations.action[1]
-    theta = estimator._draw(PRIOR, simulations)
-    x = simulations.x[1]
-    apart = x[:, None] - action * theta
-    log_p = model.log_likelihood(apart, 0 * apart, action).logsumexp(1)
-    own = model.log_likelihood(x, simulations.theta, action)
-    return (own - log_p + math.log(len(theta))).double()
-
-
 def test_bounds_are_where_they_claim_to_be():
     """Six nats are too many for 100 draws."""
     simulations, exact, model = rows(FAR), float(information(FAR)), ExactLikelihood()
@@ -89,45 +62,6 @@ def test_bounds_are_where_they_claim_to_be():
         gain, error = estimate(lower, model, simulations)
         assert float(gain) < exact - 3 * float(error)
         assert lower.bound_on(model) == "lower"
-
-
-@pytest.mark.parametrize(
-    ("estimator", "exact"),
-    [
-        (LikelihoodGain(), "upper"),
-        (ContrastiveGain(), "lower"),
-        (InfoNCEGain(), "lower"),
-        (RatioGain(), "none"),
-    ],
-)
-def test_a_learned_likelihood_gives_no_upper_bound(estimator, exact):
-    assert estimator.bound_on(ExactLikelihoodAndPosterior()) == exact
-    learned = "lower" if exact == "lower" else "none"
-    assert estimator.bound_on(ExactLikelihoodAndPosterior(spread=2.0)) == learned
-    assert estimator.bound_on(ExactRatio()) == learned
-
-
-@pytest.mark.parametrize(
-    ("estimator", "most"),
-    [
-        (lambda m: LikelihoodGain(num_contrastive=m), 1_000),
-        (lambda m: ContrastiveGain(num_contrastive=m), 1_000),
-        (lambda m: InfoNCEGain(num_contrastive=m), 511),
-    ],
-)
-def test_bias_falls_with_contrastive_draws(estimator, most):
-    """Paired with the exact log ratio, whose mean has no bias."""
-    actions = torch.tensor([[4.0]])
-    simulations, model = rows(actions), ExactLikelihoodAndPosterior(proposal=2.0)
-    control = RatioGain()(ExactRatio(), simulations, PRIOR)[0]
-    bias = []
-    for num in (4, most):
-        gain = estimator(num)(model, simulations, PRIOR)[0] - control
-        bias.append((abs(float(gain.mean())), float(standard_error(gain))))
-    (few, _), (many, error) = bias
-    assert few > 0.1
-    assert many < 0.3 * few + 3 * error
-    assert many < few
 
 
 @pytest.mark.parametrize("spread", [0.5, 2.0])

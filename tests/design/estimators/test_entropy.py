@@ -4,8 +4,6 @@ Nearest neighbors have a bias of order (k / n)^(2 / d) at the edges of the densi
 tolerances are four standard errors and the stated bound of it.
 """
 
-import math
-
 import pytest
 import torch
 
@@ -69,25 +67,6 @@ def test_large_information_does_not_saturate():
     assert (distance(declared(actions=actions), information(actions)) < BIAS).all()
 
 
-def test_noise_whose_scale_depends_on_the_parameters():
-    """x = e, sd = exp(theta / 2): entropy of x from its exact scale mixture."""
-    torch.manual_seed(0)
-    theta = torch.randn(4_000, 1)
-    x, again = ((theta / 2).exp() * torch.randn(1, 4_000, 1) for _ in "ab")
-    rows = CandidateSimulations(theta, torch.zeros(1, 1), x, replicate=again)
-    assert EntropyGain().problems(rows) == []
-    grid, t = torch.linspace(-60, 60, 24_001).double(), torch.linspace(-6, 6, 241)
-    t = t.double()
-    weight = torch.softmax(-0.5 * t**2, 0)
-    density = torch.distributions.Normal(0, (t / 2).exp()).log_prob(grid[:, None])
-    density = density.exp() @ weight
-    entropy = -(density * density.clamp_min(1e-300).log()).sum() * (grid[1] - grid[0])
-    exact = entropy - 0.5 * (math.log(2 * math.pi) + 1)  # E log sd = 0
-    gain = EntropyGain()(None, rows, PRIOR)
-    error = float(gain.std() / 4_000**0.5)
-    assert float(gain.mean()) == pytest.approx(float(exact), abs=4 * error + 0.02)
-
-
 def test_noise_that_is_not_gaussian_is_noticed():
     def two_sided(like):
         return torch.distributions.Laplace(0.0, 1.0).sample(like.shape)
@@ -96,36 +75,3 @@ def test_noise_that_is_not_gaussian_is_noticed():
     assert EntropyGain().problems(declared()) == []
     (problem,) = EntropyGain().problems(replicated(noise=two_sided))
     assert problem.startswith("noise is not Gaussian")
-
-
-@pytest.mark.parametrize("simulations", [declared, replicated])
-def test_missing_outcomes_count(simulations):
-    """No measurement where theta_1 > 0: log 2, and half of what the others tell."""
-    rows = simulations()
-    lost = (rows.theta[:, 0] > 0)[None, :, None]
-
-    def lose(part):
-        return None if part is None else torch.where(lost, torch.nan, part)
-
-    missing = CandidateSimulations(
-        rows.theta, ACTIONS, lose(rows.x), lose(rows.mean), rows.noise,
-        lose(rows.replicate),
-    )  # fmt: skip
-    # theta_1 < 0 is a half normal: x_1's entropy by quadrature
-    exact = []
-    for a in ACTIONS[:, 0].tolist():
-        grid = torch.linspace(-14, 8, 4_001).double()
-        s = (1 + a**2) ** 0.5
-        unit = torch.distributions.Normal(0.0, 1.0)
-        density = 2 / s * (unit.log_prob(grid / s)).exp() * unit.cdf(-a * grid / s)
-        entropy = -(density * density.clamp_min(1e-300).log()).sum() * 0.0055
-        first = float(entropy) - 0.5 * (math.log(2 * math.pi) + 1)
-        exact.append(math.log(2) + 0.5 * (first + math.log(s)))
-    assert (distance(missing, torch.tensor(exact)) < BIAS).all()
-
-
-def test_outcomes_that_are_always_missing_tell_nothing():
-    rows = declared(n=50)
-    nan = torch.full_like(rows.x, torch.nan)
-    lost = CandidateSimulations(rows.theta, ACTIONS, nan, nan, rows.noise)
-    assert (EntropyGain()(None, lost, PRIOR) == 0).all()

@@ -106,17 +106,6 @@ def test_missing_rows_are_left_out(name, rows):
     assert gain[2].isfinite().all()
 
 
-@pytest.mark.parametrize("name", FROM_MODELS)
-def test_outcomes_at_the_same_parameters_are_averaged(name, rows):
-    again = rows.action[:, None] * rows.theta + torch.randn_like(rows.x)
-    estimator, model = ESTIMATORS[name], Everything()
-    pairs = estimator(model, replace(rows, replicate=again), PRIOR).mean(1)
-    first = estimator(model, rows, PRIOR).mean(1)
-    second = estimator(model, replace(rows, x=again), PRIOR).mean(1)
-    tolerance = 0.1 if name in DRAWING else 1e-6
-    assert torch.allclose(pairs, (first + second) / 2, atol=tolerance)
-
-
 @pytest.mark.parametrize("name", sorted(set(FROM_MODELS) - {"posterior"}))
 def test_a_model_that_cannot_say_is_an_error(name, rows):
     """A loss that the model does not know is refused, not dropped."""
@@ -127,19 +116,3 @@ def test_a_model_that_cannot_say_is_an_error(name, rows):
     model = object()
     with pytest.raises(ValueError, match=r"expected a model with log_\w+ for \w+Gain"):
         ESTIMATORS[name](model, rows, PRIOR)
-
-
-def test_a_table_of_all_pairs_is_used(rows):
-    class Table(ExactLikelihoodAndPosterior):
-        calls = 0
-
-        def log_likelihood_table(self, x, theta, action):
-            Table.calls += 1
-            n, m = len(x), len(theta)
-            pairs = x.repeat_interleave(m, 0), theta.repeat(n, 1), action
-            return self.log_likelihood(*pairs).reshape(n, m)
-
-    estimator = ESTIMATORS["likelihood"]
-    gain = estimator(Table(), rows, PRIOR)
-    assert Table.calls == 3
-    assert torch.allclose(gain, estimator(Everything(), rows, PRIOR))

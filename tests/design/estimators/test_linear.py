@@ -5,15 +5,11 @@ import torch
 from torch.distributions import MultivariateNormal
 
 from sbi_active import (
-    DiscreteActions,
     GaussianNoise,
-    InformationGainDesigner,
-    SimulatorModel,
 )
 from sbi_active.design import LinearGain
 from sbi_active.design.estimators.base import CandidateSimulations
-from sbi_active.simulation import AutocorrelatedNoise, StudentTNoise
-from sbi_active.simulation.noise.whitening import whitened
+from sbi_active.simulation import AutocorrelatedNoise
 
 DIM, NUM = 3, 200
 TIMES = torch.linspace(0, 2, NUM, dtype=torch.float64)
@@ -89,51 +85,6 @@ def test_what_is_bent_counts_as_noise():
     assert 0 < float(gain[1]) < float(gain[0])
     (note,) = LinearGain().remarks(case)
     assert "noise deviations off what is linear" in note
-
-
-def test_lost_outcomes_tell_nothing():
-    case = linear_case(GaussianNoise(0.1))
-    case.mean[1, ::2] = torch.nan
-    whole = LinearGain()(None, linear_case(GaussianNoise(0.1)), BELIEF)[1].mean()
-    half = LinearGain()(None, case, BELIEF)[1]
-    assert (half[::2] == 0).all()
-    assert float(half.mean()) == pytest.approx(float(whole) / 2, rel=0.1)
-
-
-def test_whitened_numbers_are_independent():
-    noise = AutocorrelatedNoise([0.1, 3.0], correlation_time=0.5).at(TIMES)
-    draws = noise.sample(torch.zeros(4000, NUM, 2).double())
-    w = whitened(noise, draws)
-    assert w.shape == draws.shape
-    assert float(w.std()) == pytest.approx(1.0, abs=0.01)
-    assert abs(float((w[:, 1:, 0] * w[:, :-1, 0]).mean())) < 0.01
-    some = draws.clone()
-    some[:, 5, 0] = torch.nan  # the next is seen from the one before
-    again = whitened(noise, some)
-    assert bool(again[:, 5, 0].isnan().all())
-    assert float(again[:, 6, 0].std()) == pytest.approx(1.0, abs=0.05)
-    heavy = whitened(StudentTNoise(0.5, df=4.0), torch.ones(1, 3).double())
-    assert heavy.tolist() == [[2.0, 2.0, 2.0]]
-
-
-def test_a_designer_takes_it_by_name_with_pending_actions():
-    model = SimulatorModel(
-        lambda t, a: torch.einsum(
-            "nd,nkd->nk", t.double(), torch.stack([jacobian(float(v)) for v in a])
-        ).float(),
-        noise=GaussianNoise(0.1),
-    )
-    designer = InformationGainDesigner(
-        DiscreteActions([0.5, 1.5, 3.0]), num_samples=160, estimator="linear"
-    )
-    alone = designer.select(None, model, belief=BELIEF, seed=0)
-    after = designer.select(
-        None, model, belief=BELIEF, pending=torch.tensor([[3.0]]), seed=0
-    )
-    assert float(alone.action) == 3.0
-    best = float(alone.expected_information_gain.max())
-    assert best == pytest.approx(exact(3.0, torch.eye(NUM).double() / 0.01), abs=1.0)
-    assert 0 < float(after.expected_information_gain.max()) < 0.3 * best
 
 
 def test_of_some_parameters_it_is_exact_with_the_others_as_nuisances():

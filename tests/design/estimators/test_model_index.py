@@ -74,13 +74,6 @@ def test_quadrature(rivals):
     assert gain.argsort().tolist() == exact.argsort().tolist()
 
 
-def test_distinct_models_give_the_entropy_of_their_probabilities():
-    far = [Gaussian(0.8, 100.0), Gaussian(0.2, -100.0)]
-    entropy = -(0.8 * math.log(0.8) + 0.2 * math.log(0.2))
-    gain, _ = estimate(far, 400)
-    assert float(gain[-1]) == pytest.approx(entropy, abs=0.01)
-
-
 @dataclass
 class Trajectory:
     """A correlated trajectory of 200 numbers, a small wave on it or not."""
@@ -158,35 +151,9 @@ class Mixed:
         return mean + sd * torch.randn(num_samples, 1, generator=generator)
 
 
-class Blind:
-    """The same outcomes, of which nothing is known."""
-
-    def __init__(self, rival):
-        self.probability, self.predict = rival.probability, rival.predict
-
-
 def test_draws_that_stand_for_the_same_parameters_tell_nothing_by_it():
     """Two posteriors of few draws, far apart: each outcome is near one draw."""
     rivals = [Mixed(0.5, 0.0, 50.0, 0.01)] * 2
     gains = torch.stack([estimate(rivals, 400, seed)[0] for seed in range(4)])
     error = gains.std(0) / 4**0.5
     assert (gains.mean(0) < 3 * error + 0.02).all()
-
-
-def test_known_noise_makes_the_bound_tighter():
-    """Two classes of means that interleave, apart by many times the noise."""
-
-    class Comb(Mixed):
-        def predict_mean(self, action, num_samples, seed):
-            generator = torch.Generator().manual_seed(seed)
-            tooth = torch.randint(4, (num_samples, 1), generator=generator)
-            jitter = 0.1 * torch.randn(num_samples, 1, generator=generator)
-            mean = (tooth + self.center) * 20.0 * action + jitter
-            return mean, torch.ones_like(mean)
-
-    rivals = [Comb(0.5, 0.0, 0.0), Comb(0.5, 0.5, 0.0)]
-    known, error = estimate(rivals, 160)
-    blind, _ = estimate([Blind(rival) for rival in rivals], 160)
-    assert float(known[-1]) > math.log(2) - 0.15
-    assert float(known[-1]) < math.log(2) + 1e-9
-    assert float(known[-1]) > float(blind[-1]) + 3 * float(error[-1])

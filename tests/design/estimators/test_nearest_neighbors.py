@@ -29,20 +29,6 @@ def test_the_entropy_of_a_gaussian_of_any_units(dim, k):
     assert float(each.mean()) == pytest.approx(exact, abs=4 * error)
 
 
-def test_the_spread_of_the_rows_is_the_error_of_their_mean():
-    means, errors = [], []
-    for seed in range(60):
-        x = torch.rand(
-            300, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
-        )
-        each = nearest_neighbor_entropy(x, 3)
-        means.append(float(each.mean()))
-        errors.append(float(each.std()) / math.sqrt(300))
-    spread = float(torch.tensor(means).std())
-    # 60 sets know a deviation to 9 %.
-    assert spread == pytest.approx(sum(errors) / 60, rel=0.3)
-
-
 def test_outcomes_that_are_the_same_have_the_entropy_of_their_rounding():
     x = torch.randn(200, 1, generator=torch.Generator().manual_seed(0)).double()
     repeated = x[:20].repeat(10, 1)

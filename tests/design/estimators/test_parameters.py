@@ -12,7 +12,6 @@ from sbi.utils import BoxUniform
 from torch.distributions import MultivariateNormal
 
 from sbi_active.design.estimators.base import CandidateSimulations
-from sbi_active.design.estimators.densities import cross_fit, patterns_of_numbers
 from sbi_active.design.estimators.posterior import ParameterGain
 
 COVARIANCE = torch.tensor([[1.0, 0.6, 0.0], [0.6, 1.0, 0.0], [0.0, 0.0, 1.0]])
@@ -76,39 +75,3 @@ def test_a_bounded_belief_and_a_curve():
     assert_lower_bound(ParameterGain([0])(None, rows, belief), exact[None], 0.25)
     idle = ParameterGain([1])(None, rows, belief).mean()
     assert abs(float(idle)) < 0.05
-
-
-def test_invalid_outcomes_count():
-    """Nothing else than a validity that is the sign of theta: log 2."""
-    torch.manual_seed(0)
-    belief = MultivariateNormal(torch.zeros(2), torch.eye(2))
-    theta = belief.sample((800,))
-    x = torch.randn(1, 800, 1)
-    x[0, theta[:, 0] > 0] = torch.nan
-    missing = torch.rand(1, 800) < 0.1
-    x[missing] = torch.nan
-    rows = CandidateSimulations(theta, torch.zeros(1, 1), x, missing=missing)
-    gain = ParameterGain([0])(None, rows, belief)
-    assert torch.equal(gain.isnan(), missing)
-    known = gain[~missing]
-    error = float(known.std() / len(known) ** 0.5)
-    exact = math.log(2)
-    # a half normal is not a mixture of few Gaussians: some slack
-    assert exact - SLACK < float(known.mean()) < exact + 3 * error
-
-
-def test_rows_are_scored_without_themselves():
-    """A member that memorizes its training rows gains nothing."""
-
-    def memorizes(train, test):
-        assert not set(train.tolist()) & set(test.tolist())
-        return torch.stack([torch.zeros(len(test)), torch.ones(len(test))]).double()
-
-    score = cross_fit(memorizes, torch.arange(10), torch.ones(10))
-    assert score.tolist() == [1.0] * 10  # the better member, everywhere
-    groups = patterns_of_numbers(
-        torch.tensor([[1.0, torch.nan]] * 3 + [[1.0, 1.0]] * 3 + [[torch.nan] * 2]),
-        torch.ones(7).bool(), 2,
-    )  # fmt: skip
-    found = sorted((r.tolist(), c.tolist()) for r, c in groups)
-    assert found == [([0, 1, 2], [0]), ([3, 4, 5], [0, 1]), ([6], [])]

@@ -1,8 +1,6 @@
 """What is known of a belief, as a value."""
 
-import copy
 import json
-import pickle
 
 import pytest
 
@@ -18,25 +16,12 @@ KNOWN = Diagnostics(
 ).extended(bandwidth=0.1, num_missing=2)
 
 
-def test_a_warning_takes_the_trust():
-    assert KNOWN.warned() is KNOWN
-    warned = KNOWN.warned("one").warned("two")
-    assert not warned.trustworthy
-    assert warned.warnings == ("one", "two")
-
-
 def test_as_plain_data():
     plain = KNOWN.to_dict()
     assert json.loads(json.dumps(plain)) == plain
     assert plain["assumptions"] == {"settled": {"holds": False, "figure": 0.3}}
     assert plain["bandwidth"] == 0.1
     assert "effective_sample_size" not in plain  # not known
-
-
-@pytest.mark.parametrize("known", [KNOWN, Diagnostics()])
-def test_it_travels(known):
-    assert copy.deepcopy(known) == known
-    assert pickle.loads(pickle.dumps(known)) == known
 
 
 def test_entries_by_name_go_in_the_next_version():

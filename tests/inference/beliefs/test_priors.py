@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from sbi.utils import BoxUniform, MultipleIndependent
+from sbi.utils import BoxUniform
 from sbi.utils.torchutils import set_validate_args
 from torch.distributions import (
     Bernoulli,
@@ -27,10 +27,6 @@ from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.seeding import forked_generators
 
 TWO = torch.ones(2)
-PAYLOAD = MultipleIndependent(
-    [BoxUniform(torch.zeros(1), torch.ones(1)), Bernoulli(torch.tensor([0.5]))],
-    validate_args=False,
-)
 
 
 def independent(prior: Distribution) -> Independent:
@@ -53,26 +49,6 @@ def test_what_is_discrete_or_tied_is_refused(prior, message):
         require_support(prior)
     with pytest.raises(ValueError, match=message):
         campaign(prior)
-
-
-@pytest.mark.parametrize(
-    "options", [{"method": "alhi"}, {"refine": False}, {"max_simulations": 500}]
-)
-def test_what_does_not_refine_refuses_discrete_parameters(options):
-    with pytest.raises(ValueError, match="got a discrete one, BoxUniform, Bernoulli"):
-        campaign(PAYLOAD, **options)
-
-
-@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
-def test_a_default_dtype_of_few_bits_is_refused(dtype):
-    prior = BoxUniform(0 * TWO, TWO)
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(dtype)
-    try:
-        with pytest.raises(ValueError, match="float32 or float64 that hold numbers"):
-            require_support(prior)
-    finally:
-        torch.set_default_dtype(before)
 
 
 def test_draws_that_repeat_are_refused():
@@ -105,14 +81,12 @@ def campaign(prior: Distribution, method: str = "asbi", **options) -> Campaign:
 
 
 NETWORKS = {True: "each round", False: "on demand"}
-MODES = Normal(torch.tensor([[-1.0, 0.6], [0.0, 0.5]]), 0.3 * torch.ones(2, 2))
 
 
 @pytest.mark.parametrize(
     "prior",
     [
         independent(Cauchy(0 * TWO, TWO)),
-        independent(MixtureSameFamily(Categorical(torch.ones(2, 2)), MODES)),
         TransformedDistribution(
             independent(Normal(0 * TWO, TWO)),
             [ExpTransform(), AffineTransform(0.2, 1.0)],
@@ -125,7 +99,6 @@ MODES = Normal(torch.tensor([[-1.0, 0.6], [0.0, 0.5]]), 0.3 * torch.ones(2, 2))
     ],
     ids=[
         "Cauchy",
-        "mixture",
         "shifted log-normal",
         "mixture of bounds",
         "angle",

@@ -76,30 +76,6 @@ def test_a_density_cut_at_many_edges(dim: int):
     assert found.log_evidence == pytest.approx(exact, abs=4 / effective**0.5)
 
 
-@pytest.mark.parametrize("width", [1e-1, 1e-3])
-def test_a_slanted_normal_density_of_six_parameters(width: float):
-    dim, center = 6, np.full(6, 0.2)
-    rng = np.random.default_rng(5)
-    root = width * np.linalg.qr(rng.standard_normal((dim, dim)))[0]
-    root = root * np.linspace(0.2, 1.0, dim)
-    log_volume = np.linalg.slogdet(root)[1] + 0.5 * dim * np.log(2 * np.pi)
-
-    def log_density(z: np.ndarray) -> np.ndarray:
-        step = np.linalg.solve(root, (z - center).T)
-        return -0.5 * (step**2).sum(0) - log_volume
-
-    found = learned_fit(likelihood_of(dim, log_density), rng)
-    assert found is not None
-    # An efficiency of a hundredth would say that a tempered proposal was kept.
-    assert found.efficiency > 0.2
-    error = 4 / found.effective_sample_size**0.5
-    assert found.log_evidence == pytest.approx(-dim * np.log(2), abs=error)
-    draws = found.draws(3_000, rng)
-    scaled = np.linalg.solve(root, (draws - center).T)
-    assert abs(scaled.mean(1)).max() < 0.15
-    assert abs(scaled.std(1) - 1).max() < 0.1
-
-
 PLATEAU = -20.0  # log likelihood where nothing is known
 DIM = 4
 
@@ -124,11 +100,6 @@ def test_a_peak_on_a_plateau_is_not_lost(is_known: bool, width: float):
     assert found.log_evidence == pytest.approx(-DIM * np.log(2), abs=0.1)
     draws = found.draws(500, rng)
     assert draws.mean(0) == pytest.approx(center, abs=0.3 * width)
-
-
-def test_nothing_with_a_likelihood_is_no_fit():
-    own = likelihood_of(2, lambda z: np.full(len(z), -np.inf))
-    assert learned_fit(own, np.random.default_rng(0)) is None
 
 
 @pytest.mark.parametrize("shape", [0.5, 1.0])

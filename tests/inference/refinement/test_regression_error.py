@@ -8,12 +8,9 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from sbi_active.inference.refinement.regression_error import expected_error, widened
+from sbi_active.inference.refinement.regression_error import expected_error
 from sbi_active.inference.regression.histories import Histories
 from sbi_active.inference.regression.regions import (
-    WIDE,
-    Region,
-    around,
     whole_space,
 )
 from sbi_active.inference.regression.surrogate import (
@@ -78,73 +75,6 @@ def histories_of(curve) -> Histories:
     near = coordinates.to_z(torch.full((1, DIM), 0.2))
     histories.add(near + 0.05 * rng.standard_normal((150, DIM)), 30)
     return histories
-
-
-def missed_inside(curve, *, is_wide: bool) -> tuple[float, float]:
-    """Return the expected error of a regression, and how far it is off inside.
-
-    The second is the mean difference over the inner rows, in deviations of the noise.
-    """
-    coordinates = PriorCoordinates(PRIOR, np.random.default_rng(0))
-    weight = np.random.default_rng(1).standard_normal((DIM, 40))
-    observed = 0.3 * np.random.default_rng(2).standard_normal(40)
-    draws = 0.05 * np.random.default_rng(4).standard_normal((1_000, DIM))
-    near, rng = around(draws), np.random.default_rng(3)
-    region = near
-    if is_wide:
-        region = near.wider(WIDE)
-    z = region.sample_inside(1_500, coordinates, rng)
-    exact = curve(z) @ weight - observed
-    x = exact + 0.3 * rng.standard_normal(exact.shape)
-    pairs = 0.3 * rng.standard_normal((2, 100, 40))
-    noise = estimate_noise(pairs[0], pairs[1], np.ones(40))
-    fit = LocalRegression.fit(region, z, x, noise=noise, num_trials=1)
-    assert fit is not None
-    error = expected_error(Surrogate(coordinates, [fit]), draws, rng)
-    inside = near.distance(z) <= 1
-    gap = fit.whitened(z[inside])[0] - fit.whitened_outcomes(exact[inside])
-    return error, float(np.abs(gap.mean(0)).mean())
-
-
-@pytest.mark.parametrize("bend", [0.0, 6.0])
-def test_wide_simulations_tell_slopes_better(bend: float):
-    """They err half as much, if the response is linear and if a cubic follows it."""
-
-    def curve(z):
-        return np.sin(bend * z) / bend if bend else z
-
-    near, wide = (missed_inside(curve, is_wide=k)[0] for k in (False, True))
-    assert wide < 0.6 * near
-
-
-def test_what_differs_further_off_shifts_nothing_inside():
-    def curve(z):
-        return z + 0.1 * (np.linalg.norm(z, axis=1, keepdims=True) > 0.25)
-
-    _, gap = missed_inside(curve, is_wide=True)
-    # That is the mean of the noise of some 750 rows, .029; one intercept for all of
-    # them would be .056 off.
-    assert gap < 0.035
-
-
-@pytest.mark.parametrize("is_linear", [True, False])
-def test_simulations_from_further_off_are_taken_where_they_agree(is_linear: bool):
-    histories = histories_of(
-        (lambda t: t) if is_linear else (lambda t: torch.sin(4 * t))
-    )
-    center = histories.coordinates.to_z(torch.full((1, DIM), 0.2))[0]
-    fit = histories.regress(Region(center, 0.05 * np.eye(DIM), 3.0))
-    assert fit is not None
-    surrogate = Surrogate(histories.coordinates, [fit])
-    rng = np.random.default_rng(2)
-    draws = center + 0.02 * rng.standard_normal((1_000, DIM))
-    error = expected_error(surrogate, draws, rng)
-    wide, bias = widened(histories, surrogate, error, draws, rng)
-    if is_linear:
-        assert expected_error(wide, draws, rng) + bias < 0.6 * error
-        assert len(wide.regressions[0].residual) > 300
-    else:
-        assert len(wide.regressions[0].residual) < 250
 
 
 def test_histories_that_are_taken_over_keep_their_repetitions():

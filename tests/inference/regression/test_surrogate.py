@@ -45,20 +45,3 @@ def test_misfit_is_told_from_noise():
     assert fit.has_misfit
     assert fit.ratio > 3
     assert fit.caution >= 2
-
-
-def test_cubic_is_smooth_and_a_wave_is_not():
-    assert regress(lambda z: z**3 - z)[0].roughness < 0.01
-    assert regress(lambda z: np.sin(8 * z))[0].roughness > 0.5
-
-
-def test_powers_alone_serve_many_parameters():
-    rng = np.random.default_rng(0)
-    z = rng.uniform(-1, 1, (NUM, 12))  # too few rows for 455 cubics
-    x = np.exp(z) + 0.1 * rng.standard_normal((NUM, 12))
-    pairs = 0.1 * rng.standard_normal((2, 80, 12))
-    noise = estimate_noise(pairs[0], pairs[1], np.ones(12))
-    fit = LocalRegression.fit(whole_space(12), z, x, noise=noise, num_trials=1)
-    assert fit is not None
-    assert fit.basis.num_features == 37 == fit.basis(z).shape[1]
-    assert not fit.has_misfit

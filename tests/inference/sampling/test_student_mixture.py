@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_t
 
-from benchmarks.location_finding.kernels import KernelMixture
 from sbi_active.inference.sampling.student_mixture import (
-    Defended,
     StudentMixture,
     lower_factors,
 )
@@ -34,26 +32,6 @@ def test_the_density_is_scipy_s():
     assert even.log_prob(Z) == pytest.approx(np.log(density(np.full(2, 0.5))))
 
 
-@pytest.mark.parametrize("kind", [StudentMixture, KernelMixture])
-def test_draws_have_the_moments_of_the_mixture(kind):
-    draws = kind(MEANS, FACTORS).sample(400_000, np.random.default_rng(1))
-    assert draws.mean(0) == pytest.approx(MEANS.mean(0), abs=0.02)
-    within = 5 / 3 * (FACTORS @ np.swapaxes(FACTORS, 1, 2)).mean(0)
-    between = np.outer(*[(MEANS[1] - MEANS[0]) / 2] * 2)
-    assert np.cov(draws.T) == pytest.approx(within + between, abs=0.05)
-
-
-def test_a_defended_proposal_mixes_densities_and_draws():
-    near, far = StudentMixture(MEANS[:1], FACTORS[:1]), KernelMixture(MEANS, FACTORS)
-    defended = Defended(near, far, share=0.3)
-    expected = 0.7 * np.exp(near.log_prob(Z)) + 0.3 * np.exp(far.log_prob(Z))
-    assert defended.log_prob(Z) == pytest.approx(np.log(expected))
-    draws = defended.sample(20_000, np.random.default_rng(0))
-    assert len(draws) == 20_000
-    # Of the far kernels' draws half lie at the second mean.
-    assert (draws[:, 0] > 1.5).mean() == pytest.approx(0.15, abs=0.01)
-
-
 def test_a_split_mixture_is_normalized_and_matches_its_draws():
     rng = np.random.default_rng(0)
     axes = FACTORS @ np.array([[0.8, -0.6], [0.6, 0.8]])
@@ -68,13 +46,6 @@ def test_a_split_mixture_is_normalized_and_matches_its_draws():
     for region in (lambda u: u[:, 0] > 3.0, lambda u: u[:, 1] > u[:, 0]):
         expected = (ratio * region(z)).mean()
         assert region(draws).mean() == pytest.approx(expected, abs=0.02)
-
-
-def test_a_split_mixture_of_equal_sides_is_a_student_mixture():
-    ones = np.ones((2, 2))
-    split = StudentMixture(MEANS, FACTORS, WEIGHTS, left=ones, right=ones)
-    mixture = StudentMixture(MEANS, FACTORS, WEIGHTS)
-    assert split.log_prob(Z) == pytest.approx(mixture.log_prob(Z))
 
 
 def test_a_singular_covariance_has_its_smallest_variances_raised():

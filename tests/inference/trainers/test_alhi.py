@@ -9,7 +9,7 @@ import torch
 from sbi.inference.potentials import likelihood_estimator_based_potential
 from sbi.utils import BoxUniform
 
-from sbi_active import ALHI, MixtureDensity, RefinementOptions
+from sbi_active import ALHI, MixtureDensity
 from sbi_active.inference.models.product import Product
 from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
@@ -73,20 +73,6 @@ def test_the_belief_is_the_product_over_the_history():
     assert belief.mean.tolist() == pytest.approx(mean.tolist(), abs=0.15 * float(sd))
     # A belief of the last trial alone is far from it.
     assert divergence(belief, TRIALS[:1]) > 0.5
-
-
-def test_a_simulator_refines_and_is_counted():
-    torch.manual_seed(0)
-    inference = ALHI(PRIOR, SETTINGS, show_progress_bars=False)
-    settings = RefinementOptions(num_histories=1_000)
-    belief = observe(inference, simulator=simulator, refinement=settings)
-    # 500 rows an action or more in the last stage: .08 noise deviations of f, twice.
-    assert abs(divergence(belief)) < 0.1
-    assert belief.diagnostics.num_simulations == 2_000  # two actions each
-    trials = inference.trials
-    again = inference.update_all(trials, simulator, refinement=settings, seed=3)
-    assert abs(divergence(again)) < 0.1
-    assert inference.trials == trials
 
 
 def test_the_product_is_sbi_s_condition_on_theta():

@@ -81,16 +81,6 @@ def test_invalid_trials_count_whatever_their_place(first):
     assert not both.diagnostics.trustworthy  # no parameter explains both
 
 
-def test_an_invalid_trial_no_simulation_explains_changes_nothing():
-    invalid = Observation(torch.tensor([1.0]), torch.full((2,), torch.nan))
-    trials = [*TRIALS, invalid]
-    belief = ASBI(PRIOR).update_all(trials, simulator, refinement=SETTINGS, seed=0)
-    assert divergence(belief, exact(TRIALS)) < COST
-    assert belief.diagnostics.probability_of_outcome == [1, 1, 1, 0]
-    texts = " ".join(belief.diagnostics.warnings)
-    assert "the simulator lacks a way to fail" in texts
-
-
 class _Network:
     """A stand-in for a chained belief: the exact posterior, scaled and moved."""
 

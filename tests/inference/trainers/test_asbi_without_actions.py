@@ -53,17 +53,3 @@ def test_two_rounds_are_numerically_npe_c(density_estimator):
     torch.manual_seed(2)
     assert torch.equal(ours.log_prob(theta), expected[0])
     assert torch.equal(ours.sample((5,)), expected[1])
-
-
-@pytest.mark.filterwarnings("ignore:.*Maximum number of epochs")
-def test_the_default_estimator_is_sbi_s():
-    torch.manual_seed(0)
-    theta = PRIOR.sample((200,))
-    x = simulate(theta)
-    nets = []
-    for trainer in (ASBI(PRIOR), NPE_C(PRIOR, tracker=SilentTracker())):
-        torch.manual_seed(3)
-        nets.append(trainer.append_simulations(theta, x).train(max_num_epochs=1))
-    ours, theirs = (net.state_dict() for net in nets)
-    assert ours.keys() == theirs.keys()
-    assert all(torch.equal(ours[name], theirs[name]) for name in ours)

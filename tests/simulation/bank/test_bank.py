@@ -1,15 +1,12 @@
 import os
 import signal
-import subprocess
-import sys
-import textwrap
 import time
 import traceback
 
 import pytest
 import torch
 
-from sbi_active import Bank, GaussianNoise, SimulatorModel, simulate
+from sbi_active import Bank, simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import Simulations
 from sbi_active.simulation.bank import LockedError
@@ -39,22 +36,6 @@ def same(a, b):
         torch.equal(x.nan_to_num(nan=-99.0), y.nan_to_num(nan=-99.0))
         for x, y in [(a.theta, b.theta), (a.action, b.action), (a.x, b.x)]
     ) and torch.equal(a.status, b.status)
-
-
-def test_rows_come_back_as_they_went_in(bank):
-    theta, action = draw(500)
-    stored = simulate(simulator, theta, action, seed=3, store=bank)
-    reader = Bank(bank.path)
-    assert same(reader.read(), simulate(simulator, theta, action, seed=3))
-    assert len(reader) == 500
-    assert reader.counts == stored.counts
-    assert 20 < reader.counts["invalid"] < 80
-    column = reader.columns("index", "seed", "log_proposal")
-    assert column["index"].tolist() == list(range(500))
-    assert (column["seed"] == 3).all()
-    assert column["log_proposal"].isnan().all()
-    assert reader.header["shapes"] == {"theta": [2], "action": [1], "x": [3]}
-    assert reader.verify() == []
 
 
 def test_what_is_stored_is_not_simulated_again(tmp_path):
@@ -91,15 +72,6 @@ def test_part_of_a_run_is_completed(bank):
     assert sorted(other.load(run)[0].tolist()) == list(range(300))
 
 
-def test_same_rows_are_stored_once(bank):
-    rows = simulate(simulator, *draw(50), seed=0)
-    assert bank.append(rows, seed=0) == 50
-    assert bank.append(rows, seed=0) == 0
-    assert bank.append(rows, seed=1) == 50
-    simulate(simulator, rows.theta, rows.action, seed=0, store=bank)
-    assert len(bank) == 100
-
-
 def test_rows_by_position_slice_and_mask(bank, monkeypatch):
     monkeypatch.setattr(module, "SEGMENT_BYTES", 45 * 60)  # about 60 rows a segment
     rows = simulate(simulator, *draw(200), seed=0)
@@ -119,59 +91,12 @@ def test_rows_by_position_slice_and_mask(bank, monkeypatch):
             bank.read(bad)
 
 
-@pytest.mark.slow
-def test_memory_is_bounded_by_a_segment(tmp_path):
-    code = """
-        import resource, sys, torch
-        from sbi_active import Bank, Simulations
-
-        def simulator(theta, action):
-            return theta
-
-        rows = 2_000
-        with Bank(sys.argv[1], simulator=simulator) as bank:
-            for seed in range(10):
-                theta = torch.full((rows, 1), float(seed))
-                x = torch.full((rows, 5_000), float(seed))  # 40 MB
-                bank.append(Simulations(theta, theta, x), seed=seed)
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        total = 0.0
-        for chunk in Bank(sys.argv[1]).chunks(1_000):
-            total += float(chunk.x.double().mean())
-        after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        print(total, bank.num_bytes / 2**20, (after - before) / 2**10)
-    """
-    total, size, growth = map(float, _run(code, tmp_path / "bank").split())
-    assert total == pytest.approx(2 * sum(range(10)))
-    assert size > 380  # MiB
-    assert growth < 130
-
-
 def test_a_run_of_one_row_goes_on(bank):
     theta, action = draw(1)
     first = simulate(simulator, theta, action, seed=3, store=bank)
     again = simulate(simulator, theta, action, seed=3, store=bank)
     assert same(first, again)
     assert len(bank) == 1
-
-
-def test_many_small_sets_keep_their_places(bank):
-    for seed in range(70):
-        theta, action = draw(4)
-        simulate(simulator, theta, action, seed=seed, store=bank)
-        if seed == 59:
-            before = bank.read()
-            reader = Bank(bank.path)
-            assert len(reader) == 240
-    assert same(reader.read(torch.arange(240)), before)
-    assert bank.columns("seed")["seed"].tolist() == [
-        s for s in range(70) for _ in "abcd"
-    ]
-    assert len(bank.load(bank._rows.segments()[5].run)[0]) == 4
-    assert same(reader.read(torch.arange(240)), before)
-    assert bank.verify() == []
-    bank.close()
-    assert bank.num_bytes < 500_000
 
 
 def test_what_a_writer_that_died_left_is_removed(bank):
@@ -303,18 +228,6 @@ def test_what_is_stored_is_synchronized_with_the_disk(bank):
     assert found == [2, "wal", 0]  # 2: an fsync at each commit
 
 
-def test_names_and_settings_are_in_the_header(tmp_path):
-    model = SimulatorModel(
-        simulator, noise=GaussianNoise(0.5), parameter_names=["mass", "friction"]
-    )
-    header = Bank(tmp_path / "bank", simulator=model, created="2026-01-31").header
-    assert header["parameter_names"] == ["mass", "friction"]
-    assert header["created"] == "2026-01-31"
-    assert header["simulator"]["noise"]["sd"] == 0.5
-    assert header["simulator"]["fn"]["name"].endswith("test_bank.simulator")
-    assert Bank(tmp_path / "bank").simulator_name.endswith("test_bank.simulator")
-
-
 class forked:  # noqa: N801
     """A function in a process of its own, which needs no imports."""
 
@@ -348,12 +261,3 @@ class forked:  # noqa: N801
         if kind is not None and self():
             os.kill(self.pid, signal.SIGKILL)
         assert kind or self.join() in (0, -signal.SIGKILL)
-
-
-def _run(code, *arguments):
-    return subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code), *map(str, arguments)],
-        check=True,
-        capture_output=True,
-        text=True,
-    ).stdout

@@ -3,7 +3,6 @@ import os
 import resource
 import shutil
 import subprocess
-import warnings
 
 import pytest
 import torch
@@ -92,26 +91,6 @@ def test_version_stands_for_the_source(tmp_path):
     assert line == "version '1' there, '2' here"
 
 
-def test_settings_in_closures_and_partials_count():
-    def make(gain):
-        return lambda theta, action: gain * theta
-
-    (line,) = differences(fingerprint(make(1.0)), fingerprint(make(3.0)))
-    assert line == "simulator.captured.gain 1.0 there, 3.0 here"
-    assert differences(fingerprint(make(1.0)), fingerprint(make(1.0))) == []
-    assert differences(fingerprint(Robot(1)), fingerprint(Robot(1))) == []
-
-
-def test_other_shapes_and_lengths(bank):
-    wide = Simulations(torch.rand(3, 2), torch.rand(3, 1), torch.rand(3, 5))
-    with pytest.raises(ValueError, match=r"'x': \[2\]}, as in the bank .* 'x': \[5\]"):
-        bank.append(wide, seed=2)
-    short = {"theta": torch.rand(2, 2), "action": torch.rand(3, 1), "x": _x(3)}
-    with pytest.raises(ValueError, match="expected 3 rows, one an index; got .*'the"):
-        bank.save("run", index=torch.arange(3), status=torch.zeros(3), seed=0, **short)
-    assert len(bank) == 200
-
-
 def test_other_formats_and_folders(bank, tmp_path):
     bank.close()
     execute(bank.path, "PRAGMA user_version = 99")
@@ -129,14 +108,6 @@ def test_other_formats_and_folders(bank, tmp_path):
 def test_a_bank_that_reads_does_not_write(bank):
     with pytest.raises(ValueError, match="opened with its simulator, to write to"):
         Bank(bank.path).append(rows(), seed=5)
-
-
-def test_proposal_and_label_belong_together(bank):
-    with pytest.raises(ValueError, match="a proposal and its label together"):
-        bank.append(rows(), seed=5, label="prior")
-    normal = torch.distributions.Normal(torch.zeros(2), torch.ones(2))
-    with pytest.raises(ValueError, match=r"one log density a row .* \(100, 2\)"):
-        bank.append(rows(), seed=5, proposal=normal, label="prior")
 
 
 def full_disk(folder):
@@ -200,23 +171,3 @@ def test_a_folder_that_cannot_be_written(small_disk):
         OSError, match="a folder that can be made for a bank; got 'Read"
     ):
         Bank(small_disk / "new", simulator=simulator)
-
-
-def test_a_folder_below_a_file(tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(OSError, match="can be made for a bank; got 'Not a directory'"):
-        Bank(tmp_path / "file" / "bank", simulator=simulator)
-    with pytest.raises(ValueError, match="expected a bank; got no"):
-        Bank(tmp_path / "file" / "bank")
-
-
-def test_rows_from_elsewhere_are_noticed(bank):
-    box = torch.distributions.Uniform(torch.zeros(2), 0.5 * torch.ones(2))
-    half = torch.distributions.Independent(box, 1)
-    with pytest.warns(UserWarning, match="rows have density 0 under the proposal 'h'"):
-        bank.append(rows(), seed=7, proposal=half, label="h")
-    inside = rows()
-    inside.theta.mul_(0.5)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        bank.append(inside, seed=8, proposal=half, label="h")

@@ -89,13 +89,6 @@ def test_a_changed_global_variable_is_another_simulator(sled, monkeypatch, name,
         assert all(f"globals.{name}" in line for line in lines)
 
 
-def test_an_array_is_seen_by_its_numbers(sled):
-    before = fingerprint(sled.slide)
-    sled.TABLE[7] = -1.0
-    (line,) = differences(before, fingerprint(sled.slide))
-    assert "globals.TABLE" in line
-
-
 @pytest.mark.parametrize("of", [lambda m: m.Sled(), lambda m: m.made(2.0)])
 def test_of_methods_and_inner_functions(sled, monkeypatch, of):
     before = fingerprint(of(sled))

@@ -6,17 +6,14 @@ import pytest
 
 from sbi_active import Bank
 from sbi_active.cli import main
-from sbi_active.simulation import reuse
 from sbi_active.simulation.bank import CorruptSegmentError
 from tests.simulation.bank.filled import (
     FILE,
-    appended,
     crafted,
     execute,
     fill,
     filled,
     flip,
-    prior,
     remove,
     simulator,
 )
@@ -25,24 +22,6 @@ from tests.simulation.bank.filled import (
 @pytest.fixture
 def folder(tmp_path):
     return filled(tmp_path / "bank")
-
-
-READERS = {
-    "len": lambda folder: len(Bank(folder)),
-    "chunks": lambda folder: [*Bank(folder).chunks(3)],
-    "columns": lambda folder: Bank(folder).columns("x"),
-    "load": lambda folder: Bank(folder).load("run"),
-    "reuse": lambda folder: reuse(Bank(folder), prior()),
-    "append": appended,
-}
-
-
-@pytest.mark.parametrize("reader", READERS)
-def test_a_gap_is_told_by_every_reader(folder, reader):
-    remove(folder, 2)
-    text = r"store\.db as it was written; got no 'rows' 2: a gap"
-    with pytest.raises(CorruptSegmentError, match=text):
-        READERS[reader](folder)
 
 
 def renumber(folder, number, another):

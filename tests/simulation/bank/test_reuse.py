@@ -3,12 +3,11 @@ import warnings
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from scipy import stats
-from torch.distributions import Independent, MultivariateNormal, Normal
+from torch.distributions import Independent, Normal
 
 from sbi_active import Bank, simulate
 from sbi_active.seeding import row_normals
-from sbi_active.simulation import Simulations, reuse
+from sbi_active.simulation import reuse
 
 NOISE = 0.3
 
@@ -70,35 +69,6 @@ def test_weighted_rows_have_the_law_of_the_target(bank, proposals):
     assert abs(z_score(theta, equal, 1.0)) > 10
 
 
-@pytest.mark.parametrize("proposals", [PROPOSALS, None])
-def test_errors_have_the_size_that_is_stated(proposals, tmp_path):
-    scores = []
-    for seed in range(20):
-        with Bank(tmp_path / str(seed), simulator=simulator) as bank:
-            fill(bank, num_rows=800, seed=seed)
-        reused = reuse(bank, TARGET, proposals=proposals)
-        theta = reused.simulations().theta[:, 0].double()
-        scores.append(z_score(theta, reused.weights, 1.0))
-    total = float((torch.tensor(scores) ** 2).sum())
-    low, high = stats.chi2(20).ppf([0.0005, 0.9995])
-    assert low < total < high
-
-
-def test_effective_sample_size_is_that_of_kish(tmp_path):
-    with Bank(tmp_path / "bank", simulator=simulator) as bank:
-        fill(bank, actions=((0.0,), (0.0,)))
-    reused = reuse(bank, TARGET, proposals=PROPOSALS)
-    theta = reused.simulations().theta
-    mixture = 0.5 * (PRIOR.log_prob(theta).exp() + ROUND.log_prob(theta).exp())
-    weights = (TARGET.log_prob(theta).exp() / mixture).double()
-    expected = float(weights.sum() ** 2 / (weights**2).sum())
-    assert reused.effective_sample_size == pytest.approx(expected, rel=1e-4)
-    # The target itself needs no weights.
-    only = Bank(bank.path.parent / "only", simulator=simulator)
-    only.append(bank.read(slice(0, 2_000)), seed=0, proposal=PRIOR, label="prior")
-    assert reuse(only, PRIOR).effective_sample_size == pytest.approx(2_000)
-
-
 def test_proposals_may_have_met_with_other_actions(tmp_path):
     with Bank(tmp_path / "bank", simulator=simulator) as bank:
         uneven = ((0.0, 0.0, 0.0, 1.0), (0.0, 1.0, 1.0, 1.0))
@@ -131,17 +101,6 @@ def test_resampled_rows_have_equal_weight(bank):
     assert abs(times - 3_000 * float(reused.weights[best])) < 1
 
 
-def test_rows_of_unknown_proposals_and_missing_ones_are_left_out(bank):
-    theta, action = PRIOR.sample((50,)), torch.zeros(50, 1)
-    simulate(simulator, theta, action, seed=9, store=bank)
-    lost = Simulations(
-        theta, action, torch.full((50, 1), torch.nan), torch.full((50,), 2).char()
-    )
-    bank.append(lost, seed=10, proposal=PRIOR, label="prior")
-    assert len(bank) == 4_100
-    assert len(reuse(bank, TARGET, proposals=PROPOSALS)) == 4_000
-
-
 def test_few_effective_rows_are_told(bank):
     far = normal(-7.5, 0.3)
     with pytest.warns(UserWarning, match=r"4000 rows of the bank are worth \d+\.\d"):
@@ -150,16 +109,6 @@ def test_few_effective_rows_are_told(bank):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         reuse(bank, TARGET, proposals=PROPOSALS)
-
-
-def test_a_box_that_validates_its_arguments(bank):
-    box = MultivariateNormal(torch.zeros(1), torch.eye(1))
-    assert len(reuse(bank, box, proposals=PROPOSALS)) == 4_000
-    inside = BoxUniform(torch.zeros(1), torch.ones(1))
-    reused = reuse(bank, inside, proposals=PROPOSALS)
-    theta = reused.simulations().theta[:, 0]
-    assert (reused.weights[(theta < 0) | (theta > 1)] == 0).all()
-    assert abs(z_score(theta.double(), reused.weights, 0.5)) < 4
 
 
 @pytest.mark.parametrize(

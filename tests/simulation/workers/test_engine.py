@@ -7,7 +7,6 @@ import threading
 import time
 
 import cloudpickle
-import joblib
 import numpy as np
 import pytest
 import torch
@@ -15,7 +14,7 @@ import torch
 from sbi_active import GaussianNoise, SimulatorModel, simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import Outcome, SimulationInterrupted, Workers
-from sbi_active.simulation.workers import Pace, run_digest
+from sbi_active.simulation.workers import run_digest
 
 # A worker cannot import a test module.
 cloudpickle.register_pickle_by_value(sys.modules[__name__])
@@ -87,26 +86,6 @@ def test_x_depends_on_neither_workers_nor_batches(simulator, rows):
     fewer = simulate(simulator, *(r[:256] for r in rows), seed=3).x
     assert torch.equal(fewer, expected[:256])
     assert fewer.dtype == torch.float32
-
-
-def test_a_batch_has_the_rows_that_were_asked_for(rows, monkeypatch):
-    monkeypatch.setattr(Pace, "SECONDS", 60.0)  # whatever else the machine does
-    sizes = []
-
-    def simulator(theta, action, seeds):
-        sizes.append(len(theta))
-        return seeded(theta, action, seeds)
-
-    simulate(simulator, *rows, seed=0)
-    simulate(simulator, *rows, seed=0, batch_size=300)
-    assert sizes == [2, 700, 300, 300, 100]  # the first two rows are timed
-
-
-def test_another_executor_of_joblib_is_not_asked(rows):
-    expected = simulate(seeded, *rows, seed=3).x
-    with joblib.parallel_config(backend="threading"):
-        x = simulate(seeded, *rows, seed=3, workers=Workers(2, time_limit=5.0)).x
-    assert torch.equal(x, expected)
 
 
 def test_workers_use_one_thread_and_the_folder_of_the_caller(tmp_path, monkeypatch):
@@ -230,14 +209,6 @@ def test_an_interrupt_ends_the_workers(rows):
     assert kept.valid.any()
     expected = simulate(seeded, *rows, seed=3).x
     assert torch.equal(kept.x[kept.valid], expected[kept.valid])
-
-
-@pytest.mark.parametrize("name", ["theta", "action"])
-def test_rows_must_be_finite(name):
-    rows = {"theta": torch.rand(3, 1), "action": torch.rand(3, 1)}
-    rows[name][1] = torch.nan
-    with pytest.raises(ValueError, match=f"expected finite {name}; got"):
-        simulate(seeded, **rows, seed=0)
 
 
 def test_a_simulator_must_travel():

@@ -7,29 +7,12 @@ from typing import Any
 import pytest
 import torch
 
-from sbi_active import CampaignOptions, RefinementOptions, simulate
+from sbi_active import CampaignOptions, simulate
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.campaign.storage.codec import decode, encode
 from sbi_active.messages import RenamedWarning
 from sbi_active.migration.described import options_from
 from sbi_active.simulation import Workers
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"num_workers": 0},
-        {"num_workers": -2},
-        {"time_limit": 0.0},
-        {"time_limit": float("nan")},
-        {"num_retries": -1},
-    ],
-)
-def test_what_makes_no_sense_is_refused_where_it_is_said(wrong):
-    (name,) = wrong
-    with pytest.raises(ValueError, match=f"expected {name}"):
-        Workers(**wrong)
-
 
 ROWS = torch.ones(1, 1), torch.ones(1, 1)
 
@@ -69,10 +52,3 @@ def test_former_options_of_a_campaign_are_taken_for_one_version():
     loaded = object.__new__(CampaignOptions)
     loaded.__setstate__({**state, **former})
     assert loaded == options
-
-
-def test_a_campaign_does_not_overwrite_workers_of_its_refinement_silently():
-    own = RefinementOptions(workers=Workers(num_workers=3))
-    with pytest.raises(ValueError, match="to CampaignOptions alone"):
-        CampaignOptions(workers=Workers(2), refinement=own)
-    assert CampaignOptions(workers=Workers(3), refinement=own).workers == own.workers

@@ -15,7 +15,6 @@ import torch
 from sbi_active import simulate
 from sbi_active.simulation import MissingRowsWarning, Workers
 from sbi_active.simulation.workers.pools import waiting_workers
-from sbi_active.simulation.workers.processes import Worker
 
 # A worker cannot import a test module.
 cloudpickle.register_pickle_by_value(sys.modules[__name__])
@@ -78,19 +77,6 @@ def test_workers_are_kept_for_the_same_simulator(monkeypatch):
     assert are_gone(other)
 
 
-def test_workers_that_wait_too_long_end(monkeypatch):
-    monkeypatch.setattr(Worker, "PATIENCE", 0.3)
-    pids = workers_of(pids_of_rows)
-    assert any(map(is_alive, pids))
-    assert are_gone(pids)
-    again = workers_of(pids_of_rows)
-    assert not again & pids
-    time.sleep(0.15)
-    assert workers_of(pids_of_rows) == again  # which starts the time anew
-    time.sleep(0.2)
-    assert all(map(is_alive, again))
-
-
 def test_a_worker_that_dies_while_it_waits_costs_no_row():
     pids = workers_of(pids_of_rows)
     os.kill(min(pids), signal.SIGKILL)
@@ -100,16 +86,6 @@ def test_a_worker_that_dies_while_it_waits_costs_no_row():
         again = workers_of(pids_of_rows)
     assert max(pids) in again
     assert min(pids) not in again
-
-
-def test_a_forked_child_leaves_them_alone():
-    pids = workers_of(pids_of_rows)
-    child = os.fork()
-    if child == 0:
-        waiting_workers.cache_clear()
-        os._exit(0)
-    assert os.waitpid(child, 0)[1] == 0
-    assert workers_of(pids_of_rows) == pids
 
 
 def test_what_a_worker_started_ends_with_it(tmp_path):
