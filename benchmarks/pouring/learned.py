@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import pickle
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,10 +22,7 @@ from benchmarks.pouring.likelihood import (
 )
 from benchmarks.pouring.power import cross_validated
 from sbi_active.seeding import forked_generators
-from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import images_of, mesh_coverage
-
-T = TypeVar("T")
 
 NUM_OUTER, NUM_ALL = 100, 300  # draws behind an expected gain
 NUM_COMPONENTS = 36
@@ -170,18 +166,3 @@ def both_summaries(mesh: np.ndarray, small: np.ndarray) -> Iterator[tuple[Any, .
     mean, axes = components(small, NUM_COMPONENTS)
     yield (small - mean) @ axes, is_empty, mean, axes
     yield np.sqrt(mesh), is_empty, mean, axes
-
-
-def learned_of(bank: Path, path: Path | None) -> ByAction:
-    """Return what is learned of a bank, from a file where there is one."""
-    return kept(path, lambda: learn(bank, get_task("pouring")))
-
-
-def kept(path: Path | None, make: Callable[[], T]) -> T:
-    """Return what a file of our own holds, which is made where it is missing."""
-    if path is not None and path.exists():
-        return pickle.loads(path.read_bytes())
-    made = make()
-    if path is not None:
-        path.write_bytes(pickle.dumps(made))
-    return made
