@@ -11,7 +11,6 @@ by the default network, trained on 5,000 rows. Writes result.csv beside this fil
 
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -21,8 +20,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from benchmarks.rows import frame, write
 from sbi_active import ASBI, InformationGainDesigner, MixtureDensity, simulate
-from sbi_active.display.table import Table
 from sbi_active.inference import Belief
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import Task, get_task
@@ -147,13 +146,5 @@ def main(
             )
             rows.append({"case": name, "simulator": f"{kind} network"} | result)
         print(f"{name}: done")
-    path = Path(__file__).parent / "result.csv"
-    rows = [
-        {k: f"{v:.4g}" if isinstance(v, float) else str(v) for k, v in row.items()}
-        for row in rows
-    ]
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [*rows[0]])
-        writer.writeheader()
-        writer.writerows(rows)
-    print(Table([*rows[0]], [[str(v) for v in r.values()] for r in rows]).text())
+    write(Path(__file__).parent / "result.csv", rows)
+    print(frame(rows).to_string(index=False))

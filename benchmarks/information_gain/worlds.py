@@ -102,8 +102,8 @@ def worlds() -> list[World]:
         cases.append(World(name, task, task.prior, 2 * math.log(10), gain))
         if variant == "linear":
             action = torch.tensor([[-5.0]])
-            after = task.reference(action, task.real_system(action[0], seed=0)[None])
-            assert after is not None
+            x = task.real_system(action[0], seed=0)[None]
+            after: Any = task.reference(action, x)
             draws = after.sample(POOL, seed=0)
             entropy = -float(after.log_prob(draws).mean())
             gain = after.expected_information_gain(task.actions.values)
