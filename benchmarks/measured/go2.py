@@ -27,9 +27,9 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from benchmarks.criticism.scores import counted
+from benchmarks.fitting import local_fit
 from benchmarks.measured.go2_leg import DATA, LEGS, Leg, read_leg, usual_parameters
 from benchmarks.measured.verdicts import causes, center, row_of, said
 from benchmarks.rows import keep, measured, stages
@@ -222,19 +222,14 @@ def fit_leg(
     x0 = np.concatenate([start, STRENGTH * sds])
     scale = np.maximum(np.abs(x0), 0.02)
 
-    def jacobian(x: Array) -> Array:
-        steps = DIFFERENCE * scale
-        steps = np.where(x + steps > high, -steps, steps)
-        both = residual(np.concatenate([x[None], x + np.diag(steps)]))
-        return ((both[1:] - both[0]) / steps[:, None]).T
-
-    found = least_squares(
-        lambda x: residual(x[None])[0],
+    found = local_fit(
+        residual,
         x0,
-        jac=jacobian,  # pyright: ignore[reportArgumentType]
-        bounds=(low, high),
-        x_scale=scale,
-        max_nfev=EVALUATIONS,
+        low=low,
+        high=high,
+        scale=scale,
+        difference=DIFFERENCE,
+        evaluations=EVALUATIONS,
     )
     values = torch.from_numpy(found.x)[None]
     run = leg.free_run(parameters, effects, values)[0]
