@@ -43,21 +43,24 @@ class ExactBelief(Belief):
         return self.reference.log_prob(theta.double())
 
 
+def rounds(variant: str) -> tuple[Any, Any, Any]:
+    """Return the numerical task, and exact inference before and after a trial at -5."""
+    task = get_task("numerical", variant=variant)
+    action = torch.tensor([[-5.0]])
+    after = task.reference(action, task.real_system(action[0], seed=0)[None])
+    return task, task.reference(torch.empty(0, 1), torch.empty(0, 1)), after
+
+
 def worlds() -> list[tuple[str, Task, Distribution, Tensor]]:
     """Return name, task, belief and exact gain of every case."""
     cases: list[tuple[str, Task, Distribution, Tensor]] = []
     for variant in ("linear", "sinh", "square"):
-        task = get_task("numerical", variant=variant)
-        prior = task.reference(torch.empty(0, 1), torch.empty(0, 1))
-        assert prior is not None
-        gain = prior.expected_information_gain(task.actions.values)
-        cases.append((f"{variant}, round 1", task, task.prior, gain))
-        action = torch.tensor([[-5.0]])
-        after = task.reference(action, task.real_system(action[0], seed=0)[None])
-        assert after is not None
-        belief = ExactBelief(after, task.prior)
-        gain = after.expected_information_gain(task.actions.values)
-        cases.append((f"{variant}, round 2", task, belief, gain))
+        task, before, after = rounds(variant)
+        beliefs = task.prior, ExactBelief(after, task.prior)
+        for number, exact in enumerate((before, after)):
+            gain = exact.expected_information_gain(task.actions.values)
+            name = f"{variant}, round {number + 1}"
+            cases.append((name, task, beliefs[number], gain))
     task = get_task("oscillator")
     prior = task.reference(torch.empty(0, 2), torch.empty(0, 6))
     assert prior is not None
