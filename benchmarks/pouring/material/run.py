@@ -27,8 +27,8 @@ import torch
 from torch import Tensor
 
 from benchmarks.pouring.campaign import rounds
+from benchmarks.pouring.learned import ByAction
 from benchmarks.pouring.material.learned import (
-    ByPlace,
     Overlap,
     PointBelief,
     compared_pours,
@@ -58,7 +58,7 @@ def compared_images(material: str) -> Tensor:
 
 
 def run_trial(
-    task: Any, learned: ByPlace, overlap: Overlap, method: str, seed: int
+    task: Any, learned: ByAction, overlap: Overlap, method: str, seed: int
 ) -> tuple[list[dict[str, object]], PointBelief]:
     """Return one row a round of one campaign, and its last belief."""
     belief = PointBelief.uniform()
@@ -79,7 +79,7 @@ def run_trial(
 def poured(belief: PointBelief, material: str, num: int, seed: int) -> np.ndarray:
     """Return the shared volume of fresh pours of draws from a belief, shape (num,)."""
     task: Any = get_task("pouring_real", material=material)
-    theta = torch.from_numpy(belief.sample(num, seed)).float()
+    theta = torch.from_numpy(belief.draws(num, seed)).float()
     action = torch.tensor(COMPARED_AT).expand(num, 3)
     seeds = torch.arange(num) + derive_seed(seed, "poured") % 2**40
     images = task.pours.images(theta, action, seeds=seeds)
@@ -108,7 +108,7 @@ class Settings:
     summary: bool = False
 
 
-def run_missing(bank: Path, learned: ByPlace, arguments: Settings) -> None:
+def run_missing(bank: Path, learned: ByAction, arguments: Settings) -> None:
     """Run the trials, or the checks, that are not in the files yet."""
     last = arguments.first + arguments.trials
     for material in MATERIALS:
