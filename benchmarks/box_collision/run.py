@@ -2,16 +2,12 @@
 
     python -m benchmarks box_collision                  # both targets, 10 trials
     python -m benchmarks box_collision --trials 50      # the paper's number
-    python -m benchmarks box_collision --target 1 --setting paper --methods asbi
     python -m benchmarks box_collision --table coverage --rounds 3 --reference none
-    python -m benchmarks box_collision --table references --particles 30
     python -m benchmarks box_collision --summary
 
 Resumable: a trial that stands in the CSV is not run again. One row a round, one file a
 method, target and setting, in ``benchmarks/box_collision/results``. The tables are
 printed at the end, or alone by ``--summary``.
-
-``--table references`` adds the reference to trials in the CSV that were run without.
 
 Beside a belief stands the posterior of the same trials by importance sampling
 (``log_p_exact``, with its standard error), which is what the best inference would
@@ -30,7 +26,6 @@ from typing import Annotated, Any, Literal
 import torch
 from torch import Tensor
 
-from benchmarks.box_collision.bank import PriorBank
 from benchmarks.box_collision.summary import (
     REPORTED,
     STAGES,
@@ -38,9 +33,8 @@ from benchmarks.box_collision.summary import (
     summarize,
 )
 from benchmarks.rounds import coverage_table
-from benchmarks.rows import read, resumed, short, write
-from sbi_active import Campaign, CampaignOptions, MixtureDensity
-from sbi_active.campaign import Trial
+from benchmarks.rows import read, resumed
+from sbi_active import Campaign, CampaignOptions
 from sbi_active.campaign.learning.methods import METHODS, find_method
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.seeding import derive_seed, forked_generators
@@ -52,35 +46,12 @@ from sbi_active.tasks.box_collision import (  # pyright: ignore
 )
 
 RESULTS = Path(__file__).parent / "results"
-TABLES = ("paper", "coverage", "references")
+TABLES = ("paper", "coverage")
 NUM_DRAWS = 2_000  # behind the share of a belief that is denser than the truth
-#: Options of a campaign, and of the task.
-SETTINGS: dict[str, tuple[CampaignOptions, dict[str, Any]]] = {
-    # Section 5.3: 41 x 500 rows, (128, 128), 2000 steps of batch 50, M = 250.
-    "paper": (
-        CampaignOptions(
-            num_simulations=41 * 500,
-            num_samples=500,  # half of them choose, half report
-            density_estimator=MixtureDensity.faithful(),
-            estimator="posterior",
-            details=CampaignDetails(eliminate=False),
-            refine=False,
-        ),
-        {"left_table": "paper"},
-    ),
-    "default": (
-        CampaignOptions(num_samples=250, details=CampaignDetails(num_scored=500)),
-        {},
-    ),
-    # Beliefs and information by the networks alone, which is where the methods differ:
-    # by default the declared noise gives both, whatever was learned.
-    "learned": (
-        CampaignOptions(
-            num_samples=250, details=CampaignDetails(num_scored=500), refine=False
-        ),
-        {},
-    ),
-}
+OPTIONS = CampaignOptions(num_samples=250, details=CampaignDetails(num_scored=500))
+#: "learned" has beliefs and information by the networks alone, which is where the
+#: methods differ: by default the declared noise gives both, whatever was learned.
+SETTINGS = {"default": OPTIONS, "learned": replace(OPTIONS, refine=False)}
 
 
 class Resampled:
@@ -107,12 +78,9 @@ class Settings:
         trials: Number of trials; 10 by default, 40 for the coverage.
         first: Number of the first trial.
         rounds: Number of rounds.
-        noise: Standard deviation of the noise, in m, > 0.
         workers: Number of workers.
         reference: Rounds after which importance sampling is run.
         particles: Number of effective draws of the reference.
-        bank: Folder to keep first rounds' simulations in; for one worker, and the time
-            of a first round is then not that of a campaign alone.
         results: Folder of the results.
         summary: Whether to run nothing, and print the table of the rows.
     """
@@ -124,24 +92,11 @@ class Settings:
     trials: int | None = None
     first: int = 0
     rounds: int = 6
-    noise: float = 0.005
     workers: int = 1
     reference: Literal["last", "all", "none"] = "last"
     particles: int = 100
-    bank: Path | None = None
     results: Path = RESULTS
     summary: bool = False
-
-    def __post_init__(self) -> None:
-        if self.noise <= 0:
-            raise SystemExit(
-                f"expected --noise > 0; got {self.noise}; use 0.005: without noise "
-                "there is no posterior density, and nothing to estimate"
-            )
-        if self.bank and self.workers > 1:
-            raise SystemExit(
-                f"expected --workers 1 beside --bank; got {self.workers}; drop one"
-            )
 
     @property
     def is_coverage(self) -> bool:
@@ -159,9 +114,8 @@ def run_trial(
 ) -> list[dict[str, object]]:
     """Return one row a round of one campaign."""
     options = options_of(method, arguments.setting)
-    bank = PriorBank(arguments.bank, task) if arguments.bank else None
     campaign = Campaign(
-        task.simulator if bank is None else bank.simulator,
+        task.simulator,
         task.prior,
         task.actions,
         method=method,
@@ -172,16 +126,11 @@ def run_trial(
     past = None
     for index in range(arguments.rounds):
         trial = campaign.ask()
-        if bank is not None and bank.is_open:
-            bank.is_open = False  # from here on no other campaign is alike
-            bank.close()
         real_seed = derive_seed(seed, "real", index)
         campaign.tell(task.real_system(trial.action, seed=real_seed))
         campaign.update()
         is_last = index + 1 == arguments.rounds
         row = round_row(task, campaign, is_last=is_last)
-        if bank is not None:
-            row["num_reused"] = bank.num_reused if index == 0 else 0
         if arguments.reference == "all" or (is_last and arguments.reference == "last"):
             start = time.process_time()
             past = exact_posterior(
@@ -202,12 +151,11 @@ def run_trial(
 
 def options_of(method: str, setting: str) -> CampaignOptions:
     """Return a setting's options, with what is the method's own in them."""
-    options, own = SETTINGS[setting][0], find_method(method).faithful
-    if setting == "paper":
-        return replace(options, **own)
+    own = find_method(method).faithful
     if setting == "learned":
-        return replace(options, estimator=own.get("estimator", "posterior"))
-    return options
+        estimator = own.get("estimator", "posterior")
+        return replace(SETTINGS[setting], estimator=estimator)
+    return SETTINGS[setting]
 
 
 def round_row(task: Any, campaign: Campaign, *, is_last: bool) -> dict[str, object]:
@@ -260,15 +208,11 @@ def reference_row(
     }
 
 
-def make_task(target: str, arguments: Settings, seed: int) -> Any:
+def make_task(target: str, seed: int) -> Any:
     """Return a target of the paper, or a truth drawn from the prior."""
-    options: dict[str, Any] = {
-        "noise": arguments.noise,
-        **SETTINGS[arguments.setting][1],
-    }
     if target != "prior":
-        return get_task("box_collision", target=int(target), **options)
-    task = get_task("box_collision", **options)
+        return get_task("box_collision", target=int(target))
+    task = get_task("box_collision")
     with forked_generators(derive_seed(seed, "truth")):
         return task.with_truth(task.prior.sample(torch.Size([1]))[0])
 
@@ -276,52 +220,16 @@ def make_task(target: str, arguments: Settings, seed: int) -> Any:
 def path_of(method: str, target: str, arguments: Settings) -> Path:
     """Return the file of a method, target and setting."""
     name = f"{arguments.setting}_target_{target}_{method}"
-    if arguments.noise != 0.005:
-        name += f"_noise_{arguments.noise:g}"
     if arguments.rounds != 6:
         name += f"_rounds_{arguments.rounds}"
     return arguments.results / f"{name}.csv"
-
-
-def add_references(method: str, target: str, arguments: Settings) -> None:
-    """Add importance sampling to the last rounds in the file that have none."""
-    path = path_of(method, target, arguments)
-    rows = read(path)
-    for last in rows:
-        seed, number = int(last["seed"]), int(last["round"])
-        wanted = arguments.first <= seed < arguments.num_trials
-        if not wanted or number != arguments.rounds or last.get("log_p_exact"):
-            continue
-        start = time.process_time()
-        task = make_task(target, arguments, seed)
-        past = [r for r in rows if int(r["seed"]) == seed and int(r["round"]) <= number]
-        exact = exact_posterior(
-            task,
-            [recorded(row) for row in past],
-            num_particles=arguments.particles,
-            seed=derive_seed(seed, "reference"),
-        )
-        found = reference_row(task, exact, float(last["log_prob_true"]))
-        found["exact_cpu"] = time.process_time() - start
-        found |= errors(task, Resampled(exact), "exact_rep_err")
-        last |= {k: str(short(v)) for k, v in found.items()}
-        write(path, rows)
-        spent = time.process_time() - start
-        print(f"{path.stem} trial {seed}: reference, {spent:.0f} CPU s", flush=True)
-
-
-def recorded(row: dict[str, str]) -> Trial:
-    """Return a trial of the file."""
-    x = torch.tensor([float(row[name]) for name in "xyz"])
-    status = "ok" if int(row["is_valid"]) else "invalid"
-    return Trial(int(row["round"]) - 1, torch.tensor([float(row["speed"])]), x, status)
 
 
 def run_missing(method: str, target: str, arguments: Settings) -> None:
     """Run the trials that are not in the file yet."""
 
     def trial(seed: int) -> list[dict[str, object]]:
-        return run_trial(make_task(target, arguments, seed), method, seed, arguments)
+        return run_trial(make_task(target, seed), method, seed, arguments)
 
     seeds = [(seed,) for seed in range(arguments.first, arguments.num_trials)]
     path = path_of(method, target, arguments)
@@ -338,9 +246,7 @@ def main(arguments: Settings) -> None:
     for method in methods:
         for target in targets:
             if not arguments.summary:
-                is_extra = arguments.table == "references"
-                run = add_references if is_extra else run_missing
-                run(method, target, arguments)
+                run_missing(method, target, arguments)
             rows = read(path_of(method, target, arguments))
             rows = [row for row in rows if int(row["seed"]) < arguments.num_trials]
             if rows:

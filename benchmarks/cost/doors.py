@@ -4,13 +4,12 @@
 
 Each line is a process of its own; lines are run in turn, three times over, and the
 median counts. Those on a campaign are a round of a robot's loop, in a new folder each
-time. ``-X importtime`` then names the slowest of what is imported.
+time.
 """
 
 from __future__ import annotations
 
 import json
-import re
 import resource
 import statistics
 import subprocess
@@ -99,17 +98,6 @@ def loop_seconds() -> dict[str, float]:
     return found
 
 
-def slowest_imports(statement: str, num: int = 5) -> list[tuple[str, float]]:
-    """Return the packages that a statement imports, by their own time in seconds."""
-    command = [sys.executable, "-X", "importtime", "-c", statement]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    own: dict[str, float] = {}
-    for microseconds, name in re.findall(r"(\d+) \|\s+\d+ \|\s+(\S+)", done.stderr):
-        package = name.partition(".")[0]
-        own[package] = own.get(package, 0.0) + int(microseconds) / 1e6
-    return sorted(own.items(), key=lambda item: -item[1])[:num]
-
-
 def main() -> None:
     """Print the table and keep it."""
     runs = [
@@ -119,10 +107,6 @@ def main() -> None:
     medians = {name: statistics.median(run[name] for run in runs) for name in runs[0]}
     for name, seconds in medians.items():
         print(f"{name:36} {seconds:6.3f} CPU s")
-    imports = {statement: slowest_imports(statement) for statement in [*DOORS][:4]}
-    for statement, packages in imports.items():
-        listed = ", ".join(f"{name} {seconds:.2f}" for name, seconds in packages)
-        print(f"{statement}: {listed} s")
-    result = {"date": date.today().isoformat(), "cpu_s": medians, "imports_s": imports}
+    result = {"date": date.today().isoformat(), "cpu_s": medians}
     path = Path(__file__).parent / "doors.json"
     keep(path, result)

@@ -136,7 +136,3 @@ def main() -> None:
         for name, row in found["rounds"].items()
     ]
     print(Table(header, cells).text())
-
-
-if __name__ == "__main__":
-    main()

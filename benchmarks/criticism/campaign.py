@@ -11,9 +11,8 @@ library of world A, in which the quadratic is one of seven effects, and designs 
 actions (``--policy auto``): for the parameters, or for which model is right where that
 tells more. After an alarm it goes on asking while rivals are open, and adopts what the
 verdict names once that is settled, or when its trials are spent. Nothing else of the
-truth reaches it. Other policies: "theta" designs for the parameters alone, which
-repeats the two settings that tell most about two parameters, at which any two fit, so
-that lambda is 0; "check" does so too, but makes every second trial where none was.
+truth reaches it. Policy
+"check" designs for the parameters alone, and makes every second trial where none was.
 
 One row a case. Resumable: a case that stands in the CSV is not run again.
 """
@@ -42,7 +41,7 @@ from sbi_active.seeding import derive_seed, forked_generators, row_normals
 
 RESULTS = Path(__file__).parent / "results"
 KINDS = ("hidden", "clean")
-POLICIES = ("auto", "theta", "check")
+POLICIES = ("auto", "check")
 NUM_TRIALS = 6
 NUM_DRAWS = 4_000
 COLUMNS = [

@@ -7,8 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from sbi.utils import BoxUniform
-from scipy.optimize import OptimizeResult, differential_evolution, least_squares
+from scipy.optimize import OptimizeResult, differential_evolution
 from torch import Tensor
+
+from benchmarks.fitting import local_fit
 
 STARTS = 8
 GENERATIONS = 20  # of as many candidates as starts, where the simulator is rough
@@ -77,33 +79,19 @@ def local_fits(
     lower = np.full(starts.shape[1], -np.inf)
     upper = np.full(starts.shape[1], np.inf)
     lower[:dim], upper[:dim] = low.numpy(), high.numpy()
-    step = DIFFERENCE * spread
-
-    def value(z: np.ndarray) -> np.ndarray:
-        return residual(torch.from_numpy(z)[None])[0].numpy()
-
-    def jacobian(z: np.ndarray) -> np.ndarray:
-        # Backwards at the upper edge, so that theta stays in the box.
-        signed = np.where(z + step > upper, -step, step)
-        rows = np.concatenate([z[None], z[None] + np.diag(signed)])
-        r = residual(torch.from_numpy(rows)).numpy()
-        return ((r[1:] - r[0]) / signed[:, None]).T
-
     cost = residual(starts).square().sum(-1)
-    fits = []
-    for i in torch.argsort(cost)[:STARTS].tolist():
-        start = np.clip(starts[i].numpy(), lower + 1e-9, upper - 1e-9)
-        fits.append(
-            least_squares(
-                value,
-                start,
-                jacobian,  # type: ignore[arg-type]  # SciPy's stub has the string alone
-                bounds=(lower, upper),
-                x_scale=spread,
-                max_nfev=60,
-            )
+    return [
+        local_fit(
+            lambda rows: residual(torch.from_numpy(rows)).numpy(),
+            np.clip(starts[i].numpy(), lower + 1e-9, upper - 1e-9),
+            low=lower,
+            high=upper,
+            scale=spread,
+            difference=DIFFERENCE,
+            evaluations=60,
         )
-    return fits
+        for i in torch.argsort(cost)[:STARTS].tolist()
+    ]
 
 
 def _edges(prior: BoxUniform) -> tuple[Tensor, Tensor]:

@@ -55,13 +55,10 @@ def summary(
 
 
 def _clean(world: World, rows: Sequence[Row]) -> list[str]:
-    alarms = [r for r in rows if r["verdict"] != "none"]
-    lines = [f"false alarms {rate([r in alarms for r in rows])}"]
-    lines += [f"  case {r['case']}: {r['verdict']}" for r in alarms]
     ratio = _ratio(rows, "rmse_after", "rmse_before")
     unexplained = [r["verdict"] == "unexplained" for r in rows]
     return [
-        *lines,
+        f"false alarms {rate([*map(_detected, rows)])}",
         f'false "unexplained" {rate(unexplained)}',
         f"RMSE after/before: mean {ratio.mean():.3f}, range {_range(ratio)}",
     ]
@@ -84,12 +81,6 @@ def _library(world: World, rows: Sequence[Row]) -> list[str]:
     ]
     if said := [r["undeclared"] == "1" for r in named if r["undeclared"]]:
         lines.append(f'false "{UNDECLARED}" {rate(said)}')
-    lines += [
-        f"  case {r['case']} (lambda {float(r['lambda']):.0f}): {r['effects']} "
-        f"{r['strengths']} called {r['verdict']}"
-        for r in seen
-        if not _right(world, r)
-    ]
     for name in world.hidden:
         lines += _of_effect(name, [r for r in named if r["effects"] == name])
     lines += _separated(rows)
@@ -137,12 +128,6 @@ def _power(rows: Sequence[Row]) -> list[str]:
         lines.append(
             f"detected, lambda in {low:g}-{high:g}: {rate([*map(_detected, inside)])}"
         )
-        lines += [
-            f"  missed case {r['case']} (lambda {float(r['lambda']):.0f}): "
-            f"{r['effects']} {r['strengths']}"
-            for r in inside
-            if low >= 25 and not _detected(r)
-        ]
     return lines
 
 
@@ -178,23 +163,14 @@ def _removed(world: World, rows: Sequence[Row]) -> list[str]:
 
 
 def _said_so(world: World, title: str, rows: Sequence[Row]) -> list[str]:
-    lines = [
+    formulas = [r for r in rows if r["effects"] in world.formulas]
+    hits = [r["formula"] in world.formulas[r["effects"]] for r in formulas]
+    return [
         f"says so ({title}) {rate([*map(_unexplained, rows)])}",
         f'the same, or names an effect "beside {UNDECLARED}" ({title}) '
         f"{rate([_unexplained(r) or r['undeclared'] == '1' for r in rows])}",
+        f"names the formula ({title}) {rate(hits)}",
     ]
-    formulas = [r for r in rows if r["effects"] in world.formulas]
-    hits = [r["formula"] in world.formulas[r["effects"]] for r in formulas]
-    lines.append(f"names the formula ({title}) {rate(hits)}")
-    lines += [
-        f"  case {r['case']} (lambda {float(r['lambda']):.0f}): {r['effects']} called "
-        f"{r['verdict']}"
-        + (f", guess {r['formula']}" if r["formula"] else "")
-        + (f" beside {UNDECLARED}" if r["undeclared"] == "1" else "")
-        for r in rows
-        if title == "all" and (not _unexplained(r) or r["effects"] in world.formulas)
-    ]
-    return lines
 
 
 def _outside(world: World, rows: Sequence[Row]) -> list[str]:
@@ -217,16 +193,10 @@ def _pair(world: World, rows: Sequence[Row]) -> list[str]:
     def names_more(row: Row) -> bool:
         return bool(_names(world, row["verdict"]) - _names(world, row["effects"]))
 
-    lines = [
+    return [
         f"exact, both supported (lambda without either > 25) {rate(exact)}",
         f"false inclusion, both supported {rate([*map(names_more, supported)])}",
         f"false inclusion, all {rate([*map(names_more, rows)])}",
-    ]
-    return lines + [
-        f"  case {r['case']} (support {float(r['support']):.0f}): {r['effects']} "
-        f"({r['strengths']}) called {r['verdict']}"
-        for r in supported
-        if not _right(world, r)
     ]
 
 

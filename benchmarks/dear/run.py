@@ -1,6 +1,6 @@
 """Campaigns with few simulations, beside the default and stock sbi with as many.
 
-    python -m benchmarks dear --tasks numerical oscillator --trials 4
+    python -m benchmarks dear --task numerical oscillator --seeds 2400 2404
 
 The trials (actions, outcomes) of the campaign with a budget are given to the methods of
 sbi, which simulate all executed actions at once and choose none: what is compared is
@@ -11,8 +11,7 @@ round in benchmarks/dear/results/rows.csv, and the table is printed.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +20,14 @@ import torch
 from sbi.inference import NPE_C
 from sbi.utils import RestrictedPrior, get_density_thresholder
 
-from benchmarks.rows import append, column, grouped, read
+from benchmarks.rows import benchmark, column, grouped
 from sbi_active import Campaign
 from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task
 
 TASKS = ("numerical", "oscillator", "chain")
-ROWS = Path(__file__).parent / "results" / "rows.csv"
-FIRST_SEED, ROUNDS = 2400, 4
+ROUNDS, DEFAULT = 4, "default"
 PRICES = (0.0001, 0.001, 0.01, 0.1, 1.0, 10.0)  # CPU s of a simulation
 
 
@@ -126,11 +124,6 @@ def stock(task: Any, method: str, num: int, trials: list[Any], seed: int) -> Any
         return posterior
 
 
-def write(rows: list[dict[str, Any]]) -> None:
-    """Append rows, without what has no column."""
-    append(ROWS, [{k: v for k, v in row.items() if k != "x"} for row in rows])
-
-
 def table(rows: list[dict[str, str]]) -> str:
     """Return figures by task and method, and the best method by price."""
     lines: list[list[str]] = []
@@ -172,64 +165,39 @@ def table(rows: list[dict[str, str]]) -> str:
     return "\n".join(text)
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
-
-    Args:
-        tasks: Names of the tasks.
-        trials: Number of trials.
-        sizes: Budgets, in simulations a round.
-        methods: Names of methods.
-        summary: Whether to run nothing, and print the table of the rows.
-    """
-
-    tasks: Sequence[str] = (*TASKS,)
-    trials: int = 4
-    sizes: Sequence[int] = (500, 250, 1_000)
-    methods: Sequence[str] = ("campaign", "TSNPE", "SNPE-C")
-    summary: bool = False
+@lru_cache(1)
+def drawn(name: str, per_round: str, seed: int) -> tuple[Any, list[dict[str, Any]]]:
+    """Return a task whose truth is a draw of the prior, and a campaign's rows."""
+    task = get_task(name)
+    with forked_generators(derive_seed(seed, "truth")):
+        task = task.with_truth(task.prior.sample((1,))[0])
+    return task, campaign(task, None if per_round == DEFAULT else int(per_round), seed)
 
 
-def main(given: Settings) -> None:
-    """Run what is asked for and is not there yet, and print the table."""
-    jobs = [
-        (name, size, FIRST_SEED + k)
-        for k in range(given.trials)
-        for size in [*given.sizes, None]
-        for name in given.tasks
+def rows_of(
+    name: str, per_round: str, seed: int, method: str
+) -> list[dict[str, Any]] | dict[str, Any]:
+    """Return the rows of a campaign, or the last round's by a method of sbi."""
+    task, rows = drawn(name, per_round, seed)
+    if method == "campaign":
+        return [{k: v for k, v in row.items() if k != "x"} for row in rows]
+    trials = [
+        (torch.tensor([float(v) for v in r["action"].split()]), r["x"]) for r in rows
     ]
-    for name, size, seed in jobs if not given.summary else ():
-        label = "default" if size is None else str(size)
-        task = get_task(name)
-        with forked_generators(derive_seed(seed, "truth")):
-            task = task.with_truth(task.prior.sample((1,))[0])
-        key = {"task": name, "per_round": label, "seed": seed}
-        done = {
-            r["method"]
-            for r in read(ROWS)
-            if (r["task"], r["per_round"], int(r["seed"])) == (name, label, seed)
-        }
-        methods = [m for m in given.methods if size is not None or m == "campaign"]
-        if {*methods} <= done:
-            continue
-        rows = campaign(task, size, seed)
-        if "campaign" not in done:
-            write([{**key, "method": "campaign", **row} for row in rows])
-        if size is None:
-            continue
-        trials = [
-            (torch.tensor([float(v) for v in r["action"].split()]), r["x"])
-            for r in rows
-        ]
-        for method in methods:
-            if method == "campaign" or method in done:
-                continue
-            start = time.process_time()
-            belief = stock(task, method, size * ROUNDS, trials, seed)
-            cpu = time.process_time() - start
-            found = figures(task, trials, belief)
-            more = {"round": ROUNDS, "num_simulations": size, "cpu": cpu / ROUNDS}
-            write([{**key, "method": method, **found, **more}])
-        print(name, label, seed, flush=True)
-    print(table(read(ROWS)))
+    start, size = time.process_time(), int(per_round)
+    belief = stock(task, method, size * ROUNDS, trials, seed)
+    cpu = time.process_time() - start
+    more = {"round": ROUNDS, "num_simulations": size, "cpu": cpu / ROUNDS}
+    return {**figures(task, trials, belief), **more}
+
+
+main = benchmark(
+    Path(__file__).parent / "results" / "rows.csv",
+    rows_of,
+    table,
+    skip=lambda task, size, seed, method: size == DEFAULT and method != "campaign",
+    task=TASKS,
+    per_round=("500", "250", "1000", DEFAULT),
+    seed=range(2400, 2404),
+    method=("campaign", "TSNPE", "SNPE-C"),
+)

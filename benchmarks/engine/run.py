@@ -18,7 +18,6 @@ process. CPU times are read by psutil, which comes with Dask.
 from __future__ import annotations
 
 import os
-import platform
 import random
 import signal
 import time
@@ -36,6 +35,7 @@ from joblib import Parallel, delayed
 from torch import Tensor
 
 from benchmarks.rows import keep
+from benchmarks.table import leaves
 from sbi_active.seeding import row_normals, row_seeds
 from sbi_active.simulation import MissingRowsWarning, Workers, simulate
 
@@ -204,7 +204,6 @@ def workers(
         "seconds": {name: summary(values) for name, values in seconds.items()},
         "speedup_engine": summary(ours),
         "speedup_joblib": summary(theirs),
-        "engine_to_joblib": summary(ratios(ours, theirs)),
     }
 
 
@@ -237,24 +236,6 @@ def faults(num_rows: int, num_workers: int) -> dict[str, Any]:
     }
 
 
-def machine() -> dict[str, Any]:
-    with open("/proc/cpuinfo") as file:
-        models = [
-            line.partition(":")[2].strip() for line in file if "model name" in line
-        ]
-    return {
-        "cpu": models[0] if models else platform.processor(),
-        "cores": os.cpu_count(),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-    }
-
-
-def text(figures: dict[str, float], form: str) -> str:
-    middle, low, high = (format(value, form) for value in figures.values())
-    return f"{middle} ({low} to {high})"
-
-
 @dataclass(frozen=True)
 class Settings:
     """What is run.
@@ -269,13 +250,11 @@ class Settings:
 
 
 def main(arguments: Settings) -> None:
-    """Run what is asked for and is not there yet, and print the table."""
+    """Measure, write and print."""
     repetitions = arguments.repetitions
     result: dict[str, Any] = {
         "command": f"python -m benchmarks engine --repetitions {repetitions}",
         "date": datetime.now().isoformat(timespec="minutes"),
-        "machine": machine(),
-        "load_average_at_start": os.getloadavg()[0],
         "overhead": [],
         "workers": [],
     }
@@ -283,24 +262,11 @@ def main(arguments: Settings) -> None:
         for burns in (False, True):
             row = overhead(1_500, 250, repetitions, burns=burns, elsewhere=elsewhere)
             result["overhead"].append(row)
-            print(
-                f"overhead {row['where']}, {row['simulator']}, {row['clock']}: "
-                f"{text(row['overhead'], '.1%')}; 1 ms a row, batches of 250",
-                flush=True,
-            )
     for burns in (False, True):
         num_rows = 200 if burns else 400  # waiting takes nothing from others
         row = workers(num_rows, 20, repetitions, burns=burns)
         result["workers"].append(row)
-        print(
-            f"1 to 2 workers, {row['simulator']}: "
-            f"engine {text(row['speedup_engine'], '.2f')} x, "
-            f"joblib {text(row['speedup_joblib'], '.2f')} x, "
-            f"ratio {text(row['engine_to_joblib'], '.2f')}; 5 ms a row, batches of 20",
-            flush=True,
-        )
-    row = result["faults"] = faults(2_000, 2)
-    print(f"faults: {row['seconds']:.1f} s; {row['counts']}; {row['warning']}")
-    print(f"x of the good rows unchanged: {row['x_of_good_rows_unchanged']}")
-    result["load_average_at_end"] = os.getloadavg()[0]
+    result["faults"] = faults(2_000, 2)
     keep(arguments.out, result)
+    for name, value in leaves(result):
+        print(f"{name}: {value}")

@@ -15,7 +15,6 @@ repository; it writes peers.csv beside this file::
 
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -35,8 +34,8 @@ from torch import Tensor
 
 from benchmarks.information_gain.guides import conditional, marginal, posterior
 from benchmarks.information_gain.worlds import NUM_PILOT, World, worlds
+from benchmarks.rows import frame, write
 from sbi_active import InformationGainDesigner
-from sbi_active.display.table import Table
 from sbi_active.seeding import forked_generators
 
 FINAL = 2_000  # simulations an action of pyro's final estimate
@@ -201,14 +200,7 @@ def main(
             if name not in only or (i > 0 and name in DEAR):
                 continue
             result = measure(world, method, seeds)
-            result = {
-                k: f"{v:.4g}" if isinstance(v, float) else str(v)
-                for k, v in result.items()
-            }
             rows.append({"case": world.name, "method": name, "given": given} | result)
             print(*rows[-1].values(), sep="  ", flush=True)
-    with out.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [*rows[0]])
-        writer.writeheader()
-        writer.writerows(rows)
-    print(Table([*rows[0]], [[*map(str, r.values())] for r in rows]).text())
+    write(out, rows)
+    print(frame(rows).to_string(index=False))

@@ -11,7 +11,6 @@ by the default network, trained on 5,000 rows. Writes result.csv beside this fil
 
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -21,8 +20,8 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from benchmarks.rows import frame, write
 from sbi_active import ASBI, InformationGainDesigner, MixtureDensity, simulate
-from sbi_active.display.table import Table
 from sbi_active.inference import Belief
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import Task, get_task
@@ -44,21 +43,24 @@ class ExactBelief(Belief):
         return self.reference.log_prob(theta.double())
 
 
+def rounds(variant: str) -> tuple[Any, Any, Any]:
+    """Return the numerical task, and exact inference before and after a trial at -5."""
+    task = get_task("numerical", variant=variant)
+    action = torch.tensor([[-5.0]])
+    after = task.reference(action, task.real_system(action[0], seed=0)[None])
+    return task, task.reference(torch.empty(0, 1), torch.empty(0, 1)), after
+
+
 def worlds() -> list[tuple[str, Task, Distribution, Tensor]]:
     """Return name, task, belief and exact gain of every case."""
     cases: list[tuple[str, Task, Distribution, Tensor]] = []
     for variant in ("linear", "sinh", "square"):
-        task = get_task("numerical", variant=variant)
-        prior = task.reference(torch.empty(0, 1), torch.empty(0, 1))
-        assert prior is not None
-        gain = prior.expected_information_gain(task.actions.values)
-        cases.append((f"{variant}, round 1", task, task.prior, gain))
-        action = torch.tensor([[-5.0]])
-        after = task.reference(action, task.real_system(action[0], seed=0)[None])
-        assert after is not None
-        belief = ExactBelief(after, task.prior)
-        gain = after.expected_information_gain(task.actions.values)
-        cases.append((f"{variant}, round 2", task, belief, gain))
+        task, before, after = rounds(variant)
+        beliefs = task.prior, ExactBelief(after, task.prior)
+        for number, exact in enumerate((before, after)):
+            gain = exact.expected_information_gain(task.actions.values)
+            name = f"{variant}, round {number + 1}"
+            cases.append((name, task, beliefs[number], gain))
     task = get_task("oscillator")
     prior = task.reference(torch.empty(0, 2), torch.empty(0, 6))
     assert prior is not None
@@ -147,13 +149,5 @@ def main(
             )
             rows.append({"case": name, "simulator": f"{kind} network"} | result)
         print(f"{name}: done")
-    path = Path(__file__).parent / "result.csv"
-    rows = [
-        {k: f"{v:.4g}" if isinstance(v, float) else str(v) for k, v in row.items()}
-        for row in rows
-    ]
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, [*rows[0]])
-        writer.writeheader()
-        writer.writerows(rows)
-    print(Table([*rows[0]], [[str(v) for v in r.values()] for r in rows]).text())
+    write(Path(__file__).parent / "result.csv", rows)
+    print(frame(rows).to_string(index=False))

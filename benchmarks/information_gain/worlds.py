@@ -14,7 +14,8 @@ from torch.distributions import Distribution
 from torch.distributions.constraints import real_vector
 
 from benchmarks.information_gain.guides import Pilot
-from sbi_active.tasks import Task, get_task
+from benchmarks.information_gain.run import rounds
+from sbi_active.tasks import Task
 
 POOL = 200_000  # draws that stand in for the belief of round 2
 NUM_PILOT = 1_000  # simulations an action that standardize the outcomes
@@ -94,16 +95,11 @@ def worlds() -> list[World]:
     """Return the cases."""
     cases = []
     for variant in ("linear", "sinh"):
-        task = get_task("numerical", variant=variant)
-        prior = task.reference(torch.empty(0, 1), torch.empty(0, 1))
-        assert prior is not None
-        gain = prior.expected_information_gain(task.actions.values)
+        task, before, after = rounds(variant)
+        gain = before.expected_information_gain(task.actions.values)
         name = f"{variant}, round 1"
         cases.append(World(name, task, task.prior, 2 * math.log(10), gain))
         if variant == "linear":
-            action = torch.tensor([[-5.0]])
-            after = task.reference(action, task.real_system(action[0], seed=0)[None])
-            assert after is not None
             draws = after.sample(POOL, seed=0)
             entropy = -float(after.log_prob(draws).mean())
             gain = after.expected_information_gain(task.actions.values)

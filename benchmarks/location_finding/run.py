@@ -3,6 +3,7 @@
     python -m benchmarks location_finding --policy random --rollouts 64 --trials 30
     python -m benchmarks location_finding --policy fixed myopic_particles
     python -m benchmarks location_finding --policy myopic --rollouts 64
+    python -m benchmarks location_finding --summary
 
 Resumable: a roll-out that stands in the CSV is not run again. One row a roll-out, one
 file a policy and number of trials, in benchmarks/location_finding/results; the table of
@@ -28,12 +29,11 @@ from benchmarks.location_finding.bounds import (
 )
 from benchmarks.location_finding.particles import ParticleBelief
 from benchmarks.location_finding.policies import POLICIES, Myopic
-from benchmarks.location_finding.summary import RESULTS, table
+from benchmarks.location_finding.summary import FULL, RESULTS, path_of, table
 from benchmarks.rows import resumed
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task
 
-CONTRASTIVE = 500_000  # L, as in Foster et al. (2021)
 PARTICLES = 2_000  # of the posterior behind the proposal
 
 
@@ -112,35 +112,34 @@ class Settings:
         first: Number of the first case.
         trials: Number of trials.
         contrastive: Number of contrastive draws, L.
-        out: File of the results.
+        out: Folder of the results.
+        summary: Whether to run nothing, and print the table of the rows.
     """
 
     policy: Annotated[Sequence[str], POLICIES] = (*POLICIES,)
     rollouts: int = 64
     first: int = 0
     trials: int = 30
-    contrastive: int = CONTRASTIVE
+    contrastive: int = FULL
     out: Path = RESULTS
+    summary: bool = False
 
 
 def run(policy: str, arguments: Settings) -> None:
     """Run the roll-outs that are not in the file yet."""
-    name = f"{policy}_{arguments.trials}"
-    if arguments.contrastive != CONTRASTIVE:
-        name += f"_L{arguments.contrastive}"
 
     def made(rollout: int) -> dict[str, Any]:
         return roll_out(policy, rollout, arguments.trials, arguments.contrastive)
 
     last = arguments.first + arguments.rollouts
     jobs = [(rollout,) for rollout in range(arguments.first, last)]
-    path = arguments.out / f"{name}.csv"
+    path = path_of(arguments.out, policy, arguments.trials, arguments.contrastive)
     resumed(path, ["rollout"], jobs, made)
 
 
 def main(arguments: Settings) -> None:
     """Run what is asked for and is not there yet, and print the table."""
-    for policy in arguments.policy:
+    for policy in () if arguments.summary else arguments.policy:
         run(policy, arguments)
     cap = math.log(arguments.contrastive + 1)
     print(table(arguments.out, arguments.trials, arguments.contrastive))

@@ -1,17 +1,14 @@
-"""The table of location finding: every policy, paired differences, published figures.
-
-python -m benchmarks location_finding.summary
-"""
+"""The table of location finding: policies, paired differences, published figures."""
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.location_finding.bounds import near_cap
 from benchmarks.published import published
+from benchmarks.rows import read
 from sbi_active.display.table import Table
 
 RESULTS = Path(__file__).parent / "results"
@@ -31,21 +28,20 @@ BOUNDS = ("spce", "snmc", "lower", "upper")
 COSTS = ("cpu_design", "cpu_belief", "cpu_bounds")
 
 
-def read(folder: Path, policy: str, num_trials: int, num_contrastive: int) -> Rows:
-    """Return the roll-outs of a policy, none where there is no file."""
+def path_of(folder: Path, policy: str, num_trials: int, num_contrastive: int) -> Path:
+    """Return the file of a policy."""
     name = f"{policy}_{num_trials}"
     name += "" if num_contrastive == FULL else f"_L{num_contrastive}"
-    path = folder / f"{name}.csv"
-    if not path.exists():
-        return {}
-    with path.open(newline="") as file:
-        return {
-            int(row["rollout"]): {
-                key: float(row.get(key) or "nan")
-                for key in (*BOUNDS, *COSTS, "effective", "belief_gain")
-            }
-            for row in csv.DictReader(file)
-        }
+    return folder / f"{name}.csv"
+
+
+def by_rollout(path: Path) -> Rows:
+    """Return the roll-outs of a policy, none where there is no file."""
+    keys = (*BOUNDS, *COSTS, "effective", "belief_gain")
+    return {
+        int(row["rollout"]): {key: float(row.get(key) or "nan") for key in keys}
+        for row in read(path)
+    }
 
 
 def mean_and_error(values: np.ndarray) -> tuple[float, float]:
@@ -72,7 +68,8 @@ def difference(
 
 def table(folder: Path, num_trials: int, num_contrastive: int) -> str:
     """Return the table, and lines on the paired differences."""
-    policies = {p: read(folder, p, num_trials, num_contrastive) for p in NAMES}
+    paths = {p: path_of(folder, p, num_trials, num_contrastive) for p in NAMES}
+    policies = {p: by_rollout(path) for p, path in paths.items()}
     policies = {p: rows for p, rows in policies.items() if rows}
     cells, lines = [], []
     for policy, rows in policies.items():
@@ -105,17 +102,3 @@ def table(folder: Path, num_trials: int, num_contrastive: int) -> str:
     header = [f"{num_trials} trials (roll-outs)", "sPCE", "sNMC", "lower", "upper"]
     header.append("CPU s: design / belief / bounds")
     return "\n".join([Table(header, cells).text(), *lines])
-
-
-def main(
-    *,
-    trials: int = 30,
-    contrastive: int = FULL,
-) -> None:
-    """Run what is asked for and is not there yet, and print the table.
-
-    Args:
-        trials: Number of trials.
-        contrastive: Number of contrastive draws, L.
-    """
-    print(table(RESULTS, trials, contrastive))

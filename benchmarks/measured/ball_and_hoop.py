@@ -1,7 +1,6 @@
 """The ball and hoop: what a motor of first order lacks, from three records.
 
     python -m benchmarks measured.ball_and_hoop --data DIR
-    python -m benchmarks measured.ball_and_hoop --data DIR --clean 0 --reports reports
 
 ``DIR`` holds ``random_steps.csv``, ``fixed_steps.csv`` and ``closed_loop.csv``. The
 first 3,000 samples of the first are fitted, in ten trials of 30 s that start at a speed
@@ -15,7 +14,7 @@ them anywhere on a line, with one error on what was fitted and any on what was n
 Coulomb friction alone, plain least squares gets 2.5 to 5.5 V on the rest of the first
 record. The prior of the offset, 1 % of the largest command, is what decides
 (:mod:`benchmarks.measured.hoop_offset`). Least squares is therefore given with the
-offset at zero, and with the offset free beside it.
+offset at zero.
 
 Besides friction the library has an amplifier whose gain falls with the command. Least
 squares given it alone fits better than given quadratic drag and Coulomb friction, and
@@ -62,14 +61,6 @@ REMOVALS = (
     ("compression", "quadratic drag"),
     ("compression", "cubic drag"),
     ("compression", "quadratic drag", "cubic drag"),
-)
-#: Effects that least squares is given in any case.
-GIVEN = (
-    ("quadratic drag",),
-    ("Coulomb",),
-    ("Coulomb", "quadratic drag"),
-    ("compression",),
-    ("quadratic drag", "compression"),
 )
 #: Of the offset, V, where it is fitted: far beyond an amplifier's.
 OFFSET = 0.5
@@ -161,17 +152,14 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
     fitted = records["random_steps"]
 
     def least_squares(names: tuple[str, ...]) -> dict[str, Any]:
-        free, effects = fit_hoop(fitted, names)
-        zero, _ = fit_hoop(fitted, names, offset=0.0)
+        zero, effects = fit_hoop(fitted, names, offset=0.0)
         own = torch.from_numpy(zero.parameters)[None]
-        row = zero.row(free_run(own, held, effects))
-        own = torch.from_numpy(free.parameters)[None]
-        return row | {"offset free": free.row(free_run(own, held, effects))}
+        return zero.row(free_run(own, held, effects))
 
-    def replay(seed: int, names: tuple[str, ...]) -> Trials:
-        fit, effects = fit_hoop(fitted, names, offset=0.0)
+    def replay(seed: int) -> Trials:
+        fit, _ = fit_hoop(fitted, offset=0.0)
         whole = cut(fitted.part(0, FITTED + 1), FITTED)
-        x = run_pieces(torch.from_numpy(fit.parameters)[None], whole, effects)[0, 0]
+        x = run_pieces(torch.from_numpy(fit.parameters)[None], whole)[0, 0]
         x = torch.cat([torch.from_numpy(whole.start), x])
         output = with_error(x, SENSOR_SD, seed)
         made = Record("replay", fitted.step, fitted.voltage[: FITTED + 1], output)
@@ -181,7 +169,6 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
         ball_and_hoop,
         trials=pieces.trials(LABELS, CHANNEL),
         removals=REMOVALS,
-        given=GIVEN,
         score=lambda draws, effects: free_run(draws, held, effects),
         least_squares=least_squares,
         replay=replay,

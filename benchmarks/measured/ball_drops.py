@@ -4,8 +4,7 @@
 ``sbi_active.tasks.ball_drops`` with the two drops of every ball, writes one row a ball
 and one a fold to ``results/ball_drops.json``, and prints the tables. A fold is fitted
 to one drop and the first 0.8 s of the other; it chooses its own verdict, and is scored
-on the rest. Rows that are there are kept. ``--figures DIR`` draws, and
-``--reports DIR`` writes the library's report on each ball.
+on the rest. Rows that are there are kept. ``--figures DIR`` draws.
 """
 
 from __future__ import annotations
@@ -139,7 +138,6 @@ def main(
     data: Path = DATA,
     out: Path = RESULT,
     figures: Path | None = None,
-    reports: Path | None = None,
     balls: Sequence[str] | None = None,
     seed: int = 0,
 ) -> None:
@@ -149,7 +147,6 @@ def main(
         data: Folder of the measured set.
         out: File of the results.
         figures: Folder for the figures.
-        reports: Folder for whole reports.
         balls: Names of balls; all by default.
         seed: Seed of the engine.
     """
@@ -172,10 +169,6 @@ def main(
     print(tables([*rows.values()]))
     if figures is not None:
         _draw(rows, by_ball, figures, seed=seed)
-    if reports is not None:
-        for ball, pair in wanted.items():
-            loop = criticism(trials_of(pair), seed)
-            print(loop.report(evaluate=False).save(reports / ball))
 
 
 def _draw(
@@ -204,7 +197,7 @@ def tables(rows: Sequence[Row]) -> str:
     """
     balls = [row for row in rows if "alarm" in row]
     folds = [row for row in rows if "tested" in row]
-    return "\n\n".join([_verdicts(balls), _errors(folds), _folds(folds)])
+    return "\n\n".join([_verdicts(balls), _errors(folds)])
 
 
 def called(row: Row) -> str:
@@ -257,19 +250,6 @@ def _errors(rows: Sequence[Row]) -> str:
     names = [*WHEN, *(f"{kind}, least squares" for kind in KINDS)]
     header = [f"RMSE, m, {len(rows)} folds", *names, "after / before"]
     return Table(header, cells).markdown()
-
-
-def _folds(rows: Sequence[Row]) -> str:
-    cells = []
-    for row in rows:
-        pairs = [
-            f"{row[f'{what} before']:.2f} -> {row[f'{what} after']:.2f}"
-            for what in ("second drop", "forecast", "coverage")
-        ]
-        drop, drag = f"{row['ball']} {row['tested']}", row["probability_of_drag"]
-        cells.append((drop.replace("_", " "), called(row), f"{drag:.2f}", *pairs))
-    errors = ("second drop, m", "forecast, m", "coverage")
-    return Table(("tested drop", "verdict", "P(drag)", *errors), cells).markdown()
 
 
 def jobs_without_drag(data: Path, balls: Sequence[str]) -> Iterator[tuple[Any, ...]]:

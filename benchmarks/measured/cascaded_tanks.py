@@ -1,14 +1,13 @@
 """The cascaded tanks: what Torricelli's law lacks, from two records.
 
     python -m benchmarks measured.cascaded_tanks --data DIR
-    python -m benchmarks measured.cascaded_tanks --data DIR --clean 0 --reports reports
 
 ``DIR`` holds ``estimation.csv`` and ``validation.csv``. The first is fitted, in six
 trials of 600 s that run for 400 s before; the second is scored after its first 50
 samples, on which its start levels are found. Stages stand in
 :mod:`benchmarks.measured.record_stages`; each is added to
 ``results/cascaded_tanks.json`` unless it is there, and the tables are printed. Least
-squares fits the same pieces, and beside them the first record as a whole.
+squares fits the same pieces.
 """
 
 from __future__ import annotations
@@ -57,13 +56,6 @@ REMOVALS = (
     ("linear outflow", "outflow exponent", "pump dead zone"),
     ("overflow", "linear outflow", "outflow exponent"),
     ("overflow", "sensor saturation", "linear outflow", "outflow exponent"),
-)
-#: Effects that least squares is given in any case.
-GIVEN = (
-    ("overflow",),
-    ("linear outflow",),
-    ("overflow", "linear outflow"),
-    ("overflow", "outflow exponent"),
 )
 #: Of the start levels beside what the first readings tell, V.
 START_LOW, START_HIGH = (-10.0, -1.0), (10.0, 1.0)
@@ -211,17 +203,14 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
 
     def least_squares(names: tuple[str, ...]) -> dict[str, Any]:
         fit, effects = fit_pieces(pieces, names)
-        whole, _ = fit_tanks(fitted, names)
         own = torch.from_numpy(fit.parameters)[None]
-        row = fit.row(score(own, scored, effects))
-        own = torch.from_numpy(whole.parameters[:-2])[None]
-        return row | {"as one record": whole.row(score(own, scored, effects))}
+        return fit.row(score(own, scored, effects))
 
-    def replay(seed: int, names: tuple[str, ...]) -> Trials:
-        fit, effects = fit_tanks(fitted, names)
+    def replay(seed: int) -> Trials:
+        fit, _ = fit_tanks(fitted)
         z = torch.from_numpy(fit.parameters)[None]
         whole = cut(fitted, len(fitted) - 1, slope=SLOPE)
-        x = run_pieces(z[:, :-2], z[:, None, -2:], whole, effects)[0, 0]
+        x = run_pieces(z[:, :-2], z[:, None, -2:], whole)[0, 0]
         x = torch.cat([torch.from_numpy(whole.start) + z[0, -1:], x])
         output = with_error(x, SENSOR_SD, seed)
         made = Record("replay", fitted.step, fitted.voltage, output)
@@ -232,7 +221,6 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
         cascaded_tanks,
         trials=pieces.trials(LABELS, CHANNEL),
         removals=REMOVALS,
-        given=GIVEN,
         score=lambda draws, effects: score(draws, scored, effects),
         least_squares=least_squares,
         replay=replay,

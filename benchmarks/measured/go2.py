@@ -12,9 +12,6 @@ leg, which are added to ``results/go2.json`` unless they are there:
   torque scale of each joint, against what ``mjcf_effects`` lists of the knee, its motor
   and its encoder, and the tilt of the base; of the other legs against four of these.
 - ``FL, removed``: against these four without the effects that the first stage adopted.
-- ``FL, rigid legs``: armature and the PD law alone, in rounds: what a round says that
-  helps is in the simulator of the next, until nothing does.
-- ``FL, forces``: the library of generalized forces on the knee, with free shapes.
 
 Beside the verdicts plain least squares, given the same effects.
 """
@@ -30,22 +27,21 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from benchmarks.criticism.scores import counted
+from benchmarks.fitting import local_fit
 from benchmarks.measured.go2_leg import DATA, LEGS, Leg, read_leg, usual_parameters
-from benchmarks.measured.verdicts import center, row_of, said
+from benchmarks.measured.verdicts import causes, center, row_of, said
 from benchmarks.rows import keep, measured, stages
 from sbi_active.criticism import Criticism, Effect
 from sbi_active.criticism.report.summary import misfit_line
 from sbi_active.criticism.results import ModelKey, Tracing
 from sbi_active.display.table import Table
-from sbi_active.mujoco import force_effects, mjcf_effects
+from sbi_active.mujoco import mjcf_effects
 from sbi_active.mujoco.robot import Robot
 
 Array = NDArray[np.float64]
 RESULT = Path(__file__).parent / "results" / "go2.json"
-ROUNDS = 5
 PARTS = ("fitted", "held out")
 #: Of a joint.
 KINDS = ("friction loss by *", "static friction", "quadratic damping", "*stiffness")
@@ -72,61 +68,38 @@ def line_of(tracing: Tracing) -> str:
 
 
 def judge(
-    leg: Leg,
-    library: Callable[[Robot], Sequence[Effect]],
-    *,
-    rigid: bool = False,
-    rounds: int = 1,
-    seed: int = 0,
+    leg: Leg, library: Callable[[Robot], Sequence[Effect]], *, seed: int = 0
 ) -> dict[str, Any]:
-    """Return the row of one verdict, or of some in turn.
+    """Return the row of one verdict.
 
     Args:
-        leg: That is fitted.
-        library: Effects of a robot.
-        rigid: Start from armature and the PD law alone.
-        rounds: Verdicts at most, each with what helped before in the simulator.
-        seed: Of all draws.
+        leg: Leg that is fitted.
+        library: Function from a robot to the effects that are declared.
+        seed: Seed of all draws.
     """
-    parameters = usual_parameters(leg, rigid=rigid)
+    parameters = usual_parameters(leg)
     robot = leg.robot(parameters, leg.triangles())
     begin = time.process_time()
     effects = [*library(robot)]
     model, count = counted(robot.simulator)
-    prior, found, before, adopted = robot.prior, [], None, []
     assert robot.trials is not None
-    for _ in range(rounds):
-        left = [e for e in effects if e not in adopted]
-        # The report's residuals, each trial predicted from those before, would take as
-        # long as the verdict.
-        loop = Criticism(
-            *(model, prior, robot.trials),
-            effects=left,
-            thin=False,  # readings are chosen by hand
-            seed=seed,
-        )
-        tracing = loop.trace()
-        adopted += [e for n in tracing.chosen for e in effects if e.name == n]
-        values = center(tracing.evidences[str(ModelKey(tracing.chosen))])
-        run = leg.free_run(parameters, adopted, values)[0]
-        row = row_of(tracing) | {
-            "line": line_of(tracing),
-            "values": values[0].tolist(),
-            "after": leg.errors(run),
-        }
-        if before is None:
-            bare = center(tracing.evidences[str(ModelKey())])
-            before = leg.errors(leg.free_run(parameters, [], bare)[0])
-            row |= {"before": before, "bare values": bare[0].tolist()}
-        found.append(row)
-        if not tracing.chosen:
-            break
-        model, prior = loop.add()
-    last = {"values": found[-1]["values"], "after": found[-1]["after"]}
-    row = {**found[0], **last, "helps": [e.name for e in adopted]}
-    if rounds > 1:
-        row["rounds"] = found
-    return row | {
+    # The report's residuals, each trial predicted from those before, would take as
+    # long as the verdict.
+    tracing = Criticism(
+        *(model, robot.prior, robot.trials),
+        effects=effects,
+        thin=False,  # readings are chosen by hand
+        seed=seed,
+    ).trace()
+    helps = [e for n in tracing.chosen for e in effects if e.name == n]
+    values = center(tracing.evidences[str(ModelKey(tracing.chosen))])
+    bare = center(tracing.evidences[str(ModelKey())])
+    return row_of(tracing) | {
+        "line": line_of(tracing),
+        "values": values[0].tolist(),
+        "after": leg.errors(leg.free_run(parameters, helps, values)[0]),
+        "before": leg.errors(leg.free_run(parameters, [], bare)[0]),
+        "bare values": bare[0].tolist(),
         "cpu_seconds": time.process_time() - begin,
         "trial_simulations": count(),
     }
@@ -139,7 +112,7 @@ class Settings:
     Args:
         data: Folder of the measured set.
         legs: Names of legs.
-        stages: Names of the stages, as in 'removed', 'rigid legs'.
+        stages: Names of the stages, as in 'removed'; all by default.
         out: File of the results.
         figures: Folder for the figures.
         seed: Seed of the engine.
@@ -194,23 +167,15 @@ def _stages(leg: Leg, rows: dict[str, Any], arguments: Any) -> Any:
         chosen = arguments.stages is None or stage in arguments.stages
         return name not in rows and (chosen or not stage)
 
-    def judged(name: str, library: Any, **options: Any) -> Any:
-        return name, judge(leg, library, seed=seed, **options)
-
     if wanted(""):
-        yield judged(own, _library(leg, few=own != LEGS[0]))
+        yield own, judge(leg, _library(leg, few=own != LEGS[0]), seed=seed)
     helps = rows[own]["helps"]
     if wanted("least squares"):
         given = dict.fromkeys([(), (*helps,)])
         yield f"{own}, least squares", _least_squares(leg, [*given])
     if wanted("removed"):
-        yield judged(f"{own}, removed", _library(leg, helps, few=True))
-    if own == LEGS[0] and wanted("rigid legs"):
-        every = lambda robot: mjcf_effects(robot)  # noqa: E731
-        yield judged(f"{own}, rigid legs", every, rigid=True, rounds=ROUNDS)
-    if own == LEGS[0] and wanted("forces"):
-        knee = f"*of {leg.joints[-1]}"
-        yield judged(f"{own}, forces", lambda robot: force_effects(robot, include=knee))
+        library = _library(leg, helps, few=True)
+        yield f"{own}, removed", judge(leg, library, seed=seed)
 
 
 def _least_squares(leg: Leg, sets: Sequence[tuple[str, ...]]) -> dict[str, Any]:
@@ -257,19 +222,14 @@ def fit_leg(
     x0 = np.concatenate([start, STRENGTH * sds])
     scale = np.maximum(np.abs(x0), 0.02)
 
-    def jacobian(x: Array) -> Array:
-        steps = DIFFERENCE * scale
-        steps = np.where(x + steps > high, -steps, steps)
-        both = residual(np.concatenate([x[None], x + np.diag(steps)]))
-        return ((both[1:] - both[0]) / steps[:, None]).T
-
-    found = least_squares(
-        lambda x: residual(x[None])[0],
+    found = local_fit(
+        residual,
         x0,
-        jac=jacobian,  # pyright: ignore[reportArgumentType]
-        bounds=(low, high),
-        x_scale=scale,
-        max_nfev=EVALUATIONS,
+        low=low,
+        high=high,
+        scale=scale,
+        difference=DIFFERENCE,
+        evaluations=EVALUATIONS,
     )
     values = torch.from_numpy(found.x)[None]
     run = leg.free_run(parameters, effects, values)[0]
@@ -287,12 +247,8 @@ def tables(rows: Mapping[str, Any]) -> str:
     for name, row in judged.items():
         cost = f"{row['trial_simulations']:,}", f"{row['cpu_seconds']:.0f}"
         errors.append((f"{name}: before", *_errors(row["before"])))
-        for k, one in enumerate(row.get("rounds", [row])):
-            word = f", round {k + 1}" if "rounds" in row else ""
-            helps = ", ".join(f"{n} {one['cause'][n]:.2f}" for n in one["helps"])
-            spent = cost if k == 0 else ("", "")
-            verdicts.append((name + word, said(one), helps, *spent))
-            errors.append((f"{name}: after{word}", *_errors(one["after"])))
+        verdicts.append((name, said(row), causes(row), *cost))
+        errors.append((f"{name}: after", *_errors(row["after"])))
     for name, row in rows.items():
         if "line" not in row:
             errors += [

@@ -200,16 +200,9 @@ class _TorqueScale:
         motor.forcerange, motor.ctrlrange = limits
 
 
-def usual_parameters(leg: Leg, *, rigid: bool = False) -> dict[str, Any]:
-    """Return what an engineer fits: armature, damping, dry friction, torque scale.
-
-    Args:
-        leg: Whose joints they are of.
-        rigid: The armature alone.
-    """
+def usual_parameters(leg: Leg) -> dict[str, Any]:
+    """Return what an engineer fits: armature, damping, dry friction, torque scale."""
     found: dict[str, Any] = {f"{j}.armature": ARMATURE for j in leg.joints}
-    if rigid:
-        return found
     found |= {f"{j}.damping": DAMPING for j in leg.joints}
     found |= {f"{j}.frictionloss": FRICTION for j in leg.joints}
     return found | {f"{m} torque scale": (*SCALE, _TorqueScale(m)) for m in leg.motors}

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from torch import Tensor
 from torch.distributions import HalfNormal, Uniform
 
+from benchmarks.fitting import local_fit
 from sbi_active.criticism import Context, Effect
 from sbi_active.tasks.records import Pieces  # pyright: ignore
 
@@ -67,22 +67,11 @@ def best_in_box(
     def at(z: Array) -> Array:
         return residual(low + z * width)
 
-    def jacobian(z: Array) -> Array:
-        step = np.where(z + difference > 1, -difference, difference)
-        every = at(np.concatenate([z[None], z + np.diag(step)]))
-        return ((every[1:] - every[0]) / step[:, None]).T
-
     z = np.random.default_rng(seed).uniform(size=(draws, len(low)))
     order = np.argsort((at(z) ** 2).sum(1))[:starts]
+    limits: dict[str, Any] = {"low": 0.0, "high": 1.0, "difference": difference}
     found = [
-        least_squares(
-            lambda z: at(z[None])[0],
-            start,
-            jacobian,  # type: ignore[arg-type]  # SciPy's stub has the string alone
-            bounds=(0, 1),
-            max_nfev=evaluations,
-        )
-        for start in z[order]
+        local_fit(at, start, evaluations=evaluations, **limits) for start in z[order]
     ]
     best = min(found, key=lambda fit: fit.cost)
     return low + best.x * width, best.cost

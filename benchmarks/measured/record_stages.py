@@ -5,8 +5,6 @@
 - ``without NAME + ...``: the same with effects removed from the library.
 - ``clean 2000``, ``clean 2001``, ...: the pieces simulated by the bare model at its
   least-squares fit, with the sensor's error alone, by their seeds.
-- ``full 2000``, ...: the same with the effects that help in ``recorded``, at the
-  least-squares fit with them: nothing but these is there to be named.
 """
 
 from __future__ import annotations
@@ -33,7 +31,6 @@ from sbi_active.display.table import Table
 Errors = dict[str, float]
 #: Seed of the first replay; nothing was chosen by those from here on.
 FIRST_REPLAYED = 2_000
-REPLAYS = {"clean": "the bare model", "full": "the model of the first verdict"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,13 +43,10 @@ class Bench:
         effects: The declared library.
         trials: Trials to fit.
         removals: Sets of effects to remove from the library, one stage each.
-        given: Sets of effects that least squares is given in any case, each in the
-            order of the library.
         score: Function of theta and strengths (n, d), and effects, to errors by
             held-out record.
         least_squares: Function of names of effects to a fit's row.
-        replay: Function of seed and names of effects to trials that a fitted model
-            makes.
+        replay: Function of a seed to trials that the fitted bare model makes.
     """
 
     model: SimulatorModel
@@ -60,10 +54,9 @@ class Bench:
     effects: Sequence[Effect]
     trials: Trials
     removals: Sequence[tuple[str, ...]]
-    given: Sequence[tuple[str, ...]]
     score: Callable[[Tensor, Sequence[Effect]], Errors]
     least_squares: Callable[[tuple[str, ...]], dict[str, Any]]
-    replay: Callable[[int, tuple[str, ...]], Trials]
+    replay: Callable[[int], Trials]
 
     @classmethod
     def of(cls, task: Any, **parts: Any) -> Bench:
@@ -85,20 +78,14 @@ class Settings:
 
     Args:
         data: Folder of the measured set; the task's by default.
-        every: Stride of the readings that are kept; the task's by default.
         clean: Number of clean sets.
-        full: Number of sets with what helps.
         out: File of the results; the task's by default.
-        reports: Folder for whole reports.
         seed: Seed of the engine.
     """
 
     data: Path | None = None
-    every: int | None = None
     clean: int = 10
-    full: int = 0
     out: Path | None = None
-    reports: Path | None = None
     seed: int = 0
 
 
@@ -110,17 +97,15 @@ def run_settings(
     Args:
         settings: What is run.
         task: Package with records.
-        make_bench: Function ``make_bench(records, every=)``.
+        make_bench: Function ``make_bench(records)``.
         out: File of the results, unless one is given.
     """
     records = measured(task.read_recordings, settings.data or task.DATA)
     rows = run_stages(
-        make_bench(records, every=settings.every or task.recordings.EVERY),
+        make_bench(records),
         settings.out or out,
         clean=settings.clean,
-        full=settings.full,
         seed=settings.seed,
-        reports=settings.reports,
     )
     print(table(rows, "V"))
 
@@ -130,9 +115,7 @@ def run_stages(
     path: Path,
     *,
     clean: int = 10,
-    full: int = 0,
     seed: int = 0,
-    reports: Path | None = None,
 ) -> dict[str, Any]:
     """Run the stages that a file lacks, and return all of them.
 
@@ -140,30 +123,22 @@ def run_stages(
         bench: The machine.
         path: JSON file of the results.
         clean: Number of clean sets.
-        full: Number of sets that the model of the first verdict makes.
         seed: Seed of all draws.
-        reports: Folder for whole reports.
     """
     rows = stages(path)
     judged: dict[str, tuple[str, ...]] = {"recorded": ()}
     judged |= {f"without {' + '.join(gone)}": gone for gone in bench.removals}
     names = [*judged]
     names += [f"clean {FIRST_REPLAYED + k}" for k in range(clean)]
-    names += [f"full {FIRST_REPLAYED + k}" for k in range(full)]
     for name in [name for name in names if name not in rows]:
-        trials = None
-        if name not in judged:
-            kind, number = name.split(" ")
-            helps = (*rows["recorded"]["helps"],) if kind == "full" else ()
-            trials = bench.replay(int(number), helps)
-        folder = None if reports is None else reports / name.replace(" ", "_")
-        gone = judged.get(name, ())
-        row = judge(bench, gone=gone, trials=trials, seed=seed, folder=folder)
+        is_clean = name not in judged
+        trials = bench.replay(int(name.split(" ")[1])) if is_clean else None
+        row = judge(bench, gone=judged.get(name, ()), trials=trials, seed=seed)
         rows[name] = row
         keep(path, rows)
         print(f"{name}: {row['line']}, {row['cpu_seconds']:.0f} CPU s", flush=True)
     fits = rows.setdefault("least squares", {})
-    wanted = {(), *bench.given, *[(*rows[name]["helps"],) for name in judged]}
+    wanted = {(), *[(*rows[name]["helps"],) for name in judged]}
     for given in sorted(wanted):
         label = " + ".join(given) or "none"
         if label not in fits:
@@ -178,7 +153,6 @@ def judge(
     gone: Sequence[str] = (),
     trials: Trials | None = None,
     seed: int = 0,
-    folder: Path | None = None,
 ) -> dict[str, Any]:
     """Return the row of one verdict.
 
@@ -187,7 +161,6 @@ def judge(
         gone: Names of effects that are not declared.
         trials: Trials in place of the recorded ones.
         seed: Seed of all draws.
-        folder: Folder for the whole report.
     """
     effects = [effect for effect in bench.effects if effect.name not in gone]
     model, count = counted(bench.model)
@@ -202,8 +175,6 @@ def judge(
         plan=False,
     )
     seconds = time.process_time() - begin
-    if folder is not None:
-        report.save(folder)
     row = read_report(report)
     row |= {"cpu_seconds": seconds, "trial_simulations": count()}
     if trials is None:
@@ -249,22 +220,19 @@ def table(rows: dict[str, Any], unit: str) -> str:
 
 
 def _replays(rows: dict[str, Any]) -> list[tuple[str, ...]]:
-    """Return cells for each kind of replay: its verdicts, and how often."""
-    cells = []
-    for kind, what in REPLAYS.items():
-        own = {k: row for k, row in rows.items() if k.split(" ")[0] == kind}
-        if not own:
-            continue
-        verdicts = Counter(str(row["verdict"]) for row in own.values())
-        told = ", ".join(f"{v} ({n})" for v, n in verdicts.most_common())
-        seeds = sorted(int(k.split(" ")[-1]) for k in own)
-        count, seconds = (
-            np.median([row[key] for row in own.values()])
-            for key in ("trial_simulations", "cpu_seconds")
-        )
-        name = f"{len(own)} replays of {what}, seeds {seeds[0]} to {seeds[-1]}"
-        cells.append((name, told, "", "", "", f"{count:,.0f}", f"{seconds:.0f}"))
-    return cells
+    """Return cells of the replays of the bare model: verdicts, and how often."""
+    own = {k: row for k, row in rows.items() if k.startswith("clean ")}
+    if not own:
+        return []
+    verdicts = Counter(str(row["verdict"]) for row in own.values())
+    told = ", ".join(f"{v} ({n})" for v, n in verdicts.most_common())
+    seeds = sorted(int(k.split(" ")[-1]) for k in own)
+    count, seconds = (
+        np.median([row[key] for row in own.values()])
+        for key in ("trial_simulations", "cpu_seconds")
+    )
+    name = f"{len(own)} replays of the bare model, seeds {seeds[0]} to {seeds[-1]}"
+    return [(name, told, "", "", "", f"{count:,.0f}", f"{seconds:.0f}")]
 
 
 def aliases(rows: dict[str, Any]) -> str:

@@ -12,8 +12,7 @@
   off`` without friction, at the bare model's least-squares parameters, with errors of
   the size and correlation that are left in the recordings with the effect found.
 
-``--fit 0 2`` judges these trials alone. Rows of independent errors, forced, are of an
-earlier version.
+Rows of independent errors, forced, are of an earlier version.
 """
 
 from __future__ import annotations
@@ -52,7 +51,6 @@ RESULT = Path(__file__).parent / "results" / "servo_pendulum.json"
 NUM_CLEAN = 3
 QUANTUM = 2 * np.pi / 4096  # rad, of the encoder
 CATCH_ALLS = (NONE, UNEXPLAINED, SCATTER)
-SHOWN = 0.005  # probability of a model of several effects from which it is shown
 #: Keyword of the simulator and largest strength, by the name of the effect.
 FRICTIONS = {
     "Coulomb": ("coulomb", 0.3),
@@ -125,7 +123,6 @@ def judge(
     held_out: Sequence[int] = (),
     *,
     seed: int = 0,
-    folder: Path | None = None,
 ) -> Row:
     """Return what some recorded trials say.
 
@@ -134,7 +131,6 @@ def judge(
         fitted: Numbers of the trials that are fitted.
         held_out: Numbers of the trials that are only scored.
         seed: Seed of all draws.
-        folder: Folder for the whole report.
     """
     begin = time.process_time()
     loop = Criticism(
@@ -146,8 +142,6 @@ def judge(
         seed=seed,
     )
     report = loop.report(evaluate=len(held_out) > 0)
-    if folder is not None:
-        report.save(folder)
     evidences, model = report.tracing.evidences, report.tracing.model
     row = read_report(report) | {
         "fitted": [*fitted],
@@ -237,18 +231,14 @@ class Settings:
         data: Folder of the measured set.
         replay: Kind of the sets.
         clean: Number of clean sets.
-        fit: Numbers of the trials to fit alone.
         out: File of the results.
-        reports: Folder for whole reports.
         seed: Seed of the engine.
     """
 
     data: Path = DATA
     replay: Literal["recorded", "clean"] = "recorded"
     clean: int = NUM_CLEAN
-    fit: Sequence[int] | None = None
     out: Path = RESULT
-    reports: Path | None = None
     seed: int = 0
 
 
@@ -260,19 +250,12 @@ def missing(
     off = np.flatnonzero(task.recordings.motor_off).tolist()
     on = [i for i in range(len(task.recordings)) if i not in off]
 
-    def run(name: str, *parts: Any) -> tuple[str, Row]:
-        folder = chosen.reports and chosen.reports / name.replace(", ", "_")
-        return name, judge(*parts, seed=seed, folder=folder)
-
-    if chosen.fit:
-        yield run(f"trials {', '.join(map(str, chosen.fit))}", task, chosen.fit)
-        return
     if "powered" not in rows:
-        yield run("powered", task, on)
+        yield "powered", judge(task, on, seed=seed)
     extra = next_of(rows["powered"], off)
     split, held = [*on, extra], [i for i in off if i != extra]
     if "motor off" not in rows:
-        yield run("motor off", task, split, held)
+        yield "motor off", judge(task, split, held, seed=seed)
     row = rows["motor off"]
     if "least squares" not in row:
         yield "motor off", row | {"least squares": least_squares(task, row, seed)}
@@ -282,7 +265,7 @@ def missing(
         bare, full = (fit(task, split, n, seed=seed) for n in ((), named(row)))
         for i in wanted:
             clean = simulated(task, bare, full, split, seed=i)
-            yield run(f"clean {i}", clean, split, held)
+            yield f"clean {i}", judge(clean, split, held, seed=seed)
 
 
 def main(arguments: Settings) -> None:
@@ -315,14 +298,8 @@ def tables(rows: dict[str, Row], recordings: Recordings) -> str:
     ]
     header = ["stage", "trials", "verdict", "excess left", "90 % set", "log BF"]
     parts = [Table([*header, "next trial", "CPU s"], cells).markdown()]
-    parts += [
-        _models(name, row)
-        for name, row in rows.items()
-        if name in ("powered", "motor off") or name.startswith("trials")
-    ]
     if "motor off" in rows:
-        row = rows["motor off"]
-        parts += [_errors(row, recordings), _parameters(row)]
+        parts.append(_errors(rows["motor off"], recordings))
     return "\n\n".join(parts)
 
 
@@ -332,17 +309,6 @@ def _next(row: Row, recordings: Recordings) -> str:
     if row["next"] is None:
         return "none"
     return f"{_trial(row['next'], recordings)} ({max(row['gain']):.2f} nats)"
-
-
-def _models(stage: str, row: Row) -> str:
-    """Return the models of a stage, the likeliest first."""
-    null = row["log_evidence"][NONE]
-    cells = [
-        (name, f"{p:.2f}", f"{row['log_evidence'][name] - null:.1f}")
-        for name, p in row["probabilities"].items()
-        if p >= SHOWN or " + " not in name
-    ]
-    return Table((f"{stage}: model", "P", "log BF"), cells).markdown()
 
 
 def _errors(row: Row, recordings: Recordings) -> str:
@@ -359,21 +325,6 @@ def _errors(row: Row, recordings: Recordings) -> str:
         cells.append((f"least squares: {name}", *sizes, *own))
     each = [_trial(i, recordings) for i in row["held_out"]]
     return Table(("RMSE, rad", "fitted", "held out", *each), cells).markdown()
-
-
-def _parameters(row: Row) -> str:
-    both = row["parameters"][NONE], row["parameters"].get(row["model"], {})
-    cells = [
-        (
-            name,
-            *(
-                f"{m[name][0]:.4g} +- {m[name][1]:.2g}" if name in m else ""
-                for m in both
-            ),
-        )
-        for name in dict.fromkeys(name for model in both for name in model)
-    ]
-    return Table(("parameter", "bare model", row["model"]), cells).markdown()
 
 
 def _trial(number: int, recordings: Recordings) -> str:

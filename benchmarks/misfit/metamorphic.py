@@ -28,11 +28,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from benchmarks.criticism.worlds.world import effect, normal
 from benchmarks.misfit.cases import Case, Kind, Problem, draw_case
-from benchmarks.misfit.machines import GROUPS, LAYOUTS, get_machine
+from benchmarks.misfit.machines import GROUPS, get_machine
 from benchmarks.misfit.verdicts import Outcome, read_report
 from benchmarks.rows import benchmark
-from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials
 from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
@@ -53,23 +53,11 @@ def irrelevant(case: Case) -> Problem:
         def apply(x: Tensor, phi: Tensor, action: Tensor, context: Any) -> Tensor:
             with forked_generators(derive_seed(seed, "irrelevant")):
                 signs = 2.0 * torch.randint(2, (97, *x.shape[1:])).to(x) - 1
-            return (
-                x
-                + sd
-                * phi.reshape(-1, *[1] * (x.ndim - 1))
-                * signs[context.index.long() % 97]
-            )
+            each = phi.reshape(-1, *[1] * (x.ndim - 1))
+            return x + sd * each * signs[context.index.long() % 97]
 
-        prior = torch.distributions.Normal(torch.zeros(1), torch.ones(1))
-        return Effect(
-            f"pattern {seed}",
-            hook="observation",
-            prior=torch.distributions.Independent(prior, 1),
-            null=0.0,
-            apply=apply,
-            units="",
-            family="pattern",
-        )
+        own = effect(f"pattern {seed}", "observation", normal(1.0), apply)
+        return replace(own, family="pattern")
 
     more = [pattern(k) for k in range(IRRELEVANT)]
     return replace(problem, effects=[*problem.effects, *more])
@@ -84,18 +72,20 @@ def units(case: Case) -> Problem:
         return UNIT * fn(theta, action, **options)
 
     scaled.__signature__ = inspect.signature(fn)  # type: ignore[attr-defined]
-    model = _model(case, scaled, UNIT * truth.machine.noise_sd)
+    sd = UNIT * truth.machine.noise_sd
+    model = replace(truth.machine, fn=scaled, noise_sd=sd).model()
     trials = Trials(
         t.action, UNIT * t.x, index=t.index, sample_times=problem.model.sample_times
     )
-    effects = [_in_units(effect) for effect in problem.effects]
+    effects = [_in_units(own) for own in problem.effects]
     return replace(problem, model=model, trials=trials, effects=effects)
 
 
 def finer(case: Case) -> Problem:
     """Return the problem with a sensor declared finer than it is."""
-    sd = case.truth.machine.noise_sd / FINER
-    return replace(case.problem, model=_model(case, case.problem.model.fn, sd))
+    machine = case.truth.machine
+    model = replace(machine, noise_sd=machine.noise_sd / FINER).model()
+    return replace(case.problem, model=model)
 
 
 def denser(case: Case) -> Problem | None:
@@ -106,13 +96,13 @@ def denser(case: Case) -> Problem | None:
         return None
     if what is not None and what.kind == "process":  # it was drawn sample by sample
         return None
-    layout = _layout(case)
-    machine = get_machine(truth.machine.name, (layout[0], DENSER * layout[1]))
+    num_trials, num_samples = truth.machine.num_trials, truth.error.shape[1]
+    machine = get_machine(truth.machine.name, (num_trials, DENSER * num_samples))
     with forked_generators(derive_seed(len(truth.action), "denser")):
         shape = len(truth.error), DENSER * truth.error.shape[1], *truth.error.shape[2:]
         error = machine.noise_sd * torch.randn(shape, dtype=torch.float64)
     error[:, DENSER - 1 :: DENSER] = truth.error
-    kept = {effect.name for effect in case.problem.effects}
+    kept = {own.name for own in case.problem.effects}
     more = replace(
         truth,
         machine=machine,
@@ -129,7 +119,7 @@ def denser(case: Case) -> Problem | None:
         model=machine.model(),
         prior=machine.prior,
         trials=trials,
-        effects=[effect for effect in machine.library if effect.name in kept],
+        effects=[own for own in machine.library if own.name in kept],
     )
 
 
@@ -148,30 +138,15 @@ CHANGES: dict[str, Callable[[Case], Problem | None]] = {
 }
 
 
-def _layout(case: Case) -> tuple[int, int]:
-    num = case.truth.machine.num_trials
-    return next(layout for layout in LAYOUTS if layout[0] == num)
-
-
-def _model(case: Case, fn: Callable[..., Any], sd: float) -> SimulatorModel:
-    machine = case.truth.machine
-    return SimulatorModel(
-        fn,
-        noise=GaussianNoise(sd),
-        parameter_names=[*machine.parameter_names],
-        sample_times=machine.times if machine.declares_times else None,
-    )
-
-
-def _in_units(effect: Effect) -> Effect:
+def _in_units(own: Effect) -> Effect:
     """Return an effect whose outcomes are in other units."""
-    if effect.hook != "observation":
-        return effect
+    if own.hook != "observation":
+        return own
 
     def apply(x: Tensor, phi: Tensor, action: Tensor, context: Any) -> Tensor:
-        return UNIT * effect.apply(x / UNIT, phi, action, context)
+        return UNIT * own.apply(x / UNIT, phi, action, context)
 
-    return replace(effect, apply=apply)
+    return replace(own, apply=apply)
 
 
 def judged(problem: Problem, seed: int) -> Outcome:

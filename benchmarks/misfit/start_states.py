@@ -33,6 +33,7 @@ from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.report.words import TOLD
 from sbi_active.criticism.results import NONE
+from sbi_active.display.table import Table
 
 PATH = Path(__file__).parent / "results" / "start_states.csv"
 NUM_TRIALS, NUM_SAMPLES, STEPS, DT = 12, 30, 4, 0.025
@@ -186,13 +187,11 @@ def _coverage(loop: Criticism, case: Case) -> tuple[int, int]:
 
 def summary(rows: Sequence[dict[str, str]]) -> str:
     """Return the table of the bars, with and without the hidden force."""
-    lines = [
-        "| hidden force | smallest ESS | ESS >= 50 | effects alone without a printed "
-        "interval | CPU s beside the simulator's, "
-        "median (largest) | simulated trials, median (largest) | true effect in the "
-        "verdict | 90 % intervals that cover |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    header = ["hidden force", "smallest ESS", "ESS >= 50"]
+    header += ["effects alone without a printed interval"]
+    header += ["CPU s beside the simulator's, median (largest)"]
+    header += ["simulated trials, median (largest)", "true effect in the verdict"]
+    cells = []
     for hidden, label in (("0", "none"), ("1", "yes")):
         own = [row for row in rows if row["hidden"] == hidden]
         if not own:
@@ -204,22 +203,20 @@ def summary(rows: Sequence[dict[str, str]]) -> str:
             sizes = [float(row["size"]) for row in own]
             label = f"{min(sizes):.1f} to {max(sizes):.1f} sensor deviations"
         named = [row["true"] in row["chosen"].split(" + ") for row in own]
-        covered = np.repeat(
-            [True, False],
-            [
-                sum(int(row["inside"]) for row in own),
-                sum(int(row["intervals"]) - int(row["inside"]) for row in own),
-            ],
+        covered = [
+            k < int(row["inside"]) for row in own for k in range(int(row["intervals"]))
+        ]
+        left = sum(int(row["not_printed"]) for row in own)
+        cells.append(
+            (
+                *(label, f"{ess.min():.0f}", rate(ess >= BARS["ess"])),
+                f"{left} of {len(EFFECTS) * len(own)}",
+                f"{np.median(seconds):.0f} ({seconds.max():.0f})",
+                f"{np.median(trials):,.0f} ({trials.max():,.0f})",
+                *(rate(named), rate(covered)),
+            )
         )
-        lines.append(
-            f"| {label} | {ess.min():.0f} | {rate(ess >= BARS['ess'])} | "
-            f"{sum(int(row['not_printed']) for row in own)} of "
-            f"{len(EFFECTS) * len(own)} | "
-            f"{np.median(seconds):.0f} ({seconds.max():.0f}) | "
-            f"{np.median(trials):,.0f} ({trials.max():,.0f}) | {rate(named)} | "
-            f"{rate(covered)} |"
-        )
-    return "\n".join(lines)
+    return Table((*header, "90 % intervals that cover"), cells).markdown()
 
 
 main = benchmark(PATH, score_case, summary, case=range(1000, 1010), hidden=(0, 1))

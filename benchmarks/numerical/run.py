@@ -208,52 +208,23 @@ def summary(name: str, rows: list[dict[str, str]]) -> list[str]:
     for action in REPORTED:
         error = column(rows, f"rep_err_{action:g}", last)
         cells.append(f"{error.mean():.3g} +- {error.std():.2g}")
-    return cells
-
-
-def notes(rows: list[dict[str, str]]) -> str:
-    """Return the chosen actions round by round, and what a round costs."""
-    lines = []
-    for round_ in sorted({int(r["round"]) for r in rows}):
-        chosen = [r["action"] for r in rows if int(r["round"]) == round_]
-        values, counts = np.unique(chosen, return_counts=True)
-        order = np.argsort(-counts, kind="stable")[:6]
-        cells = [f"{values[i]} x{counts[i]}" for i in order]
-        lines.append(f"    round {round_}: {', '.join(cells)}")
-    for kind in ("cpu", "wall"):
-        means = {s: column(rows, f"{kind}_{s}").mean() for s in STAGES}
-        cells = [f"{s} {m:.2f}" for s, m in means.items()]
-        total = sum(means.values())
-        lines.append(f"    {kind} s a round: {total:.2f} ({', '.join(cells)})")
-    rounds = max(int(r["round"]) for r in rows)
-    spent = column(rows, "num_simulations").mean() * rounds
-    lines.append(f"    simulations a trial: {spent:.0f}")
-    masses = column(rows, "mass_positive", rounds)
-    lines.append(
-        f"    P(theta_1 > 0): in [.35, .65] in {np.mean(abs(masses - 0.5) <= 0.15):.2f}"
-    )
-    loss = column(rows, "chained_loss")
-    if not np.isnan(loss).all():
-        lines.append(
-            f"    network behind the refined belief: {np.nanmedian(loss):.2f} nats"
-        )
-    return "\n".join(lines)
+    cpu = sum(column(rows, f"cpu_{stage}").mean() for stage in STAGES)
+    return [*cells, f"{column(rows, 'num_simulations').mean():.0f}, {cpu:.2f}"]
 
 
 def main(arguments: Settings) -> None:
     """Run what is asked for and is not there yet, and print the table."""
-    table, lines = [], []
+    table = []
     for setting in arguments.settings:
         for method in arguments.methods:
             rows = run_setting(arguments, method, setting)
             table.append(summary(f"{setting}, {method.upper()}", rows))
-            lines += [f"  {setting}, {method.upper()}", notes(rows)]
     header = [f"{arguments.task}, truth {arguments.truth} (trials)"]
     header += ["median log p(truth), round 1 / 2 / ..", "gap: median mean 95 %"]
     header += ["median KL", "regret r1 / r2", "in 50, 90 % region", "(exact's own)"]
     header += [f"RepErr({a:g})" for a in REPORTED]
+    header += ["simulations, CPU s a round"]
     if arguments.truth == "fixed" and arguments.task == "linear":
         beside = published("numerical") | exact_limits()
-        table += [[k, v[0], *[""] * 5, *v[1:]] for k, v in beside.items()]
-    print(Table(header, table).text(), end="\n\n")
-    print("\n".join(lines))
+        table += [[k, v[0], *[""] * 5, *v[1:], ""] for k, v in beside.items()]
+    print(Table(header, table).text())

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from sbi_active.seeding import forked_generators
 
 SIDE = 20  # cells along each parameter
 
@@ -41,3 +44,8 @@ class GridBelief:
         """Return draws, shape (n, 3)."""
         index = self.log_density.softmax(0).multinomial(shape[0], replacement=True)
         return self.middles()[index] + (torch.rand(shape[0], 3) - 0.5) / SIDE
+
+    def draws(self, num: int, seed: int) -> np.ndarray:
+        """Return draws by a seed, shape (num, 3)."""
+        with forked_generators(seed):
+            return self.sample(torch.Size([num])).double().numpy()

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import pickle
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,11 +21,7 @@ from benchmarks.pouring.likelihood import (
     thumbnails,
 )
 from benchmarks.pouring.power import cross_validated
-from sbi_active.seeding import forked_generators
-from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import images_of, mesh_coverage
-
-T = TypeVar("T")
 
 NUM_OUTER, NUM_ALL = 100, 300  # draws behind an expected gain
 NUM_COMPONENTS = 36
@@ -61,24 +56,41 @@ class Learned:
 
 @dataclass(frozen=True)
 class ByAction:
-    """Likelihoods of their own for each action and summary.
+    """Likelihoods for each action and summary.
 
     Attributes:
         learned: By delta and action.
         actions: Shape (a, 3).
+        inputs: Function of parameters (n, d) and an action to what likelihoods take.
     """
 
     learned: list[list[Learned]]
     actions: Tensor
+    inputs: Callable[[np.ndarray, Tensor], np.ndarray] = lambda theta, action: theta
 
     def gains(
         self, belief: Any, earlier: Earlier, seed: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return gains by delta and action, nats, and their errors, on common draws."""
-        with forked_generators(seed):
-            theta = belief.sample(torch.Size([NUM_ALL])).double().numpy()
-        every = [[(own, theta) for own in by_action] for by_action in self.learned]
-        return gains_of(every, earlier, seed)
+        """Return gains by delta and action, nats, and their errors.
+
+        Draws and outcomes are common to all actions.
+        """
+        theta = belief.draws(NUM_ALL, seed)
+        values = [
+            [
+                own.likelihood.gain(
+                    self.inputs(theta, action),
+                    NUM_OUTER,
+                    np.random.default_rng(seed),
+                    earlier[delta, place],
+                )
+                for place, (own, action) in enumerate(
+                    zip(by_action, self.actions, strict=True)
+                )
+            ]
+            for delta, by_action in enumerate(self.learned)
+        ]
+        return np.mean(values, 2), np.std(values, 2) / np.sqrt(NUM_OUTER)
 
     def log_likelihood(
         self, theta: np.ndarray, image: Tensor, delta: int, place: int, earlier: Earlier
@@ -93,40 +105,12 @@ class ByAction:
             earlier: Statistics of earlier trials, to which its own are added.
         """
         own = self.learned[delta][place]
-        return told_of(own, theta, image, delta, earlier[delta, place])
-
-
-def gains_of(
-    every: Sequence[Sequence[tuple[Learned, np.ndarray]]], earlier: Earlier, seed: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return gains by delta and action, nats, and their errors, on common outcomes.
-
-    Args:
-        every: What is learned, and draws that it takes, by delta and action.
-        earlier: Statistics of earlier trials.
-        seed: Seed of the outcomes.
-    """
-    values = [
-        [
-            own.likelihood.gain(
-                theta, NUM_OUTER, np.random.default_rng(seed), earlier[delta, place]
-            )
-            for place, (own, theta) in enumerate(by_action)
-        ]
-        for delta, by_action in enumerate(every)
-    ]
-    return np.mean(values, 2), np.std(values, 2) / np.sqrt(NUM_OUTER)
-
-
-def told_of(
-    own: Learned, theta: np.ndarray, image: Tensor, delta: int, earlier: list[Any]
-) -> np.ndarray:
-    """Return log densities of an image at theta, and add its statistics to earlier."""
-    seen = own.seen(image, delta)
-    found = own.likelihood.at(theta, seen, earlier)
-    if seen is not None and len(seen):
-        earlier.append(seen)
-    return doubted(found, own.likelihood.power)
+        seen, before = own.seen(image, delta), earlier[delta, place]
+        known = self.inputs(theta, self.actions[place])
+        found = own.likelihood.at(known, seen, before)
+        if seen is not None and len(seen):
+            before.append(seen)
+        return doubted(found, own.likelihood.power)
 
 
 def looked_at(images: Tensor) -> tuple[np.ndarray, np.ndarray]:
@@ -170,18 +154,3 @@ def both_summaries(mesh: np.ndarray, small: np.ndarray) -> Iterator[tuple[Any, .
     mean, axes = components(small, NUM_COMPONENTS)
     yield (small - mean) @ axes, is_empty, mean, axes
     yield np.sqrt(mesh), is_empty, mean, axes
-
-
-def learned_of(bank: Path, path: Path | None) -> ByAction:
-    """Return what is learned of a bank, from a file where there is one."""
-    return kept(path, lambda: learn(bank, get_task("pouring")))
-
-
-def kept(path: Path | None, make: Callable[[], T]) -> T:
-    """Return what a file of our own holds, which is made where it is missing."""
-    if path is not None and path.exists():
-        return pickle.loads(path.read_bytes())
-    made = make()
-    if path is not None:
-        path.write_bytes(pickle.dumps(made))
-    return made

@@ -23,7 +23,7 @@ alone, k earlier statistics of mean :math:`\bar s` leave
 
 and less of V, for each statistic by itself; and as the scale of Student's errors is
 theta's own, it is the same for all repeats, which tell of it. So a repeat tells less
-than a first pour. c is ``SHARED``, from pours of one theta and action (``repeats.py``),
+than a first pour. c is ``SHARED``, from pours of one theta and action,
 and so is ``DOUBT``, the share of outcomes that tell nothing of theta.
 """
 

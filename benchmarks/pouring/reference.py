@@ -15,17 +15,18 @@ from torch import Tensor
 
 from benchmarks.pouring.bank import ROWS_A_FILE, Drawn, fill
 from benchmarks.pouring.bank import read as read_bank
+from benchmarks.pouring.campaign import TEMPERED
 from benchmarks.pouring.grid_belief import SIDE, GridBelief
 from benchmarks.pouring.learned import (
     ByAction,
     Earlier,
     components,
-    learned_of,
+    learn,
     looked_at,
 )
 from benchmarks.pouring.likelihood import ImageLikelihood, observed
 from benchmarks.pouring.power import grid
-from benchmarks.pouring.run import RESULTS, TEMPERED
+from benchmarks.pouring.run import RESULTS
 from benchmarks.rows import read, resumed
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.tasks import get_task
@@ -238,7 +239,6 @@ class ReferenceSettings:
 
     Args:
         bank: Folder of pours.
-        learned: File that keeps what is learned of the pours.
         target: Target of the paper; both by default.
         rows: Number of rows (of the reference).
         trials: Number of trials; all by default.
@@ -247,7 +247,6 @@ class ReferenceSettings:
     """
 
     bank: Path | None = None
-    learned: Path | None = None
     target: Literal["1", "2"] | None = None
     rows: int = 200
     trials: int | None = None
@@ -266,7 +265,7 @@ def run(
     if not arguments.summary:
         if arguments.bank is None:
             raise SystemExit("expected --bank FOLDER; got none; make one, see bank.py")
-        learned = learned_of(arguments.bank, arguments.learned)
+        learned = learn(arguments.bank, get_task("pouring"))
         for target in [arguments.target] if arguments.target else ["1", "2"]:
             known = Reference.of(target, learned, arguments.bank, arguments)
             by_seed = {own.seed: own for own in known.campaigns[: arguments.trials]}

@@ -17,8 +17,6 @@ summary in their place (``network``).
 
 from __future__ import annotations
 
-import time
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,8 +25,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import torch
 
+from benchmarks.pouring.campaign import TEMPERED, rounds
 from benchmarks.pouring.grid_belief import GridBelief
-from benchmarks.pouring.learned import ByAction, Earlier, kept, learned_of
+from benchmarks.pouring.learned import ByAction, learn
 from benchmarks.pouring.network import ByNetwork, learn_networks
 from benchmarks.pouring.summary import mean_log_p, summarize
 from benchmarks.rounds import coverage_table
@@ -39,59 +38,37 @@ from sbi_active.tasks import get_task
 RESULTS = Path(__file__).parent / "results"
 METHODS = ("asbi", "nsbi", "alhi", "nlhi")
 ACTIVE, BY_NETWORK = ("asbi", "alhi"), ("alhi", "nlhi")
-#: The product of k trials is taken to the power k^-TEMPERED: what is chosen for its
-#: gain is chosen for the error of its learned likelihood too. From seeds 100 to 149.
-TEMPERED = 0.25
 NUM_DRAWS = 2_000  # behind the share of a belief that is denser than the truth
 
 
 def run_trial(
-    task: Any, learned: ByAction | ByNetwork, is_active: bool, seed: int, rounds: int
+    task: Any, learned: ByAction | ByNetwork, is_active: bool, seed: int, num: int
 ) -> list[dict[str, object]]:
     """Return one row a round of one campaign."""
-    belief, middles = GridBelief.uniform(), GridBelief.middles().double().numpy()
     rows: list[dict[str, object]] = []
-    total = np.zeros(len(middles))
-    tempered = TEMPERED if isinstance(learned, ByAction) else 0.0
-    earlier: Earlier = defaultdict(list)
-    for index in range(rounds):
-        start = time.process_time()
-        gain = error = np.full((2, len(learned.actions)), np.nan)
-        if is_active:
-            own_seed = derive_seed(seed, "gain", index)
-            gain, error = learned.gains(belief, earlier, own_seed)
-            choice = int(gain.argmax())
-        else:
-            with forked_generators(derive_seed(seed, "action", index)):
-                choice = int(torch.randint(gain.size, ()))
-        delta, place = divmod(choice, gain.shape[1])
-        action = learned.actions[place]
-        designed = time.process_time()
-        image = task.real_system(action, seed=derive_seed(seed, "real", index))
-        total += learned.log_likelihood(middles, image, delta, place, earlier)
-        belief = GridBelief(torch.from_numpy(total * (index + 1.0) ** -tempered))
-        log_p = float(belief.log_prob(task.theta_true))
-        with forked_generators(derive_seed(seed, "draws", index)):
-            draws = belief.sample(torch.Size([NUM_DRAWS]))
-        row = {
+    for found in rounds(
+        *(task, learned, lambda log_p: GridBelief(torch.from_numpy(log_p))),
+        GridBelief.middles().double().numpy(),
+        num=num,
+        seed=seed,
+        is_active=is_active,
+        tempered=TEMPERED if isinstance(learned, ByAction) else 0.0,
+    ):
+        log_p = float(found.belief.log_prob(task.theta_true))
+        with forked_generators(derive_seed(seed, "draws", found.index)):
+            draws = found.belief.sample(torch.Size([NUM_DRAWS]))
+        row = found.row() | {
             "theta_true": " ".join(f"{v:.6g}" for v in task.theta_true.tolist()),
-            "round": index + 1,
-            **dict(zip(("height", "position", "rate"), action.tolist(), strict=True)),
-            "delta": delta,
-            "in_view": float((image > 0).float().mean()),
-            "eig": float(gain[delta, place]),
-            "eig_se": float(error[delta, place]),
-            "eig_pca": float(gain[0].max()),
-            "eig_mesh": float(gain[1].max()),
+            "eig_se": float(found.error[found.delta, found.place]),
+            "eig_pca": float(found.gain[0].max()),
+            "eig_mesh": float(found.gain[1].max()),
             "log_prob_true": log_p,
-            "hpd": float((belief.log_prob(draws) > log_p).double().mean()),
+            "hpd": float((found.belief.log_prob(draws) > log_p).double().mean()),
             "num_rows": learned.num if isinstance(learned, ByNetwork) else 0,
             "power": np.nan,
-            "cpu_design": designed - start,
-            "cpu_trial": time.process_time() - designed,
         }
         if isinstance(learned, ByAction):
-            own = learned.learned[delta][place]
+            own = learned.learned[found.delta][found.place]
             row |= {"num_rows": own.num, "power": own.likelihood.power}
         rows.append(row)
     return rows
@@ -104,7 +81,6 @@ class Settings:
     Args:
         table: Name of the table.
         bank: Folder of pours; needed for all but the summary.
-        learned: File that keeps what is learned of the pours.
         target: Target of the paper; both by default.
         methods: Names of methods.
         trials: Number of trials.
@@ -116,7 +92,6 @@ class Settings:
 
     table: Literal["paper", "coverage"] = "paper"
     bank: Path = Path()
-    learned: Path | None = None
     target: Literal["1", "2"] | None = None
     methods: Annotated[Sequence[str], METHODS] = (*METHODS,)
     trials: int = 5
@@ -130,13 +105,10 @@ class Settings:
             raise SystemExit("expected --bank FOLDER; got none; make one, see bank.py")
 
 
-def known(method: str, arguments: Settings) -> ByAction | ByNetwork:
-    """Return what a method has learned of the bank."""
-    path = arguments.learned
-    if method not in BY_NETWORK:
-        return learned_of(arguments.bank, path)
-    own = None if path is None else path.with_suffix(".networks")
-    return kept(own, lambda: learn_networks(arguments.bank))
+def known(method: str, bank: Path) -> ByAction | ByNetwork:
+    """Return what a method learns of the bank."""
+    is_network = method in BY_NETWORK
+    return learn_networks(bank) if is_network else learn(bank, get_task("pouring"))
 
 
 def make_task(target: str, seed: int) -> Any:
@@ -178,7 +150,7 @@ def main(arguments: Settings) -> None:
     targets = ["prior"] if is_coverage else targets
     if not arguments.summary:
         for method in arguments.methods:
-            learned = known(method, arguments)
+            learned = known(method, arguments.bank)
             for target in targets:
                 run_missing(method, target, learned, arguments)
     cells = {}

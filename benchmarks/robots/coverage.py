@@ -10,7 +10,7 @@ white noise beside dry friction that the model lacks. On each set, in one proces
 - ours: ``identify_robot``;
 - bare: the same with nothing beside the parameters, as for any simulator, where there
   is friction;
-- loop: with ``--loop``, where there is friction: ``close_loop`` with effects of
+- loop: where there is friction, ``close_loop`` with effects of
   ``mjcf_effects``, and ``identify`` of the simulator that it gives.
 
 Rows (results/coverage.csv): machine, condition, seed, way, CPU seconds of making and

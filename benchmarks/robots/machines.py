@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,6 @@ from benchmarks.robots.models import ARM, CART_POLE, SPRING_MASS
 from sbi_active.mujoco.models.spec import mujoco_of
 
 Array = NDArray[Any]
-Edit = Callable[[Any, float], None]
 
 #: Correlation from sample to sample, and dry friction in units of the robot's own.
 CONDITIONS = {
@@ -40,12 +40,13 @@ NUM_SINES, FREQUENCIES = 3, (0.3, 2.0)
 
 @dataclass(frozen=True)
 class Unknown:
-    """A parameter: its prior's box, where truths are drawn, and how it is written."""
+    """A parameter: the box of its prior, where truths are drawn, and how it is set."""
 
     low: float
     high: float
     inner: tuple[float, float]
-    edit: Edit
+    edit: Callable[[Any, str, float], None]
+    name: str
 
 
 @dataclass(frozen=True)
@@ -108,10 +109,10 @@ def recorded(machine: Machine, condition: str, seed: int) -> Set:
     truth, params = [], sysid.ParameterDict()
     for name, own in machine.unknown.items():
         truth.append(rng.uniform(*own.inner))
-        own.edit(true, truth[-1])
+        own.edit(true, own.name, truth[-1])
 
-        def modifier(spec: Any, given: Any, edit: Edit = own.edit) -> None:
-            edit(spec, float(given.value[0]))
+        def modifier(spec: Any, given: Any, own: Unknown = own) -> None:
+            own.edit(spec, own.name, float(given.value[0]))
 
         middle = 0.5 * (own.low + own.high)
         params.add(sysid.Parameter(name, middle, own.low, own.high, modifier=modifier))
@@ -170,40 +171,25 @@ def _errors(
 # What is written.
 
 
-def _from(text: str) -> Callable[[], Any]:
-    def made() -> Any:
-        return mujoco_of().MjSpec.from_string(text)
-
-    return made
+def _from(text: str) -> Any:
+    return mujoco_of().MjSpec.from_string(text)
 
 
-def _damping(joint: str) -> Edit:
-    def edit(spec: Any, value: float) -> None:
-        own = spec.joint(joint)
-        own.damping = value + 0.0 * np.asarray(own.damping)
-
-    return edit
+def _damping(spec: Any, name: str, value: float) -> None:
+    joint = spec.joint(name)
+    joint.damping = value + 0.0 * np.asarray(joint.damping)
 
 
-def _armature(joint: str) -> Edit:
-    def edit(spec: Any, value: float) -> None:
-        spec.joint(joint).armature = value
-
-    return edit
+def _armature(spec: Any, name: str, value: float) -> None:
+    spec.joint(name).armature = value
 
 
-def _mass(body: str) -> Edit:
-    def edit(spec: Any, value: float) -> None:
-        spec.body(body).first_geom().mass = value
-
-    return edit
+def _mass(spec: Any, name: str, value: float) -> None:
+    spec.body(name).first_geom().mass = value
 
 
-def _gain(actuator: str) -> Edit:
-    def edit(spec: Any, value: float) -> None:
-        spec.actuator(actuator).gear[0] = value
-
-    return edit
+def _gear(spec: Any, name: str, value: float) -> None:
+    spec.actuator(name).gear[0] = value
 
 
 READ_ARM = """<sensor><jointpos name="shoulder" joint="shoulder"/>
@@ -273,10 +259,10 @@ def _read_joints(spec: Any) -> None:
 
 MACHINES = {
     "spring-mass": Machine(
-        _from(SPRING_MASS),
+        partial(_from, SPRING_MASS),
         {
-            "mass": Unknown(0.3, 3.0, (0.7, 1.6), _mass("cart")),
-            "damping": Unknown(0.0, 5.0, (0.4, 2.0), _damping("slide")),
+            "mass": Unknown(0.3, 3.0, (0.7, 1.6), _mass, "cart"),
+            "damping": Unknown(0.0, 5.0, (0.4, 2.0), _damping, "slide"),
         },
         drive=((5.0, 0.0),),
         start=(0.2,),
@@ -284,11 +270,11 @@ MACHINES = {
         rough=(("slide",), 1.0),
     ),
     "cart-pole": Machine(
-        _from(CART_POLE),
+        partial(_from, CART_POLE),
         {
-            "mass": Unknown(0.3, 3.0, (0.7, 1.6), _mass("cart")),
-            "damping": Unknown(0.0, 5.0, (0.4, 2.0), _damping("slide")),
-            "pole damping": Unknown(0.0, 0.05, (0.002, 0.02), _damping("hinge")),
+            "mass": Unknown(0.3, 3.0, (0.7, 1.6), _mass, "cart"),
+            "damping": Unknown(0.0, 5.0, (0.4, 2.0), _damping, "slide"),
+            "pole damping": Unknown(0.0, 0.05, (0.002, 0.02), _damping, "hinge"),
         },
         drive=((2.5, 0.0),),
         start=(0.1, 0.5),
@@ -296,11 +282,11 @@ MACHINES = {
         rough=(("slide",), 1.0),
     ),
     "two-link arm": Machine(
-        _from(ARM.replace("</mujoco>", READ_ARM)),
+        partial(_from, ARM.replace("</mujoco>", READ_ARM)),
         {
-            "lower mass": Unknown(0.1, 2.0, (0.3, 0.9), _mass("lower")),
-            "elbow damping": Unknown(0.0, 3.0, (0.2, 1.2), _damping("elbow")),
-            "elbow armature": Unknown(0.0, 0.2, (0.01, 0.08), _armature("elbow")),
+            "lower mass": Unknown(0.1, 2.0, (0.3, 0.9), _mass, "lower"),
+            "elbow damping": Unknown(0.0, 3.0, (0.2, 1.2), _damping, "elbow"),
+            "elbow armature": Unknown(0.0, 0.2, (0.01, 0.08), _armature, "elbow"),
         },
         drive=((0.6, 0.4), (0.8, 0.5)),
         start=(0.2, 0.2),
@@ -311,9 +297,9 @@ MACHINES = {
     "Go2 leg": Machine(
         go2_leg,
         {
-            "thigh damping": Unknown(0.0, 4.0, (0.2, 1.5), _damping("FL_thigh_joint")),
-            "calf damping": Unknown(0.0, 4.0, (0.2, 1.5), _damping("FL_calf_joint")),
-            "calf armature": Unknown(0.0, 0.3, (0.01, 0.1), _armature("FL_calf_joint")),
+            "thigh damping": Unknown(0.0, 4.0, (0.2, 1.5), _damping, "FL_thigh_joint"),
+            "calf damping": Unknown(0.0, 4.0, (0.2, 1.5), _damping, "FL_calf_joint"),
+            "calf armature": Unknown(0.0, 0.3, (0.01, 0.1), _armature, "FL_calf_joint"),
         },
         drive=((0.4, 0.0), (0.4, 0.9), (0.6, -1.8)),
         start=(0.0, 0.0, 0.0),
@@ -326,9 +312,9 @@ MACHINES = {
     "swimmer": Machine(
         swimmer,
         {
-            "gear": Unknown(75.0, 300.0, (100.0, 200.0), _gain("motor 1")),
-            "damping": Unknown(0.0, 40.0, (2.0, 12.0), _damping("motor1_rot")),
-            "armature": Unknown(0.0, 10.0, (0.2, 3.0), _armature("motor1_rot")),
+            "gear": Unknown(75.0, 300.0, (100.0, 200.0), _gear, "motor 1"),
+            "damping": Unknown(0.0, 40.0, (2.0, 12.0), _damping, "motor1_rot"),
+            "armature": Unknown(0.0, 10.0, (0.2, 3.0), _armature, "motor1_rot"),
         },
         drive=((0.3, 0.0), (0.3, 0.0)),
         start=(0.0, 0.0, 0.0, 0.1, 0.1),
@@ -339,9 +325,9 @@ MACHINES = {
     "reacher": Machine(
         reacher,
         {
-            "shoulder damping": Unknown(0.0, 0.05, (0.005, 0.02), _damping("shoulder")),
-            "hand mass": Unknown(0.01, 0.2, (0.02, 0.08), _mass("hand")),
-            "wrist armature": Unknown(0.0, 1e-3, (1e-4, 5e-4), _armature("wrist")),
+            "shoulder damping": Unknown(0.0, 0.05, (0.005, 0.02), _damping, "shoulder"),
+            "hand mass": Unknown(0.01, 0.2, (0.02, 0.08), _mass, "hand"),
+            "wrist armature": Unknown(0.0, 1e-3, (1e-4, 5e-4), _armature, "wrist"),
         },
         drive=((0.6, 0.0), (0.4, 0.0)),
         start=(0.5, 0.5),

@@ -7,10 +7,7 @@ mass or damping in each row, and all readings of all sensors. Ways take turns in
 process on one thread:
 
 - ours: ``simulator.mean`` of all rows;
-- trials: the same, in which eight rows in a row share parameters, as trials do;
-- force: the same with a generalized force at every step;
-- bare: a Python loop over ``mj_step`` that writes the parameter into the one model;
-- compile: the same, which compiles the spec for each row instead.
+- bare: a Python loop over ``mj_step`` that writes the parameter into the one model.
 
 Writes speed.json beside this file: rows, steps, and rows a CPU second (median, lowest
 and highest of the repeats).
@@ -20,7 +17,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -32,11 +28,10 @@ from benchmarks.robots.models import ARM, CART_POLE, PENDULUM, SPRING_MASS
 from benchmarks.rows import keep
 from sbi_active import BoxActions
 from sbi_active.mujoco import from_mjcf
-from sbi_active.mujoco.effects.changes import PowerForce
 from sbi_active.mujoco.models.spec import mujoco_of
 
 RESULT = Path(__file__).with_suffix(".json")
-SECONDS, SHARED = 1.0, 8
+SECONDS = 1.0
 MODELS = {
     "pendulum": (PENDULUM, "hinge", 0.0, 0.1),
     "spring-mass": (SPRING_MASS, "slide", 0.0, 1.0),
@@ -65,45 +60,24 @@ def ways(xml: Any, joint: str, low: float, high: float, num: int) -> dict[str, A
     base = simulator.fn.model
     theta = torch.linspace(low, high, num, dtype=torch.float64)[:, None]
     action = torch.linspace(-0.5, 0.5, num, dtype=torch.float64)[:, None]
-    shared = theta[::SHARED].repeat_interleave(SHARED, 0)[:num]
     dof = int(base.joint(joint).dofadr[0])
     place = int(base.joint(joint).qposadr[0])
-    force = {PowerForce(((place, dof, 0.0),), "damping", 2): torch.full((num, 1), 0.01)}
+    one, data = base.__copy__(), mujoco.MjData(base)
 
-    def bare(each: Callable[[float], Any]) -> np.ndarray:
+    def bare() -> np.ndarray:
         found = np.empty((num, steps, base.nsensordata))
         for i in range(num):
-            own, data = each(float(theta[i]))
-            mujoco.mj_resetData(own, data)
+            one.dof_damping[dof] = float(theta[i])
+            mujoco.mj_resetData(one, data)
             data.qpos[place] = float(action[i])
             for k in range(steps):
-                mujoco.mj_step(own, data)
+                mujoco.mj_step(one, data)
                 found[i, k] = data.sensordata
         return found
 
-    one, data = base.__copy__(), mujoco.MjData(base)
-    text = simulator.fn.machines[0].source
-
-    def written(value: float) -> Any:
-        one.dof_damping[dof] = value
-        return one, data
-
-    def compiled(value: float) -> Any:
-        other = text.exact()
-        own = other.joint(joint)
-        own.damping = value + 0.0 * np.asarray(own.damping)
-        made = other.compile()
-        return made, mujoco.MjData(made)
-
-    run = {
-        "ours": lambda: simulator.mean(theta, action),
-        "trials": lambda: simulator.mean(shared, action),
-        "force": lambda: simulator.mean(theta, action, force=force),
-        "bare": lambda: bare(written),
-        "compile": lambda: bare(compiled),
-    }
+    run = {"ours": lambda: simulator.mean(theta, action), "bare": bare}
     x = run["ours"]().reshape(num, steps, -1).numpy()
-    difference = float(np.abs(x - run["bare"]()).max())
+    difference = float(np.abs(x - bare()).max())
     return {"run": run, "steps": steps, "difference": difference}
 
 

@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal
 
-from benchmarks.information_gain.run import ExactBelief
+from benchmarks.information_gain.run import ExactBelief, rounds
 from benchmarks.rows import grouped, resumed
 from sbi_active import (
     BoxActions,
@@ -41,7 +41,6 @@ from sbi_active import (
 from sbi_active.actions import ActionSpace
 from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed
-from sbi_active.tasks import get_task
 
 RESULT = Path(__file__).with_name("result.csv")
 
@@ -74,12 +73,8 @@ def numerical(num_seeds: int) -> Iterator[Case]:
     box = BoxActions(-5.0, 5.0, names=["xi"])
     fine = torch.linspace(-5, 5, 401)[:, None]
     for variant in ("linear", "sinh", "square"):
-        task = get_task("numerical", variant=variant)
-        before = task.reference(torch.empty(0, 1), torch.empty(0, 1))
-        action = torch.tensor([[-5.0]])
-        after = task.reference(action, task.real_system(action[0], seed=0)[None])
-        for trials, exact in enumerate((before, after)):
-            assert exact is not None
+        task, *both = rounds(variant)
+        for trials, exact in enumerate(both):
             gain = exact.expected_information_gain
             belief = ExactBelief(exact, task.prior) if trials else task.prior
             name = f"numerical {variant}, round {trials + 1}"

@@ -46,7 +46,7 @@ TABLES = {
         "search --summary --cases mixed --first 40",
     ),
     "Trials for a controller": ("target --summary",),
-    "Source location finding": ("location_finding.summary",),
+    "Source location finding": ("location_finding --summary",),
     "The simulation engine": (
         "table engine/result.json --only *overhead,*overhead,*median* "
         "workers,*speedup*median faults,*",

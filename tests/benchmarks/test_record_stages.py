@@ -27,11 +27,10 @@ def line_bench():
         x = line(draws[:, :1], far.expand(len(draws), 1), bend=bend)
         return {"far": float((x.mean() - 4.0).abs())}
 
-    def replay(seed, names):
+    def replay(seed):
         generator = torch.Generator().manual_seed(seed)
         error = 0.01 * torch.randn(12, 1, generator=generator, dtype=torch.float64)
-        bend = 0.5 * PLACES**2 if names else 0.0
-        return Trials(PLACES, PLACES + bend + error)
+        return Trials(PLACES, PLACES + error)
 
     return Bench(
         model=SimulatorModel(line, noise=GaussianNoise(0.01)),
@@ -48,7 +47,6 @@ def line_bench():
         ],
         trials=Trials(PLACES, PLACES + 0.5 * PLACES**2),
         removals=[("bend",)],
-        given=[("bias",)],
         score=score,
         least_squares=lambda names: {
             "parameters": [1.0],
@@ -61,20 +59,18 @@ def line_bench():
 
 def test_stages_name_what_is_there_and_are_run_once(tmp_path, capsys):
     path = tmp_path / "out" / "rows.json"
-    rows = run_stages(line_bench(), path, clean=1, full=1)
-    replays = ["clean 2000", "full 2000"]
-    assert [*rows] == ["recorded", "without bend", *replays, "least squares"]
+    rows = run_stages(line_bench(), path, clean=1)
+    assert [*rows] == ["recorded", "without bend", "clean 2000", "least squares"]
     recorded = rows["recorded"]
     assert recorded["verdict"] == "bend"
     assert recorded["before"]["far"] > 1
     assert recorded["after"]["far"] < 0.05
     assert "bend" not in rows["without bend"]["inclusion"]
     assert rows["clean 2000"]["verdict"] == "none"
-    assert rows["full 2000"]["verdict"] == "bend"
-    assert {*rows["least squares"]} == {"none", "bias", "bend"}
+    assert {*rows["least squares"]} == {"none", "bend"}
     assert json.loads(path.read_text()) == rows
     capsys.readouterr()
-    assert run_stages(line_bench(), path, clean=1, full=1) == rows
+    assert run_stages(line_bench(), path, clean=1) == rows
     assert capsys.readouterr().out == ""
     text = table(rows, "m")
     assert "| recorded | bend |  |" in text

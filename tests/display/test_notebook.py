@@ -5,15 +5,21 @@ from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
+import torch
 
 from sbi_active import (
     BoxActions,
     Campaign,
+    DiscreteActions,
+    RandomDesigner,
     SimulatorModel,
 )
+from sbi_active.display.notebook import badge, card, facts, items, table
+from sbi_active.display.table import Table
 from sbi_active.inference.beliefs.belief import UnchangedBelief
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from tests.campaign.storage.campaigns import MODEL, OPTIONS, PRIOR, outcome
+from tests.criticism.report.reports import report
 
 EVIL = '<script>alert("&")</script>'
 VOID = {"br", "img"}
@@ -85,9 +91,54 @@ def test_a_campaign_has_its_health_belief_and_trials(campaign):
     assert mean in page.texts
 
 
+def test_a_long_campaign_is_small(campaign):
+    c = Campaign(MODEL, PRIOR, campaign.actions, options=OPTIONS)
+    for _ in range(40):
+        c.attach([1.0], [0.1, 0.2, 0.3, 0.4])
+    page = page_of(c)
+    assert "and 28 before" in page.texts
+    assert "39" in page.texts
+
+
 def test_a_belief_has_each_parameter_and_what_speaks_against_it():
     belief = UnchangedBelief(PRIOR, PRIOR)
     belief.parameter_names = ("mass", "friction")
     belief.diagnostics = Diagnostics().warned(f"beware of {EVIL}")
     page = page_of(belief)
     assert {"mass", "friction", "not trustworthy", f"beware of {EVIL}"} <= {*page.texts}
+
+
+def test_looking_at_a_belief_draws_nothing_from_the_global_generator(campaign):
+    before = torch.get_rng_state()
+    campaign.belief._repr_html_()
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_a_design_has_the_chosen_and_the_best_candidates(campaign):
+    design = campaign.pending.design
+    page = page_of(design)
+    assert page.texts.count("chosen") == 1
+    assert f"{float(design.expected_information_gain[design.index]):.3g}" in page.texts
+    pairs = DiscreteActions([[0.0, 1.0], [1.0, 2.0]], names=["a", "b"])
+    page = page_of(RandomDesigner(pairs).select(seed=0))
+    assert {"a", "b", "chosen"} <= {*page.texts}
+
+
+def test_a_report_has_its_verdict():
+    page = page_of(report())
+    assert "Verdict" in page.text
+    assert "probability" in page.text
+
+
+def test_pieces_are_escaped():
+    pieces = [
+        card(EVIL),
+        card("title", EVIL),
+        table(Table([EVIL], [[EVIL]])),
+        badge(EVIL),
+        facts([(EVIL, EVIL)]),
+        items([EVIL]),
+        table(Table.of_parameters([EVIL], torch.randn(20, 1))),
+    ]
+    for piece in pieces:
+        assert EVIL in Page(piece).texts

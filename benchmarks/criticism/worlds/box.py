@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 from torch.distributions import Distribution, HalfNormal, Independent, Normal
 
-from benchmarks.criticism.worlds.world import World, half_normal
+from benchmarks.criticism.worlds.world import World, noise_inflation
 from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.criticism import Effect
 
@@ -44,7 +45,7 @@ def make_world() -> World:
     """
     from sbi_active.tasks.box_collision import BoxCollisionTask
 
-    task = BoxCollisionTask()
+    task: Any = BoxCollisionTask()
     simulator = task.simulator
     assert simulator.setup is not None
     model = SimulatorModel(
@@ -60,13 +61,7 @@ def make_world() -> World:
         actions=DiscreteActions(SPEEDS, names=["speed"], units=["m/s"]),
         noise_sd=task.noise,
         library=library,
-        scatter=Effect(
-            "noise inflation",
-            hook="noise",
-            prior=half_normal(2.0),
-            null=0.0,
-            apply=lambda sd, phi, action, context: sd * (1 + phi),
-        ),
+        scatter=noise_inflation(2.0),
         outside=[],
         hidden=HIDDEN,
         is_rough=True,

@@ -17,9 +17,13 @@ from torch import Tensor
 
 from benchmarks.criticism.worlds.world import (
     World,
-    half_normal,
+    drifted,
+    effect,
+    noise_inflation,
     normal,
+    shifted,
     signed_uniform,
+    stretched,
     uniform,
 )
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
@@ -64,55 +68,18 @@ def response(
 def library(scale: float = 1.0) -> list[Effect]:
     """Return the declared effects, the scales of their priors multiplied."""
     return [
-        Effect(
-            "bias",
-            hook="observation",
-            prior=normal(5.0 * scale),
-            null=0.0,
-            apply=lambda x, phi, action, context: x + phi,
-            units="",
-        ),
-        Effect(
-            "gain",
-            hook="observation",
-            prior=normal(0.2 * scale),
-            null=0.0,
-            apply=lambda x, phi, action, context: x * (1 + phi),
-            units="",
-        ),
+        effect("bias", "observation", normal(5.0 * scale), shifted),
+        effect("gain", "observation", normal(0.2 * scale), stretched),
         Effect.keyword("quadratic", prior=normal(1.0 * scale)),
-        Effect(
-            "action offset",
-            hook="action",
-            prior=normal(0.5 * scale),
-            null=0.0,
-            apply=lambda value, phi, action, context: value + phi,
-            units="",
-        ),
-        Effect(
-            "action gain",
-            hook="action",
-            prior=normal(0.1 * scale),
-            null=0.0,
-            apply=lambda value, phi, action, context: value * (1 + phi),
-            units="",
-        ),
-        Effect(
-            "saturation",
-            hook="observation",
-            prior=uniform(*LOG_LIMIT),
-            null=torch.inf,
-            apply=lambda x, phi, action, context: x.clamp(-phi.exp(), phi.exp()),
+        effect("action offset", "action", normal(0.5 * scale), shifted),
+        effect("action gain", "action", normal(0.1 * scale), stretched),
+        effect(
+            *("saturation", "observation", uniform(*LOG_LIMIT)),
+            lambda x, phi, action, context: x.clamp(-phi.exp(), phi.exp()),
             units="log",
+            null=torch.inf,
         ),
-        Effect(
-            "drift",
-            hook="observation",
-            prior=normal(1.0 * scale),
-            null=0.0,
-            apply=lambda x, phi, action, context: x + phi * context.index[:, None],
-            units="a trial",
-        ),
+        effect("drift", "observation", normal(1.0 * scale), drifted, units="a trial"),
     ]
 
 
@@ -129,14 +96,7 @@ def make_world() -> World:
         actions=DiscreteActions(torch.arange(-5, 5.5, 0.5)),
         noise_sd=NOISE_SD,
         library=library,
-        scatter=Effect(
-            "noise inflation",
-            hook="noise",
-            prior=half_normal(3.0),
-            null=0.0,
-            apply=lambda sd, phi, action, context: sd * (1 + phi),
-            units="",
-        ),
+        scatter=noise_inflation(3.0),
         outside=[
             Effect.keyword("sine", prior=signed_uniform(5.0, 12.0)),
             Effect.keyword("step", prior=signed_uniform(5.0, 12.0)),

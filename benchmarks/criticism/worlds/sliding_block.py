@@ -17,9 +17,13 @@ from torch import Tensor
 from benchmarks.criticism.worlds.block import slide
 from benchmarks.criticism.worlds.world import (
     World,
+    effect,
     half_normal,
+    noise_inflation,
     normal,
+    shifted,
     signed_uniform,
+    stretched,
     uniform,
 )
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
@@ -37,54 +41,14 @@ def library(scale: float = 1.0) -> list[Effect]:
         Effect.keyword("quadratic drag", prior=half_normal(0.2 * scale), units="1/m"),
         Effect.keyword("viscous drag", prior=half_normal(0.4 * scale), units="1/s"),
         Effect.keyword("tilt", prior=normal(math.radians(2.0) * scale), units="rad"),
-        Effect(
-            "speed gain",
-            hook="action",
-            prior=normal(0.08 * scale),
-            null=0.0,
-            apply=lambda speed, phi, action, context: speed * (1 + phi),
-            units="",
-        ),
-        Effect(
-            "speed offset",
-            hook="action",
-            prior=normal(0.1 * scale),
-            null=0.0,
-            apply=lambda speed, phi, action, context: speed + phi,
-            units="m/s",
-        ),
-        Effect(
-            "camera bias",
-            hook="observation",
-            prior=normal(0.02 * scale),
-            null=0.0,
-            apply=lambda x, phi, action, context: x + phi,
-            units="m",
-        ),
-        Effect(
-            "camera scale",
-            hook="observation",
-            prior=normal(0.05 * scale),
-            null=0.0,
-            apply=lambda x, phi, action, context: x * (1 + phi),
-            units="",
-        ),
+        effect("speed gain", "action", normal(0.08 * scale), stretched),
+        effect("speed offset", "action", normal(0.1 * scale), shifted, units="m/s"),
+        effect("camera bias", "observation", normal(0.02 * scale), shifted, units="m"),
+        effect("camera scale", "observation", normal(0.05 * scale), stretched),
         Effect.keyword(
             "time offset", prior=normal(0.03 * scale), units="s", family="observation"
         ),
     ]
-
-
-def scatter() -> Effect:
-    """Return noise inflation."""
-    return Effect(
-        "noise inflation",
-        hook="noise",
-        prior=half_normal(2.0),
-        null=0.0,
-        apply=lambda sd, phi, action, context: sd * (1 + phi),
-        units="",
-    )
 
 
 def outside() -> list[Effect]:
@@ -122,7 +86,7 @@ def make_world(*, one_way: bool = False) -> World:
         actions=DiscreteActions(speeds, names=["speed"], units=["m/s"]),
         noise_sd=NOISE_SD,
         library=library,
-        scatter=scatter(),
+        scatter=noise_inflation(2.0),
         outside=outside(),
         equivalences=[frozenset({"none", "tilt"})] if one_way else [],
         aliases=ALIASES,

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from sbi.utils import BoxUniform
+from torch import Tensor
 from torch.distributions import (
     Categorical,
     Distribution,
@@ -19,6 +21,7 @@ from torch.distributions import (
 
 from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.criticism import Effect
+from sbi_active.criticism.effects.effect import Hook
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +78,39 @@ class World:
         """Return the names that count as one with a name, itself included."""
         groups = [group for group in self.equivalences if name in group]
         return frozenset({name}).union(*groups)
+
+
+def shifted(x: Tensor, phi: Tensor, action: Any, context: Any) -> Tensor:
+    """Return a value with phi added."""
+    return x + phi
+
+
+def stretched(x: Tensor, phi: Tensor, action: Any, context: Any) -> Tensor:
+    """Return a value with the relative error phi."""
+    return x * (1 + phi)
+
+
+def drifted(x: Tensor, phi: Tensor, action: Any, context: Any) -> Tensor:
+    """Return a value with phi added for each trial before."""
+    return x + phi * context.index[:, None]
+
+
+def effect(
+    name: str,
+    hook: Hook,
+    prior: Distribution,
+    apply: Callable[..., Tensor],
+    *,
+    units: str = "",
+    null: float = 0.0,
+) -> Effect:
+    """Return an effect on a value, with the strength at which it vanishes."""
+    return Effect(name, hook=hook, prior=prior, null=null, apply=apply, units=units)
+
+
+def noise_inflation(sd: float) -> Effect:
+    """Return scatter: noise that is larger than declared."""
+    return effect("noise inflation", "noise", half_normal(sd), stretched)
 
 
 def normal(sd: float) -> Distribution:

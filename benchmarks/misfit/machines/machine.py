@@ -11,6 +11,13 @@ from sbi.utils import BoxUniform
 from torch import Tensor
 from torch.distributions import HalfNormal
 
+from benchmarks.criticism.worlds.world import (
+    drifted,
+    effect,
+    normal,
+    shifted,
+    stretched,
+)
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect
 
@@ -90,7 +97,7 @@ class Machine:
 
     def effect(self, name: str) -> Effect:
         """Return a declared effect by its name."""
-        return next(effect for effect in self.library if effect.name == name)
+        return next(own for own in self.library if own.name == name)
 
     def equivalent(self, name: str) -> frozenset[str]:
         """Return the names that count as one with a name, itself included."""
@@ -122,24 +129,11 @@ def sensor_effects(*, bias: float, gain: float, drift: float) -> list[Effect]:
         gain: Likewise, relative.
         drift: Likewise, in the units of x a trial.
     """
-    from benchmarks.criticism.worlds.world import normal
-
-    def add(x: Tensor, phi: Tensor, action: Any, context: Any) -> Tensor:
-        return x + phi
-
-    def scale(x: Tensor, phi: Tensor, action: Any, context: Any) -> Tensor:
-        return x * (1 + phi)
-
-    def grow(x: Tensor, phi: Tensor, action: Any, context: Any) -> Tensor:
-        return x + phi * context.index[:, None]
-
-    parts = (("bias", bias, add), ("sensor gain", gain, scale), ("drift", drift, grow))
-    return [
-        Effect(
-            name, hook="observation", prior=normal(sd), null=0.0, apply=apply, units=""
-        )
-        for name, sd, apply in parts
-    ]
+    parts = (
+        *(("bias", bias, shifted), ("sensor gain", gain, stretched)),
+        ("drift", drift, drifted),
+    )
+    return [effect(name, "observation", normal(sd), f) for name, sd, f in parts]
 
 
 def box(*ranges: tuple[float, float]) -> BoxUniform:

@@ -20,13 +20,10 @@ from torch import Tensor
 
 from benchmarks.pouring.bank import read, read_parts
 from benchmarks.pouring.learned import (
-    NUM_ALL,
-    Earlier,
+    ByAction,
     Learned,
     both_summaries,
-    gains_of,
     summaries_of,
-    told_of,
 )
 from benchmarks.pouring.likelihood import ImageLikelihood, observed
 from benchmarks.pouring.power import best_power
@@ -75,8 +72,8 @@ class PointBelief:
         """Effective number of points."""
         return float(np.exp(-log_sum_exp(2 * self.log_weight)))
 
-    def sample(self, num: int, seed: int) -> Array:
-        """Return draws, shape (num, 8)."""
+    def draws(self, num: int, seed: int) -> Array:
+        """Return draws by a seed, shape (num, 8)."""
         rng = np.random.default_rng(seed)
         return self.points()[rng.choice(2**LOG_NUM_POINTS, num, p=self.weight)]
 
@@ -92,51 +89,6 @@ def beside(theta: Array, action: Array) -> Array:
     low, high = np.array([HEIGHTS[0], RATES[0]]), np.array([HEIGHTS[-1], RATES[-1]])
     scaled = (np.atleast_2d(action)[:, [0, 2]] - low) / (high - low)
     return np.concatenate([theta, np.broadcast_to(scaled, (len(theta), 2))], 1)
-
-
-@dataclass(frozen=True)
-class ByPlace:
-    """Likelihoods of their own for each place of the bucket and summary.
-
-    Attributes:
-        learned: By delta, and by place along y.
-        actions: Shape (27, 3).
-    """
-
-    learned: list[dict[float, Learned]]
-    actions: Tensor
-
-    def gains(
-        self, belief: PointBelief, earlier: Earlier, seed: int
-    ) -> tuple[Array, Array]:
-        """Return gains by delta and action, nats, and their errors, on common draws."""
-        theta = belief.sample(NUM_ALL, seed)
-        rows = [beside(theta, a.double().numpy()) for a in self.actions]
-        every = [
-            [(self.at(delta, number), row) for number, row in enumerate(rows)]
-            for delta in range(len(self.learned))
-        ]
-        return gains_of(every, earlier, seed)
-
-    def at(self, delta: int, number: int) -> Learned:
-        """Return what is learned for an action."""
-        return self.learned[delta][float(self.actions[number, 1])]
-
-    def log_likelihood(
-        self, theta: Array, image: Tensor, delta: int, number: int, earlier: Earlier
-    ) -> Array:
-        """Return log densities of an image, shape (n,), and remember it.
-
-        Args:
-            theta: Spread as the prior is, shape (n, 8).
-            image: Shape (22500,).
-            delta: Of the summary.
-            number: Of the action.
-            earlier: Statistics of earlier trials, to which its own are added.
-        """
-        known = beside(theta, self.actions[number].double().numpy())
-        own = self.at(delta, number)
-        return told_of(own, known, image, delta, earlier[delta, number])
 
 
 def cross_validated(
@@ -167,8 +119,8 @@ def cross_validated(
     return replace(whole, power=best_power(log_p, own))
 
 
-def learn(folder: Path) -> ByPlace:
-    """Return what is learned of a bank."""
+def learn(folder: Path) -> ByAction:
+    """Return what is learned of a bank, of each place of the bucket by itself."""
     task: Any = get_task("pouring_real")
     rows = read_parts(folder, PARTS)
     mesh, small = summaries_of(rows, task)
@@ -181,7 +133,13 @@ def learn(folder: Path) -> ByPlace:
         ):
             fitted = cross_validated(theta[mine], action[mine], *one[:2])
             own[place] = Learned(fitted, int(mine.sum()), *one[2:])
-    return ByPlace(found, task.actions.values)
+    actions = task.actions.values
+    places = actions[:, 1].tolist()
+    return ByAction(
+        [[by_place[place] for place in places] for by_place in found],
+        actions,
+        lambda theta, action: beside(theta, action.double().numpy()),
+    )
 
 
 @dataclass(frozen=True)

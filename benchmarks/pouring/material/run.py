@@ -17,8 +17,6 @@ beliefs instead.
 
 from __future__ import annotations
 
-import time
-from collections import defaultdict
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -28,18 +26,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.pouring.learned import Earlier, kept
+from benchmarks.pouring.campaign import rounds
+from benchmarks.pouring.learned import ByAction
 from benchmarks.pouring.material.learned import (
-    ByPlace,
     Overlap,
     PointBelief,
     compared_pours,
     learn,
 )
 from benchmarks.pouring.material.summary import checks_table, summarize
-from benchmarks.pouring.run import TEMPERED
 from benchmarks.rows import read, resumed
-from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.seeding import derive_seed
 from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring import intersection_volume
 from sbi_active.tasks.pouring.real import COMPARED_AT
@@ -61,51 +58,28 @@ def compared_images(material: str) -> Tensor:
 
 
 def run_trial(
-    task: Any, learned: ByPlace, overlap: Overlap, method: str, seed: int
+    task: Any, learned: ByAction, overlap: Overlap, method: str, seed: int
 ) -> tuple[list[dict[str, object]], PointBelief]:
     """Return one row a round of one campaign, and its last belief."""
-    belief, points = PointBelief.uniform(), PointBelief.points()
+    belief = PointBelief.uniform()
     rows: list[dict[str, object]] = [{"round": 0, "intervol": overlap.mean(belief)}]
-    total = np.zeros(len(points))
-    earlier: Earlier = defaultdict(list)
-    for index in range(NUM_ROUNDS):
-        start = time.process_time()
-        gain = np.full((2, len(learned.actions)), np.nan)
-        if method == "asbi":
-            gain, _ = learned.gains(belief, earlier, derive_seed(seed, "gain", index))
-            choice = int(gain.argmax())
-        else:
-            with forked_generators(derive_seed(seed, "action", index)):
-                choice = int(torch.randint(gain.size, ()))
-        delta, number = divmod(choice, gain.shape[1])
-        action = learned.actions[number]
-        designed = time.process_time()
-        own_seed = derive_seed(seed, "real", task.material, index)
-        image = task.real_system(action, seed=own_seed)
-        total += learned.log_likelihood(points, image, delta, number, earlier)
-        belief = PointBelief(total * (index + 1.0) ** -TEMPERED)
-        rows.append(
-            {
-                "round": index + 1,
-                **dict(
-                    zip(("height", "position", "rate"), action.tolist(), strict=True)
-                ),
-                "delta": delta,
-                "in_view": float((image > 0).float().mean()),
-                "eig": float(gain[delta, number]),
-                "intervol": overlap.mean(belief),
-                "effective": belief.effective,
-                "cpu_design": designed - start,
-                "cpu_trial": time.process_time() - designed,
-            }
-        )
+    for found in rounds(
+        *(task, learned, PointBelief, PointBelief.points()),
+        num=NUM_ROUNDS,
+        seed=seed,
+        is_active=method == "asbi",
+        name=(task.material,),
+    ):
+        belief = found.belief
+        more = {"intervol": overlap.mean(belief), "effective": belief.effective}
+        rows.append(found.row() | more)
     return rows, belief
 
 
 def poured(belief: PointBelief, material: str, num: int, seed: int) -> np.ndarray:
     """Return the shared volume of fresh pours of draws from a belief, shape (num,)."""
     task: Any = get_task("pouring_real", material=material)
-    theta = torch.from_numpy(belief.sample(num, seed)).float()
+    theta = torch.from_numpy(belief.draws(num, seed)).float()
     action = torch.tensor(COMPARED_AT).expand(num, 3)
     seeds = torch.arange(num) + derive_seed(seed, "poured") % 2**40
     images = task.pours.images(theta, action, seeds=seeds)
@@ -119,7 +93,6 @@ class Settings:
 
     Args:
         bank: Folder of pours.
-        learned: File that keeps what is learned of the pours.
         trials: Number of trials.
         first: Number of the first case.
         check: Number of pours of each belief; none by default.
@@ -128,7 +101,6 @@ class Settings:
     """
 
     bank: Path | None = None
-    learned: Path | None = None
     trials: int = 3
     first: int = 2_300
     check: int = 0
@@ -136,7 +108,7 @@ class Settings:
     summary: bool = False
 
 
-def run_missing(bank: Path, learned: ByPlace, arguments: Settings) -> None:
+def run_missing(bank: Path, learned: ByAction, arguments: Settings) -> None:
     """Run the trials, or the checks, that are not in the files yet."""
     last = arguments.first + arguments.trials
     for material in MATERIALS:
@@ -174,8 +146,6 @@ def main(arguments: Settings) -> None:
     if not arguments.summary:
         if arguments.bank is None:
             raise SystemExit("expected --bank FOLDER; got none; make one, see bank.py")
-        folder = arguments.bank
-        learned = kept(arguments.learned, lambda: learn(folder))
-        run_missing(arguments.bank, learned, arguments)
+        run_missing(arguments.bank, learn(arguments.bank), arguments)
     print(summarize(read(arguments.results / "intervol.csv")))
     print(checks_table(read(arguments.results / "intervol_poured.csv")))

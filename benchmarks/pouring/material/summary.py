@@ -1,22 +1,12 @@
-"""Figure 16 of the paper, from the rows of a run: tables and the picture.
-
-python -m benchmarks pouring.material.summary docs/pouring
-"""
+"""Figure 16 of the paper, from the rows of a run."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 
-from benchmarks.pouring.figures import boxes, subplots
 from benchmarks.rounds import Rows
-from benchmarks.rows import read
-from sbi_active.display.figures import save
 from sbi_active.display.table import Table
 
-RESULTS = Path(__file__).parents[1] / "results"
 #: Section 6, medians of ASBI, mm summed over pixels of 1,000 particles, and how far
 #: NSBI is below it at the last round.
 PUBLISHED = {
@@ -96,24 +86,3 @@ def checks_table(rows: Rows) -> str:
         f"\n{text}\nlearned less poured: {gap.mean():+.0f} mm at the mean, root mean "
         f"square {spread:.0f}, of an error of {noise:.0f}"
     )
-
-
-def intervol_figure(results: Path = RESULTS) -> Any:
-    """Return InterVol by round: the paper's Figure 16, of a simulated material."""
-    rows = read(results / "intervol.csv")
-    figure, both = subplots(2)
-    for material, axes in zip(PUBLISHED, both, strict=True):
-        cells = {m: by_round(rows, material, m) for m in ("asbi", "nsbi")}
-        boxes(axes, {m: v for m, v in cells.items() if v}, first=0)
-        axes.set_title(f"{material}, simulated as well")
-        axes.set_ylabel("InterVol, mm")
-    return figure
-
-
-def main(folder: Path) -> None:
-    """Draw figure 16.
-
-    Args:
-        folder: Folder to write to.
-    """
-    save(intervol_figure(), str(folder / "intervol.png"))
