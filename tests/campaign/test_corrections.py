@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from sbi_active.campaign.options import CampaignDetails
 from tests.campaign.problem import (  # noqa: F401 # others import them from here
     ACTIONS,
     OPTIONS,
@@ -14,6 +15,7 @@ from tests.campaign.problem import (  # noqa: F401 # others import them from her
     campaign,
     draws,
 )
+from tests.effects import BIAS
 
 TOLD = [(1.0, 0.62), (3.0, 1.75), (0.5, 0.33)]  # action, x at theta = .6
 
@@ -66,6 +68,32 @@ def test_the_first_trial_alone_leaves_the_prior_marked():
     assert c.ask().index == 1
 
 
+def test_a_number_beyond_all_simulations_but_near_stays_and_is_named():
+    c = campaign()
+    c.tell(2.5, action=[1.0])
+    with pytest.warns(UserWarning, match="trial 0"):
+        belief = c.update()
+    assert belief.diagnostics.trustworthy is False
+    assert "leaves it out" not in belief.diagnostics.warnings[0]
+    assert float(belief.mean) > 0.9
+
+
+@pytest.mark.parametrize("least", [1.1, 0.985])
+def test_a_measurement_where_the_simulator_hardly_gives_one(least):
+    def lost(theta, action):
+        x = theta * action + 0.1 * torch.randn_like(theta)
+        return torch.where((action == 3.0) & (theta < least), torch.nan, x)
+
+    c = tell(campaign(simulator=lost, details=CampaignDetails(num_scored=1_000)))
+    with pytest.warns(UserWarning, match="trial 1"):
+        belief = c.update()
+    assert belief.diagnostics.trustworthy is False
+    if least > 1:  # no simulation has a number there
+        assert float(belief.mean) == pytest.approx(0.6, abs=0.15)
+        assert c.history[1].outlyingness == float("inf")
+    c.ask()
+
+
 @pytest.mark.filterwarnings("ignore:trial 0")
 def test_a_corrected_trial_is_as_if_told_at_once():
     right, wrong = tell(campaign()), tell(campaign(), x0=1e15)
@@ -108,6 +136,43 @@ def test_a_withdrawn_trial_is_as_if_missing():
     assert torch.equal(draws(right), draws(wrong))
 
 
+def test_a_pending_trial_can_be_withdrawn():
+    c = campaign()
+    c.withdraw(c.ask())
+    assert c.pending is None
+    assert c.ask().index == 1
+    with pytest.raises(ValueError, match="the index of one of 2 trials; got 2"):
+        c.withdraw(2)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:trial [0-4] at action")
+def test_a_correction_behind_an_adoption():
+    told = [(a, 0.6 * a + 0.8) for a in (1.0, 3.0, 0.5, 3.0, 1.0)]
+    campaigns = [tell(campaign(), told), tell(campaign(), told)]
+    for c in campaigns:
+        report = c.criticize([BIAS], evaluate=False)
+        assert report.verdict == "bias"
+        c.adopt(report)
+    right, wrong = campaigns
+    wrong.tell(500.0, trial=1)
+    wrong.update()
+    assert wrong.health == "alarm"
+    assert wrong.belief.diagnostics.trustworthy is False
+    truth = torch.tensor([0.6, 0.8])
+    assert bool(((wrong.belief.mean - truth).abs() < 0.3).all())
+    wrong.tell(told[1][1], trial=1)
+    wrong.update()
+    assert torch.equal(draws(right), draws(wrong))
+    assert wrong.state.version.misfit == right.state.version.misfit
+    assert [t.version for t in wrong.history] == [None] * 5
+    for c in campaigns:
+        c.tell(1.4, action=[1.0])
+        c.update()
+    assert torch.equal(draws(right), draws(wrong))
+    assert scores(right)[-1] == scores(wrong)[-1]
+
+
 @pytest.mark.parametrize(
     ("told", "text"),
     [
@@ -125,6 +190,20 @@ def test_what_is_refused_leaves_no_trace(told, text):
         c.tell(**told)
     assert c.pending is not None
     assert c.history == ()
+
+
+@pytest.mark.parametrize("make", [np.float32, torch.tensor, int, list])
+def test_what_is_told_is_a_copy(make):
+    c = campaign()
+    told = [1.0] if make is list else make(1)
+    array = np.array([0.5], dtype=np.float32)
+    trial = c.tell(told, action=array)
+    array[0] = 7.0
+    assert trial.action.tolist() == [0.5]
+    again = c.tell(array, action=[1.0])
+    array[0] = 9.0
+    assert again.x.tolist() == [7.0]
+    assert (trial.x.tolist(), trial.x.dtype) == ([1.0], torch.float32)
 
 
 def test_a_robot_that_changes_its_action_changes_no_record():

@@ -102,6 +102,21 @@ def test_the_log_and_the_answers_are_the_campaign_s(camp, series, capsys, monkey
     assert repr(one) == repr(other)
 
 
+def test_a_trial_that_somebody_else_told_is_seen(camp, capsys):
+    with Campaign.load("camp") as campaign:
+        campaign.tell([0.2, 0.4], trial=1)
+    assert main(["status", "camp", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["not_in_belief"] == [1]
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"of": 1}', "[" * 99_999])
+def test_a_summary_that_is_none_is_not_asked(camp, content, capsys):
+    forget(camp, content.encode())
+    assert main(["tell", "camp", "0.4", "0.8"]) == 0
+    assert main(["status", "camp"]) == 0
+    assert "not in the belief yet: [1]" in capsys.readouterr().out
+
+
 def test_what_is_computed_or_given_up_is_summed_up_no_more(camp):
     assert record.Record(camp).summary
     shutil.copytree(camp, "broken")
@@ -116,6 +131,22 @@ def test_what_is_computed_or_given_up_is_summed_up_no_more(camp):
     for folder in ("camp", "broken"):
         with pytest.raises(record.Unsure):
             record.Record(Path(folder))
+
+
+def test_what_was_refused_needs_the_campaign_once(camp, capsys):
+    assert main(["tell", "camp", "0.4", "0.8", "--trial", "7"]) == 2
+    assert "expected the index of one of 2 trials" in capsys.readouterr().err
+    assert [e["event"] for e in Campaign.load(camp).events][-1] == "refused"
+    assert record.Record(camp).summary["not_in_belief"] == []
+
+
+def test_one_writer_at_a_time(camp, capsys):
+    store = record.Store(camp, "campaign")
+    store.acquire()
+    with contextlib.closing(store):
+        assert main(["tell", "camp", "0.4", "0.8"]) == 2
+    assert "expected no other writer" in capsys.readouterr().err
+    assert main(["tell", "camp", "0.4", "0.8"]) == 0
 
 
 def test_a_trial_whose_record_was_lost_is_shown(camp, capsys):

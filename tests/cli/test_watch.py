@@ -14,6 +14,7 @@ import pytest
 
 from sbi_active.cli import main, watch
 from tests.cli.sled import run
+from tests.display.browser import CHROMIUM, FLAGS, assert_reads_well
 
 ROOT = Path(__file__).parents[2]
 #: A campaign that goes on one step with each line that it reads.
@@ -134,6 +135,11 @@ def test_it_listens_on_this_machine_alone(server):
     assert asked(server, Host=f"localhost:{server.server_port}")[0] == 200
 
 
+@pytest.mark.parametrize("method", ["POST", "HEAD"])
+def test_it_is_only_read(server, method):
+    assert asked(server, method=method)[0] == 403
+
+
 @pytest.mark.parametrize(
     "path",
     ["/store.db", "/../store.db", "/%2e%2e/store.db", "/version/.."],
@@ -180,6 +186,13 @@ def test_nothing_of_the_folder_changes(place, capsys):
     assert "setInterval" not in page
 
 
+def test_a_folder_that_is_no_campaign(capsys):
+    for words in (["nowhere"], ["nowhere", "--once", "page.html"]):
+        assert main(["watch", *words]) == 2
+        assert "expected a campaign; got no nowhere" in capsys.readouterr().err
+    assert not Path("page.html").exists()
+
+
 def test_a_port_in_use(place, server, capsys):
     port = str(server.server_port)
     assert main(["watch", str(place[0]), "--port", port]) == 2
@@ -187,3 +200,45 @@ def test_a_port_in_use(place, server, capsys):
     assert text in capsys.readouterr().err
     assert main(["watch", str(place[0]), "--port", "65536"]) == 2
     assert "65536 is not in the range 0<=x<=65535" in capsys.readouterr().err
+
+
+def test_a_folder_that_goes_is_said_on_the_page(place, tmp_path):
+    folder = tmp_path / "camp"
+    folder.mkdir()
+    for file in place[0].iterdir():
+        (folder / file.name).write_bytes(file.read_bytes())
+    watched = watch.Watched(folder)
+    assert "2 trials told" in watched.page()
+    (folder / "store.db").unlink()
+    assert "expected a campaign; got no" in news(watched.page())[0]
+
+
+def test_it_reads_well_in_a_browser(place, tmp_path):
+    assert_reads_well(watch.Watched(place[0]).drawn(), tmp_path)
+
+
+def test_a_browser_loads_the_page_again(place, server, tmp_path, monkeypatch):
+    if CHROMIUM is None:
+        pytest.skip("Chromium is not installed here: the page is not looked at")
+    made, drawn = [], watch.Watched.drawn
+
+    def counted(self):
+        made.append(self)
+        monkeypatch.setattr(watch, "digest", lambda _: "changed")
+        return drawn(self)
+
+    monkeypatch.setattr(watch.Watched, "drawn", counted)
+    done = subprocess.run(
+        [
+            CHROMIUM,
+            *FLAGS,
+            f"--user-data-dir={tmp_path / 'profile'}",
+            f"http://{watch.HOST}:{server.server_port}/",
+        ],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert "2 trials told" in done.stdout
+    assert len(made) == 2  # drawn, found changed, and loaded again
+    assert not [line for line in done.stderr.splitlines() if "CONSOLE" in line]

@@ -9,10 +9,14 @@ import pytest
 import torch
 
 from sbi_active import (
+    BoxActions,
+    DiscreteActions,
     GaussianNoise,
     SimulatorModel,
     simulate,
 )
+from sbi_active.criticism import Trials
+from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning
 
@@ -37,12 +41,24 @@ def one_row(theta, action, rng, *, context):
     return context.qpos
 
 
+def one_number(theta, action, rng, *, context):
+    context.qpos[0] = theta[0]
+    return context.qpos[:1]
+
+
 @pytest.mark.parametrize("options", ENGINE)
 @pytest.mark.parametrize("noise", [None, GaussianNoise(0.0)])
 def test_rows_that_return_a_view_keep_their_own_x(options, noise):
     model = SimulatorModel(one_row, batched=False, setup=State, noise=noise)
     x = simulate(model, THETA, ACTION, seed=0, **options).x
     assert torch.equal(x, torch.cat([THETA, -ACTION], 1))
+
+
+def test_the_mean_of_rows_that_return_a_view():
+    noise = GaussianNoise(0.1)
+    model = SimulatorModel(one_number, batched=False, setup=State, noise=noise)
+    mean = model.mean(THETA, ACTION)
+    assert torch.equal(mean.float(), THETA)
 
 
 class Buffer:
@@ -71,6 +87,23 @@ class SeededBuffer(Buffer):
 def test_a_simulator_may_return_the_buffer_it_fills_again(kind, seeded, options):
     x = simulate(Buffer(kind, seeded), THETA, ACTION, seed=0, **options).x
     assert torch.equal(x, 2 * THETA)
+
+
+def test_a_mean_is_not_overwritten_by_the_next():
+    model = SimulatorModel(Buffer("torch", seeded=False), noise=GaussianNoise(1.0))
+    mean = model.mean(THETA, ACTION)
+    model.mean(5 * THETA, ACTION)
+    assert torch.equal(mean, 2 * THETA)
+
+
+def test_a_random_buffer_is_no_noise_free_output():
+    buffer = torch.zeros(8, 1)
+
+    def fn(theta, action):
+        return buffer[: len(theta)].normal_()
+
+    model = SimulatorModel(fn, noise=GaussianNoise(1.0))
+    assert not model.is_deterministic(THETA, ACTION)
 
 
 def change(theta, action, seeds):
@@ -141,6 +174,43 @@ def test_a_row_that_is_tried_again_gets_its_own_theta():
     assert torch.equal(rows.x[rows.valid], theta[rows.valid])
 
 
+def test_a_model_called_directly_may_change_its_arguments():
+    effect, seeds = torch.ones(600, 1), torch.arange(600)
+
+    def fn(theta, action, seeds, gain=0.0):
+        gain += 1
+        return changing(theta, action, seeds) * gain
+
+    theta, action = THETA.clone(), ACTION.clone()
+    SimulatorModel(fn)(theta, action, seeds=seeds, gain=effect)
+    assert torch.equal(theta, THETA)
+    assert torch.equal(action, ACTION)
+    assert torch.equal(effect, torch.ones(600, 1))
+    assert torch.equal(seeds, torch.arange(600))
+
+
+def test_effects_of_rows_may_be_changed():
+    def fn(theta, action, rng, gain=None):
+        gain += 1
+        return theta + gain
+
+    effect = torch.zeros(4, 1, dtype=torch.float64)
+    model = SimulatorModel(fn, batched=False, noise=GaussianNoise(1.0))
+    for _ in range(2):
+        assert torch.equal(
+            model.mean(THETA[:4], ACTION[:4], gain=effect) - 1, THETA[:4]
+        )
+
+
+def test_simulations_keep_the_theta_that_was_simulated():
+    theta, action = THETA.clone(), ACTION.clone()
+    rows = simulate(changing, theta, action, seed=0)
+    theta.zero_()
+    action.zero_()
+    assert torch.equal(rows.theta, THETA)
+    assert torch.equal(rows.action, ACTION)
+
+
 def test_noise_keeps_the_values_that_were_declared():
     sd, times = torch.ones(2, dtype=torch.float64), np.arange(3.0)
     noise = GaussianNoise(sd).at(times)
@@ -150,3 +220,30 @@ def test_noise_keeps_the_values_that_were_declared():
     assert noise.sd.tolist() == [1.0, 1.0]
     for kept in (noise.times, model.sample_times, model.noise.times):
         assert kept.tolist() == [0.0, 1.0, 2.0]
+
+
+def test_actions_keep_the_values_that_were_given():
+    values, low, high = np.arange(3, dtype=np.float32), torch.zeros(1), torch.ones(1)
+    listed, box = DiscreteActions(values), BoxActions(low, high)
+    for given in (values, low, high):
+        given += 5
+    assert listed.values.flatten().tolist() == [0.0, 1.0, 2.0]
+    assert (box.low.item(), box.high.item()) == (0.0, 1.0)
+
+
+def test_trials_keep_the_numbers_that_were_measured():
+    action, x = np.arange(4.0)[:, None], torch.ones(4, 2, dtype=torch.float64)
+    trials = Trials(action, x, sample_times=(times := np.arange(2.0)))
+    for given in (action, x, times):
+        given += 5
+    assert trials.action.flatten().tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert trials.x.unique().tolist() == [1.0]
+    assert trials.sample_times.tolist() == [0.0, 1.0]
+
+
+def test_conditions_are_rows_of_their_own():
+    x, action = torch.ones(3, 2), torch.ones(3, 1)
+    rows = outcome_rows(x, (2,)), action_rows(action, 1)
+    x.zero_()
+    action.zero_()
+    assert all(r.unique().tolist() == [1.0] for r in rows)

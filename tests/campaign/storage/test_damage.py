@@ -5,6 +5,7 @@ import os
 import pickle
 import resource
 import shutil
+import stat
 import sys
 import zlib
 
@@ -15,13 +16,14 @@ from sbi_active import Campaign
 from sbi_active.campaign import storage
 from sbi_active.messages import RenamedWarning
 from sbi_active.simulation.bank import CorruptSegmentError
+from sbi_active.simulation.bank.store import Store
 from tests.campaign.storage.campaigns import drawn, draws, facts, go_on, new
 from tests.simulation.bank.filled import crafted, execute, flip
 
 if sys.version_info >= (3, 11):
-    pass
+    import tomllib
 else:
-    pass
+    import tomli as tomllib
 
 FILE = "store.db"
 
@@ -148,6 +150,14 @@ def test_another_schema_names_the_release(folder):
         Campaign.load(folder)
 
 
+def test_people_read_what_it_is(folder):
+    found = tomllib.loads((folder / "campaign.toml").read_text())
+    assert (found["method"], found["seed"], found["x_shape"]) == ("nsbi", 0, [4])
+    assert "BoxUniform" in found["prior"]
+    (folder / "campaign.toml").unlink()  # which nothing reads
+    Campaign.load(folder)
+
+
 def test_the_former_name_of_the_error():
     with pytest.warns(RenamedWarning, match="bank.CorruptSegmentError"):
         assert storage.DamagedCampaignError is CorruptSegmentError
@@ -220,3 +230,20 @@ def test_a_full_disk_refuses_and_loses_nothing(made, folder):
     campaign = Campaign.load(folder, simulator=drawn)
     assert facts(campaign) == facts(made[1])
     campaign.tell([0.1, 0.2, 0.3, 0.4])
+
+
+def test_a_directory_that_cannot_be_written(made, folder, monkeypatch):
+    campaign = Campaign.load(folder, simulator=drawn)
+    if os.geteuid() == 0:  # whom no permission stops
+
+        def refuse(self):
+            raise PermissionError(13, "Permission denied", str(self.path))
+
+        monkeypatch.setattr(Store, "acquire", refuse)
+    else:
+        folder.chmod(stat.S_IRUSR | stat.S_IXUSR)
+    with pytest.raises(OSError):
+        campaign.tell([0.1, 0.2, 0.3, 0.4])
+    assert campaign.pending is not None
+    assert facts(campaign) == facts(made[1])
+    folder.chmod(stat.S_IRWXU)

@@ -14,7 +14,7 @@ from sbi_active.campaign.storage.manifest import has_manifest
 from tests.campaign.storage.campaigns import drawn, draws, facts, go_on, new
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-NUM_TRIALS = 4
+NUM_TRIALS = 6
 
 
 def run(folder, num_trials):
@@ -113,7 +113,7 @@ def two_rounds():
     return go_on(new(), 2)
 
 
-@pytest.mark.parametrize("at_call", range(1, 60, 8))
+@pytest.mark.parametrize("at_call", range(1, 60, 4))
 def test_killed_at_each_write_of_a_round(tmp_path, at_call, two_rounds):
     """A first round, from the manifest on, dies at each of its writes in turn."""
     folder = tmp_path / "c"
@@ -140,7 +140,7 @@ def apart():
     return learn(attached())
 
 
-@pytest.mark.parametrize("at_call", range(1, 60, 8))
+@pytest.mark.parametrize("at_call", range(1, 60, 4))
 def test_killed_while_several_trials_are_learned(tmp_path, at_call, apart):
     folder = tmp_path / "c"
     attached(folder).close()

@@ -170,6 +170,23 @@ def test_small_numbers_are_corrected(tmp_path):
     assert torch.equal(c.tell(close, trial=0).x, close)
 
 
+def test_links_lead_nowhere(tmp_path):
+    mine = tmp_path / "mine.txt"
+    beside = ("store.lock", "store.db-wal", "store.db-shm", "store.db.damaged")
+    for name in (FILE, *beside):
+        mine.write_text("precious")
+        folder = tmp_path / f"c-{name}"
+        go_on(new(folder), 1).close()
+        (folder / name).unlink(missing_ok=True)
+        (folder / name).symlink_to(mine)
+        try:
+            with Campaign.load(folder, repair=True) as c:
+                c.attach([1.0], number(1))
+        except OSError:
+            pass
+        assert mine.read_text() == "precious", name
+
+
 def test_files_of_the_user_stay(tmp_path):
     folder = tmp_path / "c"
     c = new(folder)

@@ -1,16 +1,20 @@
 """Folders that earlier releases wrote are brought up to date, and go on."""
 
+import json
 import shutil
+import sys
 
+import numpy as np
 import pytest
 import torch
 
-from sbi_active import Campaign
+from sbi_active import Bank, Campaign
 from sbi_active.cli import main
 from sbi_active.migration import migrate
 from sbi_active.simulation.bank import CorruptSegmentError
 from tests.campaign.storage.version_1 import FOLDER, simulator
 
+BANK = FOLDER / "simulations" / "drawn"
 ROWS = 1156
 
 
@@ -93,6 +97,34 @@ def test_gone_on_with_to_the_last_bit(folder):
     assert torch.equal(draws, finished(anew))
 
 
+def test_what_was_simulated_is_there_row_by_row(folder):
+    h5py = pytest.importorskip("h5py")
+    bank = Bank(folder, name="drawn")
+    assert bank.verify() == []
+    columns = bank.columns("theta", "x", "index", "log_proposal")
+    for name, column in columns.items():
+        files = sorted(BANK.glob("segments/*.h5"))
+        parts = []
+        for path in files:
+            with h5py.File(path) as file:
+                parts.append(file[name][()])
+        assert np.array_equal(np.concatenate(parts), column.numpy(), equal_nan=True)
+    header = json.loads((BANK / "bank.json").read_text())
+    assert bank.header["simulator"] == header["simulator"]
+
+
+def test_a_bank_alone_and_several_in_a_folder(tmp_path):
+    shutil.copytree(BANK, tmp_path / "bank")
+    assert migrate(tmp_path / "bank") == {"rows": ROWS}
+    assert len(Bank(tmp_path / "bank")) == ROWS
+    with Bank(tmp_path / "bank", simulator=simulator) as bank:
+        assert bank.counts["ok"] == ROWS
+    for name in ("drawn", "noise-free"):
+        shutil.copytree(BANK, tmp_path / "banks" / name)
+    assert migrate(tmp_path / "banks") == {"drawn": ROWS, "noise-free": ROWS}
+    assert len(Bank(tmp_path / "banks", name="noise-free")) == ROWS
+
+
 def test_one_that_was_cut_short_is_done_again(old, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr("sbi_active.migration.folders.copy_bank", lambda *_: 1 / 0)
@@ -121,3 +153,20 @@ def test_damage_is_named_and_nothing_is_moved(old, name):
         migrate(old)
     assert not (old / "store.db").exists()
     assert (old / "campaign.json").exists()
+
+
+def test_without_h5py_it_says_what_to_install(old, monkeypatch):
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(ImportError, match=r"pip install 'sbi-active\[migrate\]'"):
+        migrate(old)
+    assert not (old / "store.db").exists()
+
+
+def test_computed_again_from_its_log(folder):
+    from tests.simulation.bank.filled import execute
+
+    execute(folder, "DELETE FROM records WHERE kind IN ('state', 'belief')")
+    with Campaign.load(folder, simulator=simulator) as campaign:
+        campaign.update()
+        mean = campaign.belief.mean.tolist()
+        assert mean == pytest.approx([0.2913, 0.6018], abs=0.05)

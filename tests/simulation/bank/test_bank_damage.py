@@ -3,6 +3,7 @@
 import json
 import os
 from contextlib import suppress
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,12 +14,31 @@ from sbi_active.cli import main
 from sbi_active.simulation import Simulations
 from sbi_active.simulation.bank import CorruptSegmentError
 from sbi_active.simulation.bank.rows import row_type
+from sbi_active.simulation.bank.store import Store
 from tests.simulation.bank.filled import FILE, crafted, execute, filled, simulator
 
 
 @pytest.fixture
 def folder(tmp_path):
     return filled(tmp_path / "bank")
+
+
+HEADERS = {
+    "deep": b"[" * 100_000 + b"]" * 100_000,
+    "deep in simulator": b'{"simulator": ' + b'{"a":' * 500 + b"1",
+    "null": b"null",
+    "bytes": bytes(range(256)),
+    "infinite": b'{"created": Infinity}',
+    "only a date": b'{"created": null}',
+}
+
+
+@pytest.mark.parametrize("content", HEADERS.values(), ids=HEADERS.keys())
+def test_crafted_headers(folder, content):
+    crafted(folder, "bank rows", 0, content)
+    with pytest.raises(CorruptSegmentError, match=r"store\.db as it was written"):
+        Bank(folder)
+    assert main(["bank", "inspect", str(folder)]) == 2
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, "sparse", "empty", "text"])
@@ -35,6 +55,24 @@ def test_files_that_are_no_store(folder, make):
     for options in ({}, {"simulator": simulator}):
         with pytest.raises(CorruptSegmentError, match=r"store\.db"):
             Bank(folder, **options)
+
+
+ENTRIES = ["version", "simulator", "parameter_names", "shapes", "created"]
+
+
+@pytest.mark.parametrize("name", ENTRIES)
+def test_entries_of_other_types(folder, name):
+    header = Bank(folder).header
+    for value in (-1, 1.5, [1.5], [[[]]], {"theta": 3}):
+        if (name, value) == ("simulator", {"theta": 3}):
+            continue  # any object describes a simulator
+        crafted(folder, "bank rows", 0, {**header, name: value})
+        with pytest.raises(CorruptSegmentError, match=r"store\.db"):
+            Bank(folder)
+    del header[name]
+    crafted(folder, "bank rows", 0, header)
+    with pytest.raises(CorruptSegmentError, match=r"store\.db"):
+        Bank(folder)
 
 
 KNOWN = {"run": "r", "seed": 1, "label": ""}
@@ -102,6 +140,27 @@ def test_what_anybody_can_do_with_sqlite(folder, statement):
         Bank(folder).columns("x")
 
 
+@pytest.mark.parametrize("catalog", [{"rows": "4"}, {"rows": 10**18}, None])
+def test_crafted_catalogs(folder, catalog):
+    content = json.dumps({"bank rows": 0, **catalog} if catalog else catalog).encode()
+    crafted(folder, "catalog", 0, content)
+    with pytest.raises((CorruptSegmentError, ValueError), match=str(folder)):
+        Bank(folder).columns("x")
+    assert Store(folder).problems()
+
+
+def test_a_view_in_place_of_a_table_is_not_read(folder):
+    execute(folder, "DROP TABLE records")
+    endless = (
+        "CREATE VIEW records AS WITH RECURSIVE n(kind) AS (SELECT 1 UNION ALL SELECT "
+        "kind + 1 FROM n) SELECT kind, kind AS number, x'' AS head, x'' AS "
+        "head_digest, x'' AS body_digest, x'' AS body FROM n"
+    )
+    execute(folder, endless)
+    with pytest.raises(CorruptSegmentError, match="tables that are not those"):
+        Bank(folder)
+
+
 @pytest.mark.parametrize("name", [FILE, "store.db-wal", "store.db-shm", "store.lock"])
 def test_links_lead_nowhere(folder, tmp_path, name):
     mine = tmp_path / "mine.txt"
@@ -160,6 +219,29 @@ def test_control_characters_do_not_reach_the_terminal(folder, capsys):
     crafted(folder, "bank rows", 0, header)
     assert main(["bank", "inspect", str(folder)]) == 0
     assert r"created: '\x1b[2J\ud800'" in capsys.readouterr().out
+
+
+def test_columns_and_sizes_that_are_none(folder):
+    bank = Bank(folder)
+    with pytest.raises(ValueError, match=r"expected columns among .*got \['thetas'\]"):
+        bank.columns("thetas")
+    with pytest.raises(ValueError, match="expected size >= 1; got 0"):
+        next(bank.chunks(0))
+
+
+def test_numbers_that_float32_cannot_hold(folder):
+    rows = torch.ones(3, 2)
+    with Bank(folder, simulator=simulator) as bank:
+        large = Simulations(rows, rows[:, :1], rows.double() * 1e39)
+        with pytest.raises(ValueError, match=r"x within \+-3.4e38.*got 1e\+39"):
+            bank.append(large, seed=0)
+        with pytest.raises(ValueError, match=r"x of real numbers; got torch.complex64"):
+            bank.append(
+                Simulations(rows, rows[:, :1], rows + 1j, torch.zeros(3)), seed=0
+            )
+        eight: Any = np.int64(8)
+        assert bank.append(Simulations(rows, rows[:, :1], rows), seed=eight) == 3
+    assert len(Bank(folder)) == 23
 
 
 def test_seeds_beyond_int64_are_stored(folder):

@@ -133,6 +133,67 @@ def test_a_row_that_hangs_costs_itself_on_a_cluster(client, rows):
     assert torch.equal(result.x[result.valid], clean[result.valid])
 
 
+@pytest.mark.slow
+def test_faults_on_the_cluster_cost_their_rows(client, rows):
+    def faulty(theta, action, seeds):
+        if bool((action == 3).any()):
+            raise RuntimeError("no")
+        return theta + row_normals(seeds, 1).float()
+
+    theta, action = rows
+    action[[7, 300]] = 3
+    clean = simulate(
+        lambda t, a, seeds: t + row_normals(seeds, 1).float(), theta, action, seed=0
+    ).x
+    with (
+        joblib.parallel_config(backend="dask"),
+        pytest.warns(MissingRowsWarning, match="2 of 600 rows are missing: 2 raised"),
+    ):
+        result = simulate(faulty, theta, action, seed=0, workers=-1)
+    assert result.tracebacks.keys() == {7, 300}
+    assert torch.equal(result.x[result.valid], clean[result.valid])
+
+
+@pytest.mark.slow
+def test_a_row_that_kills_every_worker_loses_no_good_row(client, rows):
+    def killer(theta, action, seeds):
+        if bool((action == 3).any()):
+            os.kill(os.getpid(), signal.SIGKILL)
+        return theta
+
+    theta, action = (r[:4] for r in rows)
+    action[2] = 3
+    with joblib.parallel_config(backend="dask"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", MissingRowsWarning)
+        result = simulate(killer, theta, action, seed=0, workers=2, batch_size=2)
+    assert result.tracebacks.keys() == {2}
+    assert "ended by signal 9" in result.tracebacks[2]
+    assert torch.equal(result.x[result.valid], theta[result.valid])
+
+
+@pytest.mark.slow
+def test_all_workers_killed_at_once_lose_nothing(client, rows, tmp_path):
+    client.wait_for_workers(2)
+    expected = simulate(seeded, *rows, seed=0).x
+
+    def kill():
+        while len([*tmp_path.iterdir()]) < 3:
+            time.sleep(1e-3)
+        for pid in client.run(os.getpid).values():
+            os.kill(pid, signal.SIGKILL)
+
+    killer = threading.Thread(target=kill, daemon=True)
+    killer.start()
+    with joblib.parallel_config(backend="dask"):
+        result = simulate(
+            ReportingSeeded(tmp_path), *rows, seed=0, workers=2, batch_size=10
+        )
+    killer.join(timeout=0)
+    assert not killer.is_alive()
+    assert result.tracebacks == {}
+    assert torch.equal(result.x, expected)
+
+
 def test_workers_that_the_cluster_gave_up_are_asked_for_again(rows, monkeypatch):
     monkeypatch.setattr(DaskPool, "PATIENCE", 0.0)
     theta, action = (r[:20] for r in rows)
@@ -195,3 +256,15 @@ def test_rows_at_risk_run_in_a_child_and_once(tmp_path):
     faults, is_here = asked(Risky(tmp_path), [1.0, 2.0, 3.0, 2.0, 1.0])
     assert faults == [None, "raised", "worker died", "raised", None]
     assert is_here == [False] * 5
+
+
+def test_of_rows_that_raise_from_the_start_the_first_is_tried_here_too(tmp_path):
+    faults, is_here = asked(Risky(tmp_path), [2.0, 2.0, 1.0, 2.0])
+    assert faults == ["raised", "raised", None, "raised"]
+    assert is_here == [False, True, False, False, False]
+
+
+def test_a_simulator_that_needs_what_was_set_up_here_runs_here(tmp_path):
+    faults, is_here = asked(Risky(tmp_path, os.getpid()), [1.0, 2.0, 1.0])
+    assert faults == [None, "raised", None]
+    assert is_here == [False, True, True, True]

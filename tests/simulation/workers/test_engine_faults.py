@@ -94,6 +94,12 @@ def test_faults_cost_their_rows_alone():
     check_faults(200, num_workers=2, time_limit=1.0, killer=40)
 
 
+@pytest.mark.slow
+def test_faults_cost_their_rows_alone_at_scale():
+    for num_workers in (1, 4):
+        check_faults(5_000, num_workers=num_workers, time_limit=0.5, killer=1_234)
+
+
 def test_a_batch_that_raises_is_divided_here_too():
     def simulator(theta, action, seeds):
         if (theta == 5).any() or (theta == 70).any():
@@ -176,6 +182,16 @@ def test_missing_rows_are_tried_again(tmp_path):
     assert torch.equal(twice.x, clean)
 
 
+def test_the_exit_code_is_told():
+    def simulator(theta, action, seeds):
+        if (theta == 1).any():
+            os._exit(3)
+        return theta
+
+    rows = quietly(simulator, *index_rows(3), seed=0, workers=2)
+    assert "ended with code 3 during the call" in rows.tracebacks[1]
+
+
 @pytest.mark.parametrize("num_workers", [1, 2])
 @pytest.mark.parametrize("n", [1, 2_000])
 def test_a_simulator_that_always_raises_is_an_error(n, num_workers):
@@ -191,6 +207,19 @@ def test_a_simulator_that_always_raises_is_an_error(n, num_workers):
     assert len(calls) < 100  # the rest of a long run is not tried
 
 
+def test_a_simulator_that_raises_on_its_first_rows_goes_on():
+    def simulator(theta, action, seeds):
+        if bool((theta < 60).any()):
+            raise RuntimeError("no")
+        return seeded(theta, action, seeds)
+
+    theta, action = index_rows(120)
+    rows = quietly(simulator, theta, action, seed=0, batch_size=4)
+    assert rows.counts == {"ok": 60, "invalid": 0, "missing": 60}
+    clean = simulate(seeded, theta, action, seed=0).x
+    assert torch.equal(rows.x[60:], clean[60:])
+
+
 @pytest.mark.parametrize("num_workers", [1, 2])
 def test_wrong_shapes_are_no_fault_of_a_row(num_workers):
     theta, action = index_rows(30)
@@ -203,6 +232,11 @@ def test_wrong_shapes_are_no_fault_of_a_row(num_workers):
 
     with pytest.raises(ValueError, match="expected x of one shape a row"):
         simulate(ragged, theta, action, seed=0, workers=num_workers, batch_size=10)
+
+
+def test_a_simulator_that_takes_no_action_is_no_fault_of_a_row():
+    with pytest.raises(TypeError, match="positional argument"):
+        simulate(lambda theta: theta, *index_rows(30), seed=0)
 
 
 class Stop(BaseException):
@@ -234,3 +268,15 @@ def test_whatever_ends_the_loading_has_its_traceback():
     model = SimulatorModel(fn, setup=setup)
     with pytest.raises(SimulationError, match=r"(?s)can load; got.*no licence"):
         simulate(model, *index_rows(3), seed=0, workers=2)
+
+
+def test_a_simulator_that_cannot_be_loaded():
+    class Unloadable:
+        def __call__(self, theta, action, seeds):
+            return theta
+
+        def __reduce__(self):
+            return int, ("no number",)
+
+    with pytest.raises(SimulationError, match="(?s)can load; got.*invalid literal"):
+        simulate(Unloadable(), *index_rows(3), seed=0, workers=2)
