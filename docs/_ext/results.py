@@ -90,6 +90,7 @@ TABLES = {
         "misfit.start_states --summary",
     ),
     "Trials that decide": ("experiments --summary",),
+    "May it go out?": ("experiments.gate --summary",),
     "Forces that nobody declared": ("forces --summary",),
     "Robots from their MJCF": (
         "robots.hidden --summary",

@@ -46,9 +46,6 @@ COUNTS, MOST_COUNTED = 0.05, 6
 #: Root mean square difference of two effects' fits, in sensor deviations, below which
 #: they are nearly the same.
 CLOSE = 1.0
-#: Effective draws from which a sample of the simulator's own posterior is taken, and
-#: not a linear model's. Half and twice say little else: it is some hundreds or a few.
-FEWEST_DRAWS = 50.0
 
 
 def traced(
@@ -164,18 +161,24 @@ def _tail(found: Verdict, key: ModelKey) -> float:
     return found.states.chi_square(key)[1] if known else float("nan")
 
 
-def _record(found: Verdict, key: ModelKey) -> Evidence:
+def _record(found: Verdict, key: ModelKey, *, fewest: float = 50.0) -> Evidence:
     """Return the record of a model that may fit, and keep its draws.
 
     The bare model and those that are likely have samples of the simulator's own
     posterior where they bend. Beside a gross error, its trial tells little.
+
+    Args:
+        found: Verdict with the model.
+        key: Key of the model.
+        fewest: Effective draws from which such a sample is taken, and not a linear
+            model's. Half and twice say little else: it is some hundreds or a few.
     """
     rivals, states, search = found.rivals, found.states, found.search
     own, effects = states.mixture(key), states.predicting(key)
     model = search.model(effects)
     if key not in rivals.fits and _is_sampled(found, key):
         fit = rivals.fit(key)
-        if fit.evidence.effective_sample_size >= FEWEST_DRAWS:
+        if fit.evidence.effective_sample_size >= fewest:
             evidence = replace(fit.evidence, log_evidence=own.log_evidence)
             rivals.fits[key] = replace(fit, evidence=evidence)
             return evidence
