@@ -38,6 +38,7 @@ from benchmarks.misfit.machines.machine import Machine, box
 from benchmarks.misfit.truth import Truth
 from benchmarks.rows import benchmark
 from sbi_active.criticism import Trials, close_loop
+from sbi_active.criticism.data import Role
 from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
 
@@ -176,10 +177,12 @@ def case_of(name: str, condition: str, seed: int) -> tuple[Machine, Trials] | No
         flat = x.reshape(len(x), -1).clone()
         flat[:, samples:] = float("nan")
         x = flat.reshape(x.shape)
+    fit: list[Role] = ["fit"]
+    other: list[Role] = ["held out"]
     trials = Trials(
         truth.action[rows],
         x,
-        role=["fit"] * len(fitted) + ["held out"] * len(held_out),
+        role=fit * len(fitted) + other * len(held_out),
         index=rows,
         sample_times=machine.times if machine.declares_times else None,
     )
