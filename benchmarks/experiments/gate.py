@@ -23,8 +23,9 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import wraps
 from pathlib import Path
 from typing import Any
 
@@ -94,32 +95,26 @@ def _ends(machine: Machine) -> tuple[Tensor, Tensor]:
     return base.low.double(), base.high.double()
 
 
-def unidentifiable(truth: Truth) -> tuple[Machine, Truth]:
-    """Return the machine with its first positive parameter as a product, and trials."""
-    machine, (low, high) = truth.machine, _ends(truth.machine)
+def unidentifiable(machine: Machine) -> Machine:
+    """Return the machine with its first positive parameter as a product."""
+    low, high = _ends(machine)
     j = int((low > 0).nonzero()[0])
     fn = machine.fn
 
+    @wraps(fn)
     def product(theta: Tensor, action: Tensor, **given: Any) -> Tensor:
         own = theta[:, :-1].clone()
         own[:, j] = own[:, j] * theta[:, -1]
         return fn(own, action, **given)
 
-    product.__signature__ = _signature(fn)  # type: ignore[attr-defined]
     ends = [*zip(low.tolist(), high.tolist(), strict=True), (0.5, 2.0)]
     ends[j] = (float(low[j]) / 2, float(high[j]) * 2)
     names = (*machine.parameter_names, "factor")
-    return replace(machine, fn=product, prior=box(*ends), parameter_names=names), truth
+    return replace(machine, fn=product, prior=box(*ends), parameter_names=names)
 
 
-def _signature(fn: Callable[..., Any]) -> Any:
-    import inspect
-
-    return inspect.signature(fn)
-
-
-def too_narrow(truth: Truth) -> tuple[Machine, Truth] | None:
-    """Return the machine with a prior that ends short of the truth, and trials."""
+def too_narrow(truth: Truth) -> Machine | None:
+    """Return the machine with a prior that ends short of the truth."""
     machine, (low, high) = truth.machine, _ends(truth.machine)
     sd, width = told(truth, truth.fitted), _width(truth.machine)
     place = ((truth.theta[0] - low) / width).tolist()
@@ -132,7 +127,7 @@ def too_narrow(truth: Truth) -> tuple[Machine, Truth] | None:
         part = NARROW * float(width[j])
         first, last = ends[j]
         ends[j] = (first, first + part) if is_below else (last - part, last)
-        return replace(machine, prior=box(*ends)), truth
+        return replace(machine, prior=box(*ends))
     return None
 
 
@@ -152,13 +147,13 @@ def case_of(name: str, condition: str, seed: int) -> tuple[Machine, Trials] | No
     machine, fitted, held_out = truth.machine, truth.fitted, truth.held_out
     samples: int | None = None
     if condition == "unidentifiable":
-        machine, truth = unidentifiable(truth)
+        machine = unidentifiable(machine)
     elif condition == "prior too narrow":
         with forked_generators(derive_seed(seed, "narrow", name)):
             narrow = too_narrow(truth)
         if narrow is None:
             return None
-        machine, truth = narrow
+        machine = narrow
     elif condition == "too few data" and seed % 2:
         fitted, held_out = fitted[:4], held_out[:1]
     elif condition == "too few data":

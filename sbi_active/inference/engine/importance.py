@@ -134,7 +134,7 @@ class _Fits:
         num_full: Number of those to the whole likelihood.
         num_tempered: Number of those to a power of it.
         ridge: Places along ridges, of the last proposal there.
-        is_along: Whether the last proposal was along ridges.
+        is_along: Whether the last proposal was along ridges; None before any.
         efficiency: Share of the draws that were effective of the last proposal along
             ridges, and of the last other one.
     """
@@ -148,7 +148,7 @@ class _Fits:
     num_full: int = 0
     num_tempered: int = 0
     ridge: Ridge | None = None
-    is_along: bool = True
+    is_along: bool | None = None
     efficiency: dict[bool, float] = field(default_factory=dict)
 
     @property
@@ -179,8 +179,9 @@ class _Fits:
         weight = normalized(log_rest + power * log_new)
         share = own.share_if_rough if is_rough else own.share_of_wide
         proposal = defended(pool, weight, self.num_components, share, own, rng)
-        before, self.is_along = self.is_along, False
-        self.efficiency[before] = efficiency
+        if self.is_along is not None:
+            self.efficiency[self.is_along] = efficiency
+        self.is_along = False
         # Where few draws count, they may lie across a ridge.
         is_first = self.num <= own.num_ridged
         if self.found is not None and (is_first or self._is_better_along):
@@ -199,7 +200,8 @@ class _Fits:
 
     @property
     def _is_better_along(self) -> bool:
-        return self.efficiency[True] > self.efficiency.get(False, np.inf)
+        known = self.efficiency
+        return known.get(True, 0.0) > known.get(False, np.inf)
 
     def _logs(self) -> tuple[Array, Array]:
         """Return log weights without the new likelihood, and that, shapes (n,)."""

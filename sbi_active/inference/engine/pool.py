@@ -134,18 +134,19 @@ class Pool:
         u, log_likelihood = u[counts], log_likelihood[counts]
         own = np.log(len(drawn)) + proposal.log_prob(self.u)
         self.log_mixture = np.logaddexp(self.log_mixture, own)
-        num = len(drawn)
+        count = len(drawn)
         if self.proposals and self.proposals[-1][1] is proposal:
-            num += self.proposals.pop()[0]
-        self.proposals.append((num, proposal))
-        log_mixture = np.full(len(u), -np.inf)
+            count += self.proposals.pop()[0]
+        log_mixture, log_own = np.full(len(u), -np.inf), proposal.log_prob(u)
         for num, each in self.proposals if len(u) else []:
             log_mixture = np.logaddexp(log_mixture, np.log(num) + each.log_prob(u))
+        log_mixture = np.logaddexp(log_mixture, np.log(count) + log_own)
+        self.proposals.append((count, proposal))
         self.u = np.concatenate([self.u, u])
         self.log_prior = np.concatenate([self.log_prior, potential.log_prior(u)])
         self.log_likelihood = np.concatenate([self.log_likelihood, log_likelihood])
         self.log_mixture = np.concatenate([self.log_mixture, log_mixture])
-        self.log_own = np.concatenate([self.log_own, proposal.log_prob(u)])
+        self.log_own = np.concatenate([self.log_own, log_own])
         log_past = np.zeros(len(u))
         if self.num_past:
             assert isinstance(potential, SimulatedPotential)  # as in with_trials

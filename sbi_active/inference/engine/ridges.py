@@ -21,7 +21,7 @@ from sbi_active.inference.engine.search import Found
 from sbi_active.inference.engine.settings import Settings
 from sbi_active.inference.sampling.least_squares import descend, floored
 from sbi_active.inference.sampling.student_mixture import StudentMixture, lower_factors
-from sbi_active.inference.sampling.weights import log_sum_exp, systematic
+from sbi_active.inference.sampling.weights import systematic
 
 Array = NDArray[Any]
 
@@ -65,13 +65,12 @@ class Ridge:
             weight: Weights of the draws, which sum to 1, shape (n,).
             rng: Source of the choice of draws.
         """
-        own, parts = self.settings, self.mixture.log_parts(u)
-        share = np.exp(parts - log_sum_exp(parts, axis=0))
+        own = self.settings
         # Tempered weights: few draws must not shrink the next proposal to a point.
         flat = np.sqrt(weight)
-        counts = share @ (flat / flat.sum()) * len(self.means)
+        counts = self.mixture.shares(u, flat / flat.sum()) * len(self.means)
         some = np.unique(systematic(weight, own.num_ridge, rng.random()))
-        nearest = parts[:, some].argmax(0)
+        nearest = self.mixture.log_parts(u[some]).argmax(0)
         kept = counts > own.idle
         weights = np.concatenate(
             [

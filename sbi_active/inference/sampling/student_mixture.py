@@ -119,10 +119,21 @@ class StudentMixture(Proposal):
 
     @override
     def log_prob(self, z: Array) -> Array:
-        # Hundreds of components by thousands of draws are more than a cache holds.
-        blocks = np.array_split(z, 1 + self.means.size * len(z) // BLOCK)
-        parts = [log_sum_exp(self.log_parts(block), axis=0) for block in blocks]
+        parts = [log_sum_exp(self.log_parts(z[at]), axis=0) for at in self._blocks(z)]
         return np.concatenate(parts)
+
+    def shares(self, z: Array, weight: Array) -> Array:
+        """Return the part of weights (n,) of places z that each component has, (k,)."""
+        total = np.zeros(len(self.means))
+        for at in self._blocks(z):
+            parts = self.log_parts(z[at])
+            total += np.exp(parts - log_sum_exp(parts, axis=0)) @ weight[at]
+        return total
+
+    def _blocks(self, z: Array) -> list[NDArray[np.intp]]:
+        # Hundreds of components by thousands of draws are more than memory holds.
+        num = 1 + self.means.size * len(z) // BLOCK
+        return np.array_split(np.arange(len(z)), num)
 
     def log_parts(self, z: Array) -> Array:
         """Return log of weight times density of each component, shape (k, n)."""
