@@ -73,11 +73,12 @@ class Settings:
             .99 SMC begins at a handful.
         num_ridge: Places along a ridge, beside draws that are known, and draws that
             count as further ones of each proposal. Of two parameters that are known by
-            their product to 1e-4, a quarter ends in 20 times as many rows; twice as
-            many cost more than they save.
+            their product to 1e-4, a quarter leaves gaps of 6 % of the evidence, half of
+            2 %, and twice as many save no rows.
         num_ridged: Proposals along ridges before others are tried as well; then those
             that were the more efficient go on.
-        idle: Share of its part of the draws below which a place is left out.
+        idle: Share of its part of the draws below which a place is left out. Half and
+            twice change rows by a tenth or a third, and no evidence.
         reach: Deviations of the prior that they span.
         returning: Steps that bring them back to the ridge.
         num_near: Draws at which a search begins after a further trial.
