@@ -30,7 +30,7 @@ from sbi_active.criticism.misfit.evaluation import chooses_again, evaluate_linea
 from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.misfit.rule import Rule
 from sbi_active.criticism.misfit.stand_ins import judged
-from sbi_active.criticism.misfit.verdict import Verdict, is_linear, judge, without
+from sbi_active.criticism.misfit.verdict import Verdict, judge, without
 from sbi_active.criticism.next_trial.next_action import choose_action
 from sbi_active.criticism.results import (
     Detection,
@@ -44,8 +44,6 @@ from sbi_active.criticism.steps.equivalence import equivalent_effects, is_large
 from sbi_active.criticism.steps.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.steps.refuted import widened
 from sbi_active.criticism.steps.residuals import find_residuals
-from sbi_active.criticism.steps.sampled import Sampled
-from sbi_active.criticism.steps.tracing import trace
 from sbi_active.criticism.thinning import thinned_to_need
 from sbi_active.expected import suggests
 from sbi_active.progress import stage
@@ -58,7 +56,6 @@ if TYPE_CHECKING:
 FEWEST_TRIALS = 4  # to leave one out
 #: Posterior draws that predict held-out trials, of models by linear evidence.
 FEW_DRAWS = 60
-NUM_OTHERS = 3  # models besides those with an effect: none and two catch-alls
 
 
 class Criticism:
@@ -172,7 +169,7 @@ class Criticism:
         self._residuals: Residuals | None = None
         self._detection: Detection | None = None
         self._tracing: Tracing | None = None
-        self._verdict: Verdict | Sampled | None = None
+        self._verdict: Verdict | None = None
 
     def _look(self) -> None:
         """Make the models of the trials that are there."""
@@ -189,13 +186,10 @@ class Criticism:
         # Each model's held-out errors would take as much as the verdict.
         self._scored = None if self._is_large else trials.held_out
 
-    def _judge(self) -> Verdict | Sampled:
-        """Return what decides: linear models, or samples where none has the error."""
+    def _judge(self) -> Verdict:
+        """Return what the models say."""
         if self._verdict is None:
             search, groups = self._linear, self.equivalent()
-            if search is None or not is_linear(self.rivals):
-                self._verdict = Sampled(self.rivals, groups)
-                return self._verdict
             with self._fitting("models fitted"):
                 self._verdict = judge(search, groups, self.rule)
             if self._verdict.is_missed and not self.set_aside:
@@ -212,11 +206,10 @@ class Criticism:
     def misfit(self) -> Verdict | None:
         """Return the models where none explains the trials to the sensor's error.
 
-        None if one does, or where the size of that error is not declared, or no linear
-        model has it: the simulator is random, or jumps without a time axis.
+        None if one does, or where the size of that error is not declared.
         """
         found = self._judge()
-        return found if isinstance(found, Verdict) and found.is_missed else None
+        return found if found.is_missed else None
 
     def residuals(self) -> Residuals:
         """Return the residuals of the bare model."""
@@ -241,13 +234,7 @@ class Criticism:
     def detect(self) -> Detection:
         """Return whether the bare model misses the data."""
         if self._detection is None:
-            found = self._judge()
-            if isinstance(found, Verdict):
-                self._detection = found.detection
-            else:
-                num = len(self.rivals.effects) + NUM_OTHERS
-                with self._fitting("models fitted", num):
-                    self._detection = found.detected()
+            self._detection = self._judge().detection
         return self._detection
 
     def trace(self) -> Tracing:
@@ -260,14 +247,12 @@ class Criticism:
         return self._tracing
 
     def _traced(self, *, compare: bool = True) -> Tracing:
-        found, detection = self._judge(), self.detect()
+        found = self._judge()
         # What separates effects of a large library, the next action looks for.
         actions = None if self._is_large else self.actions
         options = {"actions": actions, "compare": compare, "near": not self._is_large}
         with self._fitting("verdict, sets of effects fitted"):
-            if isinstance(found, Verdict):
-                return traced(found, self._scored, **options)
-            return trace(found, detection, **options)
+            return traced(found, self._scored, **options)
 
     def add(
         self, effects: Sequence[str] | None = None

@@ -7,7 +7,6 @@ from typing import Any, Literal
 
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from sbi_active.criticism.contradictions import Bounds, MissedTrial, OutlyingTrial
 from sbi_active.criticism.under_misfit import Misfit
@@ -112,8 +111,7 @@ class Evidence:
         standard_error: Standard error of log Z, Monte Carlo, nats.
         effective_sample_size: Number of draws that count.
         engine: Method that gave the evidence: "importance" sampling around least
-            squares, "smc" (sequential Monte Carlo), or of a model far behind "laplace"
-            or "linear".
+            squares, "smc" (sequential Monte Carlo), or "linear".
         num_simulations: Trials simulated.
         names: Names of the coordinates (theta, phi).
         draws: Posterior draws of (theta, phi), shape (m, dim).
@@ -147,8 +145,6 @@ class Detection:
     Attributes:
         log_bayes_factor: Log Bayes factor of the mixture of effects and catch-alls
             against the bare model, nats.
-        standard_error: Monte Carlo standard error, nats.
-        lower: log_bayes_factor minus twice its standard error.
         threshold: log 20.
         chi_square: Smallest whitened residual sum of squares of the bare model.
         degrees_of_freedom: Measurements less the parameters that they determine.
@@ -156,8 +152,6 @@ class Detection:
         level: Level below which it is an alarm; 0 where something is unknown of the
             noise.
         null_log_evidence: Log evidence by least squares, nats.
-        null_cross_check: Log evidence from other starts; None if no alarm was near
-            or these ended in the same place.
         least_chi_square: The smallest of any parameters that were tried; NaN where the
             size of the noise is not declared.
         lower_p_value: Probability of one as small, all parameters taken as determined;
@@ -165,15 +159,12 @@ class Detection:
     """
 
     log_bayes_factor: float
-    standard_error: float
-    lower: float
     threshold: float
     chi_square: float
     degrees_of_freedom: float
     p_value: float
     level: float
     null_log_evidence: float
-    null_cross_check: float | None
     least_chi_square: float = float("nan")
     lower_p_value: float = 1.0
 
@@ -185,24 +176,12 @@ class Detection:
     @property
     def by_evidence(self) -> bool:
         """Whether the Bayes factor raises the alarm."""
-        return self.lower > self.threshold
+        return self.log_bayes_factor > self.threshold
 
     @property
     def by_chi_square(self) -> bool:
         """Whether the chi-square raises the alarm."""
         return self.p_value < self.level
-
-    def refutes(self, evidence: Evidence, level: float) -> bool:
-        """Return whether known noise leaves no room for what a model leaves over.
-
-        Degrees of freedom are those of the bare model, a few too many.
-
-        Args:
-            evidence: Evidence of the model.
-            level: Tail probability below which there is none.
-        """
-        left = chi2.sf(evidence.best_chi_square, self.degrees_of_freedom)
-        return self.level > 0 and bool(left < level)
 
 
 @dataclass(frozen=True, kw_only=True)

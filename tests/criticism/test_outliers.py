@@ -2,20 +2,14 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from scipy.stats import norm
 from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, StudentTNoise
 from sbi_active.criticism import Criticism, Effect, Trials, close_loop
-from sbi_active.criticism.data import Measurements
-from sbi_active.criticism.evidence.outliers import OneOutlier
-from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.report.summary import suspects, verdict_line
-from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.steps.influence import (
     is_left_to_chance,
     unless_refuted,
@@ -51,43 +45,6 @@ def measured(xi=XI, *, quadratic=0.0, seed=0):
 def criticism(x, *, xi=XI, model=MODEL, **options):
     trials = Trials(xi, x, **options)
     return Criticism(model, PRIOR, trials, effects=[QUADRATIC], actions=ACTIONS)
-
-
-def gaussian(measurements, sd=1.0):
-    cell = NoiseCell.of(measurements, sd=np.full(len(measurements), sd))
-    return NoiseGrid([cell])
-
-
-def test_the_density_is_a_mixture_over_trials_and_sizes():
-    m = Measurements.of(Trials(torch.arange(3.0), torch.zeros(3, 1)))
-    error = OneOutlier(gaussian(m, 0.5), m, largest=2_000.0)
-    r = np.array([[0.2, -7.0, 0.4]])
-    sizes = 3.0 ** np.arange(1, 8)
-    share = 6 / np.pi**2 / np.arange(1, 8) ** 2
-    expected = 0.0
-    for k in range(3):
-        others = np.prod([norm.pdf(r[0, j], scale=0.5) for j in range(3) if j != k])
-        wide = (share * norm.pdf(r[0, k], scale=0.5 * sizes)).sum()
-        expected += others * wide / 3
-    assert np.allclose(error.sizes, sizes)
-    assert error.log_likelihood(r)[0] == pytest.approx(np.log(expected))
-    assert error.responsibility(r)[0].argmax() == 1
-
-
-@pytest.mark.parametrize("noise", [GaussianNoise(0.3), StudentTNoise(0.3, 4.0)])
-def test_all_trials_but_one_have_the_noise_alone(noise):
-    model = SimulatorModel(response, noise=noise)
-    rivals = RivalSet(model, PRIOR, Trials(XI, measured()), [])
-    r = np.random.default_rng(0).normal(size=(5, 8))
-    without = rivals.one_outlier().without_each(r)
-    for k in range(8):
-        rest = [j for j in range(8) if j != k]
-        cells = [
-            NoiseCell(c.log_weight, c.sd[rest], c.rho[rest], c.df)
-            for c in rivals.noise.cells
-        ]
-        expected = NoiseGrid(cells).log_likelihood(r[:, rest])
-        assert np.allclose(without[:, k], expected)
 
 
 def test_reports_call_trials_by_their_names():

@@ -92,13 +92,6 @@ class Fit:
         at = rng.choice(len(u), size=len(u), p=normalized(power * log_w))
         return u[at], residual[at]
 
-    def weighted(self) -> tuple[Array, Array, Array]:
-        """Return draws u (n, dim) with a weight, the weights, and residuals (n, N)."""
-        some = self.sample.weight > 0
-        u = self.sample.u[some]
-        residual = self.rival.residual(u, penalized=False)[0]
-        return u, self.sample.weight[some], residual
-
 
 def starts_near_parents(
     fits: Mapping[ModelKey, Fit], rival: Rival, seed: int

@@ -15,9 +15,9 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.evidence.fit import NUM_NEAR, Fit, starts_near_parents
+from sbi_active.criticism.evidence.fit import Fit, starts_near_parents
 from sbi_active.criticism.evidence.jumps import STEPS, look_for_jumps
-from sbi_active.criticism.evidence.outliers import OneOutlier
+from sbi_active.criticism.evidence.predicted_before import NUM_DRAWS as NUM_BEFORE
 from sbi_active.criticism.evidence.predicted_before import predicted_before
 from sbi_active.criticism.evidence.settings import (
     NESTED,
@@ -35,7 +35,6 @@ from sbi_active.criticism.rivals.trial_simulator import (
     NUM_REPLICATES,
     TrialSimulator,
 )
-from sbi_active.criticism.rivals.validity import DISAGREEMENT, UNKNOWN_RATES
 from sbi_active.inference.engine import Found, WeightedDraws, infer, search
 from sbi_active.inference.engine.search import SearchSettings
 from sbi_active.seeding import derive_seed
@@ -52,6 +51,8 @@ NUM_FACTORS = 14
 APART = 100.0
 #: Deviations of the prior predictive beyond which a number counts as that far.
 FARTHEST = 1e3
+#: Deviations of the noise that a gross error may have: it tells next to nothing.
+GROSS = 1e3
 #: Draws of largest weight, among which the best fit is sought.
 NUM_TOP = 20
 
@@ -83,6 +84,7 @@ class RivalSet:
             ``noise`` has on top of the declared one, shape (N,); 0 where it is smooth.
         fits: The rivals that were asked for.
         found: Modes of some that are not fitted yet.
+        suspect: Place of the trial that a gross error is in; None without one.
     """
 
     def __init__(
@@ -123,6 +125,7 @@ class RivalSet:
             self.noise = self.noise.with_extra(self.roughness)
         self.fits: dict[ModelKey, Fit] = {}
         self.found: dict[ModelKey, Found] = {}
+        self.suspect: int | None = None
 
     def noise_of(self, measurements: Measurements) -> NoiseGrid:
         """Return the errors of some measurements."""
@@ -153,11 +156,6 @@ class RivalSet:
             spread=self.spread,
             center=self.center,
             step=self.step,
-            disagreement=(
-                UNKNOWN_RATES
-                if key.error == UNEXPLAINED and self.can_fail
-                else (DISAGREEMENT,)
-            ),
         )
 
     def _error_model(self, error: str | None) -> ErrorModel:
@@ -165,15 +163,10 @@ class RivalSet:
             return scattered(self.noise)
         if error == UNEXPLAINED:
             return self.residual_process()
-        return self.noise if error is None else self.one_outlier()
-
-    def one_outlier(self) -> OneOutlier:
-        """Return the noise with a gross error in one trial."""
-        if not hasattr(self, "_outlier"):
-            noise = self.noise.settled(self._bare_residual)
-            off = np.abs(self.measurements.x - self.center) / noise.typical_sd
-            self._outlier = OneOutlier(noise, self.measurements, largest=off.max())
-        return self._outlier
+        if error is None or self.suspect is None:
+            return self.noise
+        at = self.measurements.trial == self.suspect
+        return self.noise.with_extra(np.where(at, GROSS * self.noise.typical_sd, 0.0))
 
     @property
     def has_known_noise(self) -> bool:
@@ -270,56 +263,18 @@ class RivalSet:
         how = how if self.is_smooth else ROUGH
         return _searched(rival, near, how, seed)
 
-    def search_again(self) -> Found:
-        """Return the bare model's modes from where other models have its parameters.
-
-        A missing effect may have drawn the first search away from a mode that the model
-        with this effect shows.
-        """
-        rival, seed = self.rival(ModelKey()), derive_seed(self.seed, "again")
-        others = [other for key, other in self.fits.items() if key != ModelKey()]
-        others.sort(key=lambda other: -other.evidence.log_evidence)
-        near = None
-        if others:
-            z = [
-                other.rival.coordinates.to_z(other.likeliest)[:, : rival.dim]
-                for other in others[:NUM_NEAR]
-            ]
-            near = rival.coordinates.from_z(np.concatenate(z))
-        return _searched(rival, near, NESTED, seed)
-
-    def fit_again(self) -> Evidence:
-        """Return the bare model's evidence by other modes, kept where it is larger."""
-        found = self.search_again()  # simulated already, where it was looked at
-        own, seed = self.fit().evidence, derive_seed(self.seed, "again, sampled")
-        rival, before = self.rival(ModelKey()), self.simulator.num_simulations
-        sample = self._inferred(rival, found, np.random.default_rng(seed))
-        other = self._record(rival, sample, before, seed)
-        both = float(np.hypot(own.standard_error, sample.standard_error))
-        if sample.log_evidence > own.log_evidence + 2 * both:
-            self.fits[ModelKey()] = other
-        return other.evidence
-
     def _inferred(
         self, rival: Rival, found: Found, rng: np.random.Generator
     ) -> WeightedDraws:
         is_bare = rival.key == ModelKey()
         repeats = NUM_REPLICATES if self.simulator.is_stochastic else 1
-        settings = settings_of(
-            len(self.trials) * repeats, is_bare=is_bare, is_smooth=self.is_smooth
-        )
-        best = -np.inf if is_bare else self._best_evidence()
-        fit = infer(rival, rng, found=found, rivaled=best, settings=settings)
+        settings = settings_of(len(self.trials) * repeats, is_bare=is_bare)
+        fit = infer(rival, rng, found=found, settings=settings)
         if len(fit.u):
             return fit
         u = rival.sample_prior(NUM_DRAWS, rng)  # nothing has a likelihood
         equal = np.full(len(u), 1 / len(u))
         return replace(fit, u=u, weight=equal, log_likelihood=equal * -np.inf)
-
-    def _best_evidence(self) -> float:
-        """Return the largest log evidence so far."""
-        known = [fit.evidence.log_evidence for fit in self.fits.values()]
-        return float(max(known, default=-np.inf))
 
     def _record(
         self,
@@ -330,8 +285,6 @@ class RivalSet:
     ) -> Fit:
         u = sample.draws(NUM_DRAWS, np.random.default_rng(seed))
         best = sample.u[np.argsort(sample.weight)[-NUM_TOP:]]
-        if sample.method == "laplace":
-            best = sample.u[:1]  # its mode, before draws that nobody simulated
         own = sum(rival.coordinates.joint.sizes)
         residual = rival.residual(best, penalized=False)[0]
         square = [(rival.error.whitener(r)(r) ** 2).sum() for r in residual]
@@ -354,6 +307,18 @@ class RivalSet:
         if names is None:
             names = [f"theta_{i + 1}" for i in range(self.prior.event_shape[0])]
         return (*names, *[n for e in rival.effects for n in e.phi_names])
+
+    def typical_deviation(self) -> Array:
+        """Return the deviation of a random simulator's numbers before the data, (N,).
+
+        It is the geometric mean over draws of the prior.
+        """
+        c = self.rival(ModelKey()).coordinates
+        u = c.sample(NUM_BEFORE, seed=derive_seed(self.seed, "spread"))
+        sd = self.simulator.predict(*c.split(u))[1]
+        assert sd is not None  # it is random
+        log_sd = np.log(np.where(np.isfinite(sd), sd, self.spread))
+        return np.exp(log_sd.mean(0))
 
     def prior_predictive(self, simulator: TrialSimulator) -> tuple[Array, Array]:
         """Return mean and deviation of each number before the data, shapes (N,)."""

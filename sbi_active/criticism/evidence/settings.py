@@ -31,7 +31,7 @@ ROUGH = replace(NESTED, num_screened=128, num_starts=8, max_starts=8, phases=2)
 MOST = 3_000
 
 
-def settings_of(num_trials: int, *, is_bare: bool, is_smooth: bool) -> Settings:
+def settings_of(num_trials: int, *, is_bare: bool) -> Settings:
     """Return the settings of what is spent on a model.
 
     The bare model is every comparison's other side, and its posterior is shown; an
@@ -40,22 +40,17 @@ def settings_of(num_trials: int, *, is_bare: bool, is_smooth: bool) -> Settings:
     Args:
         num_trials: Number of simulated trials in a row.
         is_bare: Whether it is the model without effects.
-        is_smooth: Whether derivatives mean anything; a mode is wider than they say
-            otherwise, and a likelihood higher than at any that was found.
     """
-    own = Settings(plenty=4.0, num_simulations=3 * MOST * num_trials)
-    if not is_bare:
-        own = Settings(
-            num_effective=50.0,
-            plenty=1.0,
-            divergence=np.inf,
-            num_draws=100,
-            fewest=25.0,
-            affordable=5.0,
-            broad=60.0,
-            share_of_plenty=0.0,
-            num_simulations=MOST * num_trials,
-        )
-    if is_smooth:
-        return own
-    return replace(own, laplace_wider=2.8, far_behind=np.inf)
+    if is_bare:
+        return Settings(plenty=4.0, num_simulations=3 * MOST * num_trials)
+    return Settings(
+        num_effective=50.0,
+        plenty=1.0,
+        divergence=np.inf,
+        num_draws=100,
+        fewest=25.0,
+        affordable=5.0,
+        broad=60.0,
+        share_of_plenty=0.0,
+        num_simulations=MOST * num_trials,
+    )

@@ -81,7 +81,7 @@ class Linear:
         if tried is None:
             columns = self.model.jacobian[:, ~free]
         else:
-            columns = chords(self.rival, at, ~free, tried, model.residual, unit)
+            columns = chords(self.rival, at, ~free, tried, model, unit)
         full = enlarged(model, self.rival, ~free, at[~free], columns)
         return replace(self, unit=unit, model=full)
 

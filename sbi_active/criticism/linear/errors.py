@@ -162,8 +162,12 @@ class Errors:
         return np.concatenate(each) - np.log(len(each))
 
     def grams(self, rows: Array) -> Grams:
-        """Return the Gram matrices of rows (N, k), the sensor's errors first."""
-        k, f = rows.shape[1], self.num_folds
+        """Return the Gram matrices of rows (N, k), the sensor's errors first.
+
+        Of 2 N rows the last are what no error changes.
+        """
+        k, f, size = rows.shape[1], self.num_folds, len(self.measurements)
+        every, rows = rows, rows[:size]
         n, num = len(self.log_sensor), len(self.log_sensor) + len(self.log_prior)
         count = np.bincount(self.fold, minlength=f)
         gram, log_det = np.zeros((num, f, k, k)), np.zeros((num, f))
@@ -189,7 +193,20 @@ class Errors:
                 to = slice(at + v * len(growth), at + (v + 1) * len(growth))
                 gram[to, j] = plain - growth[:, None, None] * np.outer(pull, pull)
                 log_det[to, j] = np.log1p(self.spreads**2 * square)
+        for j in range(f) if len(every) > size else ():
+            gram[:, j] += self.unchanged(every, np.arange(f) == j)
         return Grams(gram, log_det, count)
+
+    def unchanged(self, rows: Array, use: NDArray[np.bool_]) -> Array:
+        """Return the Gram matrix of the rows that no error changes, shape (k, k).
+
+        Args:
+            rows: Rows, shape (N, k) without any or (2 N, k).
+            use: Parts of the trials that count, shape (f,).
+        """
+        extra = rows[len(self.fold) :]
+        extra = extra[use[self.fold][: len(extra)]]
+        return extra.T @ extra
 
     def posterior(
         self,
@@ -213,6 +230,7 @@ class Errors:
         gram = grams.gram[:, use].sum(1)
         log_weight = np.concatenate([self.log_sensor, self.log_prior])
         log_weight += self.constants(grams, use)
+        log_weight += model.offset[use[self.fold]].sum()
         n, widths = len(self.log_sensor), [factor * width for width in WIDTHS]
         sensor = summed(gram[:n], log_weight[:n], model, widths)
         beside = summed(gram[n:], log_weight[n:], model, widths)
@@ -257,10 +275,11 @@ class Errors:
             Gram matrices, shape (c j s, k, k), and log weights, shape (c j s,).
         """
         grams, log_weight, own = [], [], use[self.fold]
+        extra, rows = self.unchanged(rows, use), rows[: len(own)]
         each = product(self.cells, self.scales)
         for (cell, size), log_p in zip(each, self.log_sensor, strict=True):
             white = cell.whiten(rows.T / (size * factors[:, None]))[..., own]
-            grams.append(white @ np.swapaxes(white, 1, 2))
+            grams.append(white @ np.swapaxes(white, 1, 2) + extra)
             scale = np.log(cell.sd * size * factors) + 0.5 * np.log1p(-(cell.rho**2))
             log_det = scale[:, own].sum(1)
             log_weight.append(log_p - log_det - 0.5 * own.sum() * LOG_2PI)

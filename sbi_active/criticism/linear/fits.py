@@ -12,7 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.criticism.linear.model import LinearModel, centered, linearize
+from sbi_active.criticism.linear.model import (
+    LinearModel,
+    centered,
+    linearize,
+    searched_from,
+)
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.sampling.least_squares import descend
 
@@ -86,7 +91,7 @@ def best_fit(rival: Rival, u: Array, unit: Array, settings: FitSettings) -> Line
     scale = max(float(np.sqrt(np.mean(r[order[0]] ** 2))), 1.0)
     u, cost = along_secants(rival, u, unit * scale, own.first)
     best = u[np.argsort(cost)[: own.num_kept]]
-    return min((polished(rival, p, unit, own) for p in best), key=lambda fit: fit.rms)
+    return min((polished(rival, p, unit, own) for p in best), key=lambda fit: fit.cost)
 
 
 def polished(rival: Rival, u: Array, unit: Array, settings: FitSettings) -> LinearModel:
@@ -103,9 +108,12 @@ def polished(rival: Rival, u: Array, unit: Array, settings: FitSettings) -> Line
         scale = max(model.rms, 1.0)
         if model.promised < settings.worth * scale**2:
             break
-        known = model.residual[None] / scale, model.jacobian[None] / scale
-        start = np.clip(model.u, model.low, model.high)[None]
-        new, _ = along_secants(rival, start, unit * scale, settings.secant, known)
+        r, jacobian = searched_from(rival, model)
+        known = r[None] / scale, jacobian[None] / scale
+        start, wide = np.clip(model.u, model.low, model.high)[None], unit * scale
+        if np.isfinite(rival.df):
+            wide = wide * model.scale
+        new, _ = along_secants(rival, start, wide, settings.secant, known)
         if (new[0] == model.u).all():
             break
         model = linearize(rival, new[0], unit)

@@ -120,10 +120,13 @@ def leave_out(
     """
     f = errors.num_folds
     use = np.ones(f, bool) if folds is None else folds
-    rows = model.rows * np.sqrt(weight)[..., None]
+    weight = np.broadcast_to(weight, model.num)
+    fold, each = (np.resize(a, len(model.residual)) for a in (errors.fold, weight))
+    rows = model.rows * np.sqrt(each)[:, None]
     rows[:, 0] -= rows[:, 1:] @ (model.center - model.u)
-    scaled = rows / max(float(np.sqrt(np.mean(weight * model.residual**2))), 1.0)
-    gram = np.stack([_gram(scaled[errors.fold == j]) for j in range(f)])
+    scaled = rows / max(float(np.sqrt(np.mean(each * model.residual**2))), 1.0)
+    gram = np.stack([_gram(scaled[fold == j]) for j in range(f)])
+    rows, scaled = rows[: model.num], scaled[: model.num]
     gram[~use] = 0.0
     total = gram.sum(0)
     prior = np.diag(1 / model.widened(WIDTH) ** 2)
@@ -138,13 +141,15 @@ def leave_out(
     error = np.where(kept, error, np.nan)
     count = np.bincount(errors.fold[kept], minlength=f)
     square = np.bincount(errors.fold[kept], error[kept] ** 2, f) / count
+    # Of models with other units of their residuals errors are compared in the sensor's.
+    wide = np.bincount(errors.fold, model.scale**2, f) / np.bincount(errors.fold)
     is_free = (refits > low) & (refits < high)
     precision = total[1:, 1:] + prior
     expected = _expected(scaled, error, errors, precision, is_free) / count
     return LeftOut(
-        np.where(use, square, np.nan),
-        np.where(use, square - expected, np.nan),
-        error,
+        np.where(use, wide * square, np.nan),
+        np.where(use, wide * (square - expected), np.nan),
+        model.scale * error,
         refits + model.center,
         fit + model.center,
     )

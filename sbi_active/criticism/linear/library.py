@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sbi_active.criticism.linear.errors import Errors, Grams, Posterior
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.steps.combinations import log_prior
+from sbi_active.criticism.steps.tracing import log_prior
 
 Array = NDArray[Any]
 
@@ -126,4 +126,7 @@ class Library:
             high=shifted("high"),
             own=fitted.own,
             trial_of=joined("trial_of"),
+            num=fitted.num,
+            scale=fitted.scale,
+            offset=fitted.offset,
         )

@@ -11,6 +11,7 @@ from scipy.stats import chi2
 
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.rivals.error_models import LOG_2PI, student
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.sampling.least_squares import within
 
@@ -30,8 +31,9 @@ class LinearModel:
     Attributes:
         key: Key of the rival.
         u: Point at which it is linearized, shape (d,).
-        residual: Residual there, in standard deviations of the sensor, shape (N,).
-        jacobian: Derivatives of the residual, shape (N, d).
+        residual: Residual there, in standard deviations of the sensor, shape (N,); of
+            a random simulator twice as long, with one for each deviation.
+        jacobian: Derivatives of the residual, shape (N, d) or (2 N, d).
         center: Center of the prior, shape (d,).
         sd: Standard deviation of the prior, shape (d,).
         scaled: Coordinates of effects whose prior has an unknown scale, bool, (d,).
@@ -39,6 +41,11 @@ class LinearModel:
         high: Upper bounds, shape (d,).
         own: Coordinates of theta and phi; those of the trials' nuisances follow.
         trial_of: The trial that each coordinate belongs to, -1 for all, shape (d,).
+        num: Number of measured numbers, N.
+        scale: Unit of each residual in deviations of the sensor, shape (N,); one unless
+            errors have heavy tails, or the simulator is random or gives no number.
+        offset: Log densities of the numbers at the best fit less those of Gaussian
+            residuals, shape (N,); zero for Gaussian errors that are declared.
     """
 
     key: ModelKey
@@ -52,6 +59,14 @@ class LinearModel:
     high: Array
     own: int
     trial_of: NDArray[np.int64]
+    num: int
+    scale: Array
+    offset: Array
+
+    @property
+    def cost(self) -> float:
+        """Twice the negative log likelihood at the best fit, but for a constant."""
+        return float((self.residual**2).sum() - 2 * self.offset.sum())
 
     @property
     def rows(self) -> Array:
@@ -65,13 +80,13 @@ class LinearModel:
     @property
     def rms(self) -> float:
         """Root mean square of the residual, in standard deviations of the sensor."""
-        return float(np.sqrt(np.mean(self.residual**2)))
+        return float(np.sqrt(np.mean(self.residual[: self.num] ** 2)))
 
     @property
     def chi_square(self) -> tuple[float, int, float]:
         """Against the sensor's error: its value, degrees of freedom and tail."""
-        square = float((self.residual**2).sum())
-        freedom = max(len(self.residual) - len(self.u), 1)
+        square = float((self.residual[: self.num] ** 2).sum())
+        freedom = max(self.num - len(self.u), 1)
         return square, freedom, float(chi2.sf(square, freedom))
 
     @property
@@ -103,16 +118,58 @@ class LinearModel:
         return np.where(self.scaled, width * self.sd, self.sd)
 
 
-def linearize(rival: Rival, u: Array, unit: Array) -> LinearModel:
-    """Return a rival linearized at one point, by steps to one side.
+def linearize(
+    rival: Rival, u: Array, unit: Array, step: float | None = None
+) -> LinearModel:
+    r"""Return a rival linearized at one point, by steps to one side.
+
+    Errors with heavy tails are those of a Gaussian that is wider for each number by
+    what its own residual says (iteratively reweighted least squares),
+
+    .. math::
+        w_i^2 = \frac{\nu + 1}{\nu - 2 + r_i^2}.
+
+    The deviations :math:`s_i` of a random simulator have residuals of their own, by
+    Fisher's scores of the Gaussian likelihood,
+
+    .. math::
+        \frac{1 - r_i^2}{\sqrt2}, \qquad \sqrt2\, \frac{\partial \log s_i}{\partial u},
+
+    so that both together have its gradient and its expected curvature; what its value
+    at the fit is besides stands in ``offset``.
 
     Args:
         rival: Rival with effects that change the prediction.
         u: Point of linearization, shape (d,).
         unit: Standard deviation of the sensor, shape (N,).
+        step: Step of finite differences; None takes the rival's.
     """
-    r, jacobian = rival.jacobian(u[None], lambda residual: residual / unit, rival.step)
-    return with_prior(rival, u, r[0], jacobian[0])
+    step = rival.step if step is None else step
+    r, jacobian = rival.jacobian(u[None], lambda residual: residual / unit, step)
+    residual, jacobian, num = r[0], jacobian[0], rival.num_observed
+    scale, offset = np.ones(num), np.zeros(num)
+    if rival.simulator.failed or rival.reference is not None:
+        # A number that the simulator does not give has the prior predictive.
+        own, log_scale, _ = rival.residual(u[None], penalized=False)
+        residual, log_scale = own[0] / unit, np.resize(log_scale[0], num)
+        if rival.reference is not None:
+            log_scale = log_scale - np.log(rival.reference)
+            slope, own = jacobian[num:] * residual[num:, None], residual[:num]
+            # Far out a number is no typical one, and its score no slope of a Gaussian.
+            scores = (1 - np.minimum(own**2, 4.0)) / np.sqrt(2)
+            jacobian = np.concatenate(
+                [jacobian[:num] + own[:, None] * slope, np.sqrt(2) * slope]
+            )
+            residual = np.append(own, scores)
+        scale, offset = np.exp(log_scale), -log_scale
+        offset = offset + 0.5 * residual[num:] ** 2 if len(residual) > num else offset
+    if np.isfinite(rival.df):
+        weight = np.sqrt((rival.df + 1) / (rival.df - 2 + residual**2))
+        offset = offset + student(residual, rival.df) + 0.5 * LOG_2PI
+        residual, jacobian = weight * residual, weight[:, None] * jacobian
+        scale, offset = scale / weight, offset + 0.5 * residual**2
+    model = with_prior(rival, u, residual, jacobian)
+    return replace(model, scale=scale, offset=offset)
 
 
 def centered(rival: Rival, model: LinearModel, unit: Array) -> LinearModel:
@@ -126,9 +183,8 @@ def centered(rival: Rival, model: LinearModel, unit: Array) -> LinearModel:
         model: Rival linearized by steps to one side.
         unit: Standard deviation of the sensor, shape (N,).
     """
-    at, step = model.u[None], -rival.step
-    _, jacobian = rival.jacobian(at, lambda residual: residual / unit, step)
-    return replace(model, jacobian=(model.jacobian + jacobian[0]) / 2)
+    other = linearize(rival, model.u, unit, step=-rival.step)
+    return replace(model, jacobian=(model.jacobian + other.jacobian) / 2)
 
 
 def with_prior(rival: Rival, u: Array, residual: Array, jacobian: Array) -> LinearModel:
@@ -155,6 +211,9 @@ def with_prior(rival: Rival, u: Array, residual: Array, jacobian: Array) -> Line
         high=c.high,
         own=sum(c.joint.sizes),
         trial_of=c.trial_of(),
+        num=rival.num_observed,
+        scale=np.ones(rival.num_observed),
+        offset=np.zeros(rival.num_observed),
     )
 
 
@@ -177,7 +236,8 @@ def enlarged(
     u, jacobian = np.empty(rival.dim), np.empty((len(model.residual), rival.dim))
     u[~new], jacobian[:, ~new] = model.u, model.jacobian
     u[new], jacobian[:, new] = values, columns
-    return with_prior(rival, u, model.residual, jacobian)
+    larger = with_prior(rival, u, model.residual, jacobian)
+    return replace(larger, scale=model.scale, offset=model.offset)
 
 
 def chords(
@@ -185,10 +245,10 @@ def chords(
     u: Array,
     new: NDArray[np.bool_],
     tried: Array | float,
-    residual: Array,
+    model: LinearModel,
     unit: Array,
 ) -> Array:
-    """Return derivatives of the residual by some coordinates, shape (N, k).
+    """Return derivatives of a model's residual by further coordinates, shape (N, k).
 
     They are difference quotients over a step within the bounds and no tangents: many
     effects are flat at their null.
@@ -198,7 +258,7 @@ def chords(
         u: Point to start from, shape (d,).
         new: Mask of the new coordinates, bool, shape (d,).
         tried: Length of the step, one or one each, shape (k,).
-        residual: Residual at u, in units, shape (N,).
+        model: Model without them, fitted at u.
         unit: Standard deviation of each number's error, shape (N,).
     """
     where = np.flatnonzero(new)
@@ -207,9 +267,35 @@ def chords(
     points = np.repeat(u[None], len(where), 0)
     points[np.arange(len(where)), where] += step
     if not len(where):
-        return np.empty((len(residual), 0))
-    r = rival.residual(points)[0] / unit
-    return ((r - residual) / step[:, None]).T
+        return np.empty((len(model.residual), 0))
+    r, before, num = rival.residual(points)[0] / unit, model.residual, model.num
+    if rival.reference is not None:
+        # Half of a square is a log; deviations stay those of the fit.
+        own = rival.residual(u[None])[0][0]
+        change = 0.5 * (r[:, num:] ** 2 - own[num:] ** 2)
+        r = np.concatenate([r[:, :num] * np.exp(change), np.sqrt(2) * change], 1)
+        before = np.append(before[:num], np.zeros(num))
+    if np.isfinite(rival.df):
+        r /= model.scale
+    return ((r - before) / step[:, None]).T
+
+
+def searched_from(rival: Rival, model: LinearModel) -> tuple[Array, Array]:
+    """Return the residual and the derivatives that a search from a model goes on from.
+
+    Args:
+        rival: Rival with the model's coordinates.
+        model: Linear model of it.
+
+    Returns:
+        Shapes (N,) and (N, d), or (2 N,) and (2 N, d) of a random simulator.
+    """
+    if rival.reference is None:
+        return model.residual, model.jacobian
+    num, r = model.num, rival.residual(model.u[None])[0][0]
+    slope = model.jacobian[num:] / np.sqrt(2)
+    jacobian = model.jacobian[:num] - r[:num, None] * slope
+    return r, np.concatenate([jacobian, slope / np.maximum(r[num:, None], 1e-3)])
 
 
 def at_null(rival: Rival, effect: Effect, tried: float) -> tuple[Array, Array]:

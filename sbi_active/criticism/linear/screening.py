@@ -47,7 +47,7 @@ class Screening:
     behind: dict[str, float]
 
 
-def linear_models(rivals: RivalSet) -> tuple[Search | None, Screening | None]:
+def linear_models(rivals: RivalSet) -> tuple[Search, Screening | None]:
     """Return linear models of the trials, and which effects were set aside.
 
     Prior probabilities stay those of the whole library: what was looked at and set
@@ -57,12 +57,9 @@ def linear_models(rivals: RivalSet) -> tuple[Search | None, Screening | None]:
         rivals: The models, with all effects; what is set aside leaves them.
 
     Returns:
-        None for models where the sensor's error is not Gaussian, or the simulator is
-        random or jumps; None for a screening where all effects are to be fitted.
+        The models; None for a screening where all effects are to be fitted.
     """
     sensor = sensor_of(rivals)
-    if sensor is None:
-        return None, None
     prior = log_priors(rivals.library, ())
     search = Search(rivals, sensor, prior)
     if isinstance(rivals.noise, ChannelNoise):
@@ -72,7 +69,6 @@ def linear_models(rivals: RivalSet) -> tuple[Search | None, Screening | None]:
         models = [c.model for c in search.found.values()]
         best = min(models, key=lambda model: _log_sizes(model.residual, channel))
         sensor = sensor_of(rivals, [search.model(ModelKey()), best])
-        assert sensor is not None
         search = Search(rivals, sensor, prior)
     found = None
     if len(rivals.effects) > MANY:
@@ -103,7 +99,7 @@ def _with_kin(found: Screening, search: Search) -> Screening:
     keys = [k for k in search.found if k.effects]
     if search.explains or not keys:
         return found
-    closest = min(keys, key=lambda k: search.found[k].model.rms)
+    closest = min(keys, key=lambda k: search.found[k].model.cost)
     family = effects[closest.effects[0]].family
     if not is_force(effects[closest.effects[0]]):
         return found

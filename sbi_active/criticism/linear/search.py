@@ -35,12 +35,13 @@ from sbi_active.criticism.linear.model import (
     chords,
     enlarged,
     has_null,
+    searched_from,
 )
 from sbi_active.criticism.linear.sensor import Sensor
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
-from sbi_active.criticism.steps.combinations import log_prior
+from sbi_active.criticism.steps.tracing import log_prior
 from sbi_active.seeding import derive_seed
 
 Array = NDArray[Any]
@@ -72,6 +73,11 @@ class Search:
         effects = self.rivals.effects.values()
         self.names = [e.name for e in effects if e.hook != "noise"]
         self._rivals: dict[ModelKey, Rival] = {}
+        self._reference: Array | None = None
+        self._units = self.sensor.unit
+        if self.rivals.simulator.is_stochastic:
+            self._reference = self.sensor.unit
+            self._units = np.ones(2 * len(self._units))
         self._library: Library | None = None
         self._process: ResidualProcess | None = None
         self._looked_again = False
@@ -84,11 +90,11 @@ class Search:
         self._library, self._has_larger = None, False
         self.errors = Errors(
             self.rivals.measurements,
-            self.unit,
+            self.sensor.unit,
             self.sensor.noise,
             largest=bare.rms,
             warm_up=self.rivals.warm_up if self.rivals.nuisances else 0.0,
-            varying=bare.jacobian[:, bare.trial_of < 0],
+            varying=bare.jacobian[: bare.num, bare.trial_of < 0],
         )
         self.keep(bare)
 
@@ -106,10 +112,9 @@ class Search:
         own = self._rival(key)
         best = min(
             (self._polished(own, u) for u in found.modes[: settings.num_kept]),
-            key=lambda fit: fit.rms,
+            key=lambda fit: fit.cost,
         )
-        before = self.found[key].model
-        fall = len(before.residual) * (before.rms**2 - best.rms**2)
+        fall = self.found[key].model.cost - best.cost
         if fall < settings.worth * max(best.rms, 1.0) ** 2:
             return False
         self._begin(best)
@@ -158,10 +163,10 @@ class Search:
         bare, rival = self.found[ModelKey()].model, self._rival(ModelKey())
         best = {key: self.columns(key, ModelKey()) for key in self._best(1)}
         u = np.array([self.found[k].model.u[own] for k, own in best.items()])
-        square = ((rival.residual(u)[0] / self.unit) ** 2).mean(1)
+        square = ((rival.residual(u)[0] / self._units) ** 2)[:, : bare.num].mean(1)
         if square.min() < 2 * bare.rms**2:
             again = self._polished(rival, u[int(np.argmin(square))])
-            if again.rms < bare.rms:
+            if again.cost < bare.cost:
                 self.keep(again)
 
     def fit_larger(self) -> None:
@@ -211,8 +216,11 @@ class Search:
         """
         if self._process is None:
             self._process = self.rivals.residual_process(self.sensor.noise)
-        grams, log_weight = self._process.grams(self.unit[:, None] * model.rows)
-        return grams, log_weight + np.log(self.unit).sum()  # of sensor deviations
+        rows, unit = model.rows, self.unit
+        grams, log_weight = self._process.grams(unit[:, None] * rows[: model.num])
+        use = np.ones(self.errors.num_folds, bool)
+        grams = grams + self.errors.unchanged(rows, use)
+        return grams, log_weight + np.log(unit).sum()  # of sensor deviations
 
     @property
     def explains(self) -> bool:
@@ -243,13 +251,13 @@ class Search:
         start = np.empty(rival.dim)
         own = ~self.columns(key, base)
         start[~own], start[own] = model.u, null
-        slope = chords(rival, start, own, step, model.residual, self.unit)
+        slope = chords(rival, start, own, step, model, self._units)
         return enlarged(model, rival, own, null, slope), own
 
     def rms(self, key: ModelKey, u: Array) -> float:
         """Return the rms residual of a model anywhere, in sensor deviations."""
-        r = self._rival(key).residual(u[None])[0] / self.unit
-        return float(np.sqrt(np.mean(r**2)))
+        r = self._rival(key).residual(u[None])[0] / self._units
+        return float(np.sqrt(np.mean(r[:, : len(self.unit)] ** 2)))
 
     # Which sets are worth a fit.
 
@@ -264,7 +272,7 @@ class Search:
         orders = [
             sorted(keys, key=lambda k: -found[k].log_p_sensor),
             sorted(keys, key=lambda k: -found[k].log_p),
-            sorted(keys, key=lambda k: found[k].model.rms),
+            sorted(keys, key=lambda k: found[k].model.cost),
         ]
         picked = [key for rank in zip(*orders, strict=True) for key in rank]
         return [*dict.fromkeys(picked)][: self.settings.num_bases]
@@ -304,7 +312,8 @@ class Search:
 
     def _rival(self, key: ModelKey) -> Rival:
         if key not in self._rivals:
-            self._rivals[key] = self.rivals.rival(key)
+            self._rivals[key] = own = self.rivals.rival(key)
+            own.reference, own.df = self._reference, self.sensor.df
         return self._rivals[key]
 
     # The fits.
@@ -314,21 +323,23 @@ class Search:
         # Draws of the prior predictive, which are simulated already.
         seed = derive_seed(self.rivals.seed, "spread")
         u = rival.coordinates.sample(NUM_DRAWS, seed=seed)
-        return best_fit(rival, u, self.unit, self.settings)
+        return best_fit(rival, u, self._units, self.settings)
 
     def _fit(self, key: ModelKey, parents: Sequence[ModelKey]) -> LinearModel:
         """Fit a set of effects from the smaller one that leaves least."""
         rival = self._rival(key)
-        parent = min(parents, key=lambda p: self.found[p].model.rms)
+        parent = min(parents, key=lambda p: self.found[p].model.cost)
         base, model = parent, self.found[parent].model
         for name in key.effects:
             if name not in base.effects:
                 model = self._with_column(model, parent, name)
         scale = max(model.rms, 1.0)
-        known = model.residual[None] / scale, model.jacobian[None] / scale
+        r, jacobian = searched_from(rival, model)
+        known = r[None] / scale, jacobian[None] / scale
         u = np.clip(model.u, model.low, model.high)[None]
-        secant, unit = self.settings.secant, self.unit * scale
-        u, _ = along_secants(rival, u, unit, secant, known)
+        secant, unit = self.settings.secant, self._units * scale
+        own = unit * model.scale if np.isfinite(rival.df) else unit
+        u, _ = along_secants(rival, u, own, secant, known)
         fits = [self._polished(rival, u[0])]
         effects = [self.rivals.effects[n] for n in key.effects]
         is_far = not all(map(has_null, effects))
@@ -336,10 +347,10 @@ class Search:
             # Not linear in phi: it may be far from where its column was taken.
             u, cost = along_secants(rival, self._starts(key, parent), unit, secant)
             fits += [self._polished(rival, p) for p in u[np.argsort(cost)[:2]]]
-        best = min(fits, key=lambda fit: fit.rms)
-        if best.rms > self.found[parent].model.rms:
+        best = min(fits, key=lambda fit: fit.cost)
+        if best.cost > self.found[parent].model.cost:
             again = self._polished(rival, self._faint(key, parent))
-            best = min(best, again, key=lambda fit: fit.rms)
+            best = min(best, again, key=lambda fit: fit.cost)
         return best
 
     def _with_column(
@@ -366,7 +377,7 @@ class Search:
         if not all(has_null(self.rivals.effects[n]) for n in key.effects):
             seed = derive_seed(self._seed, str(key), "screened")
             far = c.sample(own.num_far, seed=seed)
-            square = ((rival.residual(far)[0] / self.unit) ** 2).sum(1)
+            square = ((rival.residual(far)[0] / self._units) ** 2).sum(1)
             starts.append(far[np.argsort(square)[: own.num_kept_far]])
         return np.clip(np.concatenate(starts), c.low, c.high)
 
@@ -385,4 +396,4 @@ class Search:
         return u
 
     def _polished(self, rival: Rival, u: Array) -> LinearModel:
-        return polished(rival, u, self.unit, self.settings)
+        return polished(rival, u, self._units, self.settings)

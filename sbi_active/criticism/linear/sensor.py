@@ -30,18 +30,21 @@ class Sensor:
         unit: Its standard deviation, shape (N,); a typical one where it is unknown.
         noise: Distribution of the error.
         is_known: Whether its size is declared.
+        df: Degrees of freedom of t errors; inf for Gaussian ones.
     """
 
     unit: Array
     noise: NoiseGrid
     is_known: bool
+    df: float = np.inf
 
 
-def sensor_of(rivals: RivalSet, likely: Sequence[LinearModel] = ()) -> Sensor | None:
-    """Return the sensor's error; None where no linear model has it.
+def sensor_of(rivals: RivalSet, likely: Sequence[LinearModel] = ()) -> Sensor:
+    """Return the sensor's error.
 
-    This is so if the simulator is random or jumps, unless ``measurement_sd`` says what
-    the sensor's error is, and if the error is not Gaussian.
+    What a simulator that jumps strays from any smooth function is part of it, unless
+    ``measurement_sd`` says what it is. A random simulator has a deviation of its own,
+    which is the unit.
 
     Args:
         rivals: The models, with the noise as it was declared.
@@ -49,23 +52,25 @@ def sensor_of(rivals: RivalSet, likely: Sequence[LinearModel] = ()) -> Sensor | 
             channel; the bare one is fitted without any.
     """
     noise, m, grid = rivals.model.noise, rivals.measurements, rivals.noise
-    if noise is None:
-        return None
     measured = measurement_sds(noise, m)
     if measured is not None:
         unit = np.broadcast_to(measured, len(m)).astype(float)
         return Sensor(unit, NoiseGrid([NoiseCell.of(m, sd=unit)]), is_known=True)
-    jumps = not rivals.is_smooth or bool(rivals.roughness.any())
-    if jumps or any(np.isfinite(cell.df) for cell in grid.cells):
-        return None
+    df = float(np.median([cell.df for cell in grid.cells]))
+    if np.isfinite(df):
+        grid = grid.of_cells([replace(cell, df=np.inf) for cell in grid.cells])
+    if noise is None:
+        unit = rivals.typical_deviation()
+        cells = [replace(cell, sd=unit) for cell in grid.cells]
+        return Sensor(unit, grid.of_cells(cells), is_known=True)
     unit, is_declared = grid.cells[0].sd, noise.posterior is None
     one_size = all((cell.sd == unit).all() for cell in grid.cells)
     if is_declared and one_size and len(grid.scales) == 1:
-        return Sensor(unit, grid, is_known=True)
+        return Sensor(unit, grid, is_known=True, df=df)
 
     unit = grid.typical_sd
     if not isinstance(grid, ChannelNoise):
-        return Sensor(unit, grid, is_known=False)
+        return Sensor(unit, grid, is_known=False, df=df)
     if not likely:
         rival, seed = rivals.rival(ModelKey()), derive_seed(rivals.seed, "spread")
         u = rival.coordinates.sample(NUM_DRAWS, seed=seed)

@@ -22,9 +22,16 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.linear.left_out import Candidate
 from sbi_active.criticism.linear.mixture import WIDTHS, Mixture, summed
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.results import OUTLIER, SCATTER, UNEXPLAINED, ModelKey
+from sbi_active.criticism.rivals.validity import (
+    DISAGREEMENT,
+    UNKNOWN_RATES,
+    log_outcomes,
+)
+from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.support import support_bounds, support_of
@@ -42,13 +49,17 @@ class States:
         fewest: Trials below which none can be told to have a gross error: two that
             agree outvote one.
         num_louder: Draws of effects on the noise, over which their evidence is a mean.
+        num_outcomes: Posterior draws that tell which trials have an outcome, where the
+            simulator may have none; the rate of one is then known to a tenth.
     """
 
     search: Search
     chance: float
     fewest: int = 3
     num_louder: int = 200
+    num_outcomes: int = 64
     _known: dict[ModelKey, Mixture] = field(default_factory=dict)
+    _valid: dict[ModelKey, Array] = field(default_factory=dict)
 
     def keys(self, key: ModelKey) -> dict[ModelKey, float]:
         """Return a model in each state, and the state's log probability.
@@ -127,6 +138,7 @@ class States:
         some = np.ones(errors.num_folds, bool) if use is None else use
         n, grams = len(errors.log_sensor), c.grams
         log_weight = errors.constants(grams, some)
+        beside = self._beside_numbers(c, key.error, some)
         widths = [factor * width for width in WIDTHS] if key.effects else [1.0]
         gram = grams.gram[:, some].sum(1)
         if key.error == OUTLIER:
@@ -136,9 +148,9 @@ class States:
             log_p = errors.log_sensor + log_weight[:n]
             log_p = log_p - grams.count[some].sum() * np.log(size)[:, None]
             log_p = (log_p - np.log(len(size))).ravel()
-            gram = (gram[:n] / size[:, None, None, None] ** 2).reshape(
-                -1, *gram.shape[1:]
-            )
+            extra = errors.unchanged(c.model.rows, some)
+            gram = (gram[:n] - extra) / size[:, None, None, None] ** 2 + extra
+            gram = gram.reshape(-1, *gram.shape[2:])
         elif key.error == UNEXPLAINED:
             gram, log_p = gram[n:], errors.log_prior + log_weight[n:]
             timed = self.search.rivals.measurements.is_sequence
@@ -156,7 +168,47 @@ class States:
             log_p = log_p - np.log(len(scale))
         else:
             gram, log_p = gram[:n], errors.log_sensor + log_weight[:n]
-        return summed(gram, log_p, c.model, widths)
+        return summed(gram, log_p + beside, c.model, widths)
+
+    def _beside_numbers(
+        self, c: Candidate, error: str | None, use: NDArray[np.bool_]
+    ) -> float:
+        """Return what Gaussian residuals do not say of a model, nats.
+
+        Log densities of its numbers at the best fit, and where the simulator may have
+        no outcome the mean probability of which trials have one.
+
+        Args:
+            c: Fitted model.
+            error: State of the error.
+            use: Parts of the trials that count, shape (f,).
+        """
+        errors, rivals = self.search.errors, self.search.rivals
+        found = float(c.model.offset[use[errors.fold]].sum())
+        if not rivals.can_fail:
+            return found
+        measured = np.unique(rivals.measurements.trial)
+        counts = np.ones(len(rivals.trials), bool)
+        counts[measured] = [bool((own & use).any()) for own in errors.trials]
+        valid = rivals.measurements.valid[counts]
+        rates = UNKNOWN_RATES if error == UNEXPLAINED else (DISAGREEMENT,)
+        log_p = log_outcomes(self._outcomes(c)[:, counts], valid, rates)
+        return found + float(log_sum_exp(log_p) - np.log(len(log_p)))
+
+    def _outcomes(self, c: Candidate) -> Array:
+        """Return the probability that each trial has an outcome, by posterior draws."""
+        key, rivals = c.model.key, self.search.rivals
+        if key not in self._valid:
+            process = c.posterior.log_process > c.posterior.log_sensor
+            own = self.search.errors.posterior(c.model, c.grams, process=process)
+            rng = np.random.default_rng(derive_seed(rivals.seed, "outcomes", str(key)))
+            values, vectors = eigh(own.cov)
+            root = vectors * np.sqrt(np.clip(values, 0, None))
+            u = own.mean + rng.normal(size=(self.num_outcomes, len(root))) @ root.T
+            u = np.clip(u, c.model.low, c.model.high)
+            split = rivals.rival(key).coordinates.split(u)
+            self._valid[key] = rivals.simulator.predict(*split)[2]
+        return self._valid[key]
 
     def predicting(self, key: ModelKey) -> ModelKey:
         """Return the effects of a set that change the prediction."""
@@ -251,6 +303,7 @@ class States:
         """
         cells, model = self.search.errors.cells, self.search.model(self.predicting(key))
         residual, (square, freedom, p) = model.residual[None], model.chi_square
+        residual = residual[:, : model.num]
         if is_louder := bool(self.louder(key)):
             residual = residual / self.louder_draws(key)[1]
         if is_correlated := len(cells) == 1 and bool(cells[0].rho.any()):

@@ -33,18 +33,26 @@ def bends(search: Search, key: ModelKey, *, num: int = 16, most: float = 0.5) ->
             and linear model up to which a model counts as linear, nats. With half, more
             models are sampled.
     """
+    rivals, sensor = search.rivals, search.sensor
+    if not rivals.is_smooth:
+        return False  # its jumps leave any model, and count as noise
     c = search.found[key]
-    m, rng = c.model, np.random.default_rng(derive_seed(search.rivals.seed, "bends"))
+    m, rng = c.model, np.random.default_rng(derive_seed(rivals.seed, "bends"))
     use = np.ones(search.errors.num_folds, bool)
     own = search.errors.posterior(m, c.grams, use, process=False)
     values, vectors = eigh(own.cov)
     spread = vectors * np.sqrt(np.maximum(values, 0))
     u = own.mean + rng.standard_normal((num, len(m.u))) @ spread.T
     u = np.clip(u, m.low, m.high)
-    residual = search.rivals.rival(key).residual(u)[0]
-    linear = search.unit * (m.residual + (u - m.u) @ m.jacobian.T)
-    log_p = search.sensor.noise.log_likelihood
-    return not (log_p(residual) - log_p(linear)).std() < most  # NaN: not simulated
+    rival, linear = rivals.rival(key), m.residual + (u - m.u) @ m.jacobian.T
+    fails = rivals.can_fail and not rivals.measurements.is_sequence
+    if fails or rivals.simulator.is_stochastic:
+        ratio = rival.log_likelihood(u) + 0.5 * (linear**2).sum(1)
+    else:
+        noise = rivals.noise if np.isfinite(sensor.df) else sensor.noise
+        log_p, unit = noise.log_likelihood, search.unit * m.scale
+        ratio = log_p(rival.residual(u)[0]) - log_p(unit * linear)
+    return not ratio.std() < most  # NaN: not simulated
 
 
 def keep_draws(
@@ -81,7 +89,8 @@ def keep_draws(
     """
 
     def linear(u: Array) -> Array:
-        return unit * (model.residual + (u - model.u) @ model.jacobian.T)
+        residual = model.residual + (u - model.u) @ model.jacobian.T
+        return unit * model.scale * residual[:, : model.num]
 
     if key in rivals.fits:
         return rivals.fits[key].evidence

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,17 +21,17 @@ from sbi_active.seeding import derive_seed
 Array = NDArray[Any]
 
 
-def chooses_again(found: object, key: ModelKey) -> TypeGuard[Verdict]:
+def chooses_again(found: Verdict, key: ModelKey) -> bool:
     """Return whether a choice among linear models stands for one among all models.
 
     Without a time axis a model may bend, and trials are few enough to fit all again.
 
     Args:
-        found: Verdict of linear models, or evidence of others.
+        found: Verdict of linear models.
         key: Key of the model that all trials point to.
     """
-    if not isinstance(found, Verdict) or found.is_missed:
-        return isinstance(found, Verdict)
+    if found.is_missed:
+        return True
     search, rivals = found.search, found.rivals
     if not (search.sensor.is_known and rivals.measurements.is_sequence):
         return False
@@ -86,7 +86,7 @@ def _prediction(misfit: Verdict, key: ModelKey, fold: int, place: int) -> Predic
         mean = mean + gain @ (first[:, 0] - first[:, 1:] @ mean)
         cov = cov - gain @ first[:, 1:] @ cov
     at, rows = whole[rest], rows[rest]
-    unit = search.unit[at]
+    unit = (search.unit * model.scale)[at]
     values, vectors = eigh(cov)
     root = vectors * np.sqrt(np.clip(values, 0, None))
     u = mean + rng.normal(size=(NUM_DRAWS, len(root))) @ root.T

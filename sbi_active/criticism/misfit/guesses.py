@@ -131,6 +131,8 @@ def gained_by_guesses(search: Search, key: ModelKey, name: str) -> float:
 def _with_term(model: LinearModel, term: Array) -> LinearModel:
     """Return a model with one more coefficient, as large as its residual may be."""
     size = float(np.sqrt(np.mean(term**2)))
+    column = np.zeros(len(model.residual))
+    column[: model.num] = term / model.scale
 
     def more(values: Array, value: float) -> Array:
         return np.append(values, value)
@@ -139,7 +141,7 @@ def _with_term(model: LinearModel, term: Array) -> LinearModel:
         model,
         key=ModelKey(("formula",)),
         u=more(model.u, 0.0),
-        jacobian=np.concatenate([model.jacobian, -term[:, None]], 1),
+        jacobian=np.concatenate([model.jacobian, -column[:, None]], 1),
         center=more(model.center, 0.0),
         sd=more(model.sd, max(model.rms, 1.0) / size),
         scaled=np.append(model.scaled, True),
@@ -190,7 +192,8 @@ def _distinct(
 def _variables(search: Search, own: NDArray[np.bool_]) -> Iterator[tuple[str, Array]]:
     """Yield variables that a residual of some numbers may follow, shape (N,)."""
     trials, m = search.rivals.trials, search.rivals.measurements
-    predicted = m.x - search.found[ModelKey()].model.residual * search.unit
+    bare = search.found[ModelKey()].model
+    predicted = m.x - bare.residual[: bare.num] * search.unit * bare.scale
     action = trials.action.double().numpy()
     if not trials.action_is_label:
         names = ["xi"]

@@ -68,6 +68,8 @@ def traced(
     rivals, key = found.rivals, found.key
     if found.is_missed:
         return _beside_misfit(found, held_out)
+    if suspects := found.outliers:
+        rivals.suspect = rivals.trials.index.tolist().index(next(iter(suspects)))
     is_unexplained = key.error == UNEXPLAINED  # with an error of no declared size
     chosen = () if is_unexplained else key.effects
     shown = [k for k, p in found.choice.probabilities.items() if p >= SHOWN]
@@ -197,7 +199,9 @@ def _is_sampled(found: Verdict, key: ModelKey) -> bool:
     states, search = found.states, found.search
     if key not in search.found:
         return False
-    if found.rivals.measurements.is_sequence and key not in (ModelKey(), found.key):
+    rivals = found.rivals
+    is_dear = rivals.measurements.is_sequence or rivals.simulator.is_stochastic
+    if is_dear and key not in (ModelKey(), found.key):
         return False
     others = [*search.found, *states.keys(ModelKey())]
     least = max(map(states.log_evidence, others)) - THRESHOLD

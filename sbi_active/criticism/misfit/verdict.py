@@ -18,7 +18,6 @@ from scipy.stats import chi2
 
 from sbi_active.criticism.contradictions import OutlyingTrial
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.errors import Posterior
 from sbi_active.criticism.linear.left_out import Candidate, standard_errors
 from sbi_active.criticism.linear.model import LinearModel
@@ -43,19 +42,6 @@ from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed
 
 Array = NDArray[Any]
-
-
-def is_linear(rivals: RivalSet) -> bool:
-    """Return whether linear models tell the simulator's apart, or have to.
-
-    Along a trajectory they do wherever the sensor's error is known. Without a time axis
-    they follow no jumps, and not which trials have an outcome.
-
-    Args:
-        rivals: The models, of which linear ones have the error.
-    """
-    jumps = not rivals.is_smooth or bool(rivals.roughness.any())
-    return rivals.measurements.is_sequence or not (rivals.can_fail or jumps)
 
 
 def judge(
@@ -108,15 +94,12 @@ class Verdict:
         _, freedom, _ = bare.model.chi_square
         found = Detection(
             log_bayes_factor=log_b,
-            standard_error=0.0,
-            lower=log_b,
             threshold=THRESHOLD,
             chi_square=square,
             degrees_of_freedom=float(freedom),
             p_value=p,
             level=LEVEL if rivals.has_known_noise else 0.0,
             null_log_evidence=states.log_evidence(ModelKey()),
-            null_cross_check=None,
         )
         noise, spare = rivals.model.noise, len(bare.model.residual) - len(bare.model.u)
         is_declared = noise is not None and noise.posterior is None and spare > 0

@@ -37,7 +37,7 @@ def residuals(report: Contents) -> Section:
         f"{noise} Chi-square of the bare model "
         f"{detection.chi_square:.1f} on {detection.degrees_of_freedom:.1f} degrees of "
         f"freedom, {least}; log Bayes factor against it "
-        f"{detection.log_bayes_factor:.1f} nats, at least {detection.lower:.1f}, where "
+        f"{detection.log_bayes_factor:.1f} nats, where "
         f"{detection.threshold:.1f} raises the alarm.",
     ]
     if before.times is not None:

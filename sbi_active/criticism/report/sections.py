@@ -163,7 +163,7 @@ def _tests(report: Contents) -> Iterator[str]:
 
 
 def _record(report: Contents) -> Section:
-    evidences, detection = report.tracing.evidences, report.detection
+    evidences = report.tracing.evidences
     spent = sum(e.num_simulations for e in evidences.values())
     moved = sorted(name for name, e in evidences.items() if e.engine == "smc")
     linear = [name for name, e in evidences.items() if e.engine == "linear"]
@@ -176,11 +176,6 @@ def _record(report: Contents) -> Section:
     if moved:
         why = "evidence by sequential Monte Carlo, where that did not serve"
         told.append(f"{why}: {', '.join(moved)}")
-    if detection.null_cross_check is not None:
-        told.append(
-            f"log evidence of the bare model {detection.null_log_evidence:.2f}, "
-            f"from other starts {detection.null_cross_check:.2f}"
-        )
     if report.digest:
         declared = "hash of noise, effects and priors, declared before the data"
         told.append(f"{declared}: {report.digest}")

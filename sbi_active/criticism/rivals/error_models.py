@@ -65,14 +65,6 @@ class ErrorModel(ABC):
             where each channel has its own.
         """
 
-    def regimes(self, residual: Array) -> list[Whitener]:
-        """Return whitening transforms under which the posterior has other widths.
-
-        Args:
-            residual: Residual at a mode, shape (N,).
-        """
-        return []
-
 
 @dataclass(frozen=True)
 class NoiseCell:

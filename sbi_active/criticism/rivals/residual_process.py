@@ -133,18 +133,6 @@ class ResidualProcess(ErrorModel):
     def whitener(self, residual: Array) -> Whitener:
         return self._whitener(*self._likeliest(residual))
 
-    @override
-    def regimes(self, residual: Array) -> list[Whitener]:
-        # A large process leaves the parameters wide, a small one narrow.
-        cell = int(np.argmax(self.noise.log_prior))
-        scale = float(np.median(self.noise.scales))
-        return [
-            self._whitener(basis, a, scale)
-            for basis in self._bases
-            if basis.cell == cell
-            for a in self.amplitudes[::2]
-        ]
-
     def _likeliest(self, residual: Array) -> tuple[_Basis, float, float]:
         """Return the process, amplitude and scale that a residual (N,) points to."""
         joint = self._joint(residual[None])[0]

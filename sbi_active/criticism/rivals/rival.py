@@ -14,13 +14,16 @@ from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
 from sbi_active.criticism.rivals.error_models import ErrorModel, NoiseGrid, Whitener
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
-from sbi_active.criticism.rivals.validity import DISAGREEMENT, log_outcomes
+from sbi_active.criticism.rivals.validity import log_outcomes
 
 Array = NDArray[Any]
 
 #: Bound on a residual, so that its square is finite.
 LARGEST = 1e100
 STEP = 1e-3  # of finite differences, in deviations of the prior
+#: Square that stands for the reference of a random simulator's deviations: a thirtieth
+#: of it has a square above zero still.
+LOG_SCALE = 1 + 2 * float(np.log(30.0))
 
 
 class Rival:
@@ -37,11 +40,12 @@ class Rival:
             number where the simulator gives none.
         center: Mean of the prior predictive, shape (N,).
         step: Step of finite differences, in u.
-        disagreement: Probabilities, equally likely, that a trial has no outcome where
-            the simulator has one, or vice versa.
 
     Attributes:
         coordinates: Coordinates of z.
+        reference: Deviation of a random simulator's numbers, shape (N,), where it is
+            part of a sum of squares; None leaves it to the likelihood.
+        df: Degrees of freedom of the error, for the weights of a sum of squares.
         num_trials: Number of trials.
         num_observed: Number of measured numbers of all trials.
     """
@@ -58,12 +62,13 @@ class Rival:
         spread: Array,
         center: Array | None = None,
         step: float = STEP,
-        disagreement: Sequence[float] = (DISAGREEMENT,),
     ) -> None:
         self.key, self.effects = key, (*effects,)
         self.simulator, self.error, self.spread = simulator, error, spread
         self.center = np.zeros(len(spread)) if center is None else center
-        self.step, self.disagreement = step, disagreement
+        self.step = step
+        self.reference: Array | None = None
+        self.df = np.inf
         self.num_trials = len(simulator.trials)
         self.num_observed = len(simulator.measurements)
         self.coordinates = SearchCoordinates(
@@ -116,14 +121,15 @@ class Rival:
 
         Returns:
             Observation minus prediction divided by the effects' factor on the noise,
-            shape (n, N); log of these factors, summed, shape (n,); log probability of
-            which trials have an outcome, shape (n,).
+            shape (n, N), or (n, 2 N) with what the deviations of a random simulator
+            add to a sum of squares; log of these factors, shape (n, N), or (n, 1) of
+            zeros without any; log probability of which trials have an outcome, (n,).
         """
         theta, phi = self.coordinates.split(u)
         mean, sd, probability = self.simulator.predict(theta, phi)
         m, missing = self.simulator.measurements, ~np.isfinite(mean)
         residual = np.where(missing, self.spread, m.x - mean)
-        log_scale = np.zeros(len(u))
+        log_scale = np.zeros((len(u), 1))
         scale = self.simulator.noise_scale(phi, len(u))
         if sd is not None:
             sd = np.where(np.isfinite(sd), sd, self.spread)
@@ -134,9 +140,13 @@ class Rival:
             scale = np.where(missing, wide, 1.0 if scale is None else scale)
         if scale is not None:
             scale = np.maximum(scale, 1e-12)
-            residual, log_scale = residual / scale, np.log(scale).sum(1)
-        flags = log_outcomes(probability, m.valid, self.disagreement)
+            residual, log_scale = residual / scale, np.log(scale)
+        flags = log_outcomes(probability, m.valid)
         residual = np.clip(residual, -LARGEST, LARGEST)
+        if self.reference is not None:
+            # Half of its square is the log of a deviation, but for a constant.
+            square = LOG_SCALE + 2 * (log_scale - np.log(self.reference))
+            residual = np.concatenate([residual, np.sqrt(np.maximum(square, 0))], 1)
         return residual, log_scale, flags
 
     @property
@@ -172,16 +182,12 @@ class Rival:
             return self._white
         return self.error.whitener(self.residual(u)[0][0])
 
-    def regimes(self, u: Array) -> list[Whitener]:
-        """Return whiteners of residuals where the error leaves other widths."""
-        return self.error.regimes(self.residual(u)[0][0])
-
     def log_likelihood(self, u: Array, *, floor: float = -np.inf) -> Array:
         """Return log p(x | z), shape (n,); all trials are simulated at once."""
         if not len(u):
             return np.zeros(0)
         residual, log_scale, flags = self.residual(u, penalized=False)
-        log_p = self.error.log_likelihood(residual) - log_scale + flags
+        log_p = self.error.log_likelihood(residual) - log_scale.sum(1) + flags
         return np.where(np.isfinite(log_p), log_p, -np.inf)
 
     def log_prior(self, u: Array) -> Array:
@@ -208,9 +214,15 @@ class Rival:
         leaves = (u + step > c.high) | (u + step < c.low)
         sign = np.where(leaves, -1.0, 1.0)
         stack = [u, *[u + step * sign * g for g in groups]]
-        all_r = whiten(self.residual(np.concatenate(stack))[0])
+        points = np.concatenate(stack)
+        all_r = whiten(self.residual(points)[0])
         r = all_r.reshape(len(stack), *u.shape[:1], -1)
+        if self.simulator.failed:  # from where there is a number to where there is none
+            seen = np.isfinite(self.simulator.predict(*c.split(points))[0])
+            seen = np.resize(seen.T, (r.shape[-1], len(points))).T.reshape(r.shape)
+            r[1:] = np.where(seen[1:] == seen[0], r[1:], r[0])
         trial_of, trial = c.trial_of(), self.simulator.measurements.trial
+        trial = np.resize(trial, r.shape[-1])
         jac = np.zeros((*r[0].shape, self.dim))
         for k, group in enumerate(groups):
             change = (r[k + 1] - r[0]) / step[group > 0][0]

@@ -37,7 +37,8 @@ class TrialSimulator:
     A simulator without declared noise is its own draw. Its mean and standard deviation
     then come from 32 draws under fixed seeds, the same for all parameters: the
     synthetic likelihood, Gaussian given these two, is a smooth function of the
-    parameters wherever the simulator is one of its parameters and seeds.
+    parameters wherever the simulator is one of its parameters and seeds, or of what the
+    global generators draw.
 
     Args:
         model: Simulator with every effect that any rival has.
@@ -160,8 +161,21 @@ class TrialSimulator:
             seeds = row_seeds(self.seed, t * repeats).repeat(n)
         rows = theta.repeat_interleave(t * repeats, 0).to(self._dtype)
         tiled = self._tiled(phi, repeats)
-        with forked_generators(derive_seed(self.seed, "replicates")):
-            x = self._simulate(rows, tiled, action, context, seeds)
+        together = len(rows)
+        if self.is_stochastic and not self.model.base.fn_takes_seeds:
+            together = t * repeats  # the global generators draw the same for all
+        parts = []
+        for start in range(0, len(rows), together):
+            own = slice(start, start + together)
+            of_own = {name: p[own] for name, p in tiled.items()}
+            given = None if seeds is None else seeds[own]
+            with forked_generators(derive_seed(self.seed, "replicates")):
+                parts.append(
+                    self._simulate(
+                        rows[own], of_own, action[own], context.at(own), given
+                    )
+                )
+        x = torch.cat(parts)
         x = x.reshape(n, repeats, t, *x.shape[1:])
         flat = self._at_measured_times(x)  # (n, repeats, t * numbers)
         valid = np.isfinite(flat.reshape(n, repeats, t, -1)).any(-1).mean(1)

@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.results import (
     CATCH_ALLS,
     NONE,
@@ -27,7 +25,6 @@ from sbi_active.criticism.results import (
 )
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.criticism.under_misfit import Misfit
-from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
 
@@ -35,29 +32,6 @@ Array = NDArray[Any]
 DECISIVE = 50.0
 #: Score of trials that speaks against effects.
 DENSITY = "log predictive density"
-
-
-def needed_trials(rivals: RivalSet, key: ModelKey) -> tuple[float, ...]:
-    """Return the trials without which the data do not point to some effects.
-
-    Without any one of them the Bayes factor against the bare model is below 20; none
-    where it is below with all trials, or where effects or the simulator have an error
-    of their own.
-
-    Args:
-        rivals: The models.
-        key: Key of the effects alone.
-
-    Returns:
-        Indices of the trials.
-    """
-    own = rivals.fit(key).rival
-    log_b = log_evidence(rivals, key)[0] - log_evidence(rivals)[0]
-    if not own.searched.all() or rivals.simulator.is_stochastic or log_b < THRESHOLD:
-        return ()
-    without = log_b + _change(rivals, key) - _change(rivals, ModelKey())
-    index = rivals.trials.index.numpy()[rivals.one_outlier().trials]
-    return (*index[without < THRESHOLD].tolist(),)
 
 
 def is_left_to_chance(tracing: Tracing) -> bool:
@@ -165,12 +139,3 @@ def withdrawn(tracing: Tracing) -> Tracing:
         instead_of=str(ModelKey(tracing.chosen)),
         misfit=None if misfit is None else replace(misfit, helps=(), named=()),
     )
-
-
-def _change(rivals: RivalSet, key: ModelKey) -> Array:
-    """Return the log evidence without each trial less that of all, shape (k,)."""
-    fit = rivals.fit(key)
-    _, weights, residual = fit.weighted()
-    rest = rivals.one_outlier().without_each(residual)
-    full = fit.rival.error.log_likelihood(residual)
-    return log_sum_exp(np.log(weights)[:, None] + rest - full[:, None], axis=0)

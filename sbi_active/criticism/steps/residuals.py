@@ -116,7 +116,7 @@ def _prequential(rivals: RivalSet, key: ModelKey) -> Array:
     u, log_p = u[np.isfinite(log_p)], log_p[np.isfinite(log_p)]
     # The process is left out: what is asked is how the simulator predicts.
     residual, log_scale, _ = rival.residual(u, penalized=False)
-    log_l = noise.log_likelihood(residual) - log_scale
+    log_l = noise.log_likelihood(residual) - log_scale.sum(1)
     parts = [log_p, log_p + np.clip(log_l - fit.evidence.log_evidence, -700, 700)]
     parts += [] if between is None else [between.log_prob(u)]
     log_share = np.log([len(part) / sum(map(len, some)) for part in some])

@@ -3,31 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from math import comb
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.actions import ActionSpace
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.results import (
     CATCH_ALLS,
     NONE,
-    OUTLIER,
-    UNEXPLAINED,
-    Detection,
     Estimate,
     Evidence,
     ModelKey,
-    Tracing,
 )
-from sbi_active.criticism.steps.detection import THRESHOLD, alternatives
-from sbi_active.criticism.steps.equivalence import equivalent_effects
-from sbi_active.criticism.steps.influence import is_left_to_chance, withdrawn
-from sbi_active.criticism.steps.near_aliases import near_aliases
-from sbi_active.criticism.steps.sampled import Sampled
+from sbi_active.criticism.steps.detection import alternatives
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
@@ -36,6 +28,8 @@ PROBABILITY_OF_NONE = 0.5  # by convention, neither for nor against
 #: Probability that what is missing, if anything is, is each of the catch-alls.
 PROBABILITY_OF_CATCH_ALL = 0.1
 MASS = 0.9  # of the credible set
+#: All sets of one effect more are together this much less probable, nats.
+COST = float(np.log(3.0))
 #: Factors on the scale of the effects' priors under which a verdict should stand.
 RESCALED = (1 / 3, 3.0)
 
@@ -64,129 +58,16 @@ def log_priors(
     return {name: float(np.log(p)) for name, p in found.items()}
 
 
-def trace(
-    found: Sampled,
-    detection: Detection,
-    *,
-    actions: ActionSpace | None = None,
-    compare: bool = True,
-    near: bool = True,
-) -> Tracing:
-    """Return the probabilities of the rivals and the verdict.
+def log_prior(names: tuple[str, ...], prior: Mapping[str, float]) -> float:
+    r"""Return the log prior probability of a set of k of the n effects.
 
-    The scales of the effects' priors are unknown. After an alarm the verdict is first
-    one of: declared effects, "unexplained", "scatter", each with all of its
-    probability; then, of the effects, the most probable of the most probable families.
-    Where known noise refutes that (its chi-square has p < .001), the residual process
-    is tried beside it: then "unexplained" is the process alone or with these effects,
-    half and half. Effects that rest on one trial are named only if that trial has
-    hardly a gross error.
-
-    Args:
-        found: The models' evidence.
-        detection: Whether there is anything to trace.
-        actions: The permitted ones, for what they hardly separate.
-        compare: Whether to look for effects that are nearly the same.
-        near: Whether to look for groups that these trials do not separate as well.
+    It is proportional to the mean of the probabilities :math:`p_i` of its effects
+    alone. Over all sets of k these means add up to :math:`\binom{n-1}{k-1} \frac1k
+    \sum_i p_i`.
     """
-    rivals, equivalent = found.rivals, found.equivalent
-    # Without an alarm there is no trial to set aside.
-    catch_alls = tuple(n for n in CATCH_ALLS if detection.alarm or n != OUTLIER)
-    prior = log_priors(rivals.library, catch_alls)
-    keys = [ModelKey.of(name) for name in (NONE, *catch_alls, *rivals.effects)]
-    log_prior = {key: prior[str(key)] for key in keys}
-    log_z = {key: found.log_evidence(key) for key in keys}
-    process = ModelKey(error=UNEXPLAINED)
-    if detection.alarm:
-        singles = {n: prior[n] + log_z[ModelKey((n,))] for n in rivals.effects}
-        for key, value in found.larger(singles, prior).items():
-            log_z[key] = found.log_evidence(key)
-            log_prior[key] = value - log_z[key]
-    log_p = {key: log_prior[key] + log_z[key] for key in log_z}
-    p = probabilities_of(log_p)
-    verdict = verdict_of(p, found) if detection.alarm else ModelKey()
-    beside: tuple[str, ...] = ()
-    if verdict.effects and found.is_refuted(verdict, detection):
-        # What takes up most of the misfit need not take up all of it.
-        names, rest = verdict.effects, found.log_with_process(verdict)
-        alone = log_z[process]
-        log_z[process] = float(np.logaddexp(alone, rest) - np.log(2))
-        log_p[process] = log_prior[process] + log_z[process]
-        p = probabilities_of(log_p)
-        verdict = verdict_of(p, found)
-        if verdict == process and rest > alone:
-            beside = names
-    evidences = {str(key): found.record(key) for key in log_p}
-    groups = equivalent_effects(rivals, None) if compare and near else ()
-    aliases = ()
-    if compare and detection.alarm:
-        singles = {n: log_z[ModelKey((n,))] for n in rivals.effects}
-        aliases = near_aliases(rivals, singles, actions, [*equivalent, *groups])
-    inclusion = {
-        name: sum(share for key, share in p.items() if name in key.effects)
-        for name in rivals.effects
-    }
-    probabilities = {str(key): share for key, share in p.items()}
-    null = evidences[NONE].log_evidence
-    estimates = likeliest_first(
-        estimate_of(
-            effect,
-            evidences[name],
-            probability=inclusion[name],
-            log_bayes_factor=log_z[ModelKey((name,))] - null,
-        )
-        for name, effect in rivals.effects.items()
-    )
-    tracing = Tracing(
-        verdict=str(verdict),
-        chosen=verdict.effects,
-        probabilities=probabilities,
-        inclusion=inclusion,
-        credible_set=credible_set(probabilities),
-        equivalent=(*equivalent,),
-        near=groups,
-        aliases=aliases,
-        estimates=estimates,
-        evidences=evidences,
-        robust=_is_robust(found, detection, log_prior, log_z, verdict),
-        beside=beside,
-        outliers=found.outliers() if detection.alarm else {},
-        needed=found.needed(verdict) if verdict.effects else (),
-        trial_names=dict(
-            zip(rivals.trials.index.tolist(), rivals.trials.names, strict=True)
-        ),
-    )
-    return withdrawn(tracing) if is_left_to_chance(tracing) else tracing
-
-
-def probabilities_of(log_p: dict[ModelKey, float]) -> dict[ModelKey, float]:
-    """Return probabilities from unnormalized logarithms, most probable first."""
-    values = np.array([*log_p.values()])
-    p = np.exp(values - log_sum_exp(values))
-    order = np.argsort(-p, kind="stable")
-    keys = [*log_p]
-    return {keys[i]: float(p[i]) for i in order}
-
-
-def verdict_of(probabilities: Mapping[ModelKey, float], found: Sampled) -> ModelKey:
-    """Return the verdict: the kind of explanation, then the most probable of it.
-
-    Several effects that share the probability do not lose it to a catch-all. Equivalent
-    ones count as one, and so do forces of one family: it is chosen first, then its
-    form.
-    """
-    catch_alls = {k: p for k, p in probabilities.items() if k.error}
-    given = found.rivals, found.equivalent
-    classes: dict[frozenset[str], dict[ModelKey, float]] = {}
-    for key, p in probabilities.items():
-        if key.effects:
-            classes.setdefault(kind_of(key, *given), {})[key] = p
-    declared = sum(p for members in classes.values() for p in members.values())
-    best = max(catch_alls, key=catch_alls.__getitem__, default=ModelKey())
-    if catch_alls.get(best, 0.0) > declared or not classes:
-        return best
-    likeliest = max(classes.values(), key=lambda members: sum(members.values()))
-    return max(likeliest, key=likeliest.__getitem__)
+    num, k = sum(name not in (NONE, *CATCH_ALLS) for name in prior), len(names)
+    log_mean = log_sum_exp(np.array([prior[name] for name in names])) - np.log(k)
+    return float(log_mean + np.log(k / comb(num - 1, k - 1)) - COST * (k - 1))
 
 
 def kind_of(
@@ -271,30 +152,3 @@ def estimate_of(
 def likeliest_first(estimates: Iterable[Estimate]) -> tuple[Estimate, ...]:
     """Return estimates in the order of their probabilities."""
     return (*sorted(estimates, key=lambda e: -e.probability),)
-
-
-def _is_robust(
-    found: Sampled,
-    detection: Detection,
-    log_prior: Mapping[ModelKey, float],
-    log_z: Mapping[ModelKey, float],
-    verdict: ModelKey,
-) -> bool:
-    """Return whether priors a third and three times as wide give the same verdict."""
-    given = rivals, _ = found.rivals, found.equivalent
-    for factor in RESCALED:
-        scaled = {
-            key: found.log_evidence(key, factor=factor) if key.effects else value
-            for key, value in log_z.items()
-        }
-        other = ModelKey()
-        if (
-            log_bayes_factor(scaled, rivals.library, found.equivalent) > THRESHOLD
-            or detection.by_chi_square
-        ):
-            log_p = {key: log_prior[key] + scaled[key] for key in scaled}
-            other = verdict_of(probabilities_of(log_p), found)
-        same = kind_of(other, *given) == kind_of(verdict, *given)
-        if not same or other.error != verdict.error:
-            return False
-    return True

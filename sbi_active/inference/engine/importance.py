@@ -61,7 +61,6 @@ def importance_sample(
     num_components: int,
     settings: Settings,
     found: Found | None = None,
-    rivaled: float = -np.inf,
 ) -> bool:
     """Add draws to a pool until enough are effective; return whether it is rough.
 
@@ -75,7 +74,6 @@ def importance_sample(
         num_components: Number of components of a proposal at most.
         settings: Numbers of draws.
         found: Modes, to propose along ridges from; None if there are none.
-        rivaled: Log evidence of a better model.
     """
     own, start = settings, potential.num_simulations
     budget = own.budget(potential.dim)
@@ -89,7 +87,6 @@ def importance_sample(
         effective = pool.effective_sample_size
         is_cheap = spent < own.share_of_plenty * budget and not fits.is_rough
         wanted = own.asked(potential.dim, is_cheap=is_cheap)
-        wanted = own.num_wanted(wanted, pool.at_most - rivaled)
         if not len(pool.u) or spent >= budget:
             break
         is_heavy = False

@@ -6,8 +6,6 @@
 3. Where enough draws are effective, that is the posterior; another proposal is fitted
    while few of them outweigh all others. Otherwise particles are led from the modes to
    it by sequential Monte Carlo, whose cost grows little with the number of parameters.
-
-The Laplace approximation is precise enough for a model far behind another.
 """
 
 from __future__ import annotations
@@ -33,7 +31,7 @@ from sbi_active.inference.sampling.student_mixture import (
     Proposal,
     StudentMixture,
 )
-from sbi_active.inference.sampling.weights import log_sum_exp, normalized
+from sbi_active.inference.sampling.weights import normalized
 
 Array = NDArray[Any]
 
@@ -45,7 +43,6 @@ def infer(
     found: Found | None = None,
     past: Pool | None = None,
     near: Array | None = None,
-    rivaled: float = -np.inf,
     settings: Settings = Settings(),  # noqa: B008  (frozen)
 ) -> Fit:
     """Return the posterior of a potential.
@@ -58,16 +55,10 @@ def infer(
         past: Draws for the first of these trials, with the likelihood of all, to which
             are added.
         near: Draws of a guess, shape (n, d), looked at where the modes do not suffice.
-        rivaled: Log evidence of a better model: one that is far behind it need not be
-            known as well.
         settings: Numbers of draws, and what decides between the ways.
     """
     none = np.zeros(potential.dim, dtype=bool)
     searched = cast(Potential, potential)  # where modes were found
-    if found is not None and past is None:
-        fit = _if_far_behind(searched, found, rivaled, rng, settings)
-        if fit is not None:
-            return fit
     if past is None:
         free = none if found is None else uninformed(found, searched, rng)
         if found is not None and free.any():
@@ -89,14 +80,10 @@ def infer(
         settings=settings,
         # After a further trial the modes are not all, and the draws may know others.
         found=found if past is None else None,
-        rivaled=rivaled,
     )
     final, effective = pool.is_final, pool.effective_sample_size
-    asked = settings.asked(potential.dim, is_cheap=False)
-    wanted = settings.num_wanted(asked, pool.at_most - rivaled)
-    # An evidence is an average of likelihoods.
-    matters = pool.log_likelihood.max(initial=-np.inf) >= rivaled - settings.behind
-    if found is not None and past is None and matters and effective < wanted:
+    wanted = settings.asked(potential.dim, is_cheap=False)
+    if found is not None and past is None and effective < wanted:
         moved = led_particles(searched, found, none, rng, settings)
         if moved is not None and moved.effective_sample_size > effective:
             return fit_of(moved, searched, found, none, rng, settings)
@@ -113,56 +100,6 @@ def infer(
         free=none,
         found=found,
         pool=pool,
-    )
-
-
-def _if_far_behind(
-    potential: Potential,
-    found: Found,
-    rivaled: float,
-    rng: np.random.Generator,
-    settings: Settings,
-) -> Fit | None:
-    r"""Return Laplace's evidence where it decides nothing, the mode first of the draws.
-
-    .. math::
-        \log Z \approx \log \sum_k p(x | u_k)\, p(u_k)\, \sqrt{|2 \pi \Sigma_k|}
-
-    None unless even the largest likelihood, of which an evidence is an average, is
-    below the rival's, and this far below. Draws are not simulated, and count as less
-    likely than the mode.
-
-    References:
-        Kass & Raftery, Journal of the American Statistical Association 90 (1995).
-    """
-    modes, dim = found.modes, potential.dim
-    if not (np.isfinite(rivaled) and potential.searched.all()):
-        return None  # the error's own coordinates are where they were
-    log_likelihood = potential.log_likelihood(modes)
-    if not log_likelihood.max() < rivaled:
-        return None
-    factors = found.guess.factors[: len(modes)] / WIDER
-    volume = np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(1)
-    mass = log_likelihood + potential.log_prior(modes) + volume
-    log_z = float(log_sum_exp(mass) + 0.5 * dim * np.log(2 * np.pi))
-    if not -np.inf < log_z < rivaled - settings.far_behind:
-        return None
-    c, none = potential.coordinates, np.zeros(dim, dtype=bool)
-    normal = rng.standard_normal((settings.num_draws, dim))
-    u = np.clip(modes[0] + normal @ factors[0].T, c.low, c.high)
-    # A bound itself may round to beyond.
-    u = np.concatenate([modes[:1], u[np.isfinite(potential.log_prior(u))]])
-    return Fit(
-        u=u,
-        weight=np.full(len(u), 1 / len(u)),
-        log_likelihood=np.append(log_likelihood[0], np.full(len(u) - 1, -np.inf)),
-        log_evidence=log_z,
-        standard_error=0.0,
-        effective_sample_size=float(len(u)),
-        method="laplace",
-        free=none,
-        found=found,
-        pool=Pool.empty(dim, potential.num_trials),
     )
 
 

@@ -104,11 +104,6 @@ class Pool:
         effective, num = self.effective_sample_size, max(self.num_final, 1)
         return float(np.sqrt(max(1 / max(effective, 1e-9) - 1 / num, 0.0)))
 
-    @property
-    def at_most(self) -> float:
-        """Log evidence with twice its standard error, nats; inf without draws."""
-        return self.log_evidence + 2 * self.standard_error if self.num_final else np.inf
-
     def restart(self) -> None:
         """Rest the posterior on draws to come."""
         self.is_final, self.num_final = np.zeros_like(self.is_final), 0
@@ -193,7 +188,7 @@ class WeightedDraws:
         log_evidence: Log of the integral of prior times likelihood, nats.
         standard_error: Standard error of log_evidence, nats.
         effective_sample_size: Number of draws that count.
-        method: Method that gave the draws, "importance", "smc" or "laplace".
+        method: Method that gave the draws, "importance" or "smc".
     """
 
     u: Array

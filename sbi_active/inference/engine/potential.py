@@ -243,10 +243,6 @@ class Potential(Density, LeastSquares, Protocol):
         """
         ...
 
-    def regimes(self, u: Array) -> list[Whitener]:
-        """Return whiteners of residuals where the error leaves other widths."""
-        ...
-
     def splits_off(self, axes: NDArray[np.bool_], rng: np.random.Generator) -> bool:
         """Return whether the prior is a product over some axes and all others."""
         ...
@@ -294,10 +290,6 @@ class SimulatedPotential:
     def whitener(self, u: Array | None = None) -> Whitener:
         """Return the whitener of residuals: nothing of the error is unknown."""
         return unchanged
-
-    def regimes(self, u: Array) -> list[Whitener]:
-        """Return nothing: no other error is possible."""
-        return []
 
     def splits_off(self, axes: NDArray[np.bool_], rng: np.random.Generator) -> bool:
         """Return whether the prior is a product over some axes and all others."""

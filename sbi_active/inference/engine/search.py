@@ -150,18 +150,9 @@ def search(
     mass = np.exp(log_mass - log_mass.max())
     # A mode that is worth little is still visited.
     mass = 0.9 * mass / mass.sum() + 0.1 / len(mass)
-    means, precisions = [u[modes]], [precision[modes]]
-    for other in problem.regimes(u[modes[:1]]):
-        at, _ = descend(
-            problem, u[modes[:1]], other, problem.step, own.later, secant=True
-        )
-        means.append(at)
-        precisions.append(laplace_precision(problem, at, other)[0])
-    num_other = len(means) - 1
-    mass = np.append(len(modes) * mass, np.ones(num_other)) / (len(modes) + num_other)
-    factors = WIDER * lower_factors(np.linalg.inv(np.concatenate(precisions)))
+    factors = WIDER * lower_factors(np.linalg.inv(precision[modes]))
     return Found(
-        StudentMixture(np.concatenate(means), factors, mass, np.inf),
+        StudentMixture(u[modes], factors, mass, np.inf),
         u[modes],
         np.abs(jac).max((0, 1)) > own.faint,
         int((cost - cost.min() < own.same).sum()),

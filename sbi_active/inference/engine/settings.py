@@ -19,11 +19,6 @@ class Settings:
         divergence: Divergence of a normal fit to the draws, in nats, that is asked
             while they are cheap, and twice that always: n draws of d parameters are d
             (d + 3) / 4 n off. Half asks for twice as many of 10 parameters and more.
-        behind: Nats below a better model's evidence beyond which fewer draws do: at
-            half, a model that has a tenth of its weight is known less well.
-        num_behind: Effective draws that end the sampling of such a model.
-        far_behind: Nats below it beyond which Laplace's evidence does, where no
-            likelihood reaches it; infinite of a response that jumps.
         num_simulations: Simulated rows to spend, each at one action; None is no bound.
             More of more than ``few`` parameters, in proportion.
         share_of_plenty: Share of these within which draws are cheap, unless the
@@ -88,9 +83,6 @@ class Settings:
     num_effective: float = 200.0
     plenty: float = 6.0
     divergence: float = 0.05
-    behind: float = 5.0
-    num_behind: float = 20.0
-    far_behind: float = 10.0
     num_simulations: int | None = None
     share_of_plenty: float = 0.6
     num_draws: int = 500
@@ -135,10 +127,6 @@ class Settings:
         if is_cheap:
             return max(self.plenty * self.num_effective, num)
         return max(self.num_effective, num / 2)
-
-    def num_wanted(self, wanted: float, ahead: float) -> float:
-        """Return the effective draws of a model so far ahead of another, in nats."""
-        return min(wanted, self.num_behind) if ahead < -self.behind else wanted
 
     def affords(self, effective: float, num: int, wanted: float) -> bool:
         """Return whether a proposal, of whose draws so many count, needs few more."""

@@ -5,12 +5,11 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 from scipy.stats import multivariate_normal
-from torch.distributions import HalfNormal, Independent, Normal
+from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.evidence.unknown_scale import SCALES, log_evidence
 from sbi_active.criticism.results import ModelKey
 
 PRIOR = Independent(Normal(torch.zeros(2), torch.tensor([2.0, 1.0])), 1)
@@ -63,27 +62,6 @@ def test_importance_sampling_gives_the_evidence(names):
     assert evidence.log_evidence == pytest.approx(
         MODELS[names], abs=4 * evidence.standard_error
     )
-
-
-@pytest.mark.parametrize("factor", [1 / 3, 1.0, 3.0])
-def test_an_unknown_scale_of_the_prior_is_summed_out(factor):
-    each = [
-        exact([XI**0, XI, XI**2], [2.0, 1.0, 0.7 * factor * s], 0.5) for s in SCALES
-    ]
-    expected = np.logaddexp.reduce(each) - np.log(len(each))
-    value, error = log_evidence(rivals(), ModelKey(("curve",)), factor=factor)
-    assert error < 0.2
-    assert value == pytest.approx(expected, abs=4 * error)
-
-
-def test_the_bare_model_is_kept_where_other_starts_find_no_more():
-    sets = rivals()
-    own = sets.fit().evidence
-    again = sets.fit_again()
-    assert again.log_evidence == pytest.approx(
-        own.log_evidence, abs=4 * np.hypot(own.standard_error, again.standard_error)
-    )
-    assert sets.fit().evidence is own
 
 
 def test_no_parameters_are_simulated_twice():
@@ -151,20 +129,6 @@ def test_the_order_of_a_few_trials_is_no_structure():
     assert order(4) is None
     assert order(5, "unknown") is None
     np.testing.assert_allclose(order(5), [0, 0.25, 0.5, 0.75, 1])
-
-
-def test_a_draw_that_rounds_to_beyond_its_prior_takes_no_evidence_away():
-    own = {f: getattr(CURVE, f) for f in ("hook", "null", "apply")}
-    prior = Independent(HalfNormal(torch.tensor([0.7])), 1)
-    key, some = ModelKey(("curve",)), rivals()
-    some.effects["curve"] = Effect("curve", prior=prior, **own)
-    fit = some.fit(key)
-    before, _ = log_evidence(some, key)
-    weights = fit.sample.weight
-    least = np.where(weights > 0, weights, np.inf).argmin()
-    fit.sample.u[least, -1] = fit.rival.coordinates.low[-1] - 1e-9
-    after, _ = log_evidence(some, key)
-    assert after == pytest.approx(before, abs=0.2)
 
 
 def test_the_posterior_is_the_exact_one():

@@ -43,6 +43,9 @@ def problem(*, low=-np.inf, ragged=False, num=NUM):
         high=np.array([np.inf, np.inf]),
         own=2,
         trial_of=np.array([-1, -1]),
+        num=len(m),
+        scale=np.ones(len(m)),
+        offset=np.zeros(len(m)),
     )
     unit = np.full(len(m), 0.5)
     errors = Errors(m, unit, NoiseGrid([NoiseCell.of(m, sd=unit)]), largest=2.0)

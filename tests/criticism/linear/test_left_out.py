@@ -50,6 +50,9 @@ def line():
         high=everywhere,
         own=2,
         trial_of=np.full(2, -1),
+        num=16,
+        scale=np.ones(16),
+        offset=np.zeros(16),
     )
     fold = np.repeat(np.arange(8), 2)
     errors = SimpleNamespace(fold=fold, num_folds=8, is_scored=np.ones(16, bool))

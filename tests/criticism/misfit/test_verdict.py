@@ -8,12 +8,10 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import HalfNormal, Normal
 
-from sbi_active import BoxActions, GaussianNoise, SimulatorModel, StudentTNoise
+from sbi_active import BoxActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.evidence.unknown_scale import log_evidence
 from sbi_active.criticism.forces import force_effects
-from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.sensor import sensor_of
 from sbi_active.criticism.misfit.record import traced
@@ -105,14 +103,6 @@ def test_a_gross_error_of_one_trial_is_found_without_simulations(few):
     assert next(iter(tracing.outliers)) == 3.0
 
 
-@pytest.mark.parametrize("noise", [StudentTNoise(0.1, 4.0), None])
-def test_without_a_gaussian_sensor_there_are_no_linear_models(noise):
-    trials = Trials(torch.ones(6, 1), torch.zeros(6, 2))
-    model = SimulatorModel(lambda theta, xi: theta * xi, noise=noise)
-    prior = BoxUniform(-torch.ones(2), torch.ones(2))
-    assert linear_models(RivalSet(model, prior, trials, [], seed=0)) == (None, None)
-
-
 @pytest.fixture(scope="module")
 def biased():
     """A small library with an effect on the noise, and a missing bias."""
@@ -132,7 +122,7 @@ def test_linear_evidence_is_that_of_samples(biased):
     assert tracing.verdict == "bias"
     assert {e.engine for k, e in tracing.evidences.items() if k == "bias"} == {"linear"}
     rivals = RivalSet(OSCILLATOR, RATES, biased.trials, biased.effects, seed=0)
-    sampled = [log_evidence(rivals, ModelKey(k))[0] for k in ((), ("bias",))]
+    sampled = [rivals.fit(ModelKey(k)).evidence.log_evidence for k in ((), ("bias",))]
     linear = [tracing.evidences[k].log_evidence for k in ("none", "bias")]
     # The bare model, hundreds of nats behind, is linear no more: hence the share.
     assert np.diff(linear) == pytest.approx(np.diff(sampled), abs=1.0, rel=0.01)
@@ -217,7 +207,7 @@ LOUDER = Effect(
 )
 
 
-def test_outcomes_are_told_by_samples_however_large_the_library():
+def test_outcomes_are_told_however_large_the_library():
     """A ball that flies too far is not seen, without a time axis."""
 
     def seen(theta, action):
@@ -242,7 +232,6 @@ def test_outcomes_are_told_by_samples_however_large_the_library():
     tracing = loop.trace()
     assert loop.rivals.can_fail
     assert tracing.verdict == "turned 3"
-    assert tracing.evidences["turned 3"].engine != "linear"
 
 
 @pytest.mark.parametrize(
@@ -265,4 +254,4 @@ def test_a_larger_noise_is_chosen_again_without_each_trial(size, effects, verdic
     assert rows.loc["log predictive density", "ratio"] > 1
     assert loop.judged(evaluation).verdict == verdict
     if tracing.chosen:
-        assert not loop.detect().refutes(tracing.evidences[verdict], REFUTED)
+        assert tracing.p_value > REFUTED

@@ -1,5 +1,6 @@
 """A line with Gaussian noise and linear effects: all evidences are closed forms."""
 
+from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
@@ -10,7 +11,9 @@ from torch.distributions import Independent, Normal
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.evidence.unknown_scale import SCALES
+from sbi_active.criticism.linear.mixture import WIDTHS
+from sbi_active.criticism.linear.screening import linear_models
+from sbi_active.criticism.misfit.verdict import Verdict, judge
 
 ACTION = torch.linspace(-2, 2, 12)[:, None]
 XI = ACTION[:, 0].double().numpy()
@@ -52,6 +55,11 @@ def rivals(x: torch.Tensor, *further: Effect) -> RivalSet:
     return RivalSet(model, PRIOR, Trials(ACTION, x), effects)
 
 
+def judged(some: RivalSet, groups: Sequence[frozenset[str]] = ()) -> Verdict:
+    """Return the verdict of linear models, which in this world are exact."""
+    return judge(linear_models(some)[0], groups)
+
+
 def columns(names: tuple[str, ...]) -> np.ndarray:
     """Return what parameters and effects are multiplied by, shape (12, 2 + k)."""
     shapes = [SHAPES[name](ACTION)[:, 0].double().numpy() for name in names]
@@ -61,7 +69,7 @@ def columns(names: tuple[str, ...]) -> np.ndarray:
 def log_evidence(x: torch.Tensor, names: tuple[str, ...] = ()) -> float:
     """Return the exact log evidence, effects with priors of unknown scale."""
     design, each = columns(names), []
-    for scales in product(SCALES, repeat=len(names)):
+    for scales in product(WIDTHS, repeat=len(names)):
         root = design * np.array([1.0, 1.0, *scales])
         covariance = root @ root.T + NOISE**2 * np.eye(12)
         normal = multivariate_normal(np.zeros(12), covariance)

@@ -1,7 +1,5 @@
 """When the bare model raises an alarm: by its Bayes factor, or by its chi-square."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -11,8 +9,7 @@ from torch.distributions import Normal
 
 from sbi_active import GaussianNoise, SimulatorModel, StudentTNoise
 from sbi_active.criticism import Criticism, Effect, Trials
-from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.steps.detection import LEVEL, is_found_again, num_determined
+from sbi_active.criticism.steps.detection import LEVEL
 from sbi_active.simulation import estimate_noise
 
 NOISE = 0.1
@@ -52,38 +49,6 @@ def test_the_chi_square_alone_raises_the_alarm_where_the_noise_is_known():
     assert free.level == 0.0
     heavy = criticism(x, action, noise=StudentTNoise(NOISE, df=4.0)).detect()
     assert heavy.level == 0.0
-
-
-def test_the_bare_model_is_searched_again_before_an_alarm():
-    x, action = zigzag(0.0)
-    loop = criticism(x + 5 * NOISE * action**3, action)
-    assert loop.detect().by_evidence
-    assert loop.detect().null_cross_check is None  # two searches agree
-
-
-def test_a_mode_that_the_first_search_missed_is_no_alarm(monkeypatch):
-    """The bare model fits at a second slope, of which an effect's fit knows."""
-    action = torch.linspace(-2, 2, 8)[:, None]
-    gen = torch.Generator().manual_seed(0)
-    truth = torch.tensor([[0.5, 1.0]]).expand(8, -1)
-    x = line(truth, action) + NOISE * torch.randn(8, 1, generator=gen)
-    loop = criticism(x, action)
-    rivals = loop.rivals
-    right = rivals.fit()
-    assert is_found_again(rivals)
-    wrong = replace(right.sample, u=right.sample.u + 2.0)
-    monkeypatch.setitem(rivals.fits, ModelKey(), replace(right, sample=wrong))
-    rivals.fit(ModelKey(("cubic",)))
-    assert not is_found_again(rivals)
-
-
-def test_a_parameter_that_changes_nothing_takes_up_no_residual():
-    x, action = zigzag(1.0)
-    both = criticism(x, action)
-    idle = criticism(x, action, fn=lambda theta, xi: theta[:, :1] + 0 * xi)
-    assert np.isclose(num_determined(both.rivals), 2.0, atol=0.05)
-    # The variance of 400 draws of the idle one has a relative error of about .07.
-    assert np.isclose(num_determined(idle.rivals), 1.0, atol=0.25)
 
 
 def test_what_an_effect_leaves_over_is_undeclared_beside_it():

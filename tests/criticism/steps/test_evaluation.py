@@ -5,16 +5,15 @@ import pytest
 from scipy.stats import norm
 
 from sbi_active.criticism import Trials
+from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.steps.detection import detect
 from sbi_active.criticism.steps.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.steps.residuals import find_residuals
-from sbi_active.criticism.steps.sampled import Sampled
-from sbi_active.criticism.steps.tracing import trace
 from tests.criticism.steps.linear_world import (
     ACTION,
     NOISE,
     columns,
+    judged,
     measured,
     posterior,
     rivals,
@@ -41,7 +40,7 @@ def crps(x, mean, sd):
 @pytest.fixture(scope="module")
 def fitted():
     some = rivals(X)
-    return some, trace(Sampled(some), detect(some), compare=False)
+    return some, traced(judged(some), None, compare=False)
 
 
 def test_scores_before_and_after_are_those_of_the_normal_predictives(fitted):

@@ -6,13 +6,21 @@ import torch
 
 from sbi_active.criticism import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.steps.sampled import Sampled
-from tests.criticism.steps.linear_world import ACTION, NOISE, PRIOR, measured, rivals
+from sbi_active.criticism.results import ModelKey
+from tests.criticism.steps.linear_world import (
+    ACTION,
+    NOISE,
+    PRIOR,
+    judged,
+    measured,
+    rivals,
+)
 
 
 def found(x, **options):
     trials = Trials(ACTION, x, **options)
-    return Sampled(RivalSet(rivals(x).model, PRIOR, trials, [])).outliers()
+    some = RivalSet(rivals(x).model, PRIOR, trials, [])
+    return judged(some).states.outliers(ModelKey())
 
 
 @pytest.mark.parametrize("at", [0, 7])

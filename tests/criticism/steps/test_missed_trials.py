@@ -11,18 +11,17 @@ from torch.distributions import HalfNormal, Independent
 
 from sbi_active import AutocorrelatedNoise, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials, close_loop
+from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.results import NONE
-from sbi_active.criticism.steps.detection import detect
 from sbi_active.criticism.steps.evaluation import evaluate_held_out
 from sbi_active.criticism.steps.influence import unless_refuted
-from sbi_active.criticism.steps.sampled import Sampled
-from sbi_active.criticism.steps.tracing import trace
 from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR
 from tests.criticism.misfit.oscillator import trials as oscillations
 from tests.criticism.steps.linear_world import (
     ACTION,
     NOISE,
     columns,
+    judged,
     measured,
     posterior,
     rivals,
@@ -62,7 +61,7 @@ def report_of(x, *, action=SPEEDS, noise=SENSOR, seed=0, **changes):
 @pytest.fixture(scope="module")
 def fitted():
     some = rivals(measured(curve=0.5))
-    return some, trace(Sampled(some), detect(some), compare=False)
+    return some, traced(judged(some), None, compare=False)
 
 
 @pytest.mark.parametrize("drag", [0.0, 0.3])

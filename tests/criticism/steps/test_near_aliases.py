@@ -5,11 +5,11 @@ from torch.distributions import Normal
 
 from sbi_active import DiscreteActions
 from sbi_active.criticism import Effect
-from sbi_active.criticism.evidence.unknown_scale import log_evidence
+from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps import near_aliases as room
 from sbi_active.criticism.steps.detection import THRESHOLD
-from tests.criticism.steps.linear_world import NOISE, measured, rivals
+from tests.criticism.steps.linear_world import NOISE, judged, measured, rivals
 
 SIZE = 0.5
 X = measured(curve=SIZE)
@@ -18,7 +18,9 @@ PAIR = frozenset({"curve", "twin"})
 
 
 def near_aliases(some, actions, known=()):
-    log_z = {n: log_evidence(some, ModelKey((n,)))[0] for n in some.effects}
+    found = judged(some)
+    traced(found, None, compare=False)  # which keeps draws of each
+    log_z = {n: found.states.log_evidence(ModelKey((n,))) for n in some.effects}
     return room.near_aliases(some, log_z, actions, known)
 
 
@@ -65,6 +67,7 @@ def test_an_effect_that_the_trials_refute_has_no_alias():
     assert near_aliases(rivals(X), ACTIONS) == ()
     # Closer than the noise, and yet refuted by these trials.
     some = rivals(measured(curve=SIZE, seed=4), twin(0.95))
-    curve, other = (log_evidence(some, ModelKey((n,)))[0] for n in ("curve", "twin"))
+    states = judged(rivals(measured(curve=SIZE, seed=4), twin(0.95))).states
+    curve, other = (states.log_evidence(ModelKey((n,))) for n in ("curve", "twin"))
     assert curve - other > THRESHOLD
     assert near_aliases(some, ACTIONS) == ()

@@ -8,30 +8,23 @@ import torch
 from torch.distributions import Normal
 
 from sbi_active.criticism import Effect
-from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit.record import traced
-from sbi_active.criticism.misfit.verdict import judge
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.steps.combinations import log_prior
-from sbi_active.criticism.steps.tracing import log_priors
+from sbi_active.criticism.steps.tracing import log_prior, log_priors
 from tests.criticism.steps import linear_world
 from tests.criticism.steps.linear_world import (
     ACTION,
     NOISE,
     SHAPES,
     effect,
+    judged,
     measured,
     rivals,
 )
 
 
-def linear(x, *further, groups=()):
-    """The verdict of linear models, which in this world are exact."""
-    return judge(linear_models(rivals(x, *further))[0], groups)
-
-
 def tracing_of(x, **keywords):
-    found = linear(x)
+    found = judged(rivals(x))
     return traced(found, None, **keywords), found
 
 
@@ -56,7 +49,7 @@ def test_families_share_what_none_and_the_catch_alls_leave():
 )
 def test_probabilities_are_priors_times_evidences(phi):
     x = measured(**phi)
-    found = linear(x)
+    found = judged(rivals(x))
     states, prior = found.states, log_priors(found.rivals.library, ())
     log_p = {}
     for key in found.choice.probabilities:
@@ -138,7 +131,7 @@ def test_effects_that_the_trials_do_not_separate_count_as_one():
     )
     x = measured(curve=0.1, kink=0.28)
     group = frozenset({"curve", "twin"})
-    found = linear(x, twin, groups=[group])
+    found = judged(rivals(x, twin), [group])
     tracing = traced(found, None)
     assert group in tracing.near
     assert tracing.equivalent == (group,)
