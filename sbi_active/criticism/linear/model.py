@@ -121,22 +121,7 @@ class LinearModel:
 def linearize(
     rival: Rival, u: Array, unit: Array, step: float | None = None
 ) -> LinearModel:
-    r"""Return a rival linearized at one point, by steps to one side.
-
-    Errors with heavy tails are those of a Gaussian that is wider for each number by
-    what its own residual says (iteratively reweighted least squares),
-
-    .. math::
-        w_i^2 = \frac{\nu + 1}{\nu - 2 + r_i^2}.
-
-    The deviations :math:`s_i` of a random simulator have residuals of their own, by
-    Fisher's scores of the Gaussian likelihood,
-
-    .. math::
-        \frac{1 - r_i^2}{\sqrt2}, \qquad \sqrt2\, \frac{\partial \log s_i}{\partial u},
-
-    so that both together have its gradient and its expected curvature; what its value
-    at the fit is besides stands in ``offset``.
+    """Return a rival linearized at one point, by steps to one side.
 
     Args:
         rival: Rival with effects that change the prediction.
@@ -146,30 +131,80 @@ def linearize(
     """
     step = rival.step if step is None else step
     r, jacobian = rival.jacobian(u[None], lambda residual: residual / unit, step)
-    residual, jacobian, num = r[0], jacobian[0], rival.num_observed
-    scale, offset = np.ones(num), np.zeros(num)
+    model = with_prior(rival, u, r[0], jacobian[0])
     if rival.simulator.failed or rival.reference is not None:
-        # A number that the simulator does not give has the prior predictive.
-        own, log_scale, _ = rival.residual(u[None], penalized=False)
-        residual, log_scale = own[0] / unit, np.resize(log_scale[0], num)
-        if rival.reference is not None:
-            log_scale = log_scale - np.log(rival.reference)
-            slope, own = jacobian[num:] * residual[num:, None], residual[:num]
-            # Far out a number is no typical one, and its score no slope of a Gaussian.
-            scores = (1 - np.minimum(own**2, 4.0)) / np.sqrt(2)
-            jacobian = np.concatenate(
-                [jacobian[:num] + own[:, None] * slope, np.sqrt(2) * slope]
-            )
-            residual = np.append(own, scores)
-        scale, offset = np.exp(log_scale), -log_scale
-        offset = offset + 0.5 * residual[num:] ** 2 if len(residual) > num else offset
-    if np.isfinite(rival.df):
-        weight = np.sqrt((rival.df + 1) / (rival.df - 2 + residual**2))
-        offset = offset + student(residual, rival.df) + 0.5 * LOG_2PI
-        residual, jacobian = weight * residual, weight[:, None] * jacobian
-        scale, offset = scale / weight, offset + 0.5 * residual**2
-    model = with_prior(rival, u, residual, jacobian)
-    return replace(model, scale=scale, offset=offset)
+        model = _in_own_deviations(rival, model, unit)
+    return _reweighted(model, rival.df) if np.isfinite(rival.df) else model
+
+
+def _in_own_deviations(
+    rival: Rival, model: LinearModel, unit: Array, *, most: float = 4.0
+) -> LinearModel:
+    r"""Return a linearized rival with deviations that are the simulator's.
+
+    A number that the simulator does not give has that of the prior predictive. The
+    deviations :math:`s_i` of a random simulator have residuals of their own, by
+    Fisher's scores of the Gaussian likelihood,
+
+    .. math::
+        \frac{1 - r_i^2}{\sqrt2}, \qquad \sqrt2\, \frac{\partial \log s_i}{\partial u},
+
+    so that both together have its gradient and its expected curvature; what its value
+    at the fit is besides stands in ``offset``.
+
+    Args:
+        rival: Rival that is linearized.
+        model: Linear model with the residuals of a search.
+        unit: Standard deviation of the sensor, shape (N,).
+        most: Square of a residual beyond which it is no typical one, and its score no
+            slope of a Gaussian: with half a score is biased where the model is right,
+            with twice a few numbers far out move all deviations.
+    """
+    num = model.num
+    residual, log_scale, _ = rival.residual(model.u[None], penalized=False)
+    residual, log_scale = residual[0] / unit, np.resize(log_scale[0], num)
+    jacobian, offset = model.jacobian, np.zeros(num)
+    if rival.reference is not None:
+        log_scale = log_scale - np.log(rival.reference)
+        slope, own = jacobian[num:] * residual[num:, None], residual[:num]
+        score = (1 - np.minimum(own**2, most)) / np.sqrt(2)
+        offset = 0.5 * score**2
+        residual = np.append(own, score)
+        means = jacobian[:num] + own[:, None] * slope
+        jacobian = np.concatenate([means, np.sqrt(2) * slope])
+    return replace(
+        model,
+        residual=residual,
+        jacobian=jacobian,
+        scale=np.exp(log_scale),
+        offset=offset - log_scale,
+    )
+
+
+def _reweighted(model: LinearModel, df: float) -> LinearModel:
+    r"""Return a linear model of t errors: a Gaussian, wider by what each residual says.
+
+    .. math::
+        w_i^2 = \frac{\nu + 1}{\nu - 2 + r_i^2}
+
+    Args:
+        model: Linear model in deviations of the error.
+        df: Degrees of freedom, :math:`\nu`.
+
+    References:
+        Lange, Little & Taylor, Journal of the American Statistical Association 84
+        (1989), for iteratively reweighted least squares of t errors.
+    """
+    r = model.residual
+    weight = np.sqrt((df + 1) / (df - 2 + r**2))
+    less = student(r, df) + 0.5 * LOG_2PI + 0.5 * (weight * r) ** 2
+    return replace(
+        model,
+        residual=weight * r,
+        jacobian=weight[:, None] * model.jacobian,
+        scale=model.scale / weight,
+        offset=model.offset + less,
+    )
 
 
 def centered(rival: Rival, model: LinearModel, unit: Array) -> LinearModel:
