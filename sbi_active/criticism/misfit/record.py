@@ -13,6 +13,7 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.misfit.draws import bends, keep_draws
 from sbi_active.criticism.misfit.guesses import guess_residual
+from sbi_active.criticism.misfit.near_aliases import near_aliases
 from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.results import (
     OUTLIER,
@@ -25,7 +26,6 @@ from sbi_active.criticism.results import (
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.criticism.steps.equivalence import equivalent_effects
 from sbi_active.criticism.steps.influence import is_left_to_chance, withdrawn
-from sbi_active.criticism.steps.near_aliases import near_aliases
 from sbi_active.criticism.steps.predictive import predict
 from sbi_active.criticism.steps.tracing import (
     credible_set,
@@ -43,9 +43,6 @@ SHOWN, MOST_SHOWN = 0.01, 8
 #: Weight by the error on left-out parts from which a next action is to tell a model
 #: from others, and how many are at most: each costs some hundred trials a candidate.
 COUNTS, MOST_COUNTED = 0.05, 6
-#: Root mean square difference of two effects' fits, in sensor deviations, below which
-#: they are nearly the same.
-CLOSE = 1.0
 
 
 def traced(
@@ -83,7 +80,7 @@ def traced(
     if compare and found.detection.alarm:
         singles = {n: evidences[n].log_evidence for n in rivals.effects}
         known = [*found.equivalent, *groups]
-        aliases = near_aliases(rivals, singles, actions, known)
+        aliases = near_aliases(found.search, singles, actions, known)
     effects = ModelKey(key.effects)
     gain = found.states.log_evidence(ModelKey(found.choice.key.effects, UNEXPLAINED))
     tracing = Tracing(
@@ -131,6 +128,7 @@ def _beside_misfit(misfit: Verdict, held_out: Trials | None) -> Tracing:
         n: choice.probabilities.get(ModelKey((n,)), 0.0) for n in search.names
     }
     ordered = dict(sorted(probabilities.items(), key=lambda item: -item[1]))
+    beside = {k.effects[0]: search.found[k].posterior.log_process for k in singles}
     guess = not (choice.key.effects if rivals.measurements.is_sequence else named)
     return Tracing(
         verdict=str(ModelKey(named)) if named else misfit.key.error or UNEXPLAINED,
@@ -140,7 +138,7 @@ def _beside_misfit(misfit: Verdict, held_out: Trials | None) -> Tracing:
         credible_set=credible_set(ordered),
         equivalent=(*misfit.equivalent,),
         near=(),
-        aliases=_aliases(misfit),
+        aliases=near_aliases(search, beside, None),
         estimates=_estimates(misfit, evidences),
         evidences=evidences,
         robust=misfit.is_robust(),
@@ -311,18 +309,3 @@ def _estimates(found: Verdict, evidences: dict[str, Evidence]) -> tuple[Estimate
         for name, effect in found.rivals.effects.items()
         if name in evidences
     )
-
-
-def _aliases(misfit: Verdict) -> tuple[frozenset[str], ...]:
-    """Return pairs of effects that fit the trials nearly alike and about as well."""
-    found = {n: misfit.search.found[ModelKey((n,))] for n in misfit.search.names}
-    log_z = {n: c.posterior.log_process for n, c in found.items()}
-    best = max(log_z.values(), default=-np.inf)
-    likely = [n for n, value in log_z.items() if value > best - THRESHOLD]
-    pairs = []
-    for i, a in enumerate(likely):
-        for b in likely[i + 1 :]:
-            one, two = (found[n].model.residual for n in (a, b))
-            if np.mean((one - two) ** 2) < CLOSE**2:
-                pairs.append(frozenset({a, b}))
-    return (*pairs,)
