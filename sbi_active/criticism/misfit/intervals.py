@@ -1,19 +1,24 @@
-r"""Intervals of parameters where every model is wrong.
+r"""Errors of parameters where every model is wrong.
 
 A posterior given one error model is too narrow: it takes what the simulator gets wrong
-for independent from trial to trial. The variance is
+for independent from trial to trial. The covariance is
 
 .. math::
-    s^2 = t_f^2 \bigl(\max(s_{GLS}, s_J)^2 + (\hat u_{LSQ} - \hat u_{GLS})^2\bigr)
-        + \sum_m w_m (\hat u_m - \hat u)^2
+    \Sigma = \Sigma_{GLS} + \Delta \Delta^T, \qquad
+    \Delta = \hat u_{LSQ} - \hat u_{GLS}
 
-with that of generalized least squares given a residual process of which a part is
-shared by the trials, and the jackknife's over f trials, :math:`s_J`: what weighting the
-same residuals differently moves a parameter by is an error of it too. So is what it is
-in other models m, by how well they predict left-out trials: something undeclared may
-act as their effects do. :math:`t_f` is Student's quantile in units of the normal one,
-since few trials hardly tell how much they differ. The center is that of least squares,
-which predicts new trials better.
+with that of generalized least squares given a residual process, or a parameter that
+differs from trial to trial, of which a part is shared by the trials. What weighting the
+same residuals differently moves parameters by is an error of them too. It is one
+matrix, in which parameters make up for each other as they do in the trials, so that
+predictions follow from it. Intervals have the variance
+
+.. math::
+    s^2 = \max_m \max(\Sigma_m, s_{J, m}^2) + \max_m (\hat u_m - \hat u)^2
+
+with the jackknife's, :math:`s_J`, and the models m that have further effects and
+predict left-out trials better: something undeclared may be what they take up. The
+center is that of least squares, which predicts new trials better.
 """
 
 from __future__ import annotations
@@ -23,10 +28,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
-from sbi_active.criticism.linear.errors import Errors, Posterior
-from sbi_active.criticism.linear.left_out import LeftOut
+from sbi_active.criticism.linear.errors import Errors
+from sbi_active.criticism.linear.left_out import Candidate
 from sbi_active.criticism.linear.mixture import WIDTHS, summed
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.processes import Filter, Processes, alike
@@ -37,67 +41,46 @@ Array = NDArray[Any]
 #: Shares of the process that trials have in common, and the length over which they do,
 #: in deviations of the action.
 SHARES, LENGTHS = (0.5, 0.9), (0.7, 1e3)
-#: Upper end of the central interval that is printed.
-QUANTILE = 0.95
 #: Every so many of the sizes of the process.
 THINNED = 2
 
 
-def covariances(
-    model: LinearModel,
-    posterior: Posterior,
-    left: LeftOut,
-    errors: Errors,
-    action: Array,
-    between: Array,
-) -> tuple[Array, Array]:
-    """Return covariances of a model's coordinates about its best fit, (d, d).
-
-    The first is without what coordinates differ by from model to model, the second with
-    it.
+def covariance(own: Candidate, errors: Errors, action: Array) -> Array:
+    """Return the covariance of a model's coordinates about its best fit, (d, d).
 
     Args:
-        model: Linear model.
-        posterior: Posterior given a process that is independent in each trial.
-        left: Refits without each part of the trials.
+        own: Fitted model. Its jackknife tells as well where trials are few, or are not
+            sampled at the same times.
         errors: Errors that all models share.
         action: Action of each trial, shape (t, action_dim).
-        between: Variance of the coordinates from model to model, shape (d,).
     """
+    model, given = own.model, own.posterior
     found = shared_process(model, errors, action)
-    mean, cov = (posterior.mean, posterior.cov) if found is None else found
-    mean = np.clip(mean, model.low, model.high)
-    jackknife, apart = left.jackknife(), model.u - mean
-    within = np.maximum(np.diag(cov), np.diag(jackknife)) + apart**2
-    variance = _few(left.num_parts) ** 2 * within
-
-    def scaled(total: Array, variance: Array) -> Array:
-        widest = model.widened(WIDTHS[-1])  # of the prior
-        sd = np.minimum(np.sqrt(variance), widest)
-        scale = sd / np.sqrt(np.maximum(np.diag(total), 1e-300))
-        return total * np.outer(scale, scale)
-
-    # Parameters move together as in any of the three, whose sum is hardly wider.
-    total = cov + jackknife + np.outer(apart, apart)
-    both = total + np.diag(between), variance + between
-    return scaled(total, variance), scaled(*both)
+    mean, cov = found or (given.mean, given.cov + own.left.jackknife())
+    apart = model.u - np.clip(mean, model.low, model.high)
+    return cov + np.outer(apart, apart)
 
 
-def _few(parts: int) -> float:
-    """Return Student's quantile for so many parts in units of the normal one."""
-    return float(stats.t.ppf(QUANTILE, max(parts - 1, 1)) / stats.norm.ppf(QUANTILE))
+def widened(cov: Array, variance: Array, model: LinearModel) -> Array:
+    """Return a covariance with other variances, (d, d), at most the prior's."""
+    sd = np.minimum(np.sqrt(variance), model.widened(WIDTHS[-1]))
+    ratio = sd / np.sqrt(np.maximum(np.diag(cov), 1e-300))
+    return cov * np.outer(ratio, ratio)
 
 
 def shared_process(
     model: LinearModel, errors: Errors, action: Array
 ) -> tuple[Array, Array] | None:
-    r"""Return the posterior moments given a process that trials may share.
+    r"""Return the posterior moments given an error that trials may share.
 
     .. math::
-        C = \sigma^2 (I + s^2 A \otimes K), \qquad
+        C = \sigma^2 (I + s^2 A \otimes K) \ \text{or}\
+        \sigma^2 (I + s^2 A \otimes j j^T), \qquad
         A_{ij} = c\, e^{-|\Delta\xi|^2 / 2 \ell^2} + (1 - c) \delta_{ij}
 
-    summed over c, the length, s, the kernel and its time scale.
+    summed over c, the length, s, and the kernel with its time scale or the parameter
+    that differs, with derivatives j: what depends on the action, or on the states that
+    it leads to, is in part the same in all trials, as a wrong parameter is.
 
     Args:
         model: Linear model.
@@ -107,28 +90,71 @@ def shared_process(
     Returns:
         Shapes (d,) and (d, d); None if trials are not sampled at the same times.
     """
-    m, num = errors.measurements, errors.num_folds
-    patterns = alike(m, errors.fold)
-    if not errors.is_by_trial or len(patterns) != 1:
+    num = errors.num_folds
+    patterns = alike(errors.measurements, errors.fold)
+    if not errors.is_by_trial or len(patterns) != 1 or len(patterns[0]) % num:
         return None
-    (places,) = patterns  # by trial, then channel
-    channels = len(places) // num
-    if len(places) != channels * num:
-        return None
+    between = _between(action, num)
+    parts = [_processes(model, errors, patterns[0], between)]
+    if errors.varying.any():
+        parts.append(_differing(model, errors, between))
+    grams, logs = zip(*parts, strict=True)
+    log_p = np.concatenate([log_det - np.log(len(log_det)) for log_det in logs])
+    found = summed(np.concatenate(grams), log_p, model)
+    return found.mean, found.cov
+
+
+def _processes(
+    model: LinearModel,
+    errors: Errors,
+    places: Array,
+    between: list[tuple[Array, Array]],
+) -> tuple[Array, Array]:
+    """Return Gram matrices with a process, (h, k, k), and log constants, (h,).
+
+    Args:
+        model: Linear model.
+        errors: Errors that all models share.
+        places: Numbers of each series, by trial, then channel, shape (b, n).
+        between: Eigenvalues and vectors of what trials share, by hypothesis.
+    """
+    num = errors.num_folds
     blocks = model.rows[places].reshape(num, -1)
     variance = errors.sizes[::THINNED] ** 2
     variances = np.stack([np.ones(len(variance)), variance], 1)
     own = Processes.grid(variances, errors.times, errors.kernels)
     grams, logs = [], []
-    for weights, basis in _between(action, num):
+    for weights, basis in between:
         # Along these directions trials have processes of their own, of other sizes.
         turned = (basis.T @ blocks).reshape(*places.shape, -1)
-        each = own.process[:, None] * np.repeat(weights, channels)
-        filters = Filter(replace(own, process=each), m.time[places[0]])
+        each = own.process[:, None] * np.repeat(weights, len(places) // num)
+        filters = Filter(
+            replace(own, process=each), errors.measurements.time[places[0]]
+        )
         grams.append(filters.grams(turned).sum(1))
         logs.append(-0.5 * filters.log_det.sum(1))
-    found = summed(np.concatenate(grams), np.concatenate(logs), model)
-    return found.mean, found.cov
+    return np.concatenate(grams), np.concatenate(logs)
+
+
+def _differing(
+    model: LinearModel, errors: Errors, between: list[tuple[Array, Array]]
+) -> tuple[Array, Array]:
+    """Return Gram matrices with a parameter that differs, (h, k, k), and constants."""
+    rows, fold, num = model.rows, errors.fold, errors.num_folds
+    grams, logs = [], []
+    for column in errors.varying.T:
+        square = np.bincount(fold, column**2, num)
+        pulls = np.stack([np.bincount(fold, column * r, num) for r in rows.T], 1)
+        for weights, basis in between:
+            root = basis * np.sqrt(weights)
+            values, vectors = eigh(root.T @ (square[:, None] * root))
+            values, pull = np.maximum(values, 0.0), vectors.T @ (root.T @ pulls)
+            size = errors.spreads[:, None] ** 2
+            less = size / (1 + size * values)
+            taken = np.einsum("st,ti,tj->sij", less, pull, pull)
+            grams.append(rows.T @ rows - taken)
+            logs.append(-0.5 * np.log1p(size * values).sum(1))
+    return np.concatenate(grams), np.concatenate(logs)
 
 
 def _between(action: Array, num: int) -> list[tuple[Array, Array]]:

@@ -212,13 +212,12 @@ def _is_sampled(found: Verdict, key: ModelKey) -> bool:
 def _record_misfit(misfit: Verdict, key: ModelKey) -> Evidence:
     """Return a model's record, and keep its draws as its posterior sample."""
     model, log_z = misfit.model(key), misfit.search.found[key].posterior.log_process
-    own, shown = misfit.covariances(key)
-    # Draws as wide as misfit asks leave the valleys of what bends: left-out trials are
-    # predicted from the best fit, and so are others.
+    # Wide draws leave the valleys of what bends: left-out trials are predicted from the
+    # best fit, and so are others.
     return keep_draws(
-        *(misfit.rivals, key, model, model.u, own, log_z),
+        *(misfit.rivals, key, model, model.u, misfit.covariance(key), log_z),
         best=model.u,
-        shown=shown,
+        shown=misfit.shown(key),
     )
 
 

@@ -24,7 +24,7 @@ from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.states import States
 from sbi_active.criticism.misfit.guesses import gained_by_guesses
-from sbi_active.criticism.misfit.intervals import covariances
+from sbi_active.criticism.misfit.intervals import covariance, widened
 from sbi_active.criticism.misfit.rule import Choice, Rule
 from sbi_active.criticism.misfit.scored import Scored
 from sbi_active.criticism.misfit.weights import weights_by_error
@@ -83,6 +83,7 @@ class Verdict:
     def __post_init__(self) -> None:
         self.rivals = self.search.rivals
         self.states = States(self.search, self.rule.chance)
+        self._covariances: dict[ModelKey, Array] = {}
 
     @cached_property
     def detection(self) -> Detection:
@@ -255,23 +256,43 @@ class Verdict:
         given = found.model, found.grams, use
         return self.search.errors.posterior(*given, process=self.is_missed)
 
-    def covariances(self, key: ModelKey) -> tuple[Array, Array]:
-        """Return covariances of a model's coordinates about its best fit, (d, d).
+    def shown(self, key: ModelKey) -> Array:
+        """Return the covariance that intervals of a model's coordinates have, (d, d).
 
-        The first is that of the model, which predictions have. Intervals have the
-        second, with what coordinates differ by from model to model besides.
+        It has what larger models say that predict left-out trials better.
         """
-        found = self.search.found[key]
-        action = self.rivals.trials.action.numpy()
-        action = action[np.unique(self.rivals.measurements.trial)]
-        return covariances(
-            found.model,
-            found.posterior,
-            found.left,
-            self.search.errors,
-            action,
-            between=self._between(key),
-        )
+        search, own = self.search, self.search.found[key]
+        better = [
+            other
+            for other, c in search.found.items()
+            if {*other.effects} > {*key.effects}
+            and c.left.mean_square < own.left.mean_square
+        ]
+        variance, away = self._variance(key), np.zeros_like(own.model.u)
+        for other in better:
+            at = search.columns(other, key)
+            away = np.maximum(away, (self.model(other).u[at] - own.model.u) ** 2)
+        if better:
+            best = min(better, key=lambda k: search.found[k].left.mean_square)
+            its = self._variance(best)[search.columns(best, key)]
+            variance = np.maximum(variance, its)
+        return widened(self.covariance(key), variance + away, own.model)
+
+    def _variance(self, key: ModelKey) -> Array:
+        jackknife = self.search.found[key].left.jackknife()
+        return np.maximum(np.diag(self.covariance(key)), np.diag(jackknife))
+
+    def covariance(self, key: ModelKey) -> Array:
+        """Return the covariance of a model's coordinates about its best fit, (d, d).
+
+        Predictions have it; intervals have what larger models say besides.
+        """
+        if key not in self._covariances:
+            action = self.rivals.trials.action.numpy()
+            action = action[np.unique(self.rivals.measurements.trial)]
+            given = self.search.found[key], self.search.errors, action
+            self._covariances[key] = covariance(*given)
+        return self._covariances[key]
 
     @cached_property
     def weights(self) -> dict[ModelKey, float]:
@@ -282,22 +303,6 @@ class Verdict:
             {key: candidate.log_prior for key, candidate in found.items()},
             derive_seed(self.rivals.seed, "weights"),
         )
-
-    def _between(self, key: ModelKey) -> Array:
-        """Return the variance of a model's coordinates among those that predict, (d,).
-
-        By the square roots of the weights: errors of neighboring parts have causes in
-        common, and count for about half as many.
-        """
-        search, u = self.search, self.model(key).u
-        total, norm = np.zeros_like(u), np.zeros_like(u)
-        for other, weight in self.weights.items():
-            common = ModelKey(tuple(n for n in key.effects if n in other.effects))
-            own = search.columns(key, common)
-            its = self.model(other).u[search.columns(other, common)]
-            total[own] += np.sqrt(weight) * (its - u[own]) ** 2
-            norm[own] += np.sqrt(weight)
-        return total / np.maximum(norm, 1e-300)
 
     def selected_without(self, fold: int) -> ModelKey:
         """Return the effects that are chosen without one part of the trials."""

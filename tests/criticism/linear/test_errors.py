@@ -23,7 +23,7 @@ KERNELS = (
 )
 
 
-def problem(*, low=-np.inf, ragged=False, num=NUM):
+def problem(*, low=-np.inf, ragged=False, num=NUM, differs=False):
     rng = np.random.default_rng(0)
     x = rng.normal(size=(num, SAMPLES))
     if ragged:
@@ -48,8 +48,9 @@ def problem(*, low=-np.inf, ragged=False, num=NUM):
         offset=np.zeros(len(m)),
     )
     unit = np.full(len(m), 0.5)
-    errors = Errors(m, unit, NoiseGrid([NoiseCell.of(m, sd=unit)]), largest=2.0)
-    return model, errors
+    noise = NoiseGrid([NoiseCell.of(m, sd=unit)])
+    varying = jacobian if differs else None
+    return model, Errors(m, unit, noise, largest=2.0, varying=varying)
 
 
 def about_zero(model):
@@ -173,31 +174,36 @@ def test_few_trials_are_left_out_in_parts():
         assert np.ptp(np.flatnonzero(at)) == at.sum() - 1  # neighbors in time
 
 
-def test_a_process_that_trials_share_is_that_of_the_dense_integral():
-    model, errors = problem()
+@pytest.mark.parametrize("differs", [False, True])
+def test_an_error_that_trials_share_is_that_of_the_dense_integral(differs):
+    model, errors = problem(differs=differs)
     m, rows = errors.measurements, about_zero(model)
     action = np.linspace(-1, 1, NUM)[:, None]
     mean, cov = shared_process(model, errors, action)
     scaled = action / action.std()
     square = (scaled - scaled.T) ** 2
-    logs, means, covs = [], [], []
     between = [np.eye(NUM)]
     for share in (0.5, 0.9):
         for length in (0.7, 1e3):
             shared = share * np.exp(-0.5 * square / length**2)
             between.append(shared + (1 - share) * np.eye(NUM))
-    for shape in KERNELS:
-        for tau in errors.times:
-            apart = np.abs(m.time[:, None] - m.time) / tau
+    apart = np.abs(m.time[:, None] - m.time)
+    along = [shape(apart / tau) for shape in KERNELS for tau in errors.times]
+    columns = (model.jacobian / np.sqrt((model.jacobian**2).mean(0))).T
+    logs, means, covs = [], [], []
+    for kernels in (along, [np.outer(j, j) for j in columns])[: 1 + differs]:
+        each = len(kernels) * len(between) * len(errors.sizes[::2])
+        for inside in kernels:
             for a in between:
                 for size in errors.sizes[::2]:
-                    k = shape(apart) * a[m.trial[:, None], m.trial]
+                    k = inside * a[m.trial[:, None], m.trial]
                     noise = np.eye(len(m)) + size**2 * k
                     prior = np.diag(model.sd**2)
                     design = rows[:, 1:]
                     whole = noise + design @ prior @ design.T
                     off = rows[:, 0] - design @ model.center
-                    logs.append(multivariate_normal(cov=whole).logpdf(off))
+                    log_p = multivariate_normal(cov=whole).logpdf(off)
+                    logs.append(log_p - np.log(each))
                     gain = prior @ design.T @ np.linalg.inv(whole)
                     means.append(model.center + gain @ off)
                     covs.append(prior - gain @ design @ prior)
