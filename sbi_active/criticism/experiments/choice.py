@@ -9,17 +9,19 @@ from itertools import takewhile
 import numpy as np
 import torch
 from scipy import stats
+from scipy.optimize import brentq
 from scipy.spatial.distance import cdist
+from scipy.special import gammaln
 
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.criticism import Criticism
-from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.next_trial.candidates import following
 from sbi_active.criticism.report.predicted import Registered, TestedTrial
 from sbi_active.criticism.report.report import Report
 from sbi_active.criticism.results import NONE, UNEXPLAINED, Array, ModelKey
 from sbi_active.criticism.steps.predictive import Prediction, predict
-from sbi_active.criticism.under_misfit import Misfit
+from sbi_active.inference.sampling.weights import normalized
 from sbi_active.seeding import derive_seed
 
 #: Probability with which an outcome lies within the registered interval.
@@ -194,11 +196,10 @@ def register(
     mean, sd = prediction.moments()
     distance = np.sqrt((((prediction.x - mean) / sd) ** 2).mean(1))
     limit = float(np.quantile(distance, COVERAGE))
-    if report.tracing.misfit is not None:
+    if (verdict := criticism.misfit()) is not None:
         mean = prediction.middle
-        sd, limit = _by_left_out(
-            *(rivals, report.tracing.misfit, report.tracing.model, prediction)
-        )
+        key = ModelKey(report.tracing.chosen)
+        sd, limit = _by_left_out(verdict, key, prediction)
     return Registered(
         index=index,
         action=choice.action,
@@ -213,38 +214,72 @@ def register(
 
 
 def _by_left_out(
-    rivals: RivalSet, misfit: Misfit, name: str, prediction: Prediction
+    verdict: Verdict, key: ModelKey, prediction: Prediction
 ) -> tuple[Array, float]:
-    r"""Return deviations (N,) and a limit by what left-out trials were missed by.
+    """Return deviations (N,) of a prediction, and its limit by left-out trials.
 
-    The logarithm of the root mean square by which a model misses a trial that it was
-    not fitted to is taken as normal, so that of a further one lies below
-
-    .. math::
-        \bar\ell + t_{n-1, .9}\, s_\ell \sqrt{1 + 1/n}
-
-    with mean and standard deviation over the n trials, or parts of trials. Where the
-    new action is, refits differ by more, which the deviations have besides.
+    A number errs by the sensor and the residual process, which together are as large as
+    the residuals of its channel, and by what the parameters are unsure of: more where
+    the trials so far tell less.
 
     Args:
-        rivals: The models.
-        misfit: Errors on left-out trials, where every model misses.
-        name: Name of the model that predicts.
+        verdict: The models, where every one misses.
+        key: Key of the model that predicts.
         prediction: Its prediction of one trial.
+    """
+    search, own, cov = (
+        verdict.search,
+        verdict.search.found[key],
+        verdict.covariance(key),
+    )
+    m, fold, model = search.errors.measurements, search.errors.fold, own.model
+    count = np.maximum(np.bincount(m.channel), 1)
+    residual = np.bincount(m.channel, model.residual**2) / count  # sensor variances
+    known = ((model.jacobian @ cov) * model.jacobian).sum(1)
+    each = own.left.error**2 / (np.maximum(residual, TINY)[m.channel] + known)
+    use = np.isfinite(own.left.square)
+    kept = search.errors.is_scored & use[fold]
+    square = np.bincount(fold[kept], each[kept], len(use))[use]
+    square /= np.bincount(fold[kept], minlength=len(use))[use]
+    channel = np.zeros(int(np.prod(m.shape[1:])), dtype=np.int64)
+    channel[m.position % len(channel)] = m.channel
+    own_size = np.bincount(m.channel, (search.unit * model.residual) ** 2) / count
+    sd = np.sqrt(own_size[channel[prediction.position]] + prediction.mean.var(0))
+    return sd, limit_of(square, len(prediction.position))
+
+
+def limit_of(square: Array, most: int, num: int = 25) -> float:
+    r"""Return the root of what a further mean square error stays below (.9).
+
+    Each is as if of k independent numbers of one size, so that
+
+    .. math::
+        z / \bar z \sim F_{k, nk}, \qquad p(k) \propto \frac{1}{k}
+        \frac{\Gamma(nk / 2)}{\Gamma(k / 2)^n} \prod_i \Bigl(
+        \frac{z_i}{n \bar z}\Bigr)^{k / 2}, \qquad 1 \le k \le N,
+
+    whatever their size is: along a trajectory neighbors err alike.
+
+    Args:
+        square: Mean square errors so far, shape (n,).
+        most: Numbers N that the further one is the mean of.
+        num: Number of k, a factor apart, that are summed over.
 
     References:
         Barber et al., Annals of Statistics 49 (2021), on intervals by left-out errors.
     """
-    own, m = misfit.of(name), rivals.measurements
-    square = np.maximum(own.parts, TINY)
-    size = 0.5 * np.log(square)
-    num, spread = len(size), float(size.std(ddof=1))
-    channel = np.zeros(int(np.prod(m.shape[1:])), dtype=np.int64)
-    channel[m.position % len(channel)] = m.channel
-    typical = np.exp(size.mean()) / np.sqrt(square.mean())
-    sd = typical * own.left_out[channel[prediction.position]]
-    limit = stats.t.ppf(COVERAGE, num - 1) * spread * np.sqrt(1 + 1 / num)
-    return np.sqrt(sd**2 + prediction.mean.var(0)), float(np.exp(limit))
+    n, z = len(square), np.maximum(square, TINY)
+    k = np.geomspace(1, most, num if most > 1 else 1)
+    log_p = gammaln(n * k / 2) - n * gammaln(k / 2)
+    log_p += k / 2 * np.log(z / z.sum()).sum()
+    p = normalized(log_p)
+
+    def off(ratio: float) -> float:
+        return float(p @ stats.f.cdf(ratio, k, n * k)) - COVERAGE
+
+    ends = stats.f.ppf(COVERAGE, k, n * k)
+    ratio = brentq(off, 0.9 * ends.min(), 1.1 * ends.max())
+    return float(np.sqrt(z.mean() * ratio))
 
 
 def probability_of(report: Report) -> float:

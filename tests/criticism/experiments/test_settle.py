@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
@@ -9,6 +10,7 @@ from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials, close_loop
+from sbi_active.criticism.experiments.choice import limit_of
 from sbi_active.criticism.experiments.journal import NAME
 from sbi_active.criticism.experiments.settle import VerdictError, settle
 
@@ -169,6 +171,16 @@ def test_predictions_where_every_model_misses_are_as_wide_as_left_out_errors():
     # The process has a root mean square of .07; t of 8 trials widens its 90 % limit.
     assert sum(held) >= 5  # fewer of 8 at .9 have a probability of .005
     assert 0.07 < sum(sizes) / len(sizes) < 0.2
+
+
+@pytest.mark.parametrize(("most", "worth"), [(1, 1), (30, 1), (30, 4), (30, 30)])
+def test_nine_of_ten_further_errors_stay_below_the_limit(most, worth):
+    """Whatever the numbers of a trial are worth, and whatever their size."""
+    rng = np.random.default_rng(0)
+    draws = 7 * rng.chisquare(worth, (2000, 8)) / worth
+    below = [new <= limit_of(before, most) ** 2 for *before, new in draws]
+    # A prior of what a trial is worth has a share in it where few trials tell of that.
+    assert 0.86 < np.mean(below) < 0.96
 
 
 def comparing(fails_at=()):
