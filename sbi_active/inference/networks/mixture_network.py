@@ -115,11 +115,12 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
     ) -> None:
         dim, num = theta.shape[1], num_components
         missing = ~condition.isfinite()
-        # Columns that go missing together need one mask between them.
-        masks, columns = missing.unique(dim=1, return_inverse=True)
-        masked = [int((columns == k).nonzero()[0]) for k in range(masks.shape[1])]
-        masked = [column for column in masked if bool(missing[:, column].any())]
         ever_missing, largest_gap = missing.any(0), int(missing.sum(1).max())
+        # Columns that go missing together need one mask between them.
+        lost = ever_missing.nonzero()[:, 0]
+        masks, columns = missing[:, lost].unique(dim=1, return_inverse=True)
+        first = [int((columns == k).nonzero()[0]) for k in range(masks.shape[1])]
+        masked = lost[first].tolist()
 
         if embedding_net is not None:
             scaling, baseline = "global", "none"
