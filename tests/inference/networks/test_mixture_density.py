@@ -59,9 +59,11 @@ def test_beyond_twelve_parameters_draws_follow_the_density():
     net = MixtureDensity(hidden_features=(8,), num_components=2).build(
         torch.randn(300, dim), condition, 1
     )
-    torch.nn.init.normal_(net._upper, 0.0, 0.3)
-    torch.nn.init.normal_(net.net[-1].bias, 0.0, 0.3)
-    assert net.net[-1].out_features == 2 * (1 + 2 * dim)
+    *_, last = net.net.children()
+    assert last.out_features == 2 * (1 + 2 * dim)
+    own = dict(net.named_parameters())
+    for name in ("_upper", "net.2.bias"):
+        torch.nn.init.normal_(own[name], 0.0, 0.3)
     row = condition[:1]
     with torch.no_grad():
         drawn = net.sample(torch.Size([20_000]), row)[:, 0]
