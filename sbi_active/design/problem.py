@@ -195,7 +195,10 @@ class GainEvaluator:
             model: Any = self.problem.model
             if self.num_others and model is not None:
                 model = JointLikelihood(model, sampler.action.shape[1])
-            self._chosen, self.notes = choose_estimator(model, first)
+            listed = self.problem.limits.actions.listed() is not None
+            # Of a list the first simulations are compared, half of them at a time.
+            num_rows = num_samples // 2 if listed else num_samples
+            self._chosen, self.notes = choose_estimator(model, first, num_rows=num_rows)
             # A model was learned from whole outcomes.
             if sampler.summaries is not None and self._chosen.needs_model:
                 sampler.summaries = None

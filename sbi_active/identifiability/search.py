@@ -65,7 +65,7 @@ def search(
         span: Range of each under the prior, shape (d,).
         floor: Width below which combinations are as good as each other.
         most_shifted: Pairs of which a shift is looked for at most, the narrowest first:
-            all of twelve parameters. Each takes some 50 ms.
+            all of twelve parameters. Each takes some 50 ms, where it may be known.
 
     Returns:
         Each with its width; empty if there are none.
@@ -107,7 +107,8 @@ def search(
                 break
             known_pair = any({*c.index} <= {*subset} for c, _ in found)
             if not known_pair:
-                keep(*_best_formula(moments, subset, low, span, floor))
+                needed = KNOWN * alone[[place[i] for i in subset]].min()
+                keep(*_best_formula(moments, subset, low, span, floor, needed))
     for log in (False, True):
         if len(plain) > 3 and (not log or (low[list(open_parameters)] > 0).all()):
             terms = [Term(i, log=log) for i in open_parameters]
@@ -161,9 +162,17 @@ def _eigenvectors(covariance: Array, prior: Array) -> tuple[Array, Array]:
 
 
 def _best_formula(
-    moments: Moments, subset: tuple[int, ...], low: Array, span: Array, floor: float
+    moments: Moments,
+    subset: tuple[int, ...],
+    low: Array,
+    span: Array,
+    floor: float,
+    needed: float,
 ) -> tuple[Combination, float]:
-    """Return the simplest formula about as narrow as the best, and its width."""
+    """Return the simplest formula about as narrow as the best, and its width.
+
+    A shift is looked for where one may give a width as small as is needed.
+    """
     tried: list[tuple[Combination, float]] = []
 
     def attempt(terms: Sequence[Term], limit: float) -> None:
@@ -174,7 +183,8 @@ def _best_formula(
 
     for terms in _forms(subset, low):
         attempt(terms, floor)
-    if len(subset) == 2:
+    limit = AS_GOOD * max(needed, floor)
+    if len(subset) == 2 and _least_shifted(moments, subset, low, span) <= limit:
         shifted = _shifted(moments, subset, low, span, floor)
         tried += [(c, _own_width(c, moments)) for c in shifted]
     limit = max(ABOUT_AS_GOOD * min(own for _, own in tried), floor)
@@ -190,6 +200,42 @@ def _forms(subset: tuple[int, ...], low: Array) -> Iterator[list[Term]]:
             continue
         if all(low[i] > 0 or not log for i, log in zip(subset, logs, strict=True)):
             yield [Term(i, log=log) for i, log in zip(subset, logs, strict=True)]
+
+
+def _least_shifted(
+    moments: Moments,
+    subset: tuple[int, ...],
+    low: Array,
+    span: Array,
+    *,
+    refined: int = 3,
+) -> float:
+    """Return the smallest width of a product in which one of two has a number added.
+
+    Between the two neighbors of the best shift others are tried, so many times: the
+    last are some thousandths of the range apart.
+    """
+    least = np.inf
+    for i, other in (subset, subset[::-1]):
+        shifts = _shifts(low[i], span[i])
+        for _ in range(1 + refined if low[other] > 0 else 0):
+            moved = [Term(i, log=True, shift=float(shift)) for shift in shifts]
+            parts = moments([Term(other, log=True), *moved])
+            at = np.stack([np.zeros(len(shifts), int), 1 + np.arange(len(shifts))], 1)
+            pairs = (m[at[:, :, None], at[:, None, :]] for m in parts)
+            widths = _eigenvectors(*pairs)[0][:, 0]
+            best = int(widths.argmin())
+            least = min(least, float(widths[best]))
+            ends = shifts[max(best - 1, 0)], shifts[min(best + 1, len(shifts) - 1)]
+            shifts = np.linspace(*ends, 2 * len(SHIFTS))
+    return least
+
+
+def _shifts(low: float, span: float) -> Array:
+    """Return the shifts that are tried of a parameter, ascending."""
+    sizes = span * np.array(SHIFTS)
+    shifts = np.sort(np.concatenate([-sizes, sizes]))
+    return shifts[shifts > -low + 0.02 * span]
 
 
 def _shifted(
@@ -232,9 +278,7 @@ def _best_shift(
     def narrowest(shift: float) -> float:
         return _own_width(made(shift), moments)
 
-    sizes = span * np.array(SHIFTS)
-    grid = np.sort(np.concatenate([-sizes, sizes]))
-    grid = grid[grid > -low + 0.02 * span]
+    grid = _shifts(low, span)
     at = int(np.argmin([narrowest(shift) for shift in grid]))
     ends = grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)]
     best: Any = minimize_scalar(

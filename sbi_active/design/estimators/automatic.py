@@ -39,6 +39,12 @@ ESTIMATORS: dict[str, type[InformationGainEstimator]] = {
 }
 #: Numbers of x up to which nearest neighbors are trusted.
 MAX_NEIGHBOR_OUTCOMES = 2
+#: Parameters up to which local draws of nested Monte Carlo meet a posterior: of 40
+#: uniform ones nearly all lie outside a bound, and 47 nats became 500.
+MAX_NESTED_PARAMETERS = 12
+#: Deviations of the noise that outcomes of more may be off a plane, which counts as
+#: noise: a number loses half the square of it, nats.
+MAX_BENT = 0.3
 
 
 def find_estimator(
@@ -69,20 +75,32 @@ def find_estimator(
 
 
 def choose_estimator(
-    model: Any, simulations: CandidateSimulations
+    model: Any, simulations: CandidateSimulations, *, num_rows: int | None = None
 ) -> tuple[InformationGainEstimator, list[str]]:
     """Return the first estimator whose assumptions pass their checks.
 
-    With declared noise it is entropies if x is one number, else nested Monte Carlo.
+    With declared noise it is entropies if x is one number, the linear estimate of more
+    than twelve parameters that x is linear in, else nested Monte Carlo.
     With replicates it is entropies for one or two numbers, else nested Monte Carlo on
     the smoothed outcomes. If checks fail, it depends on the model: the bound of a
     posterior, nested Monte Carlo on a likelihood, or InfoNCE on a ratio, which no
     normalization of it can fool, but the mean log ratio where that is near its largest
     value. Beside it, why others were not taken.
+
+    Args:
+        model: Model that was learned, or None.
+        simulations: Simulations to check assumptions by.
+        num_rows: Fewest simulations of a candidate that an estimate will rest on; None
+            are as many as these.
     """
+    num_rows = len(simulations.theta) if num_rows is None else num_rows
     options: list[InformationGainEstimator] = []
     num_outcomes = simulations.x[0, 0].numel()
     if simulations.mean is not None and simulations.noise is not None:
+        many = num_outcomes > 1 and simulations.theta.shape[1] > MAX_NESTED_PARAMETERS
+        linear = LinearGain(max_bent=MAX_BENT)
+        if many and linear.suits(simulations, num_rows):
+            return linear, []
         options.append(EntropyGain() if num_outcomes == 1 else NestedGain())
     elif simulations.replicate is not None:
         few = num_outcomes <= MAX_NEIGHBOR_OUTCOMES

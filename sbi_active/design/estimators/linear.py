@@ -17,6 +17,8 @@ from sbi_active.design.estimators.base import (
 from sbi_active.simulation import NoiseModel
 from sbi_active.simulation.noise.whitening import whitened
 
+NUM_GROUPS = 24  # of simulations, each left out in turn
+
 
 class LinearGain(InformationGainEstimator):
     r"""Gauss-Newton entropies: the outcome is regressed on the parameters.
@@ -47,6 +49,8 @@ class LinearGain(InformationGainEstimator):
     Args:
         index: Places of the parameters S, or a function of parameters (n, d) whose
             numbers (n, k) stand for them; None are all.
+        max_bent: Deviations of the noise that outcomes may be off a plane without a
+            word.
 
     Raises:
         ValueError: If no parameter or one twice is named.
@@ -74,14 +78,22 @@ class LinearGain(InformationGainEstimator):
     needs_model = False
 
     def __init__(
-        self, index: Sequence[int] | Callable[[Tensor], Tensor] | None = None
+        self,
+        index: Sequence[int] | Callable[[Tensor], Tensor] | None = None,
+        *,
+        max_bent: float = 1.0,
     ) -> None:
         self.target = None if index is None else numbers_of(index)
+        self.max_bent = max_bent
+
+    def suits(self, simulations: CandidateSimulations, num_rows: int) -> bool:
+        """Return whether outcomes are complete and on a plane that so many tell."""
+        dim, complete = simulations.theta.shape[1], bool(simulations.complete.all())
+        enough = _smallest(num_rows) >= _fewest(dim)
+        return complete and enough and not self.remarks(simulations)
 
     @override
-    def remarks(
-        self, simulations: CandidateSimulations, *, max_bent: float = 1.0
-    ) -> list[str]:
+    def remarks(self, simulations: CandidateSimulations) -> list[str]:
         mean, noise = simulations.mean, simulations.noise
         if mean is None or noise is None:
             return []
@@ -93,7 +105,7 @@ class LinearGain(InformationGainEstimator):
             rest = off @ y[complete]
             bent.append(float((rest.square().sum() / off.trace() / y.shape[1]).sqrt()))
         worst = max(bent, default=0.0)
-        if worst <= max_bent:
+        if worst <= self.max_bent:
             return []
         return [
             f"outcomes are up to {worst:.1f} noise deviations off what is linear in "
@@ -131,55 +143,62 @@ def _rows(noise: NoiseModel, mean: Tensor) -> Tensor:
     return joint.reshape(len(mean), -1)
 
 
-def _jackknife(
-    theta: Tensor, y: Tensor, *, num_groups: int = 24, spare: int = 3
-) -> Tensor:
+def _fewest(dim: int, *, spare: int = 3) -> int:
+    """Return the simulations that a plane takes, and some to spare."""
+    return dim + 1 + spare
+
+
+def _smallest(num: int) -> int:
+    """Return the simulations that are left without one of the groups."""
+    return num - -(-num // min(num, NUM_GROUPS))
+
+
+def _jackknife(theta: Tensor, y: Tensor) -> Tensor:
     """Return pseudovalues of the information, shape (n,).
 
     Args:
         theta: Parameters, shape (n, d).
         y: Outcomes in deviations of their noise, shape (n, N).
-        num_groups: Number of groups, each left out in turn.
-        spare: Number of simulations beyond those that a plane takes.
     """
     n, d = theta.shape
-    groups = min(n, num_groups)
-    fewest = d + 1 + spare
-    if n - -(-n // groups) < fewest:
+    groups, fewest = min(n, NUM_GROUPS), _fewest(d)
+    if _smallest(n) < fewest:
         raise ValueError(
             f"expected {fewest + 1} or more outcomes of an action at a time for "
             f"LinearGain of {d} parameters; got {n}; pass num_samples of "
             f"{4 * (fewest + 2)} or more for a list, {12 * (fewest + 2)} for a box"
         )
-    gram = (y - y.mean(0)) @ (y - y.mean(0)).T
-    whole = _information(theta, gram)
+    y, ones = y - y.mean(0), torch.ones(n, 1, dtype=y.dtype)
+    if y.shape[1] > n:  # along the span of the outcomes
+        y = torch.linalg.qr(y.T).R.T
+    basis = n**0.5 * _basis(theta)
+    known = 1, 1 + basis.shape[1]
+    rows = torch.cat([ones, basis, y], 1)
     group = torch.arange(n) % groups
-    without = torch.stack(
-        [
-            _information(theta[group != g], gram[group != g][:, group != g])
-            for g in range(groups)
-        ]
-    )
-    return (groups * whole - (groups - 1) * without)[group]
+    parts = [rows[group == g] for g in range(groups)]
+    moments = torch.stack([part.T @ part for part in parts])
+    whole = moments.sum(0)
+    moments = torch.cat([whole[None], whole - moments])
+    count = torch.tensor([n, *(n - len(part) for part in parts)], dtype=y.dtype)
+    one = torch.eye(y.shape[1], dtype=y.dtype)
+    left = []
+    for num, lost in zip(known, (1, 1 + d), strict=True):  # the mean, and the plane
+        beside = moments[:, :num, known[1] :]
+        slope = torch.linalg.solve(moments[:, :num, :num], beside)
+        rest = moments[:, known[1] :, known[1] :] - beside.mT @ slope
+        left.append(torch.linalg.slogdet(one + rest / (count - lost)[:, None, None])[1])
+    each = 0.5 * (left[0] - left[1])
+    return (groups * each[0] - (groups - 1) * each[1:])[group]
 
 
-def _information(theta: Tensor, gram: Tensor) -> Tensor:
-    """Return the information by inner products of the outcomes (n, n)."""
-    n, d = theta.shape
-    center = torch.eye(n, dtype=gram.dtype) - 1 / n
-    off = _off_plane(theta)
-    one = torch.eye(n, dtype=gram.dtype)
-    total = torch.linalg.slogdet(one + center @ gram @ center / (n - 1))[1]
-    rest = torch.linalg.slogdet(one + off @ gram @ off / (n - 1 - d))[1]
-    return 0.5 * (total - rest)
+def _basis(theta: Tensor) -> Tensor:
+    """Return orthonormal functions (n, k) of theta that are linear, of no mean."""
+    apart = (theta - theta.mean(0)) / theta.std(0).clamp(min=1e-300)
+    basis, values, _ = torch.linalg.svd(apart, full_matrices=False)
+    return basis[:, values > 1e-9 * values[0]]
 
 
 def _off_plane(theta: Tensor) -> Tensor:
     """Return the projection (n, n) on what no linear function of theta follows."""
-    ones = torch.ones(len(theta), 1, dtype=theta.dtype)
-    basis, values, _ = torch.linalg.svd(
-        torch.cat([ones, (theta - theta.mean(0)) / theta.std(0).clamp(min=1e-300)], 1),
-        full_matrices=False,
-    )
-    basis = basis[:, values > 1e-9 * values[0]]
-    return torch.eye(len(theta), dtype=theta.dtype) - basis @ basis.T
+    basis, n = _basis(theta), len(theta)
+    return torch.eye(n, dtype=theta.dtype) - basis @ basis.T - 1 / n

@@ -20,6 +20,8 @@ from sbi_active.messages import warn
 from sbi_active.seeding import forked_generators
 from sbi_active.support import parameter_dim, support_of, within_support
 
+#: Numbers of draws at once: networks take some hundred bytes for each.
+MOST_NUMBERS = 10_000_000
 #: Draws behind moments and a chained belief's normalizer: a hundredth of a deviation.
 NUM_DRAWS = 20_000
 NUM_SHOWN = 2_000  # draws behind the page of a notebook
@@ -240,9 +242,9 @@ def within_prior(
         acceptance: Share of draws within the support.
     """
     kept: list[Tensor] = []
-    missing = num_samples
+    missing, most = num_samples, MOST_NUMBERS // max(parameter_dim(prior), 10)
     while missing > 0:
-        draws = draw(min(int(1.1 * missing / acceptance) + 20, 1_000_000)).float()
+        draws = draw(min(int(1.1 * missing / acceptance) + 20, most)).float()
         draws = draws[within_support(prior, draws)]
         kept.append(draws[:missing])
         missing -= len(kept[-1])

@@ -31,6 +31,7 @@ from sbi_active.inference.engine import (
     infer,
     search,
 )
+from sbi_active.inference.engine.particles import share_cut
 from sbi_active.inference.engine.pool import Pool
 from sbi_active.inference.engine.potential import (
     STEP,
@@ -179,6 +180,8 @@ def _gone_on(
     rows = [weight.argmax(), *systematic(weight, own.num_near - 1, rng.random())]
     again = replace(own.search, num_screened=0)
     found = search(potential, rng, pool.u[rows], again)
+    if found is not None and share_cut(potential, found) > own.hopeless:
+        return None
     fit = infer(potential, rng, past=pool, found=found, settings=own)
     if fit.effective_sample_size < own.num_effective:
         return None

@@ -100,6 +100,21 @@ class LinearResponse:
         return log_sum_exp(-0.5 * squares / WIDER**2, axis=0)
 
 
+@dataclass(frozen=True)
+class _Line:
+    """A direction of a few axes, drawn anew at each particle.
+
+    Attributes:
+        axes: The axes, shape (k,).
+        precision: Precision of these given all others, shape (k, k).
+        root: Root of its inverse, shape (k, k).
+    """
+
+    axes: NDArray[np.int64]
+    precision: Array
+    root: Array
+
+
 class LineMoves(Moves):
     r"""Moves along lines, each to a normal draw between where the bounds cut it.
 
@@ -137,10 +152,11 @@ class LineMoves(Moves):
         self._prior = np.maximum(precision, 1 / (high - low) ** 2)
         self._num, self._sizes = num_lines * len(low), sizes
         self._normals: list[tuple[Array, Array]] = []
+        self._lines: dict[int, list[_Line]] = {}
 
     def begin(self, u: Array, weight: Array, power: float) -> None:
         """Take the normal density of each mode at a power of its likelihood."""
-        self._normals = []
+        self._normals, self._lines = [], {}
         for mode in self._response.modes:
             pull = power / WIDER**2 * mode.slope.T
             precision = pull @ mode.slope + np.diag(self._prior)
@@ -149,39 +165,51 @@ class LineMoves(Moves):
 
     def propose(self, u: Array, rng: np.random.Generator) -> tuple[Array, Array]:
         """Return proposed particles, and the log ratio of the normal densities."""
-        mean, precision = self._normals[rng.integers(len(self._normals))]
-        new = u.copy()
-        pull = (new - mean) @ precision
-        before = ((new - mean) * pull).sum(1)
-        scale = np.sqrt(np.diag(precision))
+        k = int(rng.integers(len(self._normals)))
+        mean, precision = self._normals[k]
+        if k not in self._lines:
+            self._lines[k] = self._drawn_lines(precision, rng)
+        new = u.T.copy()  # a line reads a few axes of all particles
+        apart = new - mean[:, None]
+        pull = precision @ apart
+        before = (apart * pull).sum(0)
+        # In any order: a walk is as likely as the one that leads back.
+        for place in rng.permutation(len(self._lines[k])):
+            line = self._lines[k][place]
+            step = line.root @ rng.standard_normal((len(line.axes), len(u)))
+            square = (step * (line.precision @ step)).sum(0)
+            old, sd = new[line.axes], square**-0.5
+            center = -(step * pull[line.axes]).sum(0) / square
+            with np.errstate(divide="ignore", invalid="ignore"):
+                low = (self._low[line.axes, None] - old) / step
+                high = (self._high[line.axes, None] - old) / step
+            first_end = np.minimum(low, high).max(0)
+            last_end = np.maximum(low, high).min(0)
+            to = old + truncated_normal(center, sd, first_end, last_end, rng) * step
+            np.clip(to, self._low[line.axes, None], self._high[line.axes, None], out=to)
+            pull += precision[:, line.axes] @ (to - old)
+            new[line.axes] = to
+        apart = new - mean[:, None]
+        after = (apart * (precision @ apart)).sum(0)
+        return new.T.copy(), 0.5 * (after - before)
+
+    def _drawn_lines(self, precision: Array, rng: np.random.Generator) -> list[_Line]:
+        """Return lines along axes that a precision couples."""
+        scale, dim = np.sqrt(np.diag(precision)), len(precision)
         # Axes that are not coupled are moved together as well, now and then.
         coupled = np.abs(precision) / scale / scale[:, None] + 1e-3
         np.fill_diagonal(coupled, 0.0)
+        lines = []
         for _ in range(self._num):
-            size = min(int(rng.choice(self._sizes)), len(mean))
-            first = int(rng.integers(len(mean)))
+            first = int(rng.integers(dim))
+            num = min(int(rng.choice(self._sizes)), dim) - 1
             axes = np.array([first])
-            if size > 1:
+            if num:
                 share = coupled[first] / coupled[first].sum()
-                others = rng.choice(len(mean), size - 1, replace=False, p=share)
-                axes = np.append(axes, others)
-            own = precision[axes[:, None], axes]
-            root = np.linalg.inv(np.linalg.cholesky(own))
-            step = rng.standard_normal((len(u), size)) @ root
-            square = ((step @ own) * step).sum(1)
-            center, sd = -(step * pull[:, axes]).sum(1) / square, square**-0.5
-            with np.errstate(divide="ignore", invalid="ignore"):
-                low = (self._low[axes] - new[:, axes]) / step
-                high = (self._high[axes] - new[:, axes]) / step
-            first_end = np.minimum(low, high).max(1)
-            last_end = np.maximum(low, high).min(1)
-            t = truncated_normal(center, sd, first_end, last_end, rng)
-            to = new[:, axes] + t[:, None] * step
-            to = np.clip(to, self._low[axes], self._high[axes])
-            pull += (to - new[:, axes]) @ precision[axes]
-            new[:, axes] = to
-        after = ((new - mean) @ precision * (new - mean)).sum(1)
-        return new, 0.5 * (after - before)
+                axes = np.append(axes, rng.choice(dim, num, replace=False, p=share))
+            own = precision[np.ix_(axes, axes)]
+            lines.append(_Line(axes, own, np.linalg.inv(np.linalg.cholesky(own)).T))
+        return lines
 
     def remembered(self, before: Array, after: Array, acceptance: float) -> float:
         """Return the mean correlation of the axes across a move."""

@@ -115,6 +115,8 @@ def importance_sample(
         else:
             if efficiency > best and effective >= own.seen:
                 kept = proposal
+            if pool.num_past and kept is None and fits.num_full > own.max_fits:
+                break  # modes are found again, and particles led from there
             best, latched = max(best, efficiency), 0.0
             pool.restart()
             proposal = fits.again(power, efficiency)

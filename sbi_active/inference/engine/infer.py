@@ -21,7 +21,12 @@ from sbi_active.inference.engine.importance import (
     pareto_shape,
     wider,
 )
-from sbi_active.inference.engine.particles import fit_of, led_particles, uninformed
+from sbi_active.inference.engine.particles import (
+    fit_of,
+    led_particles,
+    share_cut,
+    uninformed,
+)
 from sbi_active.inference.engine.pool import Fit, Pool, PriorDraws
 from sbi_active.inference.engine.potential import Density, Potential
 from sbi_active.inference.engine.search import WIDER, Found
@@ -61,7 +66,9 @@ def infer(
     searched = cast(Potential, potential)  # where modes were found
     if past is None:
         free = none if found is None else uninformed(found, searched, rng)
-        if found is not None and free.any():
+        if found is not None and (
+            free.any() or share_cut(searched, found) > settings.hopeless
+        ):
             moved = led_particles(searched, found, free, rng, settings)
             if moved is not None:
                 return fit_of(moved, searched, found, free, rng, settings)

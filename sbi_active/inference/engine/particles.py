@@ -59,6 +59,13 @@ def uninformed(
     return free if is_free else none
 
 
+def share_cut(potential: Potential, found: Found, *, num: int = 500) -> float:
+    """Return the share of the modes' normal approximations beyond the bounds."""
+    c, rng = potential.coordinates, np.random.default_rng(0)
+    drawn = found.guess.sample(num, rng)
+    return float(((drawn < c.low) | (drawn > c.high)).any(1).mean())
+
+
 def led_particles(
     potential: Potential,
     found: Found,

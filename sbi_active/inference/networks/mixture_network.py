@@ -20,8 +20,9 @@ LOG_PRECISION_RANGE = (-10.0, 16.0)
 #: Where components of local frames are, one of the global frame starts with a twentieth
 #: of the weight of each.
 GLOBAL_LOGIT = -3.0
-#: From where on batched matrices are faster than products and sums, whose room grows
-#: with the square.
+#: Numbers of parameters beyond which correlations of a component are the same for all
+#: conditions, in its frame: their number grows with the square, and thousands of rows
+#: do not tell how each depends on the condition.
 FEW_DIMENSIONS = 12
 #: Numbers of the factors of draws in memory at once, 40 MB.
 MOST_FACTORS = 10_000_000
@@ -61,7 +62,8 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         q(\theta | c) = \sum_k \pi_k(c)\, \mathcal{N}(u; \mu_k(c), (R_k^\top R_k)^{-1})
         \, |\mathrm{d}u / \mathrm{d}\theta|, \qquad u = (\theta - m) / s,
 
-    with R_k upper triangular, its diagonal the exponential of an output. The condition
+    with R_k upper triangular, its diagonal the exponential of an output; of more than
+    12 parameters what is above the diagonal does not depend on c. The condition
     is standardized column by column. Where training rows hold NaN (outcomes without a
     measurement), those numbers are set to zero and a 0/1 mask is appended, so that
     "there was no measurement" is itself something to condition on.
@@ -113,11 +115,12 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
     ) -> None:
         dim, num = theta.shape[1], num_components
         missing = ~condition.isfinite()
-        # Columns that go missing together need one mask between them.
-        masks, columns = missing.unique(dim=1, return_inverse=True)
-        masked = [int((columns == k).nonzero()[0]) for k in range(masks.shape[1])]
-        masked = [column for column in masked if bool(missing[:, column].any())]
         ever_missing, largest_gap = missing.any(0), int(missing.sum(1).max())
+        # Columns that go missing together need one mask between them.
+        lost = ever_missing.nonzero()[:, 0]
+        masks, columns = missing[:, lost].unique(dim=1, return_inverse=True)
+        first = [int((columns == k).nonzero()[0]) for k in range(masks.shape[1])]
+        masked = lost[first].tolist()
 
         if embedding_net is not None:
             scaling, baseline = "global", "none"
@@ -144,7 +147,8 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         for hidden in hidden_features:
             layers += [nn.Linear(width, hidden), ACTIVATIONS[activation]()]
             width = hidden
-        last = nn.Linear(width, num * (1 + 2 * dim + dim * dim))
+        num_upper = dim * dim if dim <= FEW_DIMENSIONS else 0
+        last = nn.Linear(width, num * (1 + 2 * dim + num_upper))
         super().__init__(
             nn.Sequential(*layers, last), theta.shape[1:], condition.shape[1:]
         )
@@ -152,7 +156,9 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         self._num_components, self._dim = num, dim
         self._masked_columns = masked
         self._ever_missing, self._largest_gap = ever_missing.cpu(), largest_gap
-        self._sections = [num, num * dim, num * dim, num * dim * dim]
+        self._sections = [num, num * dim, num * dim, num * num_upper]
+        if not num_upper:
+            self._upper = nn.Parameter(torch.zeros(num, dim, dim))
         with torch.no_grad():  # start near a broad mixture that ignores the condition
             last.weight.mul_(0.1)
             last.bias.zero_()
@@ -244,12 +250,17 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
 
     def prepare(self, theta: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
         """Return rows for :class:`PreparedLoss`: all that no weight changes."""
+        most = max(1, MOST_FACTORS // (self.num_frames * self._dim**2))
+        prepared, inputs = [], []
         with torch.no_grad():
-            seen, frames = self._see(condition)
-            assert frames is not None
-            v, log_det = self._local(theta, frames)
-        v, log_det = v[:, self._frame_of], log_det[:, self._frame_of]
-        return torch.cat([v.flatten(1), log_det], 1), seen
+            for part, own in zip(theta.split(most), condition.split(most), strict=True):
+                seen, frames = self._see(own)
+                assert frames is not None
+                v, log_det = self._local(part, frames)
+                v, log_det = v[:, self._frame_of], log_det[:, self._frame_of]
+                prepared.append(torch.cat([v.flatten(1), log_det], 1))
+                inputs.append(seen)
+        return torch.cat(prepared), torch.cat(inputs)
 
     def _log_density(self, theta: Tensor, condition: Tensor) -> Tensor:
         seen, frames = self._see(condition)
@@ -284,7 +295,8 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         if self._dim <= FEW_DIMENSIONS:  # a product and a sum are faster
             above = (upper * error[..., None, :]).sum(-1)
         else:
-            above = torch.einsum("nkij,...nkj->...nki", upper, error)
+            own = "kij" if upper.ndim == 3 else "nkij"  # of earlier versions: by row
+            above = torch.einsum(f"{own},...nkj->...nki", upper, error)
         z = log_diagonal.exp() * error + above
         component = log_diagonal.sum(-1) - 0.5 * z.square().sum(-1)
         return (logits + component + log_det).logsumexp(-1) - logits.logsumexp(-1)
@@ -303,14 +315,18 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         return torch.cat([z, mask], -1), frames
 
     def _mixture(self, seen: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return logits, means, log-diagonals and factors above them, (n, K, ...)."""
+        """Return logits, means, log-diagonals and factors above them, (n, K, ...).
+
+        The factors are of shape (K, d, d) where they do not depend on the condition.
+        """
         logits, mean, log_diagonal, upper = self.net(seen).split(self._sections, -1)
         shape = (len(seen), self._num_components, self._dim)
+        upper = upper.reshape(*shape, self._dim) if upper.shape[1] else self._upper
         return (
             logits,
             mean.reshape(shape),
             log_diagonal.reshape(shape).clamp(*LOG_PRECISION_RANGE),
-            upper.reshape(*shape, self._dim) * self.strict_upper,
+            upper * self.strict_upper,
         )
 
 
@@ -356,7 +372,14 @@ def _location_and_scale(rows: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
 
 def _solved(factor: Tensor, row: Tensor, which: Tensor, right: Tensor) -> Tensor:
     """Return solutions (..., d) of upper factors [row, which] for right sides."""
-    most = max(1, MOST_FACTORS // (row[0].numel() * right.shape[-1] ** 2))
+    dim = right.shape[-1]
+    if len(factor) == 1 and dim > FEW_DIMENSIONS:  # a factor serves many draws
+        found = torch.empty_like(right)
+        for k, own in enumerate(factor[0]):
+            at = which == k
+            found[at] = torch.linalg.solve_triangular(own, right[at].mT, upper=True).mT
+        return found
+    most = max(1, MOST_FACTORS // (row[0].numel() * dim**2))
     parts = [part.split(most) for part in (row, which, right[..., None])]
     solve = torch.linalg.solve_triangular
     steps = [solve(factor[r, k], e, upper=True) for r, k, e in zip(*parts, strict=True)]

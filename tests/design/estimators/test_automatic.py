@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.distributions import Distribution
 
-from sbi_active.design import LikelihoodGain, PosteriorGain, RatioGain
+from sbi_active.design import LikelihoodGain, LinearGain, PosteriorGain, RatioGain
 from sbi_active.design.estimators.automatic import (
     choose_estimator,
     disagreements,
@@ -12,6 +12,7 @@ from sbi_active.design.estimators.automatic import (
 )
 from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.design.estimators.contrast import ContrastiveGain, InfoNCEGain
+from sbi_active.simulation import GaussianNoise
 from tests.linear_gaussian import (
     PRIOR,
     ExactLikelihood,
@@ -51,6 +52,24 @@ def test_what_the_model_can_say_is_used_where_the_noise_cannot(model, estimator)
         assert notes[-1] == "used all the same: there is no model"
         estimator = type(choose_estimator(None, rows(pairs=True))[0])
     assert type(chosen) is estimator
+
+
+@pytest.mark.parametrize(
+    ("dim", "n", "bend", "linear"),
+    [(14, 200, 0, True), (14, 200, 3, False), (14, 16, 0, False), (3, 200, 0, False)],
+)
+def test_many_parameters_that_outcomes_are_linear_in_have_the_linear_estimate(
+    dim, n, bend, linear
+):
+    torch.manual_seed(0)
+    theta, slope = torch.rand(n, dim).double(), 9 * torch.rand(dim, 2).double()
+    mean = (theta @ slope + bend * torch.sin(theta @ slope))[None]
+    x = mean + torch.randn(mean.shape)
+    given = CandidateSimulations(
+        theta.float(), torch.zeros(1, 1), x, mean, GaussianNoise(1.0)
+    )
+    chosen, _ = choose_estimator(ExactLikelihood(), given)
+    assert (type(chosen) is LinearGain) == linear
 
 
 def test_a_ratio_beyond_the_reach_of_info_nce_is_averaged():
