@@ -96,10 +96,7 @@ def closed_loop(draw: Callable[[], Any], seed: int) -> Result:
         plan=False,
     )
     found = Result(words={"verdict": report.verdict})
-    found.figures["log Bayes factor"] = (
-        report.detection.log_bayes_factor,
-        report.detection.standard_error,
-    )
+    found.figures["log Bayes factor"] = report.detection.log_bayes_factor, None
     if report.tracing is not None:
         for name, value in report.tracing.inclusion.items():
             found.figures[f"P({name})"] = float(value), None

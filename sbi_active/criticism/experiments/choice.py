@@ -234,8 +234,9 @@ def _by_left_out(
     )
     m, fold, model = search.errors.measurements, search.errors.fold, own.model
     count = np.maximum(np.bincount(m.channel), 1)
-    residual = np.bincount(m.channel, model.residual**2) / count  # sensor variances
-    known = ((model.jacobian @ cov) * model.jacobian).sum(1)
+    rows = model.scale[:, None] * model.rows[: model.num]  # in sensor deviations
+    residual = np.bincount(m.channel, rows[:, 0] ** 2) / count
+    known = ((rows[:, 1:] @ cov) * rows[:, 1:]).sum(1)
     each = own.left.error**2 / (np.maximum(residual, TINY)[m.channel] + known)
     use = np.isfinite(own.left.square)
     kept = search.errors.is_scored & use[fold]
@@ -243,7 +244,7 @@ def _by_left_out(
     square /= np.bincount(fold[kept], minlength=len(use))[use]
     channel = np.zeros(int(np.prod(m.shape[1:])), dtype=np.int64)
     channel[m.position % len(channel)] = m.channel
-    own_size = np.bincount(m.channel, (search.unit * model.residual) ** 2) / count
+    own_size = np.bincount(m.channel, (search.unit * rows[:, 0]) ** 2) / count
     sd = np.sqrt(own_size[channel[prediction.position]] + prediction.mean.var(0))
     return sd, limit_of(square, len(prediction.position))
 

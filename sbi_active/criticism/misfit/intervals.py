@@ -100,7 +100,9 @@ def shared_process(
         parts.append(_differing(model, errors, between))
     grams, logs = zip(*parts, strict=True)
     log_p = np.concatenate([log_det - np.log(len(log_det)) for log_det in logs])
-    found = summed(np.concatenate(grams), log_p, model)
+    use = np.ones(num, bool)
+    gram = np.concatenate(grams) + errors.unchanged(model.rows, use)
+    found = summed(gram, log_p, model)
     return found.mean, found.cov
 
 
@@ -140,7 +142,7 @@ def _differing(
     model: LinearModel, errors: Errors, between: list[tuple[Array, Array]]
 ) -> tuple[Array, Array]:
     """Return Gram matrices with a parameter that differs, (h, k, k), and constants."""
-    rows, fold, num = model.rows, errors.fold, errors.num_folds
+    rows, fold, num = model.rows[: model.num], errors.fold, errors.num_folds
     grams, logs = [], []
     for column in errors.varying.T:
         square = np.bincount(fold, column**2, num)
