@@ -237,7 +237,10 @@ def plan() -> list[Any]:
     problem = draw_case(get_world("A"), "library", 2, num_trials=8).problem
     effects = generic_effects(problem.model, task.actions, prior=problem.prior)
     report = problem.report(0, effects=effects)
-    return [report.verdict, str(report.next_action)]
+    found = report.next_action
+    assert found is not None
+    groups = sorted(map(sorted, found.inseparable))  # a set is printed in any order
+    return [report.verdict, str(replace(found, inseparable=())), str(groups)]
 
 
 def box() -> list[Any]:

@@ -71,6 +71,11 @@ class FitSettings:
     passes: float = 0.01
 
 
+#: Where the simulator jumps a search ends at any of many places near the best one: with
+#: half of the starts one of six sets of the box collision had a wrong name.
+JUMPING = FitSettings(num_starts=12, num_kept=4, num_drawn=12)
+
+
 def best_fit(rival: Rival, u: Array, unit: Array, settings: FitSettings) -> LinearModel:
     """Return a model linearized at the best fit that searches from draws find.
 

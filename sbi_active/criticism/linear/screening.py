@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
+from sbi_active.criticism.linear.fits import JUMPING, FitSettings
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.sensor import sensor_of
 from sbi_active.criticism.results import ModelKey
@@ -61,7 +62,8 @@ def linear_models(rivals: RivalSet) -> tuple[Search, Screening | None]:
     """
     sensor = sensor_of(rivals)
     prior = log_priors(rivals.library, ())
-    search = Search(rivals, sensor, prior)
+    settings = JUMPING if rivals.roughness.any() else FitSettings()
+    search = Search(rivals, sensor, prior, settings)
     if isinstance(rivals.noise, ChannelNoise):
         # What is missing may be seen in one channel alone, and no error of it.
         search.fit_singles()
@@ -69,7 +71,7 @@ def linear_models(rivals: RivalSet) -> tuple[Search, Screening | None]:
         models = [c.model for c in search.found.values()]
         best = min(models, key=lambda model: _log_sizes(model.residual, channel))
         sensor = sensor_of(rivals, [search.model(ModelKey()), best])
-        search = Search(rivals, sensor, prior)
+        search = Search(rivals, sensor, prior, settings)
     found = None
     if len(rivals.effects) > MANY:
         search.library.look_at_each()
