@@ -24,7 +24,8 @@ Array = NDArray[Any]
 def chooses_again(found: Verdict, key: ModelKey) -> bool:
     """Return whether a choice among linear models stands for one among all models.
 
-    Without a time axis a model may bend, and trials are few enough to fit all again.
+    Without a time axis a model may bend, and trials are few enough to fit all again, as
+    are trajectories of which only parts are left out.
 
     Args:
         found: Verdict of linear models.
@@ -33,7 +34,8 @@ def chooses_again(found: Verdict, key: ModelKey) -> bool:
     if found.is_missed:
         return True
     search, rivals = found.search, found.rivals
-    if not (search.sensor.is_known and rivals.measurements.is_sequence):
+    known, by_trial = search.sensor.is_known, search.errors.is_by_trial
+    if not (known and by_trial and rivals.measurements.is_sequence):
         return False
     return key in search.found or is_large(rivals.library)  # which takes long
 
