@@ -13,6 +13,7 @@ from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import LOG_2PI, student
 from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.least_squares import within
 
 Array = NDArray[Any]
@@ -112,6 +113,15 @@ class LinearModel:
 
         after = cost(self.residual + self.jacobian @ move, self.u + move)
         return (cost(self.residual, self.u) - after) * scale
+
+    def draws(
+        self, mean: Array, cov: Array, num: int, rng: np.random.Generator
+    ) -> Array:
+        """Return normal draws of the coordinates, moved into the bounds, (num, d)."""
+        values, vectors = eigh(cov)
+        root = vectors * np.sqrt(np.clip(values, 0, None))
+        u = mean + rng.normal(size=(num, len(root))) @ root.T
+        return np.clip(u, self.low, self.high)
 
     def widened(self, width: float) -> Array:
         """Return the prior's deviations with effects on another scale, shape (d,)."""

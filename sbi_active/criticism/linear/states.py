@@ -31,7 +31,6 @@ from sbi_active.criticism.rivals.validity import (
     UNKNOWN_RATES,
     log_outcomes,
 )
-from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.support import support_bounds, support_of
@@ -202,10 +201,7 @@ class States:
             process = c.posterior.log_process > c.posterior.log_sensor
             own = self.search.errors.posterior(c.model, c.grams, process=process)
             rng = np.random.default_rng(derive_seed(rivals.seed, "outcomes", str(key)))
-            values, vectors = eigh(own.cov)
-            root = vectors * np.sqrt(np.clip(values, 0, None))
-            u = own.mean + rng.normal(size=(self.num_outcomes, len(root))) @ root.T
-            u = np.clip(u, c.model.low, c.model.high)
+            u = c.model.draws(own.mean, own.cov, self.num_outcomes, rng)
             split = rivals.rival(key).coordinates.split(u)
             self._valid[key] = rivals.simulator.predict(*split)[2]
         return self._valid[key]

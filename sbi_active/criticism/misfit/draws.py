@@ -14,7 +14,6 @@ from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.results import Evidence, ModelKey
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.engine import WeightedDraws
-from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.seeding import derive_seed
 
 Array = NDArray[Any]
@@ -40,10 +39,7 @@ def bends(search: Search, key: ModelKey, *, num: int = 16, most: float = 0.5) ->
     m, rng = c.model, np.random.default_rng(derive_seed(rivals.seed, "bends"))
     use = np.ones(search.errors.num_folds, bool)
     own = search.errors.posterior(m, c.grams, use, process=False)
-    values, vectors = eigh(own.cov)
-    spread = vectors * np.sqrt(np.maximum(values, 0))
-    u = own.mean + rng.standard_normal((num, len(m.u))) @ spread.T
-    u = np.clip(u, m.low, m.high)
+    u = m.draws(own.mean, own.cov, num, rng)
     rival, linear = rivals.rival(key), m.residual + (u - m.u) @ m.jacobian.T
     fails = rivals.can_fail and not rivals.measurements.is_sequence
     if fails or rivals.simulator.is_stochastic:
@@ -151,7 +147,4 @@ def _with_louder(rival: Rival, model: LinearModel, u: Array, phi: Array) -> Arra
 def drawn(rivals: RivalSet, model: LinearModel, center: Array, cov: Array) -> Array:
     """Return draws of a model's coordinates within their bounds, (NUM_DRAWS, d)."""
     rng = np.random.default_rng(derive_seed(rivals.seed, "linear", str(model.key)))
-    values, vectors = eigh(cov)
-    root = vectors * np.sqrt(np.clip(values, 0, None))
-    u = center + rng.normal(size=(NUM_DRAWS, len(cov))) @ root.T
-    return np.clip(u, model.low, model.high)
+    return model.draws(center, cov, NUM_DRAWS, rng)
