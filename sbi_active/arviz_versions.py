@@ -79,31 +79,3 @@ def inference_data(groups: Groups) -> Any:
         return data_tree(groups)
     datasets: dict[str, Any] = groups.datasets()
     return az.InferenceData(**datasets)
-
-
-def pareto_smoothed(
-    log_likelihood: np.ndarray, *, relative_efficiency: float = 1.0
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return smoothed log weights of leaving out each trial, and Pareto shapes k.
-
-    Args:
-        log_likelihood: Log likelihood of each trial given each posterior draw, shape
-            (n, t).
-        relative_efficiency: Effective number of draws over their number.
-
-    Returns:
-        Log weights, which sum to one over the draws, shape (n, t), and k, shape (t,).
-
-    References:
-        Vehtari, Simpson, Gelman, Yao & Gabry, JMLR 25 (2024) 72.
-    """
-    rows = np.ascontiguousarray(log_likelihood.T, dtype=float)
-    if int(az.__version__.split(".")[0]) >= 1:
-        from arviz_stats.base import array_stats  # pyright: ignore
-
-        smoothed, k = array_stats.psislw(rows, r_eff=relative_efficiency)
-    else:
-        smoothed, k = az.psislw(-rows, reff=relative_efficiency)
-    smoothed, k = np.asarray(smoothed), np.asarray(k)
-    smoothed = smoothed - smoothed.max(1, keepdims=True)
-    return (smoothed - np.log(np.exp(smoothed).sum(1, keepdims=True))).T, k

@@ -26,7 +26,7 @@ from sbi_active.criticism.effects.joint_prior import joint_prior
 from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summarize
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.screening import linear_models
-from sbi_active.criticism.misfit.evaluation import chooses_again, evaluate_linear
+from sbi_active.criticism.misfit.evaluation import evaluate_left_out
 from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.misfit.rule import Rule
 from sbi_active.criticism.misfit.stand_ins import judged
@@ -41,7 +41,7 @@ from sbi_active.criticism.results import (
 )
 from sbi_active.criticism.rivals.further_trials import with_known_inputs
 from sbi_active.criticism.steps.equivalence import equivalent_effects, is_large
-from sbi_active.criticism.steps.evaluation import evaluate_held_out, evaluate_left_out
+from sbi_active.criticism.steps.evaluation import evaluate_held_out
 from sbi_active.criticism.steps.refuted import widened
 from sbi_active.criticism.steps.residuals import find_residuals
 from sbi_active.criticism.thinning import thinned_to_need
@@ -246,13 +246,12 @@ class Criticism:
             self._tracing = replace(tracing, set_aside=self.set_aside)
         return self._tracing
 
-    def _traced(self, *, compare: bool = True) -> Tracing:
+    def _traced(self) -> Tracing:
         found = self._judge()
         # What separates effects of a large library, the next action looks for.
         actions = None if self._is_large else self.actions
-        options = {"actions": actions, "compare": compare, "near": not self._is_large}
         with self._fitting("verdict, sets of effects fitted"):
-            return traced(found, self._scored, **options)
+            return traced(found, self._scored, actions=actions, near=not self._is_large)
 
     def add(
         self, effects: Sequence[str] | None = None
@@ -313,12 +312,9 @@ class Criticism:
             return evaluate_held_out(self.rivals, tracing, held_out, **self._fewer)
         if int(self.trials.valid.sum()) < FEWEST_TRIALS:
             return None
-        found = self._judge()
-        if chooses_again(found, tracing.key):
-            return evaluate_linear(found, trials.fit)
-        return evaluate_left_out(
-            trials.fit, self._fold, show_progress=self.show_progress
-        )
+        what = "error before and after, a verdict without each trial"
+        with stage(what, show_progress=self.show_progress):
+            return evaluate_left_out(self._judge(), trials.fit, **self._fewer)
 
     def judged(self, evaluation: Evaluation | None) -> Tracing:
         """Return the tracing, unless trials that had no part in it speak against it.
@@ -342,14 +338,6 @@ class Criticism:
             count=lambda: (len(fits) - before, total),
         )
 
-    def _fold(self, trials: Trials) -> tuple[RivalSet, Tracing]:
-        model, _, effects = self._parts
-        kept = {"warm_up": self._warm_up, "rule": self.rule, "seed": self.seed}
-        parts = model, self.prior, trials
-        part = Criticism(*parts, effects=effects, summaries=0, thin=False, **kept)
-        part._equivalent = self.equivalent()
-        return part.rivals, part._traced(compare=False)
-
     def report(
         self,
         *,
@@ -361,8 +349,7 @@ class Criticism:
         """Return the report of all steps.
 
         Args:
-            evaluate: Whether to report the error before and after. Without held-out
-                trials it costs one verdict a trial.
+            evaluate: Whether to report the error before and after.
             plan: Whether to name the next action and the severest tests of the verdict,
                 which takes about as long as the verdict.
             designed: Whether the trials' actions were chosen for their information; the

@@ -24,7 +24,6 @@ from sbi_active.criticism.results import (
     Tracing,
 )
 from sbi_active.criticism.steps.evaluation import evaluate_held_out
-from sbi_active.criticism.steps.leave_one_out import leave_one_out
 from sbi_active.criticism.steps.missed_trials import outlying_trials
 from sbi_active.criticism.steps.residuals import find_residuals
 from sbi_active.progress import stage
@@ -87,7 +86,6 @@ def report_of(
         residuals, after = loop.residuals(), None
         if tracing.verdict != NONE:
             after = find_residuals(loop.rivals, tracing.key)
-        left_out = () if tracing.misfit else leave_one_out(loop.rivals, tracing)
         tests = () if space is None else severe_tests(loop.rivals, tracing, space)
     given = made_given(
         loop.trials,
@@ -112,7 +110,7 @@ def report_of(
         digest=loop.digest,
         designed=designed,
         exploratory=exploratory,
-        leave_one_out=left_out,
+        num_simulations=loop.rivals.simulator.num_simulations,
         severe_tests=tests,
         warnings=(*given, *_outlying(loop, tracing)),
     )

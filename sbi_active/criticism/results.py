@@ -72,8 +72,6 @@ class Residuals:
         mean: Posterior predictive mean of the model refitted to all trials, shape of x.
         sd: Predictive standard deviation, noise included, shape of x.
         refitted: (x - mean) / sd, shape of x.
-        prequential: Residuals of trial t predicted from the trials before it, the first
-            from the prior, shape of x.
         correlation: Correlation of neighboring noise errors along the time axis,
             posterior mean; 0 without a time axis.
         noise: "declared", "estimated" (from repeats or the trajectories themselves), or
@@ -93,7 +91,6 @@ class Residuals:
     mean: Array
     sd: Array
     refitted: Array
-    prequential: Array
     correlation: float
     noise: Literal["declared", "estimated", "stochastic"]
     probability_valid: Array | None = None
@@ -112,7 +109,6 @@ class Evidence:
         effective_sample_size: Number of draws that count.
         engine: Method that gave the evidence: "importance" sampling around least
             squares, "smc" (sequential Monte Carlo), or "linear".
-        num_simulations: Trials simulated.
         names: Names of the coordinates (theta, phi).
         draws: Posterior draws of (theta, phi), shape (m, dim).
         narrow: Draws by this model alone, where ``draws`` were widened; or None.
@@ -125,7 +121,6 @@ class Evidence:
     standard_error: float
     effective_sample_size: float
     engine: str
-    num_simulations: int
     names: tuple[str, ...]
     draws: Array
     best_chi_square: float

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.criticism.results import Evidence, ModelKey
+from sbi_active.criticism.rivals.error_models import ErrorModel, NoiseGrid
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.engine import Fit as Sampled
 from sbi_active.inference.engine import WeightedDraws
@@ -34,6 +35,7 @@ class Fit:
         mode: Point at which it is linear, shape (dim,); None if it was sampled.
         linear: Function from u (n, dim) to the residuals (n, N) of the linear model
             that draws are of; None if they are of the simulator's own posterior.
+        known: Mask of the numbers that it is fitted to, shape (N,); None for all.
     """
 
     rival: Rival
@@ -42,6 +44,16 @@ class Fit:
     best: Array | None = None
     mode: Array | None = None
     linear: Callable[[Array], Array] | None = None
+    known: NDArray[np.bool_] | None = None
+
+    @property
+    def error(self) -> ErrorModel:
+        """The error of the numbers that it is fitted to."""
+        error = self.rival.error
+        if self.known is None:
+            return error
+        assert isinstance(error, NoiseGrid)  # a process joins all of them
+        return error.part(self.known)
 
     @property
     def likeliest(self) -> Array:
@@ -72,7 +84,8 @@ class Fit:
 
         Args:
             u: Draws, shape (n, dim).
-            residual: Residuals of the simulator there, shape (n, N).
+            residual: Residuals of the simulator there, of the numbers that it is fitted
+                to, shape (n, N).
             rng: Source of what is drawn from them.
             linear: Deviation of the log density ratio up to which none is weighed,
                 nats.
@@ -81,8 +94,10 @@ class Fit:
         """
         if self.linear is None:
             return u, residual
-        error = self.rival.error
-        log_w = error.log_likelihood(residual) - error.log_likelihood(self.linear(u))
+        error, linear_residual = self.error, self.linear(u)
+        if self.known is not None:
+            linear_residual = linear_residual[:, self.known]
+        log_w = error.log_likelihood(residual) - error.log_likelihood(linear_residual)
         log_w = np.nan_to_num(log_w, nan=-1e9, neginf=-1e9, posinf=-1e9)
         if log_w.std() < linear:
             return u, residual

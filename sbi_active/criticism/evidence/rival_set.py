@@ -248,11 +248,10 @@ class RivalSet:
         """Return one rival with its posterior and evidence, computed once."""
         if key not in self.fits:
             rival, seed = self.rival(key), derive_seed(self.seed, "evidence", str(key))
-            before = self.simulator.num_simulations
             rng = np.random.default_rng(seed)
             found = self.found.pop(key, None) or self.search(key)
             sample = self._inferred(rival, found, rng)
-            self.fits[key] = self._record(rival, sample, before, seed)
+            self.fits[key] = self._record(rival, sample, seed)
         return self.fits[key]
 
     def search(self, key: ModelKey) -> Found:
@@ -280,7 +279,6 @@ class RivalSet:
         self,
         rival: Rival,
         sample: WeightedDraws,
-        before: int,
         seed: int,
     ) -> Fit:
         u = sample.draws(NUM_DRAWS, np.random.default_rng(seed))
@@ -294,7 +292,6 @@ class RivalSet:
             standard_error=sample.standard_error,
             effective_sample_size=sample.effective_sample_size,
             engine=sample.method,
-            num_simulations=self.simulator.num_simulations - before,
             names=self.names_of(rival),
             draws=rival.coordinates.to_z(u)[:, :own],
             best_chi_square=float(min(square)),

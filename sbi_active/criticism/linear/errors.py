@@ -19,6 +19,7 @@ References:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 from typing import Any
 
@@ -317,7 +318,7 @@ class Errors:
         weight = np.concatenate(weights)
         return np.concatenate(found), weight - np.log(len(weight))
 
-    @property
+    @cached_property
     def trials(self) -> list[NDArray[np.bool_]]:
         """Masks of the parts of each trial, shape (f,)."""
         trial = self.measurements.trial

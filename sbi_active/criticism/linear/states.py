@@ -215,18 +215,21 @@ class States:
         effects = [self.search.rivals.effects[name] for name in key.effects]
         return [e for e in effects if e.hook == "noise"]
 
-    def louder_draws(self, key: ModelKey) -> tuple[Array, Array]:
+    def louder_draws(
+        self, key: ModelKey, use: NDArray[np.bool_] | None = None
+    ) -> tuple[Array, Array]:
         """Return posterior draws of a set's effects on the noise, and its factors.
 
         Args:
             key: Key of the set.
+            use: Parts of the trials that count, shape (f,); None takes all.
 
         Returns:
             Natural values, shape (n, k), and factors on the error, shape (n, N).
         """
         rng = np.random.default_rng(derive_seed(self.search.rivals.seed, "louder"))
         num = self.num_louder
-        share = self.mixture(key).share.reshape(-1, num).sum(0)
+        share = self.mixture(key, use).share.reshape(-1, num).sum(0)
         drawn = rng.choice(num, size=num, p=share / share.sum())
         phi, scale = self._scales(self.louder(key), 1.0)
         return phi[drawn], scale[drawn]

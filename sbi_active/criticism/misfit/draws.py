@@ -51,7 +51,7 @@ def bends(search: Search, key: ModelKey, *, num: int = 16, most: float = 0.5) ->
     return not ratio.std() < most  # NaN: not simulated
 
 
-def keep_draws(
+def linear_fit(
     rivals: RivalSet,
     key: ModelKey,
     model: LinearModel,
@@ -64,11 +64,12 @@ def keep_draws(
     louder: Array | None = None,
     chi_square: float | None = None,
     unit: Array | None = None,
-) -> Evidence:
-    """Return a linear model's record, and keep its draws as its posterior sample.
+    known: NDArray[np.bool_] | None = None,
+) -> Fit:
+    """Return a linear model with its draws as its posterior sample.
 
     Args:
-        rivals: Rivals that keep them.
+        rivals: Rivals that the model is one of.
         key: Key of the model, with an error or with effects on the noise.
         model: Fitted model of its effects on the prediction.
         center: Center of its posterior, shape (d,).
@@ -82,15 +83,13 @@ def keep_draws(
         chi_square: Chi-square with these effects; None takes the fitted model's.
         unit: Unit of the model's residuals, shape (N,), where draws are to be weighed
             by the simulator; None leaves them.
+        known: Mask of the numbers that the posterior knows, shape (N,); None for all.
     """
 
     def linear(u: Array) -> Array:
         residual = model.residual + (u - model.u) @ model.jacobian.T
         return unit * model.scale * residual[:, : model.num]
 
-    if key in rivals.fits:
-        return rivals.fits[key].evidence
-    before = rivals.simulator.num_simulations if key.effects else 0
     rival = rivals.rival(key)
     u, at, mode = drawn(rivals, model, center, cov), best, model.u
     if louder is not None:
@@ -113,15 +112,13 @@ def keep_draws(
         standard_error=0.0,
         effective_sample_size=float(NUM_DRAWS),
         engine="linear",
-        num_simulations=rivals.simulator.num_simulations - before,
         names=rivals.names_of(rival),
         draws=rival.coordinates.to_z(u)[:, :own],
         best_chi_square=model.chi_square[0] if chi_square is None else chi_square,
         best=None if at is None else rival.coordinates.to_z(at[None])[0, :own],
     )
     weighs = None if unit is None else linear
-    rivals.fits[key] = Fit(rival, sample, evidence, at, mode, weighs)
-    return evidence
+    return Fit(rival, sample, evidence, at, mode, weighs, known)
 
 
 def _with_louder(rival: Rival, model: LinearModel, u: Array, phi: Array) -> Array:

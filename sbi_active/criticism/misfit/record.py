@@ -11,7 +11,12 @@ from numpy.typing import NDArray
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.misfit.draws import bends, keep_draws
+from sbi_active.criticism.evidence.fit import Fit
+from sbi_active.criticism.linear.errors import Posterior
+from sbi_active.criticism.linear.left_out import leave_out
+from sbi_active.criticism.linear.model import LinearModel, reweighted_at
+from sbi_active.criticism.linear.search import Search
+from sbi_active.criticism.misfit.draws import bends, linear_fit
 from sbi_active.criticism.misfit.guesses import guess_residual
 from sbi_active.criticism.misfit.near_aliases import near_aliases
 from sbi_active.criticism.misfit.verdict import Verdict
@@ -50,7 +55,6 @@ def traced(
     held_out: Trials | None,
     *,
     actions: ActionSpace | None = None,
-    compare: bool = True,
     near: bool = True,
 ) -> Tracing:
     """Return the verdict, and record the models behind it with posterior draws.
@@ -59,7 +63,6 @@ def traced(
         found: The models and what helps.
         held_out: Trials on which the recorded models are scored; None for none.
         actions: The permitted ones, for what they hardly separate.
-        compare: Whether to look for effects that are nearly the same.
         near: Whether to look for groups that these trials do not separate as well.
     """
     rivals, key = found.rivals, found.key
@@ -75,9 +78,9 @@ def traced(
     keys = [k for k in dict.fromkeys(keys) if k.error is None or not k.effects]
     probabilities = found.probabilities
     evidences = {str(k): _record(found, k) for k in keys}
-    groups = equivalent_effects(rivals, None) if compare and near else ()
+    groups = equivalent_effects(rivals, None) if near else ()
     aliases: tuple[frozenset[str], ...] = ()
-    if compare and found.detection.alarm:
+    if found.detection.alarm:
         singles = {n: evidences[n].log_evidence for n in rivals.effects}
         known = [*found.equivalent, *groups]
         aliases = near_aliases(found.search, singles, actions, known)
@@ -119,7 +122,9 @@ def _beside_misfit(misfit: Verdict, held_out: Trials | None) -> Tracing:
     weights = _weights(misfit)
     evidences = {}
     for key in dict.fromkeys([*tabled, *singles, *weights]):
-        evidences[str(key)] = _record_misfit(misfit, key)
+        if key not in rivals.fits:
+            rivals.fits[key] = _beside(misfit, key)
+        evidences[str(key)] = rivals.fits[key].evidence
     models = [_scored(misfit, key, held_out) for key in tabled]
     found = _found(misfit, tuple(models), weights)
     named = found.named
@@ -161,11 +166,88 @@ def _tail(found: Verdict, key: ModelKey) -> float:
     return found.states.chi_square(key)[1] if known else float("nan")
 
 
+def fitted(found: Verdict, key: ModelKey, use: NDArray[np.bool_]) -> Fit:
+    """Return a linear model with its posterior by some parts of the trials.
+
+    Args:
+        found: Verdict with the model.
+        key: Key of the model.
+        use: Parts of the trials that count, shape (f,).
+    """
+    known = use[found.search.errors.fold]
+    return (_beside if found.is_missed else _alone)(found, key, use, known)
+
+
+def _alone(
+    found: Verdict,
+    key: ModelKey,
+    use: NDArray[np.bool_] | None = None,
+    known: NDArray[np.bool_] | None = None,
+) -> Fit:
+    """Return a model that may fit. Beside a gross error, its trial tells little."""
+    states, search = found.states, found.search
+    at = own = states.mixture(key, use)
+    if key.effects and found.key == ModelKey(key.effects, OUTLIER):
+        at = states.mixture(found.key, use)
+    model = search.model(states.predicting(key))
+    if use is not None and np.isfinite(search.sensor.df):
+        model, at = _by_weights(model, search, use)
+    given = found.rivals, key, model, at.mean, at.cov, own.log_evidence
+    if not states.louder(key):
+        return linear_fit(*given, unit=search.unit, known=known)
+    phi, square = states.louder_draws(key, use)[0], states.chi_square(key)[0]
+    return linear_fit(*given, louder=phi, chi_square=square, known=known)
+
+
+def _by_weights(
+    model: LinearModel, search: Search, use: NDArray[np.bool_], *, rounds: int = 5
+) -> tuple[LinearModel, Posterior]:
+    """Return a model of t errors with the weights of a fit to some parts, and the fit.
+
+    Args:
+        model: Model with the weights of the fit to all.
+        search: Search with the errors.
+        use: Parts of the trials that count, shape (f,).
+        rounds: Times that weights follow from residuals, and the fit from weights;
+            two agree to some percent of a deviation.
+    """
+    errors = search.errors
+    for _ in range(rounds):
+        grams = errors.grams(model.rows)
+        own = errors.posterior(model, grams, use, process=False)
+        u = np.clip(own.mean, model.low, model.high)
+        model = reweighted_at(model, u, search.sensor.df)
+    return model, own
+
+
+def _beside(
+    misfit: Verdict,
+    key: ModelKey,
+    use: NDArray[np.bool_] | None = None,
+    known: NDArray[np.bool_] | None = None,
+) -> Fit:
+    """Return a model that misses.
+
+    Wide draws leave the valleys of what bends: left-out trials are predicted from the
+    best fit, and so are others.
+    """
+    own, errors = misfit.search.found[key], misfit.search.errors
+    model, log_z, best = own.model, own.posterior.log_process, own.model.u
+    if use is not None:
+        best = leave_out(model, errors, use).fit
+    return linear_fit(
+        *(misfit.rivals, key, model, best, misfit.covariance(key), log_z),
+        best=best,
+        shown=misfit.shown(key) if use is None else None,
+        known=known,
+    )
+
+
 def _record(found: Verdict, key: ModelKey, *, fewest: float = 50.0) -> Evidence:
     """Return the record of a model that may fit, and keep its draws.
 
     The bare model and those that are likely have samples of the simulator's own
-    posterior where they bend. Beside a gross error, its trial tells little.
+    posterior where they bend.
 
     Args:
         found: Verdict with the model.
@@ -173,24 +255,18 @@ def _record(found: Verdict, key: ModelKey, *, fewest: float = 50.0) -> Evidence:
         fewest: Effective draws from which such a sample is taken, and not a linear
             model's. Half and twice say little else: it is some hundreds or a few.
     """
-    rivals, states, search = found.rivals, found.states, found.search
-    own, effects = states.mixture(key), states.predicting(key)
-    model = search.model(effects)
+    rivals = found.rivals
     if key not in rivals.fits and _is_sampled(found, key):
         fit = rivals.fit(key)
         if fit.evidence.effective_sample_size >= fewest:
-            evidence = replace(fit.evidence, log_evidence=own.log_evidence)
+            log_z = found.states.log_evidence(key)
+            evidence = replace(fit.evidence, log_evidence=log_z)
             rivals.fits[key] = replace(fit, evidence=evidence)
-            return evidence
-        del rivals.fits[key]  # a few draws would claim to know what is open
-    at = own
-    if key.effects and found.key == ModelKey(key.effects, OUTLIER):
-        at = states.mixture(found.key)
-    given = rivals, key, model, at.mean, at.cov, own.log_evidence
-    if not states.louder(key):
-        return keep_draws(*given, unit=search.unit)
-    phi, square = states.louder_draws(key)[0], states.chi_square(key)[0]
-    return keep_draws(*given, louder=phi, chi_square=square)
+        else:
+            del rivals.fits[key]  # a few draws would claim to know what is open
+    if key not in rivals.fits:
+        rivals.fits[key] = _alone(found, key)
+    return rivals.fits[key].evidence
 
 
 def _is_sampled(found: Verdict, key: ModelKey) -> bool:
@@ -207,18 +283,6 @@ def _is_sampled(found: Verdict, key: ModelKey) -> bool:
     if several or (key.effects and states.log_evidence(key) < least):
         return False
     return bends(search, key)
-
-
-def _record_misfit(misfit: Verdict, key: ModelKey) -> Evidence:
-    """Return a model's record, and keep its draws as its posterior sample."""
-    model, log_z = misfit.model(key), misfit.search.found[key].posterior.log_process
-    # Wide draws leave the valleys of what bends: left-out trials are predicted from the
-    # best fit, and so are others.
-    return keep_draws(
-        *(misfit.rivals, key, model, model.u, misfit.covariance(key), log_z),
-        best=model.u,
-        shown=misfit.shown(key),
-    )
 
 
 def _weights(misfit: Verdict) -> dict[ModelKey, float]:

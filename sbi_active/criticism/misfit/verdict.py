@@ -304,14 +304,21 @@ class Verdict:
             derive_seed(self.rivals.seed, "weights"),
         )
 
-    def selected_without(self, fold: int) -> ModelKey:
-        """Return the effects that are chosen without one part of the trials."""
+    def chosen_by(self, use: NDArray[np.bool_]) -> ModelKey:
+        """Return the model that is chosen by some parts of the trials.
+
+        Args:
+            use: Parts of the trials that count, shape (f,).
+        """
         search = self.search
-        use = np.arange(search.errors.num_folds) != fold
         if self._log_bayes_factor(use) < THRESHOLD and not self.detection.by_chi_square:
             return ModelKey()
         standard = standard_errors(search.found, search.errors, use)
-        return self._settled(partial(self._scored, use=use, standard=standard)).key
+        key = self._settled(partial(self._scored, use=use, standard=standard)).key
+        if self.is_missed:
+            return key if key.effects else ModelKey(error=UNEXPLAINED)
+        joint = self.states.joint(key, use)
+        return max(joint, key=joint.__getitem__)
 
     def outlying(self) -> tuple[OutlyingTrial, ...]:
         """Return the trials that err far more than the others let expect.

@@ -27,7 +27,6 @@ from sbi_active.criticism.results import (
     Residuals,
     Tracing,
 )
-from sbi_active.criticism.steps.leave_one_out import LeaveOneOut
 from sbi_active.identifiability.known import (
     Combinations,
     combinations_of_draws,
@@ -51,13 +50,12 @@ class Contents:
         simulator: The augmented simulator, or the bare one where nothing was added.
         prior: Prior of its parameters (never a posterior).
         warnings: Warnings, one sentence each.
+        num_simulations: Trials simulated for all of it.
         digest: Hash of noise, library and priors as they were before the data.
         exploratory: Library or priors were changed after the data were seen.
         num_trials: Trials that could be fitted.
         action_labels: Labels of the entries of the action, with their units.
         channel_names: Names of the entries of x's last axis, where known.
-        leave_one_out: Leave-one-out scores of the bare model and of the one that was
-            chosen, where trials are independent given their parameters.
         severe_tests: Actions that would put a verdict that names effects to the test
             most: a permitted action, and one beyond.
         action_is_label: Whether the action is only the trial's number.
@@ -79,7 +77,7 @@ class Contents:
     evaluation: Evaluation | None = None
     next_action: NextAction | None = None
     digest: str = ""
-    leave_one_out: tuple[LeaveOneOut, ...] = ()
+    num_simulations: int = 0
     severe_tests: tuple[SevereTest, ...] = ()
     action_is_label: bool = False
     tested: tuple[TestedTrial, ...] = ()

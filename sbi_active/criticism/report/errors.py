@@ -48,12 +48,12 @@ def residuals(report: Contents) -> Section:
 def _by_prediction(
     report: Contents, models: list[tuple[str, Residuals]]
 ) -> tuple[str, Table]:
-    rows = [[name, *_sizes(z.refitted), *_sizes(z.prequential)] for name, z in models]
-    header = ["residuals [sd]", "refitted", "beyond 2", "predicted", "beyond 2"]
+    rows = [[name, *_sizes(z.refitted)] for name, z in models]
+    header = ["residuals [sd]", "root mean square", "beyond 2"]
     told = (
         "Observation minus prediction, in standard deviations of the prediction: a "
-        "root mean square of about 1, and 5 % beyond 2, where the model holds. "
-        "Refitted to all trials, and each trial predicted from those before it."
+        "root mean square of about 1, and 5 % beyond 2, where the model holds. Models "
+        "are fitted to all trials."
     )
     return told, Table(header, rows)
 

@@ -12,14 +12,12 @@ from sbi_active.criticism.report.figures import pictured
 from sbi_active.criticism.report.summary import added, label, sizes
 from sbi_active.criticism.report.words import (
     TOLD,
-    called,
     estimated,
     listed,
     number,
     probability,
-    with_error,
 )
-from sbi_active.criticism.results import NONE, UNEXPLAINED, Estimate
+from sbi_active.criticism.results import NONE, Estimate
 from sbi_active.criticism.under_misfit import Misfit
 from sbi_active.display.page import Section
 from sbi_active.display.table import Table
@@ -204,40 +202,6 @@ def _joined(pairs: tuple[frozenset[str], ...]) -> list[frozenset[str]]:
         groups = [group for group in groups if group not in touching]
         groups.append(pair.union(*touching))
     return groups
-
-
-def leave_one_out(report: Contents) -> Section:
-    """Return the scores of each trial's prediction from the others."""
-    found = report.leave_one_out
-    limit = found[0].largest_k
-    titles = ["bare model", f"with {added(report)}"]
-    rows = [
-        [
-            title,
-            f"{one.total:.1f}",
-            f"{one.pareto_k.max():.2f}",
-            ", ".join(called(one.names, i) for i in one.unreliable) or "none",
-        ]
-        for title, one in zip(titles, found, strict=False)
-    ]
-    text = [
-        "Log density of each trial given the others, nats, summed over the "
-        f"{report.num_trials} trials: PSIS-LOO, which depends less on the priors of "
-        "the effects than log BF does."
-    ]
-    if len(found) > 1:
-        gain = found[1].density - found[0].density
-        error = np.sqrt(len(gain)) * gain.std(ddof=1)
-        rows.append(["difference", with_error(gain.sum(), error), "", ""])
-    elif report.verdict == UNEXPLAINED:
-        text.append("The residual process joins the trials, and has no such density.")
-    if any(one.unreliable for one in found):
-        text.append(
-            f"Where the Pareto shape k exceeds {limit:.2f}, a trial decides so much of "
-            "the posterior that its density is a guess, too high as a rule."
-        )
-    header = ["model", "log density", "largest k", f"trials with k > {limit:.2f}"]
-    return Section("Leave one out", text, table=Table(header, rows))
 
 
 def parameters(report: Contents) -> Section:

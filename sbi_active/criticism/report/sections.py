@@ -49,8 +49,6 @@ def _sections(report: Contents) -> Iterator[Section]:
     yield errors.residuals(report)
     yield errors.by_trial(report)
     yield errors.before_and_after(report)
-    if report.leave_one_out:
-        yield models.leave_one_out(report)
     yield models.parameters(report)
     if report.tested:
         settings = [report.setting(t.registered.action) for t in report.tested]
@@ -164,10 +162,9 @@ def _tests(report: Contents) -> Iterator[str]:
 
 def _record(report: Contents) -> Section:
     evidences = report.tracing.evidences
-    spent = sum(e.num_simulations for e in evidences.values())
     moved = sorted(name for name, e in evidences.items() if e.engine == "smc")
     linear = [name for name, e in evidences.items() if e.engine == "linear"]
-    told = [f"evidence cost {spent:,} simulated trials"]
+    told = [f"the comparison cost {report.num_simulations:,} simulated trials"]
     if linear:
         process = " with a residual process in each" if report.tracing.misfit else ""
         told.append(f"evidence by linearized models{process}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -16,12 +15,9 @@ from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import NONE, Evaluation, Tracing
 from sbi_active.criticism.steps.missed_trials import LEVEL, missed_trials
 from sbi_active.criticism.steps.predictive import NUM_DRAWS, Prediction, predict
-from sbi_active.progress import stage
 from sbi_active.simulation import GaussianNoise
 
 Array = NDArray[Any]
-#: The models fitted to some trials, and what was traced in them.
-Fold = Callable[[Trials], tuple[RivalSet, Tracing]]
 
 COVERAGE = 0.9  # a convention: the central interval that reports state
 #: Trials below which a bootstrap interval is not what it claims to be.
@@ -85,38 +81,6 @@ def tail(prediction: Prediction, trials: Trials) -> float:
     cov = off.T @ off / (len(off) - 1) + np.diag((prediction.sd**2).mean(0))
     error = x - prediction.middle
     return float(chi2.sf(error @ np.linalg.solve(cov, error), len(error)))
-
-
-def evaluate_left_out(
-    trials: Trials, fold: Fold, *, show_progress: bool = False
-) -> Evaluation:
-    """Return the error on each trial of models chosen and fitted without it.
-
-    Args:
-        trials: Trials that may be fitted.
-        fold: Fits and traces some trials; called once a trial.
-        show_progress: Whether to draw a bar of the trials.
-    """
-    valid = np.flatnonzero(trials.valid.numpy())
-    before, after, selected = [], [], []
-    with stage(
-        "error before and after, a verdict without each trial",
-        show_progress=show_progress,
-        count=lambda: (len(selected), len(valid)),
-    ):
-        for i in valid:
-            rest = [j for j in range(len(trials)) if j != i]
-            rivals, tracing = fold(trials.select(rest))
-            one = trials.select([int(i)])
-            for kept, prediction in zip(
-                (before, after), _predictions(rivals, tracing, one), strict=True
-            ):
-                kept.append(scores(prediction, one))
-            selected.append(tracing.verdict)
-    names = tuple(trials.names[i] for i in valid)
-    return summary(
-        "leave one out", valid, joined(before), joined(after), (*selected,), names
-    )
 
 
 def _predictions(

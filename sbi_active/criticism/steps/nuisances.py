@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sbi_active.criticism.data.measurements import Measurements
+from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 
@@ -26,7 +26,7 @@ NUM_STEPS = 4
 
 def conditioned(
     rivals: RivalSet,
-    key: ModelKey,
+    fit: Fit,
     u: Array,
     simulator: TrialSimulator,
     rng: np.random.Generator,
@@ -38,12 +38,12 @@ def conditioned(
 
     Args:
         rivals: The models, which say how long the first part is.
-        key: Key of the model.
+        fit: Fit of the model.
         u: Draws of its coordinates, shape (n, dim).
         simulator: Simulator of the trials that were not fitted.
         rng: Source of the draws.
     """
-    fit, m = rivals.fit(key), simulator.measurements
+    key, m = fit.rival.key, simulator.measurements
     center, spread = rivals.prior_predictive(simulator)
     error = rivals.noise_of(m)
     rival = Rival(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell, NoiseGrid
@@ -75,6 +76,7 @@ def predict(
     trials: Trials | None = None,
     *,
     key: ModelKey = ModelKey(),  # noqa: B008  (frozen)
+    fit: Fit | None = None,
     num_draws: int = NUM_DRAWS,
     seed: int | None = None,
     scored: bool = True,
@@ -87,16 +89,20 @@ def predict(
             nuisances are known from, which is left out; None takes those that were
             fitted, with the residual process of "unexplained" conditioned on them.
         key: Key of the model.
+        fit: Fit of the model, by some of the trials; None is by all.
         num_draws: Number n of posterior draws.
         seed: Seed of the draws; None is that of the models.
         scored: Whether to compute ``log_likelihood``, which is empty without.
     """
-    fit = rivals.fit(key)
-    rival, sample = fit.rival, fit.sample
+    fit = rivals.fit(key) if fit is None else fit
+    rival, sample, key = fit.rival, fit.sample, fit.rival.key
     seed = rivals.seed if seed is None else seed
     rng = np.random.default_rng(derive_seed(seed, "predictive", str(key)))
     u = sample.draws(num_draws, rng)
-    u, own_residual = fit.weighed(u, rival.residual(u, penalized=False)[0], rng)
+    own_residual = rival.residual(u, penalized=False)[0]
+    if fit.known is not None:
+        own_residual = own_residual[:, fit.known]
+    u, own_residual = fit.weighed(u, own_residual, rng)
     target = rivals.trials if trials is None else trials
     simulator = TrialSimulator(
         rivals.simulator.model, target, seed=derive_seed(rivals.seed, "predicted")
@@ -105,7 +111,7 @@ def predict(
     theta, phi = rival.coordinates.split(u)
     drops = np.zeros(len(m), dtype=bool)
     if trials is not None and rivals.nuisances and rivals.warm_up > 0:
-        theta, phi = conditioned(rivals, key, u, simulator, rng)
+        theta, phi = conditioned(rivals, fit, u, simulator, rng)
         drops = is_first_part(m, rivals.warm_up) if scored else drops
     elif trials is not None:
         with forked_generators(seed, "fresh nuisances"):
@@ -144,7 +150,7 @@ def predict(
             spread=spread,
         )
         mean = mean + shift
-    cells, sizes = rival.error.noise_posterior(own_residual, rng)
+    cells, sizes = fit.error.noise_posterior(own_residual, rng)
     sizes = noise.by_number(sizes)
     errors, sd = correlated_errors(noise, cells, sizes, rng)
     errors, sd = errors * factor, np.sqrt((sd * factor) ** 2 + extra**2)

@@ -98,7 +98,7 @@ def test_start_states_are_those_of_least_squares(found):
     u = fit.sample.u[:40]
     simulator = TrialSimulator(rivals.simulator.model, own.held_out)
     rng = np.random.default_rng(0)
-    theta, phi = conditioned(rivals, ModelKey(("drag",)), u, simulator, rng)
+    theta, phi = conditioned(rivals, fit, u, simulator, rng)
     drawn = phi["start"][..., 0].numpy()
     grid = torch.linspace(-2, 2, 2001, dtype=torch.float64)
     middle, drag = float(theta.mean()), float(phi["drag"].mean())

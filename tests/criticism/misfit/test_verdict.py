@@ -98,7 +98,7 @@ def test_a_gross_error_of_one_trial_is_found_without_simulations(few):
         Trials(trials.action, x, sample_times=trials.sample_times),
         list(few.rivals.effects.values()),
     )
-    tracing = traced(judge(wrong), None, compare=False)
+    tracing = traced(judge(wrong), None)
     assert tracing.verdict == OUTLIER
     assert next(iter(tracing.outliers)) == 3.0
 

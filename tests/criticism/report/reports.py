@@ -21,7 +21,6 @@ from sbi_active.criticism.results import (
     Residuals,
     Tracing,
 )
-from sbi_active.criticism.steps.leave_one_out import LeaveOneOut
 
 DRAG = Effect(
     "drag",
@@ -43,7 +42,6 @@ def evidence(name: str, log_evidence: float) -> Evidence:
         standard_error=0.05,
         effective_sample_size=312.0,
         engine="least squares",
-        num_simulations=7_000,
         names=names,
         draws=0.3 + 0.01 * rng.normal(size=(400, len(names))),
         best_chi_square=40.0,
@@ -97,7 +95,6 @@ def residuals(shape=(6,), *, size: float = 1.0, num: int = 8, times=None) -> Res
         mean=np.full_like(z, 2.0),
         sd=np.ones_like(z),
         refitted=z,
-        prequential=1.5 * z,
         correlation=0.8 if times is not None else 0.0,
         noise="declared",
     )
@@ -132,13 +129,6 @@ def evaluation(num: int = 8) -> Evaluation:
         after=after,
         table=pd.DataFrame(rows, columns=columns),
     )
-
-
-def left_out(name: str, *, density: float, k: float = 0.2) -> LeaveOneOut:
-    pareto_k = np.full(8, 0.2)
-    pareto_k[[3, 5]] = k
-    each = density + 0.1 * np.arange(8)
-    return LeaveOneOut(name=name, density=each, pareto_k=pareto_k, num_draws=400)
 
 
 def flat(made) -> str:
@@ -179,7 +169,6 @@ def report(**changes):
         "prior": BoxUniform(torch.zeros(3), torch.ones(3)),
         "actions": DiscreteActions([1.0, 3.0], names=["speed"], units=["m/s"]),
         "digest": "0123456789abcdef",
-        "leave_one_out": (left_out("none", density=-20), left_out("drag", density=2)),
     }
     return build_report(**(parts | changes))
 

@@ -19,7 +19,6 @@ from tests.criticism.report.reports import (
     DRAG,
     evaluation,
     flat,
-    left_out,
     report,
     residuals,
     tracing,
@@ -196,15 +195,6 @@ def test_tables_stand_in_columns():
     ends = {row.index("312") + 3 for row in rows if "312" in row}
     assert ends == {rows[0].index("ESS") + 3}
     assert max(map(len, lines)) <= 88
-
-
-def test_leaving_one_out_stands_beside_the_evidence():
-    assert "bare model -157.2 0.20 none with drag 18.8 0.20 none" in flat(report())
-    unsure = left_out("drag", density=2, k=0.9)
-    text = flat(report(leave_one_out=(left_out("none", density=-20), unsure)))
-    assert "with drag 18.8 0.90 3, 5" in text
-    assert "a trial decides so much" in text
-    assert "Leave one out" not in flat(report(leave_one_out=()))
 
 
 GROUP = frozenset({"tilt", "none"})

@@ -77,10 +77,12 @@ def log_evidence(x: torch.Tensor, names: tuple[str, ...] = ()) -> float:
     return float(np.logaddexp.reduce(each) - np.log(len(each)))
 
 
-def posterior(x: torch.Tensor, names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+def posterior(
+    x: torch.Tensor, names: tuple[str, ...], known: np.ndarray | slice = slice(None)
+) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and covariance of (theta, phi) under the declared priors."""
-    design = columns(names)
+    design = columns(names)[known]
     precision = design.T @ design / NOISE**2 + np.eye(2 + len(names))
     covariance = np.linalg.inv(precision)
-    mean = covariance @ design.T @ x[:, 0].double().numpy() / NOISE**2
+    mean = covariance @ design.T @ x[known, 0].double().numpy() / NOISE**2
     return mean, covariance

@@ -61,7 +61,7 @@ def report_of(x, *, action=SPEEDS, noise=SENSOR, seed=0, **changes):
 @pytest.fixture(scope="module")
 def fitted():
     some = rivals(measured(curve=0.5))
-    return some, traced(judged(some), None, compare=False)
+    return some, traced(judged(some), None)
 
 
 @pytest.mark.parametrize("drag", [0.0, 0.3])

@@ -17,7 +17,6 @@ def evidence(key, names, center, log_z, square):
         standard_error=0.0,
         effective_sample_size=4_000.0,
         engine="least squares",
-        num_simulations=0,
         names=names,
         draws=draws,
         best_chi_square=square,

@@ -73,7 +73,7 @@ def test_probabilities_are_priors_times_evidences(phi):
     told = found.probabilities
     assert sum(told.values()) == pytest.approx(1)
     assert {k: p for k, p in told.items() if p > 0} == pytest.approx(expected)
-    chosen = traced(found, None, compare=False).chosen
+    chosen = traced(found, None).chosen
     assert chosen == ((*phi,) if found.detection.alarm else ())
 
 
@@ -117,7 +117,7 @@ def test_what_an_effect_leaves_over_is_unexplained_beside_it():
     ("phi", "robust"), [({"curve": 0.065}, False), ({"curve": 0.5}, True), ({}, True)]
 )
 def test_a_verdict_that_hangs_on_the_width_of_a_prior_is_not_robust(phi, robust):
-    assert tracing_of(measured(**phi), compare=False)[0].robust == robust
+    assert tracing_of(measured(**phi))[0].robust == robust
 
 
 def test_effects_that_the_trials_do_not_separate_count_as_one():
@@ -141,7 +141,7 @@ def test_effects_that_the_trials_do_not_separate_count_as_one():
 
 @pytest.mark.parametrize("kink", [0.2, 0.32])
 def test_inclusion_and_the_credible_set_add_probabilities_up(kink):
-    tracing, _ = tracing_of(measured(curve=0.14, kink=kink), compare=False)
+    tracing, _ = tracing_of(measured(curve=0.14, kink=kink))
     p = tracing.probabilities
     for name, total in tracing.inclusion.items():
         parts = [p[k] for k, e in tracing.evidences.items() if name in e.key.effects]
