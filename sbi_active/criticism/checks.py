@@ -30,11 +30,14 @@ from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.noise.estimation import estimate_noise
 
-FEWEST_REPEATS = 3  # a choice: two degrees of freedom for the spread
-
 
 def with_noise(
-    model: SimulatorModel, prior: Distribution, trials: Trials
+    model: SimulatorModel,
+    prior: Distribution,
+    trials: Trials,
+    *,
+    # a choice: two degrees of freedom for the spread
+    fewest_repeats: int = 3,
 ) -> SimulatorModel:
     """Return the model with noise from repeats where it is deterministic without."""
     theta, action = _some_rows(prior, trials)
@@ -45,10 +48,10 @@ def with_noise(
     first = torch.where(fit.repeat_of < 0, torch.arange(len(fit)), fit.repeat_of)
     groups = [fit.x[first == i] for i in first.unique()]
     most = max(len(group) for group in groups)
-    if most < FEWEST_REPEATS:
+    if most < fewest_repeats:
         raise ValueError(
             "expected measurement noise, declared or estimated from at least "
-            f"{FEWEST_REPEATS} repeats of one action; got a deterministic simulator "
+            f"{fewest_repeats} repeats of one action; got a deterministic simulator "
             f"without noise and at most {most} trials of one action, so that nothing "
             "tells noise from effect; declare SimulatorModel(fn, noise=...)"
         )

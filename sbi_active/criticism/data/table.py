@@ -29,9 +29,6 @@ from sbi_active.messages import ChangedWarning, warn
 
 Array = NDArray[Any]
 
-#: Decades between the sizes of two groups of trials that look like two units, and those
-#: within each.
-GAP, WITHIN = 1.7, 1.0
 SHOWN = 5  # places that a message lists
 
 
@@ -263,7 +260,16 @@ class _TrialRows(Rows):
                     stacklevel=stack_level(),
                 )
 
-    def _note_scales(self, sizes: Sequence[Array] | Array, column: str) -> None:
+    def _note_scales(
+        self,
+        sizes: Sequence[Array] | Array,
+        column: str,
+        *,
+        # Decades between the sizes of two groups of trials that look like two units,
+        # and those within each.
+        gap: float = 1.7,
+        within: float = 1.0,
+    ) -> None:
         """Warn where some trials' numbers are larger by as much as another unit."""
         middle = [np.nanmedian(s) if np.isfinite(s).any() else 0 for s in sizes]
         some = np.flatnonzero(np.array(middle) > 0)
@@ -273,7 +279,7 @@ class _TrialRows(Rows):
         order = np.argsort(decades)
         k = int(np.argmax(np.diff(decades[order]))) + 1
         low, high = decades[order[:k]], decades[order[k:]]
-        if high[0] - low[-1] < GAP or max(np.ptp(low), np.ptp(high)) > WITHIN:
+        if high[0] - low[-1] < gap or max(np.ptp(low), np.ptp(high)) > within:
             return
         fewer, word = order[k:], "larger"
         if len(low) < len(high):

@@ -26,9 +26,6 @@ from sbi_active.simulation.model import NOISE_STREAM
 #: Rows on which an effect is compared with the simulator without it; of those that are
 #: simulated in any case, so many that x of two channels leaves more than one.
 NUM_CHECKED, NUM_FIRST = 16, 3
-#: Largest difference at the null, in deviations of x over the checked rows: single
-#: precision, with room for a formula's rounding.
-TOLERANCE = 1e-4
 
 
 class AugmentedSimulator(SimulatorModel):
@@ -338,7 +335,16 @@ class AugmentedSimulator(SimulatorModel):
         )
         return x[place]
 
-    def _check_null(self, theta: Tensor, action: Tensor, context: Context) -> None:
+    def _check_null(
+        self,
+        theta: Tensor,
+        action: Tensor,
+        context: Context,
+        *,
+        # Largest difference at the null, in deviations of x over the checked rows:
+        # single precision, with room for a formula's rounding.
+        tolerance: float = 1e-4,
+    ) -> None:
         """Raise if an effect at its null changes x."""
         x = self._seeded(theta, {}, action, context)
         shapes = [x.shape, *(u.shape for u in (context.inputs or {}).values())]
@@ -350,9 +356,9 @@ class AugmentedSimulator(SimulatorModel):
         spread = float(finite.double().std()) if finite.numel() > 1 else 0.0
         scale = max(spread, float(finite.abs().mean()) if len(finite) else 0.0, 1e-30)
         for effect in self._unchecked:
-            changed, without, allowed = "x", x, TOLERANCE * scale
+            changed, without, allowed = "x", x, tolerance * scale
             if effect.hook == "noise":
-                changed, without, allowed = "the noise", torch.ones_like(x), TOLERANCE
+                changed, without, allowed = "the noise", torch.ones_like(x), tolerance
 
             def at_null(null: Tensor, e: Effect = effect, x: Tensor = without) -> Any:
                 if e.hook == "noise":

@@ -8,9 +8,6 @@ import torch
 
 from sbi_active.criticism.effects.effect import NUM_DRAWS, Effect
 
-#: Step from the null towards a draw: a null on the edge of a support belongs to it.
-STEP = 1e-6
-
 
 def require_nested(effects: Sequence[Effect]) -> None:
     """Raise if a prior excludes the null, so that no phi is close to no effect.
@@ -53,11 +50,17 @@ def _require_once(names: Sequence[str], expected: str) -> None:
         )
 
 
-def _reaches_null(effect: Effect) -> bool:
+def _reaches_null(
+    effect: Effect,
+    *,
+    # Step from the null towards a draw: a null on the edge of a support belongs to
+    # it.
+    step: float = 1e-6,
+) -> bool:
     draws = effect.declared_draws()
     null = effect.null_phi(NUM_DRAWS)
     known = null.isfinite()
-    near = torch.where(known, null + STEP * (draws - null), draws)
+    near = torch.where(known, null + step * (draws - null), draws)
     exact = torch.where(known, null, draws)
     return bool((effect.log_prob(torch.cat([exact, near])) > -torch.inf).any())
 

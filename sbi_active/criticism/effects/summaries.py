@@ -34,8 +34,6 @@ MANY = 500
 #: Summaries at most.
 MOST = 20
 NUM_SIMULATIONS = 1_000
-#: Share of the variance, in units of the noise, that the components leave out.
-NEGLIGIBLE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -213,9 +211,15 @@ def _trained(
     return torch.linalg.qr(rows.T).Q.T / sd, center * sd
 
 
-def _components(y: Tensor, num: int) -> Tensor:
+def _components(
+    y: Tensor,
+    num: int,
+    *,
+    # Share of the variance, in units of the noise, that the components leave out.
+    negligible: float = 1e-4,
+) -> Tensor:
     """Return principal directions, shape (k, N)."""
     _, size, rows = torch.linalg.svd(y, full_matrices=False)
     share = 1 - size.square().cumsum(0) / size.square().sum().clamp_min(1e-300)
-    enough = int((share > NEGLIGIBLE).sum()) + 1
+    enough = int((share > negligible).sum()) + 1
     return rows[: min(num, enough)]

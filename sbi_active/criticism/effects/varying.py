@@ -15,9 +15,6 @@ from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
 from sbi_active.support import support_bounds, support_of
 
-#: Draws of the prior that tell its deviations to some 5 %.
-NUM_DRAWS = 256
-
 
 @dataclass(frozen=True)
 class _Varied:
@@ -57,6 +54,7 @@ def varying_parameters(
     trials: Trials,
     *,
     scale: float = 0.5,
+    num_draws: int = 256,
 ) -> list[Effect]:
     r"""Return effects that make each parameter depend on what the trials show.
 
@@ -77,6 +75,7 @@ def varying_parameters(
         scale: Prior standard deviation of phi: the change of a parameter, in its own
             prior deviations, from the middle to an end of the range. A third
             and three times are tried as well, so that half or twice says little else.
+        num_draws: Draws of the prior that tell its deviations to some 5 %.
 
     Returns:
         Effects for ``close_loop(effects=...)``, up to (action_dim + 1) a parameter.
@@ -94,7 +93,7 @@ def varying_parameters(
     """
     low, high = support_bounds(support_of(prior), prior.event_shape[0])
     with forked_generators(0, "deviations"):
-        sd = prior.sample(torch.Size([NUM_DRAWS])).double().std(0)
+        sd = prior.sample(torch.Size([num_draws])).double().std(0)
     names = model.parameter_names or [f"theta_{j + 1}" for j in range(len(sd))]
     effects = []
     for j, name in enumerate(names):

@@ -45,16 +45,6 @@ Array = NDArray[Any]
 NUM_DRAWS = 400  # kept of a model; a mean is then known to a 20th of a deviation
 #: Trials from which their order may be what residuals follow.
 FEW_TRIALS = 5
-#: Factors on the declared noise where every model misses by more.
-NUM_FACTORS = 14
-#: Ranges of the action space between two trials whose actions are labels.
-APART = 100.0
-#: Deviations of the prior predictive beyond which a number counts as that far.
-FARTHEST = 1e3
-#: Deviations of the noise that a gross error may have: it tells next to nothing.
-GROSS = 1e3
-#: Draws of largest weight, among which the best fit is sought.
-NUM_TOP = 20
 
 
 class RivalSet:
@@ -97,6 +87,8 @@ class RivalSet:
         actions: ActionSpace | None = None,
         seed: int = 0,
         warm_up: float = 0.0,
+        # Deviations of the prior predictive beyond which a number counts as that far.
+        farthest: float = 1e3,
     ) -> None:
         self.model, self.prior, self.trials, self.seed = model, prior, trials, seed
         self.actions = actions
@@ -113,7 +105,7 @@ class RivalSet:
         self.noise = self.noise_of(self.measurements)
         self._predictives: dict[tuple[bytes | None, ...], tuple[Array, Array]] = {}
         self.center, self.spread = self.prior_predictive(self.simulator)
-        reach = FARTHEST * np.hypot(self.spread, self.noise.typical_sd)
+        reach = farthest * np.hypot(self.spread, self.noise.typical_sd)
         self.measurements = self.measurements.bounded(self.center, reach)
         self.simulator.measurements = self.measurements
         self.step, self.is_smooth = STEPS[0], True
@@ -133,14 +125,16 @@ class RivalSet:
         noise = declared_noise(self.model.noise, measurements, seed=seed)
         return noise if self._factors is None else noise.scaled(*self._factors)
 
-    def widen(self, largest: float) -> None:
+    def widen(self, largest: float, *, num_factors: int = 14) -> None:
         """Let errors be larger than declared, by an unknown factor.
 
         Args:
             largest: Largest value of the factor, which is log-uniform from one.
+            num_factors: Factors on the declared noise where every model
+                misses by more.
         """
-        factors = np.geomspace(1.0, max(largest, 2.0), NUM_FACTORS)
-        weights = np.full(NUM_FACTORS, -np.log(NUM_FACTORS))
+        factors = np.geomspace(1.0, max(largest, 2.0), num_factors)
+        weights = np.full(num_factors, -np.log(num_factors))
         self._factors = factors, weights
         self.noise = self.noise.scaled(factors, weights)
 
@@ -158,7 +152,13 @@ class RivalSet:
             step=self.step,
         )
 
-    def _error_model(self, error: str | None) -> ErrorModel:
+    def _error_model(
+        self,
+        error: str | None,
+        *,
+        # Deviations of the noise that a gross error may have: it tells next to nothing.
+        gross: float = 1e3,
+    ) -> ErrorModel:
         if error == SCATTER:
             return scattered(self.noise)
         if error == UNEXPLAINED:
@@ -166,7 +166,7 @@ class RivalSet:
         if error is None or self.suspect is None:
             return self.noise
         at = self.measurements.trial == self.suspect
-        return self.noise.with_extra(np.where(at, GROSS * self.noise.typical_sd, 0.0))
+        return self.noise.with_extra(np.where(at, gross * self.noise.typical_sd, 0.0))
 
     @property
     def has_known_noise(self) -> bool:
@@ -205,7 +205,9 @@ class RivalSet:
     def _bare_residual(self) -> Array:
         return self.rival(ModelKey()).residual(self.fit().likeliest)[0][0]
 
-    def scaled_actions(self, trials: Trials | None = None) -> Array:
+    def scaled_actions(
+        self, trials: Trials | None = None, *, apart: float = 100.0
+    ) -> Array:
         """Return actions in ranges of the action space, those of the fit first.
 
         Actions that are labels are so far from each other that a smooth function of
@@ -213,11 +215,13 @@ class RivalSet:
 
         Args:
             trials: Further trials.
+            apart: Ranges of the action space between two trials whose
+                actions are labels.
         """
         if self.trials.action_is_label:  # which says nothing of how near trials are
             parts = [self.trials, *([] if trials is None else [trials])]
             labels = np.concatenate([part.action.numpy() for part in parts])
-            return labels * APART
+            return labels * apart
         action = some = self.trials.action.numpy()
         if self.actions is not None:
             draws = self.actions.sample((256,), seed=0).double().numpy()
@@ -280,9 +284,12 @@ class RivalSet:
         rival: Rival,
         sample: WeightedDraws,
         seed: int,
+        *,
+        # Draws of largest weight, among which the best fit is sought.
+        num_top: int = 20,
     ) -> Fit:
         u = sample.draws(NUM_DRAWS, np.random.default_rng(seed))
-        best = sample.u[np.argsort(sample.weight)[-NUM_TOP:]]
+        best = sample.u[np.argsort(sample.weight)[-num_top:]]
         own = sum(rival.coordinates.joint.sizes)
         residual = rival.residual(best, penalized=False)[0]
         square = [(rival.error.whitener(r)(r) ** 2).sum() for r in residual]

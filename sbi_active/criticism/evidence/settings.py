@@ -27,11 +27,9 @@ NESTED = SearchSettings(
 #: Searches where the simulator jumps: derivatives lead to the neighborhood of a mode at
 #: most.
 ROUGH = replace(NESTED, num_screened=128, num_starts=8, max_starts=8, phases=2)
-#: Rows of all trials that one model may take.
-MOST = 3_000
 
 
-def settings_of(num_trials: int, *, is_bare: bool) -> Settings:
+def settings_of(num_trials: int, *, is_bare: bool, most: int = 3_000) -> Settings:
     """Return the settings of what is spent on a model.
 
     The bare model is every comparison's other side, and its posterior is shown; an
@@ -40,9 +38,10 @@ def settings_of(num_trials: int, *, is_bare: bool) -> Settings:
     Args:
         num_trials: Number of simulated trials in a row.
         is_bare: Whether it is the model without effects.
+        most: Rows of all trials that one model may take.
     """
     if is_bare:
-        return Settings(plenty=4.0, num_simulations=3 * MOST * num_trials)
+        return Settings(plenty=4.0, num_simulations=3 * most * num_trials)
     return Settings(
         num_effective=50.0,
         plenty=1.0,
@@ -52,5 +51,5 @@ def settings_of(num_trials: int, *, is_bare: bool) -> Settings:
         affordable=5.0,
         broad=60.0,
         share_of_plenty=0.0,
-        num_simulations=MOST * num_trials,
+        num_simulations=most * num_trials,
     )

@@ -26,14 +26,8 @@ from sbi_active.seeding import derive_seed
 
 #: Probability with which an outcome lies within the registered interval.
 COVERAGE = 0.9
-#: Probability of as many failed predictions below which they are a warning.
-SURPRISING = 0.05
-#: Distance, in widths of the permitted actions, below which two are the same.
-SAME = 1e-6
 #: Mean squared error, in sensor variances, that counts as none.
 TINY = 1e-9
-#: Draws of a registered prediction: its 90 % limit has a standard error of 1 %.
-NUM_DRAWS = 400
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +96,12 @@ def choose(
     return chosen
 
 
-def _untried(report: Report) -> Choice | None:
+def _untried(
+    report: Report,
+    *,
+    # Distance, in widths of the permitted actions, below which two are the same.
+    same: float = 1e-6,
+) -> Choice | None:
     """Return the permitted action that is farthest from all that were tried."""
     if report.next_action is None or report.action_is_label:
         return None
@@ -111,7 +110,7 @@ def _untried(report: Report) -> Choice | None:
     width = np.where(width > 0, width, 1.0)
     distance = cdist(candidates / width, tried / width).min(1)
     best = int(np.argmax(distance))
-    if distance[best] < SAME:
+    if distance[best] < same:
         return None
     return Choice(candidates[best], "shows the residual where no trial was")
 
@@ -136,7 +135,9 @@ def _testing(report: Report, actions: ActionSpace, settling: Settling) -> Choice
     return None
 
 
-def failures(report: Report, tested: Sequence[TestedTrial]) -> list[str]:
+def failures(
+    report: Report, tested: Sequence[TestedTrial], *, surprising: float = 0.05
+) -> list[str]:
     """Return a warning if a verdict stands though its predictions failed.
 
     As many failures have a probability below .05 if the intervals hold in .9.
@@ -144,11 +145,13 @@ def failures(report: Report, tested: Sequence[TestedTrial]) -> list[str]:
     Args:
         report: Report with the verdict.
         tested: Trials that were run.
+        surprising: Probability of as many failed predictions below which they
+            are a warning.
     """
     own = [t for t in tested if t.registered.verdict == report.verdict]
     own = [t for t in own if t.is_measured]
     failed = [f"{t.registered.index:g}" for t in own if not t.held]
-    if stats.binom.sf(len(failed) - 1, len(own), 1 - COVERAGE) >= SURPRISING:
+    if stats.binom.sf(len(failed) - 1, len(own), 1 - COVERAGE) >= surprising:
         return []
     told = f"SA531 {report.verdict} did not predict trials {', '.join(failed)}"
     return [f"{told} of {len(own)} that tested it, and is the verdict still"]
@@ -174,7 +177,12 @@ def is_settled(
 
 
 def register(
-    criticism: Criticism, report: Report, choice: Choice, index: float
+    criticism: Criticism,
+    report: Report,
+    choice: Choice,
+    index: float,
+    *,
+    num_draws: int = 400,
 ) -> Registered:
     """Return what the verdict predicts of a trial.
 
@@ -183,12 +191,14 @@ def register(
         report: Report with their verdict.
         choice: The trial.
         index: Place of the trial in the order of execution.
+        num_draws: Draws of a registered prediction: its 90 % limit has a
+            standard error of 1 %.
     """
     rivals = criticism.rivals
     trial = following(rivals, torch.from_numpy(choice.action)[None])
     trial.index = torch.full_like(trial.index, index)
     seed = derive_seed(rivals.seed, "registered", len(rivals.trials))
-    options = {"num_draws": NUM_DRAWS, "seed": seed, "scored": False}
+    options = {"num_draws": num_draws, "seed": seed, "scored": False}
     prediction = predict(rivals, trial, key=report.tracing.key, **options)
     bare = prediction
     if report.tracing.key != ModelKey():

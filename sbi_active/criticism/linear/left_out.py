@@ -20,11 +20,6 @@ from sbi_active.inference.sampling.least_squares import within
 
 Array = NDArray[Any]
 
-#: Factor on the scale of effects' priors in refits, which are to follow the trials.
-WIDTH = 3.0
-#: Steps of a search within bounds, each of which ends at one or at the best x.
-STEPS = 30
-
 
 @dataclass(frozen=True)
 class LeftOut:
@@ -109,6 +104,7 @@ def leave_out(
     folds: NDArray[np.bool_] | None = None,
     *,
     weight: Array | float = 1.0,
+    width: float = 3.0,
 ) -> LeftOut:
     """Return a model's errors on each part of the trials that it was not fitted to.
 
@@ -117,6 +113,8 @@ def leave_out(
         errors: Errors, which say what the parts are.
         folds: Parts that count, shape (f,); None takes all.
         weight: Weight of each squared error, in refits and in what is returned, (N,).
+        width: Factor on the scale of effects' priors in refits, which are to
+            follow the trials.
     """
     f = errors.num_folds
     use = np.ones(f, bool) if folds is None else folds
@@ -129,7 +127,7 @@ def leave_out(
     rows, scaled = rows[: model.num], scaled[: model.num]
     gram[~use] = 0.0
     total = gram.sum(0)
-    prior = np.diag(1 / model.widened(WIDTH) ** 2)
+    prior = np.diag(1 / model.widened(width) ** 2)
     without = total - gram
     low, high = model.low - model.center, model.high - model.center
     refits = bounded(without[:, 1:, 1:] + prior, without[:, 1:, 0], low, high)
@@ -185,7 +183,9 @@ def standard_errors(
     return standard
 
 
-def bounded(system: Array, right: Array, low: Array, high: Array) -> Array:
+def bounded(
+    system: Array, right: Array, low: Array, high: Array, *, steps: int = 30
+) -> Array:
     r"""Return the x within bounds that minimize :math:`x^T A x / 2 - b^T x`, (n, d).
 
     If the best x without bounds were only clipped, other coordinates would keep values
@@ -196,11 +196,13 @@ def bounded(system: Array, right: Array, low: Array, high: Array) -> Array:
         right: b, shape (n, d).
         low: Lower bounds, shape (d,).
         high: Upper bounds, shape (d,).
+        steps: Steps of a search within bounds, each of which ends at one or at
+            the best x.
     """
     free = np.linalg.solve(system, right[..., None])[..., 0]
     x = np.clip(free, low, high)
     some = np.flatnonzero((x != free).any(1))
-    for _ in range(STEPS if len(some) else 0):
+    for _ in range(steps if len(some) else 0):
         gradient = np.einsum("nij,nj->ni", system[some], x[some]) - right[some]
         new = x[some] - within(system[some], gradient, x[some], low, high)
         new = np.clip(new, low, high)

@@ -15,9 +15,6 @@ from sbi_active.criticism.steps.tracing import log_prior
 
 Array = NDArray[Any]
 
-#: Effects whose Gram matrices are computed together.
-TOGETHER = 12
-
 
 class Library:
     """A model at its best fit, with a column of every effect that it lacks.
@@ -63,10 +60,15 @@ class Library:
         """Return the model with one effect where it vanishes, and its columns."""
         return self._singles[name], self._blocks[name]
 
-    def look_at_each(self) -> None:
+    def look_at_each(
+        self,
+        *,
+        # Effects whose Gram matrices are computed together.
+        together: int = 12,
+    ) -> None:
         """Compute the posterior of each effect alone, several at a time."""
-        for start in range(0, len(self.names), TOGETHER):
-            some = self.names[start : start + TOGETHER]
+        for start in range(0, len(self.names), together):
+            some = self.names[start : start + together]
             self.prepare(some)
             for name in some:
                 self._posterior((name,))

@@ -20,9 +20,6 @@ Array = NDArray[Any]
 
 #: Share of the squares that is added to them, so that a flat direction is solved for.
 RIDGE = 1e-9
-#: Precision of the Gaussian that stands for a prior between two bounds: wide enough
-#: to leave parameters alone that the trials determine.
-FLAT = 0.3
 
 
 @dataclass(frozen=True)
@@ -257,12 +254,21 @@ def centered(rival: Rival, model: LinearModel, unit: Array) -> LinearModel:
     return replace(model, jacobian=(model.jacobian + other.jacobian) / 2)
 
 
-def with_prior(rival: Rival, u: Array, residual: Array, jacobian: Array) -> LinearModel:
+def with_prior(
+    rival: Rival,
+    u: Array,
+    residual: Array,
+    jacobian: Array,
+    *,
+    # Precision of the Gaussian that stands for a prior between two bounds: wide
+    # enough to leave parameters alone that the trials determine.
+    flat: float = 0.3,
+) -> LinearModel:
     """Return a linearized rival with the Gaussian that stands for its prior."""
     c = rival.coordinates
     bounded = np.isfinite(c.low) & np.isfinite(c.high)
     scaled = np.zeros(rival.dim, dtype=bool)
-    precision = np.where(c.precision > 0, c.precision, FLAT)
+    precision = np.where(c.precision > 0, c.precision, flat)
     names = {e.name for e in rival.effects}
     for name, place in rival.columns().items():
         if name in names:

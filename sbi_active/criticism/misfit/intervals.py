@@ -38,12 +38,6 @@ from sbi_active.inference.sampling.eigen import eigh
 
 Array = NDArray[Any]
 
-#: Shares of the process that trials have in common, and the length over which they do,
-#: in deviations of the action.
-SHARES, LENGTHS = (0.5, 0.9), (0.7, 1e3)
-#: Every so many of the sizes of the process.
-THINNED = 2
-
 
 def covariance(own: Candidate, errors: Errors, action: Array) -> Array:
     """Return the covariance of a model's coordinates about its best fit, (d, d).
@@ -111,6 +105,8 @@ def _processes(
     errors: Errors,
     places: Array,
     between: list[tuple[Array, Array]],
+    *,
+    thinned: int = 2,
 ) -> tuple[Array, Array]:
     """Return Gram matrices with a process, (h, k, k), and log constants, (h,).
 
@@ -119,10 +115,12 @@ def _processes(
         errors: Errors that all models share.
         places: Numbers of each series, by trial, then channel, shape (b, n).
         between: Eigenvalues and vectors of what trials share, by hypothesis.
+        thinned: Step through the sizes of the process, of which a half tells as
+            much.
     """
     num = errors.num_folds
     blocks = model.rows[places].reshape(num, -1)
-    variance = errors.sizes[::THINNED] ** 2
+    variance = errors.sizes[::thinned] ** 2
     variances = np.stack([np.ones(len(variance)), variance], 1)
     own = Processes.grid(variances, errors.times, errors.kernels)
     grams, logs = [], []
@@ -159,15 +157,23 @@ def _differing(
     return np.concatenate(grams), np.concatenate(logs)
 
 
-def _between(action: Array, num: int) -> list[tuple[Array, Array]]:
+def _between(
+    action: Array,
+    num: int,
+    *,
+    # Shares of the process that trials have in common, and the length over which
+    # they do, in deviations of the action.
+    shares: tuple[float, ...] = (0.5, 0.9),
+    lengths: tuple[float, ...] = (0.7, 1e3),
+) -> list[tuple[Array, Array]]:
     """Return eigenvalues and vectors of what trials share, for each hypothesis."""
     spread = action.std(0)
     some = spread > 0
     scaled = action[:, some] / spread[some]
     square = ((scaled[:, None] - scaled) ** 2).sum(-1)
     found = [(np.ones(num), np.eye(num))]
-    for share in SHARES:
-        for length in LENGTHS if some.any() else LENGTHS[-1:]:
+    for share in shares:
+        for length in lengths if some.any() else lengths[-1:]:
             kernel = share * np.exp(-0.5 * square / length**2)
             values, vectors = eigh(kernel + (1 - share) * np.eye(num))
             found.append((np.clip(values, 0, None), vectors))

@@ -45,9 +45,6 @@ Array = NDArray[Any]
 #: Probability from which an admitted model is recorded with its errors and draws, and
 #: how many are at most.
 SHOWN, MOST_SHOWN = 0.01, 8
-#: Weight by the error on left-out parts from which a next action is to tell a model
-#: from others, and how many are at most: each costs some hundred trials a candidate.
-COUNTS, MOST_COUNTED = 0.05, 6
 
 
 def traced(
@@ -285,11 +282,19 @@ def _is_sampled(found: Verdict, key: ModelKey) -> bool:
     return bends(search, key)
 
 
-def _weights(misfit: Verdict) -> dict[ModelKey, float]:
+def _weights(
+    misfit: Verdict,
+    *,
+    # Weight by the error on left-out parts from which a next action is to tell a
+    # model from others, and how many are at most: each costs some hundred trials a
+    # candidate.
+    counts: float = 0.05,
+    most_counted: int = 6,
+) -> dict[ModelKey, float]:
     """Return the models that count, by their errors on left-out parts."""
     weights = misfit.weights
-    kept = [key for key, weight in weights.items() if weight >= COUNTS]
-    return {key: weights[key] for key in kept[:MOST_COUNTED]}
+    kept = [key for key, weight in weights.items() if weight >= counts]
+    return {key: weights[key] for key in kept[:most_counted]}
 
 
 def _found(

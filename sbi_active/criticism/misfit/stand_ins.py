@@ -11,12 +11,6 @@ from sbi_active.criticism.misfit.wider_prior import beyond_bounds
 from sbi_active.criticism.results import Evaluation, Tracing
 from sbi_active.criticism.steps.influence import unless_refuted, withdrawn
 
-#: Tail probability of the chi-square below which a model is not adopted, on fitted
-#: trials and on others.
-LEVEL, HELD_OUT = 0.01, 0.01
-#: Log Bayes factor of a residual process above which a model does not explain all.
-PROCESS = 1.1
-
 
 def judged(
     rivals: RivalSet, tracing: Tracing, evaluation: Evaluation | None
@@ -45,16 +39,26 @@ def judged(
 
 
 def _reasons(
-    rivals: RivalSet, tracing: Tracing, evaluation: Evaluation | None
+    rivals: RivalSet,
+    tracing: Tracing,
+    evaluation: Evaluation | None,
+    *,
+    # Log Bayes factor of a residual process above which a model does not explain
+    # all.
+    process: float = 1.1,
+    # Tail probability of the chi-square below which a model is not adopted, on
+    # fitted trials and on others.
+    level: float = 0.01,
+    held_out: float = 0.01,
 ) -> Iterator[str]:
-    if tracing.p_value < LEVEL:
+    if tracing.p_value < level:
         yield f"its chi-square has p = {tracing.p_value:.2g}"
-    if evaluation is not None and evaluation.p_value < HELD_OUT:
+    if evaluation is not None and evaluation.p_value < held_out:
         yield f"that of held-out trials has p = {evaluation.p_value:.2g}"
     if any(name.startswith("free") for name in tracing.chosen):
         yield "its form is free"
     families = [e.family for e in rivals.library if e.name in tracing.chosen]
     if len({*families}) < len(families):
         yield "it takes several forms of one family"
-    if tracing.log_process > PROCESS:
+    if tracing.log_process > process:
         yield f"a residual process beside it gains {tracing.log_process:.1f} nats"

@@ -29,11 +29,13 @@ from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
 
-NUM_BOOTSTRAP = 400
-
 
 def weights_by_error(
-    square: Mapping[ModelKey, Array], log_prior: Mapping[ModelKey, float], seed: int
+    square: Mapping[ModelKey, Array],
+    log_prior: Mapping[ModelKey, float],
+    seed: int,
+    *,
+    num_bootstrap: int = 400,
 ) -> dict[ModelKey, float]:
     """Return the weight of each model, largest first, adding up to one.
 
@@ -42,6 +44,7 @@ def weights_by_error(
             parts that do not count.
         log_prior: Log prior probability of each model, nats.
         seed: Seed of the bootstrap.
+        num_bootstrap: Number of draws of the bootstrap, a choice.
 
     Example:
         >>> one, two = ModelKey(("one",)), ModelKey(("two",))
@@ -54,7 +57,7 @@ def weights_by_error(
     each = np.stack([square[key] for key in keys])  # (m, f)
     each = each[:, np.isfinite(each).all(0)]
     parts = each.shape[1]
-    shares = np.random.default_rng(seed).dirichlet(np.ones(parts), NUM_BOOTSTRAP)
+    shares = np.random.default_rng(seed).dirichlet(np.ones(parts), num_bootstrap)
     log_w = -0.5 * parts * np.log(shares @ each.T)  # (b, m)
     log_w += np.array([log_prior[key] for key in keys])
     w = np.exp(log_w - log_sum_exp(log_w, axis=1)[:, None]).mean(0)

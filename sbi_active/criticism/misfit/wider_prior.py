@@ -23,14 +23,6 @@ Array = NDArray[Any]
 
 #: Draws of a posterior that say whether it lies at a bound, and steps of a refit.
 NUM_DRAWS, STEPS = 400, 30
-#: Move of a bound, in widths of the prior. Half of it still reaches what a
-#: prior barely excludes, twice asks too much of the simulator.
-WIDER = 1.0
-#: Share of a positive parameter's bound that a moved one keeps of it: what has a sign
-#: keeps it, since a simulator may not know what a negative friction is.
-KEPT = 0.1
-#: Distance of an effect's null to a bound, in prior deviations, that is rounding.
-NEAR = 1e-6
 
 
 def beyond_bounds(rivals: RivalSet, tracing: Tracing) -> Tracing:
@@ -84,7 +76,14 @@ def _unless_none(tracing: Tracing, bounds: Bounds) -> Tracing:
     return replace(tracing, bounds=bounds)
 
 
-def _sides(rivals: RivalSet, key: ModelKey) -> NDArray[np.int64]:
+def _sides(
+    rivals: RivalSet,
+    key: ModelKey,
+    *,
+    # Distance of an effect's null to a bound, in prior deviations, that is
+    # rounding.
+    near: float = 1e-6,
+) -> NDArray[np.int64]:
     """Return at which bound each of theta and phi is in a model, (d,): -1, 1 or 0."""
     fit = rivals.fits[key]
     c = fit.rival.coordinates
@@ -102,7 +101,7 @@ def _sides(rivals: RivalSet, key: ModelKey) -> NDArray[np.int64]:
     first = own - len(declared)  # of a simulator that was extended there are more
     z[first:own] = declared
     ends = np.where(side < 0, c.low[:own], c.high[:own])
-    vanishes = np.abs(c.from_z(z[None])[0, :own] - ends) < NEAR
+    vanishes = np.abs(c.from_z(z[None])[0, :own] - ends) < near
     side[first:][vanishes[first:]] = 0
     return side
 
@@ -129,17 +128,27 @@ def _starts(rivals: RivalSet, key: ModelKey, other: ModelKey) -> Array:
     return np.stack([own, np.r_[_start(rivals, other)[:dim], own[dim:]]])
 
 
-def _moved(rival: Rival, side: NDArray[np.int64]) -> Rival:
+def _moved(
+    rival: Rival,
+    side: NDArray[np.int64],
+    *,
+    # Share of a positive parameter's bound that a moved one keeps of it: what has a
+    # sign keeps it, since a simulator may not know what a negative friction is.
+    kept: float = 0.1,
+    # Move of a bound, in widths of the prior. Half of it still reaches what a prior
+    # barely excludes, twice asks too much of the simulator.
+    wider: float = 1.0,
+) -> Rival:
     """Return a rival with some of its bounds moved."""
     c = rival.coordinates
-    zero, width = -c.shift / c.scale, WIDER * (c.high - c.low)
+    zero, width = -c.shift / c.scale, wider * (c.high - c.low)
     low, high = c.low.copy(), c.high.copy()
     for k in np.flatnonzero(side):
         end, bound = (low, c.low[k]) if side[k] < 0 else (high, c.high[k])
         end[k] = bound + side[k] * width[k]
         is_signed = not c.is_log[k] and side[k] * (zero[k] - bound) > 0
         if is_signed:
-            last = zero[k] + KEPT * (bound - zero[k])
+            last = zero[k] + kept * (bound - zero[k])
             end[k] = max(end[k], last) if side[k] < 0 else min(end[k], last)
     c.low, c.high = low, high
     return rival

@@ -32,9 +32,6 @@ from sbi_active.inference.sampling.weights import log_sum_exp
 
 __all__ = ["ChannelNoise", "SettledNoise"]
 
-#: Common factors of sizes whose ratio is given, and how far they reach.
-NUM_FACTORS, REACH = 40, 30.0
-
 
 class ChannelNoise(NoiseGrid):
     """Gaussian noise with an unknown size in each channel.
@@ -167,11 +164,19 @@ class SettledNoise(NoiseGrid):
         residual: Residuals, shape (N,).
     """
 
-    def __init__(self, noise: ChannelNoise, residual: Array) -> None:
+    def __init__(
+        self,
+        noise: ChannelNoise,
+        residual: Array,
+        *,
+        # Common factors of sizes whose ratio is given, and how far they reach.
+        num_factors: int = 40,
+        reach: float = 30.0,
+    ) -> None:
         _, self.ratio = noise.likeliest(residual)
         unit = self.ratio[noise.channel]
         cells = [replace(cell, sd=cell.sd * unit) for cell in noise.cells]
-        scales = np.geomspace(1 / REACH, REACH, NUM_FACTORS)
+        scales = np.geomspace(1 / reach, reach, num_factors)
         super().__init__(cells, scales=scales)
         one = residual[None]
         apart = noise.log_likelihood(one) - self.log_likelihood(one)

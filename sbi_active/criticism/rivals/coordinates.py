@@ -19,17 +19,8 @@ from sbi_active.support import support_bounds, support_of
 
 Array = NDArray[Any]
 
-#: Distance from a bound, in deviations of the prior, within which densities are those
-#: there.
-ROUNDING = 1e-6
-#: Draws that give a prior's mean and deviation to some 3 %; they only set units.
-NUM_DRAWS = 1_000
 #: A positive number whose prior spans this ratio (5 % to 95 %) is searched in logs.
 WIDE = 100.0
-#: Share of draws within a share of the prior's range from a bound from which they lie
-#: at it, and the deviation, in that range, from which trials leave a parameter open:
-#: it is near any bound now and then. (Of a uniform prior it is .29.)
-AT_EDGE, EDGE, OPEN = 0.05, 0.01, 0.2
 
 
 class SearchCoordinates:
@@ -104,11 +95,18 @@ class SearchCoordinates:
         low, high = (end[: z.shape[1]] for end in self._bounds())
         return np.clip(z, low, high)
 
-    def sides(self, u: Array) -> NDArray[np.int64]:
+    def sides(
+        self, u: Array, *, at_edge: float = 0.05, edge: float = 0.01, open: float = 0.2
+    ) -> NDArray[np.int64]:
         """Return the bound at which each of the first coordinates lies, (k,).
 
         Args:
             u: Draws of a posterior, shape (n, k).
+            at_edge: Share of draws near a bound from which they lie at it.
+            edge: Distance to a bound that is near, in ranges of the prior.
+            open: Deviation, in that range, from which trials leave a
+                parameter open: it is near any bound now and then. Of a
+                uniform prior it is .29.
 
         Returns:
             -1 for the lower one, 1 for the upper one, 0 for none.
@@ -117,9 +115,9 @@ class SearchCoordinates:
         bounded = np.isfinite(low) & np.isfinite(high)
         low, high = np.where(bounded, low, 0.0), np.where(bounded, high, 1.0)
         place = (u - low) / (high - low)
-        below, above = (place < EDGE).mean(0), (place > 1 - EDGE).mean(0)
-        is_there = np.maximum(below, above) > AT_EDGE
-        is_there &= bounded & (place.std(0) <= OPEN)
+        below, above = (place < edge).mean(0), (place > 1 - edge).mean(0)
+        is_there = np.maximum(below, above) > at_edge
+        is_there &= bounded & (place.std(0) <= open)
         return np.where(is_there, np.where(below > above, -1, 1), 0)
 
     def split(self, u: Array) -> tuple[Tensor, dict[str, Tensor]]:
@@ -133,14 +131,21 @@ class SearchCoordinates:
             phi[effect.name] = p.reshape(len(z), self.num_trials, effect.phi_dim)
         return theta, phi
 
-    def log_prob(self, u: Array) -> Array:
+    def log_prob(
+        self,
+        u: Array,
+        *,
+        # Distance from a bound, in deviations of the prior, within which densities are
+        # those there.
+        rounding: float = 1e-6,
+    ) -> Array:
         """Return log prior densities with respect to u, shape (n,)."""
         inside = ((u >= self.low) & (u <= self.high)).all(1)
         density = np.full(len(u), -np.inf)
         if not inside.any():
             return density
         # A bound itself may round to beyond.
-        u = np.clip(u[inside], self.low + ROUNDING, self.high - ROUNDING)
+        u = np.clip(u[inside], self.low + rounding, self.high - rounding)
         z = torch.from_numpy(self.to_z(u))
         own = sum(self.joint.sizes)
         log_p = self.joint.log_prob(z[:, :own]).double()
@@ -180,21 +185,26 @@ class SearchCoordinates:
             parts.append(np.repeat(np.arange(self.num_trials), effect.phi_dim))
         return np.concatenate(parts).astype(np.int64)
 
-    def _for_units(self) -> Array:
+    def _for_units(
+        self,
+        *,
+        # Draws that give a prior's mean and deviation to some 3 %; they only set units.
+        num_draws: int = 1_000,
+    ) -> Array:
         """Return draws by which each part has the same units beside any others.
 
         A null, or an end of another search, is carried from one rival to the next.
         """
         with forked_generators(0):
-            parts = [self.joint.prior.sample(torch.Size([NUM_DRAWS])).double()]
+            parts = [self.joint.prior.sample(torch.Size([num_draws])).double()]
         for effect in self.joint.effects:
             with forked_generators(0, effect.name):
-                parts.append(effect.sample(NUM_DRAWS).double())
+                parts.append(effect.sample(num_draws).double())
         for effect in self.nuisances:
             with forked_generators(0, effect.name):
-                own = effect.sample(NUM_DRAWS * self.num_trials).double()
-            parts.append(own.reshape(NUM_DRAWS, -1))
-        return torch.cat([part.reshape(NUM_DRAWS, -1) for part in parts], -1).numpy()
+                own = effect.sample(num_draws * self.num_trials).double()
+            parts.append(own.reshape(num_draws, -1))
+        return torch.cat([part.reshape(num_draws, -1) for part in parts], -1).numpy()
 
     def _raw(self, num: int, *, seed: int) -> Array:
         with forked_generators(seed):

@@ -17,12 +17,6 @@ from sbi_active.criticism.effects.effect import Context, Effect
 
 Array = NDArray[Any]
 
-#: Degrees of freedom, and states, at which a force is asked.
-NUM_DOFS, NUM_STATES = 64, 8
-#: Speeds far beyond any tried, and the exponent of the speed from which a force
-#: outgrows damping in proportion to it.
-SPEEDS, EXPONENT = (1e3, 1e4), 1.5
-
 
 def dissipative_bounds(effect: Effect) -> tuple[Array, Array]:
     """Return between which phi a force dissipates, shapes (phi_dim,); else infinite.
@@ -55,17 +49,28 @@ def dissipative_bounds(effect: Effect) -> tuple[Array, Array]:
     return low, high
 
 
-def _runs_away(effect: Effect, phi: torch.Tensor) -> bool:
+def _runs_away(
+    effect: Effect,
+    phi: torch.Tensor,
+    *,
+    # Speeds far beyond any tried, and the exponent of the speed from which a force
+    # outgrows damping in proportion to it.
+    speeds: tuple[float, ...] = (1e3, 1e4),
+    exponent: float = 1.5,
+    # Degrees of freedom, and states, at which a force is asked.
+    num_dofs: int = 64,
+    num_states: int = 8,
+) -> bool:
     """Return whether the force drives at high speeds, and ever more so."""
     rng = np.random.default_rng(0)
-    shape = NUM_STATES, NUM_DOFS
+    shape = num_states, num_dofs
     ways = np.where(rng.random(shape) < 0.5, -1.0, 1.0)
     q = rng.uniform(-1, 1, shape)
-    context = Context(index=torch.zeros(NUM_STATES, dtype=torch.float64))
-    action = torch.zeros(NUM_STATES, 1, dtype=torch.float64)
-    given = effect.apply({}, phi.expand(NUM_STATES, -1), action, context)
+    context = Context(index=torch.zeros(num_states, dtype=torch.float64))
+    action = torch.zeros(num_states, 1, dtype=torch.float64)
+    given = effect.apply({}, phi.expand(num_states, -1), action, context)
     sizes = []
-    for speed in SPEEDS:
+    for speed in speeds:
         total = np.zeros(shape)
         with np.errstate(all="ignore"):
             for force, numbers in given.get("force", {}).items():
@@ -74,5 +79,5 @@ def _runs_away(effect: Effect, phi: torch.Tensor) -> bool:
         if not (np.isfinite(power).all() and (power > 0).all()):
             return False
         sizes.append(np.abs(power).mean())
-    growth = np.log(sizes[1] / sizes[0]) / np.log(SPEEDS[1] / SPEEDS[0])
-    return bool(growth > EXPONENT)
+    growth = np.log(sizes[1] / sizes[0]) / np.log(speeds[1] / speeds[0])
+    return bool(growth > exponent)

@@ -13,9 +13,6 @@ from sbi_active.criticism.data.input_series import held_at
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.simulation import SimulatorModel
 
-#: Relative and absolute difference of actions that are the same in single precision.
-RTOL, ATOL = 1e-5, 1e-7
-
 
 def with_known_inputs(
     model: SimulatorModel, trials: Trials, actions: ActionSpace
@@ -118,10 +115,18 @@ def _signals(
     return {name: recorded[name].where(known, played[name]) for name in recorded}
 
 
-def _same(trials: Trials, action: Tensor) -> Tensor:
+def _same(
+    trials: Trials,
+    action: Tensor,
+    *,
+    # Relative and absolute difference of actions that are the same in single
+    # precision.
+    rtol: float = 1e-5,
+    atol: float = 1e-7,
+) -> Tensor:
     """Return a mask of the trials that have each action, shape (a, t)."""
     own, asked = trials.action.double(), action.double()
-    return torch.isclose(asked[:, None], own[None], rtol=RTOL, atol=ATOL).all(-1)
+    return torch.isclose(asked[:, None], own[None], rtol=rtol, atol=atol).all(-1)
 
 
 def _starts(start: Any, first: Tensor, found: Tensor) -> Any:

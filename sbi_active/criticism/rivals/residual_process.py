@@ -42,13 +42,8 @@ Array = NDArray[Any]
 
 #: Length scales, in ranges of the action space: a local and a global misfit.
 LENGTHS = (0.1, 0.3)
-#: Length scale along the order of the trials, in their span.
-ORDER_LENGTH = 0.3
 #: Length scale along a trajectory, in its span.
 TIME_LENGTH = 0.3
-NUM_AMPLITUDES = 10
-#: Points that represent the process; as many as there are up to here.
-MAX_POINTS = 300
 #: Directions of less than this share of the variance are left out.
 NEGLIGIBLE = 1e-5
 
@@ -91,12 +86,13 @@ class ResidualProcess(ErrorModel):
         largest: float,
         lengths: tuple[float, ...] = LENGTHS,
         spread: Array | None = None,
+        num_amplitudes: int = 10,
     ) -> None:
         self.noise, self.measurements, self.spread = noise, measurements, spread
         self.lengths = lengths
-        self.amplitudes = np.geomspace(1.0, max(largest, 3.0), NUM_AMPLITUDES)
+        self.amplitudes = np.geomspace(1.0, max(largest, 3.0), num_amplitudes)
         # With an unknown size of the noise, the amplitude is a multiple of it.
-        self._log_amplitude = -np.log(NUM_AMPLITUDES)
+        self._log_amplitude = -np.log(num_amplitudes)
         typical = noise.typical_sd
         self._bases: list[_Basis] = []
         units = {False: typical}
@@ -208,11 +204,18 @@ class ResidualProcess(ErrorModel):
         """Return the spread, in the median as large as the noise."""
         return spread * np.median(sd / spread)
 
-    def _inputs(self, action: Array, order: Array | None) -> list[Array]:
+    def _inputs(
+        self,
+        action: Array,
+        order: Array | None,
+        *,
+        # Length scale along the order of the trials, in their span.
+        order_length: float = 0.3,
+    ) -> list[Array]:
         """Return the places of trials for each process, in lengths, (t, columns)."""
         inputs = [action / length for length in self.lengths]
         if order is not None:
-            inputs.append(order[:, None] / ORDER_LENGTH)
+            inputs.append(order[:, None] / order_length)
         return inputs
 
     def _joint(self, residual: Array) -> Array:
@@ -273,9 +276,15 @@ def _kernel(rows: tuple[Array, Array], columns: tuple[Array, Array]) -> Array:
     return np.exp(-0.5 * distance) * (rows[1][:, None] == columns[1][None])
 
 
-def _features(points: Array, channel: Array) -> Array:
+def _features(
+    points: Array,
+    channel: Array,
+    *,
+    # Points that represent the process; as many as there are up to here.
+    max_points: int = 300,
+) -> Array:
     """Return F, shape (N, m), with F F^T the process's covariance at unit amplitude."""
-    some = np.unique(np.linspace(0, len(points) - 1, MAX_POINTS).astype(int))
+    some = np.unique(np.linspace(0, len(points) - 1, max_points).astype(int))
     few = points[some], channel[some]
     values, vectors = eigh(_kernel(few, few))
     keep = values > NEGLIGIBLE * values.max()

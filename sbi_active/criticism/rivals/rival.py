@@ -18,8 +18,6 @@ from sbi_active.criticism.rivals.validity import log_outcomes
 
 Array = NDArray[Any]
 
-#: Bound on a residual, so that its square is finite.
-LARGEST = 1e100
 STEP = 1e-3  # of finite differences, in deviations of the prior
 #: Square that stands for the reference of a random simulator's deviations: a thirtieth
 #: of it has a square above zero still.
@@ -108,7 +106,7 @@ class Rival:
         return np.concatenate([flags, np.ones(self.dim - len(flags), bool)])
 
     def residual(
-        self, u: Array, *, penalized: bool = True
+        self, u: Array, *, penalized: bool = True, largest: float = 1e100
     ) -> tuple[Array, Array, Array]:
         """Return residuals in units of the declared noise.
 
@@ -118,6 +116,7 @@ class Rival:
                 that drives it away: the spread of the prior predictive, in units of the
                 noise. False gives what the likelihood has there, the prior predictive
                 itself as the number's distribution.
+            largest: Bound on a residual, so that its square is finite.
 
         Returns:
             Observation minus prediction divided by the effects' factor on the noise,
@@ -142,7 +141,7 @@ class Rival:
             scale = np.maximum(scale, 1e-12)
             residual, log_scale = residual / scale, np.log(scale)
         flags = log_outcomes(probability, m.valid)
-        residual = np.clip(residual, -LARGEST, LARGEST)
+        residual = np.clip(residual, -largest, largest)
         if self.reference is not None:
             # Half of its square is the log of a deviation, but for a constant.
             square = LOG_SCALE + 2 * (log_scale - np.log(self.reference))

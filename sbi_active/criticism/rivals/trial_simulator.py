@@ -25,8 +25,6 @@ Prediction = tuple[Array, "Array | None", Array]
 
 #: Draws a row from which a stochastic simulator's mean and deviation are taken.
 NUM_REPLICATES = 32
-#: Draws with a number from which a mean and a deviation are taken, at least.
-FEWEST = 4
 #: Numbers of x in memory at once, and predicted numbers that are kept.
 CHUNK = KEPT = 8_000_000
 
@@ -249,14 +247,19 @@ class TrialSimulator:
         return simulated.reshape(n, repeats, -1)
 
 
-def _moments(x: Array) -> tuple[Array, Array]:
+def _moments(
+    x: Array,
+    *,
+    # Draws with a number from which a mean and a deviation are taken, at least.
+    fewest: int = 4,
+) -> tuple[Array, Array]:
     """Return mean and deviation over replicates, shape (n, r, N), of those with x.
 
     NaN where fewer than a quarter of them, and at least 4, give a number.
     """
     finite = np.isfinite(x)
     count = finite.sum(1)
-    enough = count >= max(FEWEST, x.shape[1] // 4)
+    enough = count >= max(fewest, x.shape[1] // 4)
     safe = np.maximum(count, 2)
     mean = np.where(finite, x, 0.0).sum(1) / safe
     square = np.where(finite, x - mean[:, None], 0.0) ** 2

@@ -17,8 +17,6 @@ Array = NDArray[Any]
 DISAGREEMENT = 0.02
 #: Rates where nothing declared explains the outcomes, equally likely.
 UNKNOWN_RATES = (DISAGREEMENT, 0.1, 0.3, 0.5)
-#: Probability below which an outcome is named.
-SURPRISING = 0.05
 
 
 def log_outcomes(
@@ -48,11 +46,14 @@ def log_outcomes(
     return log_sum_exp(np.stack(each), axis=0) - np.log(len(rates)) - agreed
 
 
-def surprising_outcomes(residuals: Residuals) -> tuple[list[int], list[int]]:
+def surprising_outcomes(
+    residuals: Residuals, *, surprising: float = 0.05
+) -> tuple[list[int], list[int]]:
     """Return places of trials whose validity the model holds for improbable.
 
     Args:
         residuals: Residuals with the probability of a measurement in each trial.
+        surprising: Probability below which an outcome is named.
 
     Returns:
         Those without a measurement and those with one, of a probability below 1/20.
@@ -61,6 +62,6 @@ def surprising_outcomes(residuals: Residuals) -> tuple[list[int], list[int]]:
     if p is None:
         return [], []
     valid = np.isfinite(residuals.x.reshape(len(p), -1)).any(1)
-    lost = np.flatnonzero(~valid & (p > 1 - SURPRISING))
-    kept = np.flatnonzero(valid & (p < SURPRISING))
+    lost = np.flatnonzero(~valid & (p > 1 - surprising))
+    kept = np.flatnonzero(valid & (p < surprising))
     return lost.tolist(), kept.tolist()

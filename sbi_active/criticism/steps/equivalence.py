@@ -26,28 +26,13 @@ Array = NDArray[Any]
 
 #: Effects of a library whose pairs are all compared, and that are all fitted.
 MANY = 24
-#: A choice: of a list that is longer, or a box, so many actions stand for all.
-MAX_ACTIONS = 48
-NUM_THETA = 6  # a choice: five of six agree by the share below
-#: Share of the parameters at which two effects must look the same.
-AGREEMENT = 0.8
 #: Squared distance, in noise units over all actions, of two effects that look the same.
 SAME = 1.0
 #: Share of an effect's size that may be left of it for the effects to look the same.
 RELATIVE = 1e-2
-#: Step from the null, in deviations of the prior.
-STEP = 1e-4
 #: Steps at which an effect must leave nothing too, to be none: one that is flat at its
 #: null, such as a dead zone or a lag held over a step, shows there alone.
 FAR = (0.3, 1.0)
-#: Steps of a search for parameters that imitate such an effect.
-NUM_SEARCH = 6
-#: Share of the rest from which a step has not lowered it.
-ENDED = 0.99
-#: Distance, in noise units, at which a search has found what it looked for.
-FOUND = 1e-4
-#: Parameters at which a pair that is alike near its null is compared far from it.
-NUM_FAR = 2
 
 
 def is_large(effects: Collection[Effect]) -> bool:
@@ -59,7 +44,12 @@ def is_large(effects: Collection[Effect]) -> bool:
 
 
 def equivalent_effects(
-    rivals: RivalSet, actions: ActionSpace | None
+    rivals: RivalSet,
+    actions: ActionSpace | None,
+    *,
+    num_far: int = 2,
+    agreement: float = 0.8,
+    num_theta: int = 6,
 ) -> tuple[frozenset[str], ...]:
     r"""Return groups of effects whose predictions can be told apart by no action.
 
@@ -80,6 +70,12 @@ def equivalent_effects(
     Args:
         rivals: The models.
         actions: The permitted ones; None compares on the trials at hand.
+        num_far: Number of parameters at which a pair that is alike near its
+            null is compared far from it.
+        agreement: Share of the parameters at which two effects must look the
+            same.
+        num_theta: Number of parameters at which effects are compared; five of
+            six agree by ``agreement``.
     """
     trials = rivals.trials if actions is None else every_action(rivals, actions)
     world = _World(rivals, trials)
@@ -87,13 +83,13 @@ def equivalent_effects(
     votes = np.zeros((2, len(effects) + 1, len(effects) + 1))
     local = [bool(e.null_phi(1).isfinite().all()) for e in effects]
     every_u = world.coordinates.sample(
-        NUM_THETA, seed=derive_seed(rivals.seed, "theta")
+        num_theta, seed=derive_seed(rivals.seed, "theta")
     )
     for u in every_u:
         left = world.left_over(u, effects)
         vote = _alike(left, local)
         for i, effect in enumerate(effects, 1):
-            lost = votes[1, 0, i] - votes[0, 0, i] > (1 - AGREEMENT) * NUM_THETA
+            lost = votes[1, 0, i] - votes[0, 0, i] > (1 - agreement) * num_theta
             if lost:  # whatever the other parameters say
                 vote[0, 0, i] = vote[0, i, 0] = 0.0
             # Where the simulator jumps, the direction near the null says enough.
@@ -101,14 +97,14 @@ def equivalent_effects(
             if not lost and local[i - 1] and vote[0, 0, i] and near:
                 vote[0, 0, i] = vote[0, i, 0] = float(world.imitates(None, effect, u))
         votes += vote
-    same = (votes[0] >= AGREEMENT * votes[1]) & (votes[1] > NUM_THETA / 2)
+    same = (votes[0] >= agreement * votes[1]) & (votes[1] > num_theta / 2)
     for i, j in zip(*np.nonzero(np.triu(same, 1)), strict=True):
         pair = effects[i - 1], effects[j - 1]
         if i > 0 and world.is_smooth:  # else a search would find the jumps
             same[i, j] = same[j, i] = all(
                 world.imitates(a, b, u)
                 for a, b in (pair, pair[::-1])
-                for u in every_u[:NUM_FAR]
+                for u in every_u[:num_far]
             )
     names = [NONE, *[e.name for e in effects]]
     return _groups(names, same)
@@ -131,13 +127,20 @@ class _World:
         trials: Trials that are predicted.
     """
 
-    def __init__(self, rivals: RivalSet, trials: Trials) -> None:
+    def __init__(
+        self,
+        rivals: RivalSet,
+        trials: Trials,
+        *,
+        # Step from the null, in deviations of the prior.
+        step: float = 1e-4,
+    ) -> None:
         self.simulator = TrialSimulator(
             rivals.simulator.model, trials, seed=derive_seed(rivals.seed, "equivalence")
         )
         self.prior, self.is_smooth = rivals.prior, rivals.is_smooth
         self.unit = noise_unit(rivals, self.simulator)
-        self.step = max(rivals.step, STEP)
+        self.step = max(rivals.step, step)
         self.coordinates = SearchCoordinates(self.prior, (), (), len(trials))
 
     def predict(
@@ -206,7 +209,18 @@ class _World:
         return True
 
     def _rest(
-        self, c: SearchCoordinates, u: Array, aim: Array, both: NDArray[np.bool_]
+        self,
+        c: SearchCoordinates,
+        u: Array,
+        aim: Array,
+        both: NDArray[np.bool_],
+        *,
+        # Distance, in noise units, at which a search has found what it looked for.
+        found: float = 1e-4,
+        # Share of the rest from which a step has not lowered it.
+        ended: float = 0.99,
+        # Steps of a search for parameters that imitate such an effect.
+        num_search: int = 6,
     ) -> tuple[Array, bool, bool]:
         """Return the rest of predictions that parameters leave, by Gauss-Newton steps.
 
@@ -216,7 +230,7 @@ class _World:
         """
         rest, has_ended = (aim - self.predict(c, u[None])[0])[both], False
         # Where the simulator jumps, a search for parameters finds the jumps.
-        for _ in range(NUM_SEARCH):
+        for _ in range(num_search):
             slope = self.slopes(c, u)[1][both]
             slope = np.where(np.isfinite(slope), slope, 0.0)
             move = np.linalg.lstsq(slope, rest, rcond=1e-9)[0]
@@ -228,12 +242,12 @@ class _World:
                 after = (aim - self.predict(c, to[None])[0])[both]
                 if np.linalg.norm(after) < size:
                     u, rest = to, after
-                    has_ended = bool(np.linalg.norm(after) > ENDED * size)
+                    has_ended = bool(np.linalg.norm(after) > ended * size)
                     break
             else:
                 has_ended = bool(np.linalg.norm(rest - slope @ move) > 0.5 * size)
                 break
-            if np.linalg.norm(rest) < FOUND:
+            if np.linalg.norm(rest) < found:
                 break
         return rest, bool(((u > c.low) & (u < c.high)).all()), has_ended
 
@@ -293,11 +307,17 @@ def _groups(names: list[str], same: NDArray[Any]) -> tuple[frozenset[str], ...]:
     return tuple(frozenset(g) for g in groups if len(g) > 1)
 
 
-def every_action(rivals: RivalSet, actions: ActionSpace) -> Trials:
+def every_action(
+    rivals: RivalSet,
+    actions: ActionSpace,
+    *,
+    # A choice: of a list that is longer, or a box, so many actions stand for all.
+    max_actions: int = 48,
+) -> Trials:
     """Return the trials at hand and one of every permitted action, in random order."""
     values = actions.listed()
-    if values is None or len(values) > MAX_ACTIONS:
-        values = actions.sample((MAX_ACTIONS,), seed=derive_seed(rivals.seed, "every"))
+    if values is None or len(values) > max_actions:
+        values = actions.sample((max_actions,), seed=derive_seed(rivals.seed, "every"))
     order = np.random.default_rng(rivals.seed).permutation(len(values))
     own = rivals.trials
     template, first = own.template()

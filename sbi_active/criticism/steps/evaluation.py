@@ -19,10 +19,6 @@ from sbi_active.simulation import GaussianNoise
 
 Array = NDArray[Any]
 
-COVERAGE = 0.9  # a convention: the central interval that reports state
-#: Trials below which a bootstrap interval is not what it claims to be.
-ENOUGH_TRIALS = 8
-NUM_BOOTSTRAP = 2_000
 #: Metrics whose "ratio" is a difference, after minus before.
 DIFFERENCES = ("log predictive density", "coverage")
 
@@ -92,11 +88,17 @@ def _predictions(
     return before, predict(rivals, trials, key=tracing.key, num_draws=num_draws)
 
 
-def scores(prediction: Prediction, trials: Trials) -> dict[str, Array]:
+def scores(
+    prediction: Prediction,
+    trials: Trials,
+    *,
+    # a convention: the central interval that reports state
+    coverage: float = 0.9,
+) -> dict[str, Array]:
     """Return one value a trial of each metric, and squares and counts for the RMSE."""
     x = trials.x.numpy().reshape(-1)[prediction.position]
     middle = prediction.middle
-    tail = 0.5 * (1 - COVERAGE)
+    tail = 0.5 * (1 - coverage)
     low, high = np.quantile(prediction.x, [tail, 1 - tail], axis=0)
     rows = []
     for t in range(len(trials)):
@@ -134,17 +136,21 @@ def summary(
     after: dict[str, Array],
     selected: tuple[str, ...],
     names: tuple[str, ...],
+    *,
+    num_bootstrap: int = 2_000,
+    # Trials below which a bootstrap interval is not what it claims to be.
+    enough_trials: int = 8,
 ) -> Evaluation:
     """Return scores before and after with their contrast, and its interval."""
     rng = np.random.default_rng(0)
     num = len(positions)
-    resampled = rng.integers(num, size=(NUM_BOOTSTRAP, num))
+    resampled = rng.integers(num, size=(num_bootstrap, num))
     rows = []
     for metric in ("rmse", "energy score", *DIFFERENCES):
         first, second = (_total(s, metric, np.arange(num)) for s in (before, after))
         ratio = _contrast(metric, first, second)
         low = high = np.nan
-        if num >= ENOUGH_TRIALS:
+        if num >= enough_trials:
             many = _contrast(
                 metric,
                 _total(before, metric, resampled),

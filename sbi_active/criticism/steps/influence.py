@@ -28,13 +28,16 @@ from sbi_active.criticism.under_misfit import Misfit
 
 Array = NDArray[Any]
 
-#: Odds against a gross error from which one trial may speak for an effect alone.
-DECISIVE = 50.0
 #: Score of trials that speaks against effects.
 DENSITY = "log predictive density"
 
 
-def is_left_to_chance(tracing: Tracing) -> bool:
+def is_left_to_chance(
+    tracing: Tracing,
+    *,
+    # Odds against a gross error from which one trial may speak for an effect alone.
+    decisive: float = 50.0,
+) -> bool:
     """Return whether the effects of a verdict may be one trial's gross error.
 
     This is the case if the verdict falls without the trial that a gross error would be
@@ -45,7 +48,7 @@ def is_left_to_chance(tracing: Tracing) -> bool:
     suspect = next(iter(tracing.outliers))
     p = tracing.probabilities
     declared = sum(v for name, v in p.items() if name not in (NONE, *CATCH_ALLS))
-    return suspect in tracing.needed and declared < DECISIVE * p.get(OUTLIER, 0.0)
+    return suspect in tracing.needed and declared < decisive * p.get(OUTLIER, 0.0)
 
 
 def unless_refuted(tracing: Tracing, evaluation: Evaluation | None) -> Tracing:

@@ -43,12 +43,6 @@ Array = NDArray[Any]
 #: as that of the chi-squares that refute. What is in another unit, or of another
 #: machine, is so far outside that half or twice the level calls the same trials.
 LEVEL = 0.01
-#: Trials below which their errors do not show how errors differ.
-FEWEST_TRIALS = 5
-#: Deviation that logarithms of their mean squared errors have at least, so that none of
-#: ten is called outlying that errs by less than three times the others, the smallest
-#: gross error; half and twice make it two and ten times.
-LEAST_SPREAD = 0.5
 
 
 def missed_trials(
@@ -114,7 +108,11 @@ def missed_trials(
 
 
 def outlying_trials(
-    squares: Sequence[float], *, level: float = LEVEL
+    squares: Sequence[float],
+    *,
+    level: float = LEVEL,
+    least_spread: float = 0.5,
+    fewest_trials: int = 5,
 ) -> list[tuple[int, float]]:
     """Return fitted trials whose error is far beyond what all others show.
 
@@ -124,16 +122,22 @@ def outlying_trials(
         squares: Mean squared error of each trial on the fit to the others, in sensor
             variances, shape (t,). Less than one is no better than one.
         level: Probability that any of ordinary trials is called so (Bonferroni).
+        least_spread: Deviation that logarithms of mean squared errors have at
+            least, so that none of ten is called outlying that errs by less than
+            three times the others, the smallest gross error; half and twice
+            make it two and ten times.
+        fewest_trials: Number of trials below which their errors do not show how
+            errors differ.
 
     Returns:
         Positions and how many times the median of the others the error is, largest
         first.
     """
     logs, found = np.log(np.maximum(squares, 1.0)), []
-    for k in range(len(logs) if len(logs) >= FEWEST_TRIALS else 0):
+    for k in range(len(logs) if len(logs) >= fewest_trials else 0):
         others = np.delete(logs, k)
         n = len(others)
-        spread = max(others.std(ddof=1), LEAST_SPREAD) * np.sqrt(1 + 1 / n)
+        spread = max(others.std(ddof=1), least_spread) * np.sqrt(1 + 1 / n)
         if student.sf((logs[k] - others.mean()) / spread, n - 1) < level / len(logs):
             found.append((k, float(np.exp(0.5 * (logs[k] - np.median(others))))))
     return sorted(found, key=lambda each: -each[1])

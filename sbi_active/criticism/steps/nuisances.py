@@ -20,9 +20,6 @@ from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 
 Array = NDArray[Any]
 
-#: Gauss-Newton steps at the posterior's mean.
-NUM_STEPS = 4
-
 
 def conditioned(
     rivals: RivalSet,
@@ -30,6 +27,8 @@ def conditioned(
     u: Array,
     simulator: TrialSimulator,
     rng: np.random.Generator,
+    *,
+    num_steps: int = 4,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Return theta and phi with nuisances drawn given the first part of each trial.
 
@@ -42,6 +41,7 @@ def conditioned(
         u: Draws of its coordinates, shape (n, dim).
         simulator: Simulator of the trials that were not fitted.
         rng: Source of the draws.
+        num_steps: Gauss-Newton steps at the posterior's mean.
     """
     key, m = fit.rival.key, simulator.measurements
     center, spread = rivals.prior_predictive(simulator)
@@ -75,7 +75,7 @@ def conditioned(
         for t in range(len(simulator))
     ]
     gains: list[tuple[Array, Array]] = []
-    for _ in range(NUM_STEPS):
+    for _ in range(num_steps):
         r, jacobian = rival.jacobian(point, whiten, rivals.step)
         gains = [_gain(jacobian[0], c.precision, *block) for block in blocks]
         _correct(point, r, c.center, c.precision, blocks, gains)

@@ -24,10 +24,6 @@ from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
 
-PROBABILITY_OF_NONE = 0.5  # by convention, neither for nor against
-#: Probability that what is missing, if anything is, is each of the catch-alls.
-PROBABILITY_OF_CATCH_ALL = 0.1
-MASS = 0.9  # of the credible set
 #: All sets of one effect more are together this much less probable, nats.
 COST = float(np.log(3.0))
 #: Factors on the scale of the effects' priors under which a verdict should stand.
@@ -35,7 +31,11 @@ RESCALED = (1 / 3, 3.0)
 
 
 def log_priors(
-    effects: Sequence[Effect], catch_alls: Sequence[str] = CATCH_ALLS
+    effects: Sequence[Effect],
+    catch_alls: Sequence[str] = CATCH_ALLS,
+    *,
+    probability_of_catch_all: float = 0.1,
+    probability_of_none: float = 0.5,
 ) -> dict[str, float]:
     """Return log prior probabilities of none, each effect and the catch-alls.
 
@@ -45,13 +45,17 @@ def log_priors(
     Args:
         effects: The declared ones.
         catch_alls: Catch-alls that are compared.
+        probability_of_catch_all: Probability that what is missing, if anything
+            is, is each of the catch-alls.
+        probability_of_none: Probability of the bare model: half, by convention,
+            is neither for nor against.
     """
     members: dict[str, list[str]] = {}
     for effect in effects:
         members.setdefault(str(effect.family), []).append(effect.name)
-    missing = 1 - PROBABILITY_OF_NONE
-    each = missing * PROBABILITY_OF_CATCH_ALL
-    found = {NONE: PROBABILITY_OF_NONE} | dict.fromkeys(catch_alls, each)
+    missing = 1 - probability_of_none
+    each = missing * probability_of_catch_all
+    found = {NONE: probability_of_none} | dict.fromkeys(catch_alls, each)
     share = (missing - len(catch_alls) * each) / max(len(members), 1)
     for names in members.values():
         found |= {name: share / len(names) for name in names}
@@ -112,13 +116,18 @@ def log_bayes_factor(
     return float(log_sum_exp(np.array(parts)) - log_z[ModelKey()])
 
 
-def credible_set(probabilities: dict[str, float]) -> tuple[str, ...]:
+def credible_set(
+    probabilities: dict[str, float],
+    *,
+    # of the credible set
+    mass: float = 0.9,
+) -> tuple[str, ...]:
     """Return the smallest set of names with 90 % of the probability, best first."""
     names, total = [], 0.0
     for name, p in probabilities.items():  # most probable first
         names.append(name)
         total += p
-        if total >= MASS:
+        if total >= mass:
             break
     return (*names,)
 
