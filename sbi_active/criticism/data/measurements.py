@@ -108,6 +108,11 @@ class Measurements:
         few = 0 < len(beyond) <= self.valid.sum() / 2
         return replace(self, x=x) if few else self
 
+    def part(self, at: NDArray[np.bool_]) -> Measurements:
+        """Return some of the numbers, shape (N,), with all of their trials."""
+        names = ("x", "position", "trial", "channel", "time", "gap")
+        return replace(self, **{name: getattr(self, name)[at] for name in names})
+
     def __len__(self) -> int:
         return len(self.x)
 

@@ -178,28 +178,34 @@ class RivalSet:
         """Return draws of a model, (n, d), moved into the bounds of its prior."""
         return self.rival(key).coordinates.within(z)
 
-    def residual_process(self, noise: NoiseGrid | None = None) -> ResidualProcess:
+    def residual_process(
+        self, noise: NoiseGrid | None = None, at: NDArray[np.bool_] | None = None
+    ) -> ResidualProcess:
         """Return the noise with a smooth function of the action and time.
 
         Args:
             noise: Noise without it; None takes that of the bare model, and keeps what
                 is made of it.
+            at: Mask of the numbers that it is of, shape (N,); None for all.
         """
         if noise is not None:
-            return self._beside_process(noise)
+            every = np.ones(len(self.measurements), dtype=bool)
+            return self._beside_process(noise, every if at is None else at)
         if not hasattr(self, "_process"):
             noise = self.noise.settled(self._bare_residual)
-            self._process = self._beside_process(noise)
+            self._process = self.residual_process(noise)
         return self._process
 
-    def _beside_process(self, noise: NoiseGrid) -> ResidualProcess:
+    def _beside_process(
+        self, noise: NoiseGrid, at: NDArray[np.bool_]
+    ) -> ResidualProcess:
         return ResidualProcess(
-            noise,
-            self.measurements,
+            noise if at.all() else noise.part(at),
+            self.measurements.part(at),
             action=self.scaled_actions(),
             order=self.scaled_order(),
             largest=float(np.median(self.spread / noise.typical_sd)),
-            spread=None if self.simulator.is_stochastic else self.spread,
+            spread=None if self.simulator.is_stochastic else self.spread[at],
         )
 
     def _bare_residual(self) -> Array:

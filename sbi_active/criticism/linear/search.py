@@ -79,7 +79,7 @@ class Search:
             self._reference = self.sensor.unit
             self._units = np.ones(2 * len(self._units))
         self._library: Library | None = None
-        self._process: ResidualProcess | None = None
+        self._processes: dict[bytes, ResidualProcess] = {}
         self._looked_again = False
         self._seed = derive_seed(self.rivals.seed, "misfit")
         self._begin(self._fit_bare())
@@ -203,22 +203,25 @@ class Search:
             self.keep(self._fit(key, known or [ModelKey()]))
         return self.found[key]
 
-    def smooth(self, model: LinearModel) -> tuple[Array, Array]:
+    def smooth(self, model: LinearModel, use: NDArray[np.bool_]) -> tuple[Array, Array]:
         """Return Gram matrices of a model beside a smooth function of the action.
 
         It stands for what was not declared where x has no time axis.
 
         Args:
             model: Linear model.
+            use: Parts of the trials that count, shape (f,).
 
         Returns:
             Gram matrices, shape (h, k, k), and log weights, shape (h,).
         """
-        if self._process is None:
-            self._process = self.rivals.residual_process(self.sensor.noise)
-        rows, unit = model.rows, self.unit
-        grams, log_weight = self._process.grams(unit[:, None] * rows[: model.num])
-        use = np.ones(self.errors.num_folds, bool)
+        own = use[self.errors.fold]
+        if (key := own.tobytes()) not in self._processes:
+            process = self.rivals.residual_process(self.sensor.noise, own)
+            self._processes[key] = process
+        rows, unit = model.rows, self.unit[own]
+        own_rows = unit[:, None] * rows[: model.num][own]
+        grams, log_weight = self._processes[key].grams(own_rows)
         grams = grams + self.errors.unchanged(rows, use)
         return grams, log_weight + np.log(unit).sum()  # of sensor deviations
 

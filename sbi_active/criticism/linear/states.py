@@ -87,8 +87,8 @@ class States:
 
         Args:
             key: Effects on the prediction.
-            use: Parts of the trials that count, shape (f,); None takes all. Of some,
-                smooth functions of the action are no state.
+            use: Parts of the trials that count, shape (f,); None takes all. Of some
+                trajectories, smooth functions of the action are no state.
             factor: Factor on the scales of effects' priors.
         """
         return {
@@ -157,8 +157,8 @@ class States:
                 # Errors of their own are scatter; what differs by trial is not.
                 own = slice(errors.num_processes, None)
                 gram, log_p = gram[own], log_p[own]
-                if use is None:  # it is a function of all trials
-                    smooth = self.search.smooth(c.model)
+                if use is None or not timed:  # it is dear along trajectories
+                    smooth = self.search.smooth(c.model, some)
                     gram = np.concatenate([gram, smooth[0]])
                     log_p = np.concatenate([log_p, smooth[1]])
         elif louder := self.louder(key):

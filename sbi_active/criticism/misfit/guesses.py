@@ -96,7 +96,8 @@ def _guess_of_numbers(search: Search) -> tuple[tuple[str, float], ...]:
     The simplest of those that it does not beat by the margin comes before it.
     """
     bare, errors, gains = search.found[ModelKey()].model, search.errors, {}
-    least = summed(*search.smooth(bare), bare).log_evidence
+    every = np.ones(errors.num_folds, dtype=bool)
+    least = summed(*search.smooth(bare, every), bare).log_evidence
     for name, term in _terms(search, of_all=True):
         model = _with_term(bare, term / search.unit)
         gains[name] = errors.posterior(model, errors.grams(model.rows)).log_sensor

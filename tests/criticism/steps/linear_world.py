@@ -46,13 +46,15 @@ def measured(*, seed: int = 0, further: torch.Tensor | float = 0.0, **phi: float
     return x + sum((size * SHAPES[name](ACTION) for name, size in phi.items()), 0.0)
 
 
-def rivals(x: torch.Tensor, *further: Effect) -> RivalSet:
+def rivals(
+    x: torch.Tensor, *further: Effect, action: torch.Tensor = ACTION
+) -> RivalSet:
     model = SimulatorModel(
         lambda theta, action: theta[:, :1] + theta[:, 1:] * action,
         noise=GaussianNoise(NOISE),
     )
     effects = [*map(effect, SHAPES), *further]
-    return RivalSet(model, PRIOR, Trials(ACTION, x), effects)
+    return RivalSet(model, PRIOR, Trials(action, x), effects)
 
 
 def judged(some: RivalSet, groups: Sequence[frozenset[str]] = ()) -> Verdict:

@@ -80,6 +80,16 @@ def test_each_trial_is_predicted_from_the_others():
     assert made.selected == 12 * ("curve",)
 
 
+def test_errors_of_some_trials_are_those_of_a_verdict_on_them():
+    """A smooth function of the action is one of them; without it scatter took over."""
+    x, keep = measured(curve=0.1), np.arange(12) != 4
+    whole = judged(rivals(x)).states.joint(ModelKey(), keep)
+    part = judged(rivals(x[keep], action=ACTION[keep])).states.joint(ModelKey())
+    assert [*whole] == [*part]
+    for key, log_p in part.items():
+        assert whole[key] == pytest.approx(log_p, abs=0.3), key
+
+
 @pytest.mark.parametrize("names", [(), ("curve",)])
 def test_residuals_are_standardized_by_the_normal_predictive(fitted, names):
     made = find_residuals(fitted[0], ModelKey(names))
