@@ -13,7 +13,9 @@ from sbi_active import (
     simulate,
 )
 from sbi_active.criticism import Effect, Trials, close_loop
+from sbi_active.criticism.misfit.rule import Rule
 from sbi_active.mujoco import from_mjcf
+from sbi_active.simulation.workers.settings import Workers
 
 PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
 ACTIONS = DiscreteActions([1.0, 2.0], names=["push"])
@@ -41,6 +43,8 @@ def slide(theta, action):
         (lambda **k: from_mjcf("", {}, **k), "sensor", "sensors"),
         (close_loop, "warmup", "warm_up"),
         (Effect, "prio", "prior"),
+        (Rule, "chances", "chance"),
+        (Workers, "num_worker", "num_workers"),
     ],
 )
 def test_a_mistyped_keyword_is_told_with_the_one_that_was_meant(call, wrong, meant):

@@ -15,7 +15,7 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.evidence.fit import Fit, starts_near_parents
+from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.jumps import STEPS, look_for_jumps
 from sbi_active.criticism.evidence.predicted_before import NUM_DRAWS as NUM_BEFORE
 from sbi_active.criticism.evidence.predicted_before import predicted_before
@@ -74,7 +74,6 @@ class RivalSet:
             ``noise`` has on top of the declared one, shape (N,); 0 where it is smooth.
         fits: The rivals that were asked for.
         found: Modes of some that are not fitted yet.
-        suspect: Place of the trial that a gross error is in; None without one.
     """
 
     def __init__(
@@ -117,7 +116,6 @@ class RivalSet:
             self.noise = self.noise.with_extra(self.roughness)
         self.fits: dict[ModelKey, Fit] = {}
         self.found: dict[ModelKey, Found] = {}
-        self.suspect: int | None = None
 
     def noise_of(self, measurements: Measurements) -> NoiseGrid:
         """Return the errors of some measurements."""
@@ -138,23 +136,33 @@ class RivalSet:
         self._factors = factors, weights
         self.noise = self.noise.scaled(factors, weights)
 
-    def rival(self, key: ModelKey) -> Rival:
-        """Return the simulator with some effects and an error model."""
+    def rival(
+        self, key: ModelKey, *, suspect: int | None = None, **further: Any
+    ) -> Rival:
+        """Return the simulator with some effects and an error model.
+
+        Args:
+            key: Key of the rival.
+            suspect: Place of the trial that a gross error is in; None without one.
+            **further: Arguments of :class:`.Rival` for a sum of squares.
+        """
         return Rival(
             key,
             simulator=self.simulator,
             prior=self.prior,
             effects=[self.effects[name] for name in key.effects],
             nuisances=self.nuisances,
-            error=self._error_model(key.error),
+            error=self._error_model(key.error, suspect),
             spread=self.spread,
             center=self.center,
             step=self.step,
+            **further,
         )
 
     def _error_model(
         self,
         error: str | None,
+        suspect: int | None,
         *,
         # Deviations of the noise that a gross error may have: it tells next to nothing.
         gross: float = 1e3,
@@ -163,9 +171,9 @@ class RivalSet:
             return scattered(self.noise)
         if error == UNEXPLAINED:
             return self.residual_process()
-        if error is None or self.suspect is None:
+        if error is None or suspect is None:
             return self.noise
-        at = self.measurements.trial == self.suspect
+        at = self.measurements.trial == suspect
         return self.noise.with_extra(np.where(at, gross * self.noise.typical_sd, 0.0))
 
     @property
@@ -254,20 +262,29 @@ class RivalSet:
             return None
         return (index - own.min()) / span
 
-    def fit(self, key: ModelKey = ModelKey()) -> Fit:  # noqa: B008  (frozen)
-        """Return one rival with its posterior and evidence, computed once."""
+    def fit(
+        self,
+        key: ModelKey = ModelKey(),  # noqa: B008  (frozen)
+        near: Array | None = None,
+    ) -> Fit:
+        """Return one rival with its posterior and evidence, computed once.
+
+        Args:
+            key: Key of the rival.
+            near: Points from which its modes are searched, shape (k, dim); None
+                searches from many draws of the prior.
+        """
         if key not in self.fits:
             rival, seed = self.rival(key), derive_seed(self.seed, "evidence", str(key))
             rng = np.random.default_rng(seed)
-            found = self.found.pop(key, None) or self.search(key)
+            found = self.found.pop(key, None) or self.search(key, near)
             sample = self._inferred(rival, found, rng)
             self.fits[key] = self._record(rival, sample, seed)
         return self.fits[key]
 
-    def search(self, key: ModelKey) -> Found:
-        """Return the modes of a rival, from where smaller ones ended."""
+    def search(self, key: ModelKey, near: Array | None = None) -> Found:
+        """Return the modes of a rival, see :meth:`fit`."""
         rival, seed = self.rival(key), derive_seed(self.seed, "search", str(key))
-        near = starts_near_parents(self.fits, rival, seed)
         how = THOROUGH if near is None else NESTED
         how = how if self.is_smooth else ROUGH
         return _searched(rival, near, how, seed)

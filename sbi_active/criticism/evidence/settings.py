@@ -14,7 +14,7 @@ from sbi_active.inference.engine.settings import Settings
 THOROUGH = SearchSettings(
     num_screened=128, max_starts=48, explained=0.0, phases=10, num_kept=8
 )
-#: Searches with fits of smaller models to begin at.
+#: Searches with a fit to begin at.
 NESTED = SearchSettings(
     num_screened=32,
     num_starts=4,

@@ -21,6 +21,7 @@ from sbi_active.criticism.report.predicted import Registered, TestedTrial
 from sbi_active.criticism.report.report import Report
 from sbi_active.criticism.results import NONE, UNEXPLAINED, Array, ModelKey
 from sbi_active.criticism.steps.predictive import Prediction, predict
+from sbi_active.expected import suggests
 from sbi_active.inference.sampling.weights import normalized
 from sbi_active.seeding import derive_seed
 
@@ -30,6 +31,7 @@ COVERAGE = 0.9
 TINY = 1e-9
 
 
+@suggests
 @dataclass(frozen=True, kw_only=True)
 class Settling:
     """When a verdict is settled, and when a trial is worth running.

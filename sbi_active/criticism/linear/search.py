@@ -315,8 +315,8 @@ class Search:
 
     def _rival(self, key: ModelKey) -> Rival:
         if key not in self._rivals:
-            self._rivals[key] = own = self.rivals.rival(key)
-            own.reference, own.df = self._reference, self.sensor.df
+            given = {"reference": self._reference, "df": self.sensor.df}
+            self._rivals[key] = self.rivals.rival(key, **given)
         return self._rivals[key]
 
     # The fits.

@@ -65,6 +65,7 @@ def linear_fit(
     chi_square: float | None = None,
     unit: Array | None = None,
     known: NDArray[np.bool_] | None = None,
+    suspect: int | None = None,
 ) -> Fit:
     """Return a linear model with its draws as its posterior sample.
 
@@ -84,13 +85,14 @@ def linear_fit(
         unit: Unit of the model's residuals, shape (N,), where draws are to be weighed
             by the simulator; None leaves them.
         known: Mask of the numbers that the posterior knows, shape (N,); None for all.
+        suspect: Place of the trial that a gross error is in; None without one.
     """
 
     def linear(u: Array) -> Array:
         residual = model.residual + (u - model.u) @ model.jacobian.T
         return unit * model.scale * residual[:, : model.num]
 
-    rival = rivals.rival(key)
+    rival = rivals.rival(key, suspect=suspect)
     u, at, mode = drawn(rivals, model, center, cov), best, model.u
     if louder is not None:
         u, mode = _with_louder(rival, model, u, louder), None

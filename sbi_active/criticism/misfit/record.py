@@ -65,8 +65,6 @@ def traced(
     rivals, key = found.rivals, found.key
     if found.is_missed:
         return _beside_misfit(found, held_out)
-    if suspects := found.outliers:
-        rivals.suspect = rivals.trials.index.tolist().index(next(iter(suspects)))
     is_unexplained = key.error == UNEXPLAINED  # with an error of no declared size
     chosen = () if is_unexplained else key.effects
     shown = [k for k, p in found.choice.probabilities.items() if p >= SHOWN]
@@ -190,10 +188,11 @@ def _alone(
     if use is not None and np.isfinite(search.sensor.df):
         model, at = _by_weights(model, search, use)
     given = found.rivals, key, model, at.mean, at.cov, own.log_evidence
+    options = {"known": known, "suspect": found.suspect}
     if not states.louder(key):
-        return linear_fit(*given, unit=search.unit, known=known)
+        return linear_fit(*given, unit=search.unit, **options)
     phi, square = states.louder_draws(key, use)[0], states.chi_square(key)[0]
-    return linear_fit(*given, louder=phi, chi_square=square, known=known)
+    return linear_fit(*given, louder=phi, chi_square=square, **options)
 
 
 def _by_weights(
@@ -254,7 +253,7 @@ def _record(found: Verdict, key: ModelKey, *, fewest: float = 50.0) -> Evidence:
     """
     rivals = found.rivals
     if key not in rivals.fits and _is_sampled(found, key):
-        fit = rivals.fit(key)
+        fit = rivals.fit(key, found.search.model(key).u[None] if key.effects else None)
         if fit.evidence.effective_sample_size >= fewest:
             log_z = found.states.log_evidence(key)
             evidence = replace(fit.evidence, log_evidence=log_z)

@@ -50,6 +50,7 @@ from numpy.typing import NDArray
 from sbi_active.criticism.misfit.scored import Scored, predicts_better
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.under_misfit import Support
+from sbi_active.expected import suggests
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 Array = NDArray[Any]
@@ -77,6 +78,7 @@ class Choice:
     instead: dict[str, tuple[str, ...]]
 
 
+@suggests
 @dataclass(frozen=True, kw_only=True)
 class Rule:
     """The rule that decides which effects help, and which is the cause.

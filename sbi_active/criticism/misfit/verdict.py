@@ -242,6 +242,12 @@ class Verdict:
         is_beside = self.key.error == OUTLIER
         return self.states.outliers(self.choice.key if is_beside else ModelKey())
 
+    @property
+    def suspect(self) -> int | None:
+        """Place of the trial that a gross error is in, if one has; None for none."""
+        index = self.rivals.trials.index.tolist()
+        return next((index.index(own) for own in self.outliers), None)
+
     def model(self, key: ModelKey) -> LinearModel:
         """Return a fitted model."""
         return self.search.found[key].model

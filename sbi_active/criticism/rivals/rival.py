@@ -38,12 +38,12 @@ class Rival:
             number where the simulator gives none.
         center: Mean of the prior predictive, shape (N,).
         step: Step of finite differences, in u.
-
-    Attributes:
-        coordinates: Coordinates of z.
         reference: Deviation of a random simulator's numbers, shape (N,), where it is
             part of a sum of squares; None leaves it to the likelihood.
         df: Degrees of freedom of the error, for the weights of a sum of squares.
+
+    Attributes:
+        coordinates: Coordinates of z.
         num_trials: Number of trials.
         num_observed: Number of measured numbers of all trials.
     """
@@ -60,13 +60,14 @@ class Rival:
         spread: Array,
         center: Array | None = None,
         step: float = STEP,
+        reference: Array | None = None,
+        df: float = np.inf,
     ) -> None:
         self.key, self.effects = key, (*effects,)
         self.simulator, self.error, self.spread = simulator, error, spread
         self.center = np.zeros(len(spread)) if center is None else center
         self.step = step
-        self.reference: Array | None = None
-        self.df = np.inf
+        self.reference, self.df = reference, df
         self.num_trials = len(simulator.trials)
         self.num_observed = len(simulator.measurements)
         self.coordinates = SearchCoordinates(

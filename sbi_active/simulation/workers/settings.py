@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sbi_active.expected import require
+from sbi_active.expected import require, suggests
 
 
+@suggests
 @dataclass(frozen=True)
 class Workers:
     """Workers that run simulations, and the cost of a row; x does not depend on them.
