@@ -32,8 +32,14 @@ from pyro.contrib.oed.eig import (
 )
 from torch import Tensor
 
-from benchmarks.information_gain.guides import conditional, marginal, posterior
-from benchmarks.information_gain.worlds import NUM_PILOT, World, worlds
+from benchmarks.information_gain.worlds import (
+    NUM_PILOT,
+    World,
+    conditional,
+    marginal,
+    posterior,
+    worlds,
+)
 from benchmarks.rows import frame, write
 from sbi_active import InformationGainDesigner
 from sbi_active.seeding import forked_generators

@@ -174,7 +174,7 @@ def main(
 def _draw(
     rows: dict[str, Row], by_ball: dict[str, list[Drop]], folder: Path, *, seed: int
 ) -> None:
-    from benchmarks.measured.ball_figures import draw_exponents, draw_forecasts
+    from benchmarks.measured.ball_forecast import draw_exponents, draw_forecasts
 
     folder.mkdir(parents=True, exist_ok=True)
     judged = [row for row in rows.values() if "alarm" in row]

@@ -137,7 +137,7 @@ def main(arguments: Settings) -> None:
             print(f"{name}: {row.get('line', '')}", flush=True)
     print(tables(rows))
     if arguments.figures is not None:
-        from benchmarks.measured.go2_figures import draw
+        from benchmarks.measured.go2_leg import draw
 
         for leg in legs:
             draw(rows[leg.name], leg, arguments.figures)

@@ -22,8 +22,8 @@ from torch.distributions import (
     Uniform,
 )
 
-from benchmarks.robustness.attacks import Attacks
 from benchmarks.robustness.exact import Problem
+from benchmarks.robustness.run import Attacks
 from sbi_active import ASBI, RefinementOptions
 from sbi_active.inference import Belief
 from sbi_active.seeding import forked_generators
