@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.criticism.cases import Case, extend
-from benchmarks.criticism.scores import counted
+from benchmarks.criticism.problem import counted
 from benchmarks.criticism.worlds import World, get_world
 from sbi_active import InformationGainDesigner
 from sbi_active.criticism import Criticism

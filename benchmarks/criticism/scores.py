@@ -5,13 +5,7 @@ The error that remains when the true effect is known and only fitted.
 
 from __future__ import annotations
 
-import copy
-import functools
 import json
-import time
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,8 +14,7 @@ from scipy.stats import multivariate_t
 from torch import Tensor
 
 from benchmarks.criticism.cases import Case
-from benchmarks.criticism.refit import local_fits
-from sbi_active import SimulatorModel
+from benchmarks.fitting import local_fits
 from sbi_active.criticism import Report, joint_prior
 from sbi_active.criticism.under_misfit import UNDECLARED
 from sbi_active.seeding import derive_seed
@@ -91,21 +84,6 @@ COLUMNS = [
 ]
 
 
-def counted(model: SimulatorModel) -> tuple[SimulatorModel, Callable[[], int]]:
-    """Return a copy of the model that counts its rows, and how to read the count."""
-    rows, fn = 0, model.fn
-
-    @functools.wraps(fn)
-    def counting(theta: Tensor, *arguments: Any, **keywords: Any) -> Any:
-        nonlocal rows
-        rows += len(theta)
-        return fn(theta, *arguments, **keywords)
-
-    twin = copy.copy(model)
-    twin.fn = counting
-    return twin, lambda: rows
-
-
 def score_case(case: Case, number: int, *, oracle: bool = False) -> dict[str, object]:
     """Run the loop on a case and return its row of the results.
 
@@ -125,17 +103,11 @@ def score_case(case: Case, number: int, *, oracle: bool = False) -> dict[str, ob
         "lambda": truth.non_centrality,
         "support": _support(case),
     }
-    model, count = counted(problem.model)
-    start = time.process_time()
-    try:
-        # No table needs a plan but that of active choice.
-        report = replace(problem, model=model).report(number, plan=False)
-    except Exception as error:  # a crash is a result of the benchmark
-        return row | {"failure": f"{type(error).__name__}: {error}"[:300]}
-    row |= {
-        "cpu_seconds": time.process_time() - start,
-        "trial_simulations": count(),
-    }
+    # No table needs a plan but that of active choice.
+    report, cost = problem.attempt(number, plan=False)
+    row |= cost
+    if report is None:
+        return row
     if oracle and problem.trials.held_out is not None:
         row["rmse_oracle"] = oracle_rmse(case)
     return row | read_report(report)

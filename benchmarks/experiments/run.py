@@ -30,9 +30,9 @@ import torch
 from torch import Tensor
 
 from benchmarks.criticism.intervals import rate
+from benchmarks.criticism.problem import named
 from benchmarks.misfit.cases import Case, Kind, draw_case
 from benchmarks.misfit.truth import Truth
-from benchmarks.misfit.verdicts import read_report
 from benchmarks.rows import benchmark
 from sbi_active import DiscreteActions
 from sbi_active.criticism import Report, close_loop
@@ -196,7 +196,7 @@ def row_of(number: int, kind: Kind, design: str) -> Row:
     ]
     return row | {
         "verdict": report.verdict,
-        "named": [*read_report(report, ()).named],
+        "named": [*named(report)],
         "trials": len(tested) if design == "chosen" else NUM_TRIALS,
         "stopped": report.stopped,
         "tested": tested,

@@ -28,7 +28,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.criticism.scores import counted
+from benchmarks.criticism.problem import counted
 from benchmarks.fitting import local_fit
 from benchmarks.measured.go2_leg import DATA, LEGS, Leg, read_leg, usual_parameters
 from benchmarks.measured.verdicts import causes, center, row_of, said

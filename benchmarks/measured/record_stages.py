@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.criticism.scores import counted
+from benchmarks.criticism.problem import counted
 from benchmarks.measured.verdicts import causes, center, read_report, said, shares_left
 from benchmarks.rows import keep, measured, stages
 from sbi_active import SimulatorModel

@@ -27,7 +27,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.measured.least_squares import best_in_box
+from benchmarks.fitting import best_in_box
 from benchmarks.measured.verdicts import causes, read_report, said, spreads
 from benchmarks.rows import keep, measured, stages
 from sbi_active.criticism import Criticism
