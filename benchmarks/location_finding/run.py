@@ -32,8 +32,7 @@ from benchmarks.location_finding.bounds import (
     posterior_bounds,
 )
 from benchmarks.location_finding.policies import POLICIES, Myopic, ParticleBelief
-from benchmarks.published import published
-from benchmarks.rows import read, resumed
+from benchmarks.rows import published, read, resumed
 from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task

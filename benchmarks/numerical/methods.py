@@ -40,8 +40,7 @@ from benchmarks.numerical.run import (
     reference,
 )
 from benchmarks.numerical.run import run_trial as by_round
-from benchmarks.published import published
-from benchmarks.rows import column, resumed
+from benchmarks.rows import column, published, resumed
 from sbi_active import Campaign, CampaignOptions, RefinementOptions
 from sbi_active.campaign.learning.methods import METHODS, faithful_options
 from sbi_active.display.table import Table

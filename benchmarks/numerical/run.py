@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.published import published
-from benchmarks.rows import column, read, resumed
+from benchmarks.rounds import played
+from benchmarks.rows import column, published, read, resumed
 from sbi_active import Campaign, CampaignOptions, RefinementOptions
 from sbi_active.campaign import Trial
 from sbi_active.display.table import Table
@@ -104,26 +104,20 @@ def run_trial(
         rounds: How many.
         jitter: Relative error of executed actions.
     """
-    campaign = Campaign(
-        *(task.simulator, task.prior, task.actions),
-        method=method,
-        seed=seed,
-        options=options,
-    )
-    for index in range(rounds):
+
+    def executed(action: Tensor, seed: int) -> Tensor:
+        if not jitter:
+            return action
+        # The robot does not do quite what it was asked.
+        generator = torch.Generator().manual_seed(seed)
+        return action * (1 + jitter * torch.randn(action.shape, generator=generator))
+
+    own = {"method": method, "options": options, "executed": executed}
+    for index, (campaign, _) in enumerate(played(task, seed, rounds, **own)):
         gain = None
         if task.name == "numerical":
-            before = reference(task, campaign.history)
+            before = reference(task, campaign.history[:-1])
             gain = before.expected_information_gain(task.actions.values)
-        trial = campaign.ask()
-        real_seed = derive_seed(seed, "real", index)
-        executed = trial.action
-        if jitter:  # the robot does not do quite what it was asked
-            generator = torch.Generator().manual_seed(real_seed)
-            off = torch.randn(executed.shape, generator=generator)
-            executed = executed * (1 + jitter * off)
-        campaign.tell(task.real_system(executed, seed=real_seed), action=executed)
-        campaign.update()
         row = {"round": index + 1} | round_row(task, campaign, gain, index)
         yield row, campaign
 

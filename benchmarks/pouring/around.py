@@ -29,8 +29,8 @@ import numpy as np
 from scipy.special import logsumexp
 from torch import Tensor
 
-from benchmarks.pouring.grid_belief import GridBelief
-from benchmarks.pouring.power import best_power, told_by
+from benchmarks.pouring.campaign import GridBelief
+from benchmarks.pouring.learned import best_power, told_by
 from benchmarks.pouring.reference import (
     Campaign,
     Reference,

@@ -15,17 +15,16 @@ from torch import Tensor
 
 from benchmarks.pouring.bank import ROWS_A_FILE, Drawn, Rows, fill
 from benchmarks.pouring.bank import read as read_bank
-from benchmarks.pouring.campaign import TEMPERED
-from benchmarks.pouring.grid_belief import SIDE, GridBelief
+from benchmarks.pouring.campaign import SIDE, TEMPERED, GridBelief
 from benchmarks.pouring.learned import (
     ByAction,
     Earlier,
     components,
+    grid,
     learn,
     looked_at,
 )
 from benchmarks.pouring.likelihood import ImageLikelihood, observed
-from benchmarks.pouring.power import grid
 from benchmarks.pouring.run import RESULTS
 from benchmarks.rows import read, resumed
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds

@@ -33,8 +33,7 @@ from benchmarks.pouring.around import (
 )
 from benchmarks.pouring.bank import read as read_bank
 from benchmarks.pouring.bank import read_parts
-from benchmarks.pouring.learned import PARTS
-from benchmarks.pouring.power import best_power
+from benchmarks.pouring.learned import PARTS, best_power
 from benchmarks.pouring.reference import (
     Campaign,
     Pours,
