@@ -6,8 +6,7 @@
     python -m benchmarks box_collision --summary
 
 Resumable: a trial that stands in the CSV is not run again. One row a round, one file a
-method, target and setting, in ``benchmarks/box_collision/results``. The tables are
-printed at the end, or alone by ``--summary``.
+method, target and setting, in ``results``; tables are printed at the end.
 
 Beside a belief stands the posterior of the same trials by importance sampling
 (``log_p_exact``, with its standard error), which is what the best inference would
@@ -200,7 +199,6 @@ def spread(values: Any) -> str:
 
 
 RESULTS = Path(__file__).parent / "results"
-TABLES = ("paper", "coverage")
 NUM_DRAWS = 2_000  # behind the share of a belief that is denser than the truth
 OPTIONS = CampaignOptions(num_samples=250, details=CampaignDetails(num_scored=500))
 #: "learned" has beliefs and information by the networks alone, which is where the
@@ -239,7 +237,7 @@ class Settings:
         summary: Whether to run nothing, and print the table of the rows.
     """
 
-    table: Annotated[str, TABLES] = "paper"
+    table: Literal["paper", "coverage"] = "paper"
     target: Literal["1", "2"] | None = None
     methods: Annotated[Sequence[str] | None, METHODS] = None
     setting: Annotated[str, SETTINGS] = "default"

@@ -148,36 +148,33 @@ def history_log_likelihood(theta: Tensor, action: Tensor, x: Tensor) -> Tensor:
     )
 
 
-def contrastive_bounds(log_p_true: Tensor, log_p: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Return what histories contribute to sPCE and to sNMC.
+def contrastive_bounds(
+    log_p_true: Tensor,
+    log_p: Tensor,
+    log_ratio_true: Tensor | float = 0.0,
+    log_ratio: Tensor | float = 0.0,
+) -> tuple[Tensor, Tensor]:
+    r"""Return what histories contribute to both bounds.
+
+    These are sPCE and sNMC with draws of the prior, adaptive contrastive and
+    variational nested with draws of a proposal q, which may know the history and not
+    :math:`\theta_0`.
 
     Args:
         log_p_true: :math:`\log p(h | \theta_0)`, shape (n,).
         log_p: :math:`\log p(h | \theta_l)` of the L others, shape (n, L).
+        log_ratio_true: :math:`\log p(\theta_0) - \log q(\theta_0 | h)`, shape (n,);
+            0 for draws of the prior.
+        log_ratio: The same of the L others, shape (n, L).
 
     Returns:
         Shapes (n,), float64, nats; their means are the estimates.
     """
-    return _bounds(log_p_true, log_p_true, log_p)
-
-
-def proposal_bounds(
-    log_p_true: Tensor, log_ratio_true: Tensor, log_p: Tensor, log_ratio: Tensor
-) -> tuple[Tensor, Tensor]:
-    r"""Return the same with draws of a proposal q that may know the history.
-
-    It may know the history and not :math:`\theta_0`.
-
-    Args:
-        log_p_true: :math:`\log p(h | \theta_0)`, shape (n,).
-        log_ratio_true: :math:`\log p(\theta_0) - \log q(\theta_0 | h)`, shape (n,).
-        log_p: :math:`\log p(h | \theta_l)` of L draws of q, shape (n, L).
-        log_ratio: :math:`\log p(\theta_l) - \log q(\theta_l | h)`, shape (n, L).
-
-    Returns:
-        Shapes (n,), float64, nats: adaptive contrastive, variational nested.
-    """
-    return _bounds(log_p_true, log_p_true + log_ratio_true, log_p + log_ratio)
+    log_w_true, log_w = (log_p_true + log_ratio_true).double(), log_p + log_ratio
+    num, log_sum = log_w.shape[1], log_w.double().logsumexp(1)
+    log_with = torch.logaddexp(log_sum, log_w_true) - math.log(num + 1)
+    log_without = log_sum - math.log(num)
+    return log_p_true.double() - log_with, log_p_true.double() - log_without
 
 
 def posterior_bounds(
@@ -215,16 +212,11 @@ def posterior_bounds(
     )
     log_ratio = torch.from_numpy(base.log_prob(draws) - proposal.log_prob(draws))
     log_p = history_log_likelihood(torch.from_numpy(draws), action, x)
-    lower, upper = proposal_bounds(
-        log_p[:1], log_ratio[:1], log_p[None, 1:], log_ratio[None, 1:]
+    lower, upper = contrastive_bounds(
+        log_p[:1], log_p[None, 1:], log_ratio[:1], log_ratio[None, 1:]
     )
     weights = (log_p + log_ratio)[1:].softmax(0)
     return float(lower), float(upper), float(1 / weights.square().sum())
-
-
-def near_cap(lower: float, num_contrastive: int) -> bool:
-    """Return whether a prior contrastive bound is close to the largest it can be."""
-    return lower > math.log(num_contrastive + 1) - CLOSE
 
 
 @dataclass(frozen=True)
@@ -238,20 +230,3 @@ class _StandardNormal:
 
     def log_prob(self, z: NDArray[np.float64]) -> NDArray[np.float64]:
         return -0.5 * (z**2).sum(1) - 0.5 * self.dim * math.log(2 * math.pi)
-
-
-def _bounds(
-    log_p_true: Tensor, log_w_true: Tensor, log_w: Tensor
-) -> tuple[Tensor, Tensor]:
-    log_p_true, log_w = log_p_true.double(), log_w.double()
-    if log_w.ndim != 2 or log_p_true.shape != log_w.shape[:1]:
-        raise ValueError(
-            "expected log_p_true (n,) and log_p (n, L), one row a history; got "
-            f"{tuple(log_p_true.shape)} and {tuple(log_w.shape)}; stack histories "
-            "along axis 0"
-        )
-    num = log_w.shape[1]
-    log_sum = log_w.logsumexp(1)
-    log_with = torch.logaddexp(log_sum, log_w_true.double()) - math.log(num + 1)
-    log_without = log_sum - math.log(num)
-    return log_p_true - log_with, log_p_true - log_without

@@ -68,11 +68,6 @@ class ParticleBelief(Belief):
     label = "particles, exact likelihood"
 
     def __init__(self, task: Task, *, num_particles: int = 2_000, seed: int) -> None:
-        if num_particles < 100 or num_particles % 2:
-            raise ValueError(
-                f"expected an even num_particles >= 100; got {num_particles}; use "
-                "about 2000"
-            )
         super().__init__(task.prior)
         self._generator = torch.Generator().manual_seed(seed)
         dim = self.event_shape[0]

@@ -26,9 +26,9 @@ import numpy as np
 import torch
 
 from benchmarks.location_finding.bounds import (
+    CLOSE,
     contrastive_bounds,
     history_log_likelihood,
-    near_cap,
     posterior_bounds,
 )
 from benchmarks.location_finding.policies import POLICIES, Myopic, ParticleBelief
@@ -104,7 +104,7 @@ def table(folder: Path, num_trials: int, num_contrastive: int) -> str:
         cpu = [f"{columns[k].mean():.1f}" for k in COSTS]
         bounds = [f"{mean:.2f} +- {error:.2f}" for mean, error in means.values()]
         cells.append([f"{NAMES[policy]} ({len(rows)})", *bounds, " / ".join(cpu)])
-        if near_cap(means["spce"][0], num_contrastive):
+        if means["spce"][0] > math.log(num_contrastive + 1) - CLOSE:
             lines.append(f"{policy}: sPCE is at its cap; sNMC rests on few draws")
         gap = columns["belief_gain"] - columns["lower"]
         if np.isfinite(gap).all():
