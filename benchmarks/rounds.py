@@ -1,17 +1,54 @@
-"""Tables of campaigns by round: rows of several methods on several targets."""
+"""Campaigns by round, and tables of several methods on several targets."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from scipy import stats
+from torch import Tensor
 
 from benchmarks.rows import column
+from sbi_active import Campaign
 from sbi_active.display.table import Table
+from sbi_active.seeding import derive_seed
 
 Rows = Sequence[Mapping[str, str]]
 Cells = Mapping[tuple[str, str], Rows]  # by method and target
+
+
+def played(
+    task: Any,
+    seed: int,
+    num: int,
+    *,
+    method: str = "asbi",
+    options: Any = None,
+    executed: Callable[[Tensor, int], Tensor] | None = None,
+) -> Iterator[tuple[Campaign, float]]:
+    """Yield a campaign after each of its rounds, with the CPU seconds of the round.
+
+    Args:
+        task: What is asked, with ``real_system(action, seed=)``.
+        seed: Seed of the campaign.
+        num: Number of rounds.
+        method: Name of the method.
+        options: Of the campaign.
+        executed: Function of an action and the trial's seed to what the robot does;
+            what it was asked by default.
+    """
+    own = {"method": method, "seed": seed, "options": options}
+    campaign = Campaign(task.simulator, task.prior, task.actions, **own)
+    for index in range(num):
+        start = time.process_time()
+        trial, real = campaign.ask(), derive_seed(seed, "real", index)
+        action = executed(trial.action, real) if executed else None
+        asked = trial.action if action is None else action
+        campaign.tell(task.real_system(asked, seed=real), action=action)
+        campaign.update()
+        yield campaign, time.process_time() - start
 
 
 def num_rounds(rows: Rows) -> int:

@@ -1,4 +1,7 @@
-"""Rows of results in files, and the one loop of benchmarks that add to them."""
+"""Rows of results in files, and the one loop of benchmarks that add to them.
+
+What papers report, from ``published.csv``: table, row, values and source.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import csv
 import inspect
 import io
 import json
+import random
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import product
@@ -203,9 +207,47 @@ def keep(path: Path, rows: Mapping[str, Any]) -> None:
     path.write_text(json.dumps(rows, indent=1) + "\n")
 
 
+def add(path: Path, rows: dict[str, Any], name: str, row: Mapping[str, Any]) -> None:
+    """Add a stage to those of a JSON file, write all, and say what it is."""
+    rows[name] = row
+    keep(path, rows)
+    print(f"{name}: {row.get('line') or row.get('verdict', '')}", flush=True)
+
+
 def measured(read_data: Callable[..., T], *arguments: Any) -> T:
     """Return measured data, or end the process where they are not there."""
     try:
         return read_data(*arguments)
     except FileNotFoundError as error:
         raise SystemExit(f"{error}, as in --data DIR") from None
+
+
+def in_turn(
+    variants: Mapping[str, Callable[[], Any]],
+    repetitions: int,
+    clock: Callable[[], float] = time.perf_counter,
+) -> dict[str, list[float]]:
+    """Return how long each variant took in each repetition."""
+    for run in variants.values():
+        run()  # starts what it needs
+    order = random.Random(0)
+    seconds: dict[str, list[float]] = {name: [] for name in variants}
+    for _ in range(repetitions):
+        for name in order.sample([*variants], len(variants)):
+            start = clock()
+            variants[name]()
+            seconds[name].append(clock() - start)
+    return seconds
+
+
+FILE = Path(__file__).with_name("published.csv")
+
+
+def published(table: str) -> dict[str, tuple[str, ...]]:
+    """Return the rows of a table, by name, each with its values in the file's order."""
+    with FILE.open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["table"] == table]
+    return {
+        row["row"]: tuple(value.strip() for value in row["values"].split(";"))
+        for row in rows
+    }

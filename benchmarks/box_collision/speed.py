@@ -18,7 +18,7 @@ from pathlib import Path
 
 import torch
 
-from benchmarks.rows import keep
+from benchmarks.rows import in_turn, keep
 from sbi_active.simulation import simulate
 from sbi_active.tasks import get_task  # pyright: ignore
 from sbi_active.tasks.box_collision.scene import (  # pyright: ignore
@@ -53,13 +53,7 @@ def main() -> None:
         "bare loop, same steps": lambda: bare(steps),
         "bare loop, all steps": lambda: bare(full),
     }
-    runs["simulate"]()  # compiles the scene
-    seconds: dict[str, list[float]] = {name: [] for name in runs}
-    for _ in range(NUM_TURNS):
-        for name, run in runs.items():
-            start = time.process_time()
-            run()
-            seconds[name].append(time.process_time() - start)
+    seconds = in_turn(runs, NUM_TURNS, time.process_time)
     # The least disturbed turn of each: other programs only ever add time.
     best = {name: min(times) for name, times in seconds.items()}
     result = {

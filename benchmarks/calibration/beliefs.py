@@ -19,7 +19,7 @@ from sbi.utils.sbiutils import within_support
 from torch import Tensor
 from torch.distributions import Distribution
 
-from benchmarks.calibration.table import shares
+from benchmarks.calibration.networks import shares
 from benchmarks.rows import benchmark
 from sbi_active.diagnostics import check_belief
 from sbi_active.inference.beliefs.belief import Belief

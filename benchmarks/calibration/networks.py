@@ -5,6 +5,8 @@
 Under-trained: 20 to 100 steps of the paper's network on 5,000 rows. Trained: 3,000
 steps of the default one on 20,000; of location 5,000 steps of eight components on
 40,000, where "trained less" is as elsewhere. Seeds from 2000 on judge.
+
+The share of networks or beliefs that are flagged, by problem and kind.
 """
 
 from __future__ import annotations
@@ -17,14 +19,30 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.calibration.table import shares
-from benchmarks.rows import benchmark
+from benchmarks.rows import benchmark, column, grouped
 from sbi_active import ASBI, MixtureDensity
 from sbi_active.diagnostics import check_calibration
+from sbi_active.diagnostics.verdict import clopper_pearson
 from sbi_active.inference import ActionPosterior
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 from sbi_active.tasks import Task, get_task
+
+
+def shares(rows: list[dict[str, str]]) -> str:
+    """Return a line for each problem and kind."""
+    lines = []
+    for (problem, kind), own in grouped(rows, "problem", "kind").items():
+        n, k = len(own), sum(row["verdict"] != "trust" for row in own)
+        low, high = clopper_pearson(k, n, 0.05)
+        line = f"{problem:12s} {kind:14s} flagged {k}/{n} ({low:.2f} to {high:.2f})"
+        if kind == "one action":
+            hit = [(r["wrong_flagged"] == "1", r["others_flagged"] == "0") for r in own]
+            line += f", at the wrong action {sum(at for at, _ in hit)}"
+            line += f", only there {sum(at and alone for at, alone in hit)}"
+        lines.append(f"{line}; {column(own, 'cpu_seconds').mean():.1f} CPU s")
+    return "\n".join(lines)
+
 
 #: Name of a problem: task and options.
 PROBLEMS: dict[str, tuple[str, dict[str, Any]]] = {

@@ -32,8 +32,9 @@ import torch
 from scipy.stats import binom, t
 from torch import Tensor
 
+from benchmarks.rounds import played
 from benchmarks.rows import resumed
-from sbi_active import Campaign, RefinementOptions
+from sbi_active import RefinementOptions
 from sbi_active.display.table import Table
 from sbi_active.inference import refine
 from sbi_active.seeding import derive_seed, forked_generators
@@ -118,20 +119,12 @@ def judged(parameters: int, seed: int, *, with_reference: bool) -> dict[str, Any
 
 def rounds(parameters: int, seed: int) -> list[dict[str, Any]]:
     """Return CPU seconds of each round of a campaign with its defaults."""
-    task = problem(parameters, seed)[0]
-    campaign = Campaign(task.simulator, task.prior, task.actions, seed=seed)
-    rows = []
-    for i in range(NUM_TRIALS):
-        start = time.process_time()
-        trial = campaign.ask()
-        campaign.tell(task.real_system(trial.action, seed=derive_seed(seed, "real", i)))
-        campaign.update()
-        seconds = time.process_time() - start
+    task, rows = problem(parameters, seed)[0], []
+    for i, (campaign, seconds) in enumerate(played(task, seed, NUM_TRIALS)):
         parts = campaign.history[i].cpu_seconds
         d = campaign.belief.diagnostics  # pyright: ignore
         row = {"round": i + 1, "cpu_s": seconds, "trustworthy": bool(d.trustworthy)}
-        row |= {f"{name}_s": value for name, value in sorted(parts.items())}
-        rows.append(row)
+        rows.append(row | {f"{name}_s": v for name, v in sorted(parts.items())})
     return rows
 
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 import os
-import time
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
@@ -21,9 +20,10 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.rounds import played
 from benchmarks.rows import keep
-from sbi_active import Campaign, CampaignOptions
-from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active import CampaignOptions
+from sbi_active.seeding import forked_generators
 from sbi_active.tasks import get_task  # pyright: ignore
 
 MODES = ("each round", "on demand")
@@ -33,26 +33,12 @@ def rounds(
     mode: Any, seed: int, num_rounds: int
 ) -> tuple[list[dict[str, Any]], list[float]]:
     """Return what each round cost, and the standard deviations after the last."""
-    task = get_task("numerical")
+    task, rows = get_task("numerical"), []
     options = CampaignOptions(network=mode)
-    campaign = Campaign(
-        task.simulator, task.prior, task.actions, seed=seed, options=options
-    )
-    rows = []
-    for index in range(num_rounds):
-        start = time.process_time()
-        trial = campaign.ask()
-        real = derive_seed(seed, "real", index)
-        campaign.tell(task.real_system(trial.action, seed=real))
-        campaign.update()
-        spent, trial = time.process_time() - start, campaign.history[-1]
-        rows.append(
-            {
-                "cpu_s": spent,
-                **trial.cpu_seconds,
-                "num_simulations": trial.num_simulations,
-            }
-        )
+    for campaign, spent in played(task, seed, num_rounds, options=options):
+        trial = campaign.history[-1]
+        own = {"cpu_s": spent, "num_simulations": trial.num_simulations}
+        rows.append(own | trial.cpu_seconds)
     with forked_generators(0):
         return rows, campaign.belief.sample((4_000,)).std(0).tolist()
 

@@ -26,16 +26,16 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor
 
+from benchmarks.rounds import played
 from benchmarks.rows import keep
 from sbi_active import (
     ASBI,
     BoxActions,
-    Campaign,
     CampaignOptions,
     MixtureDensity,
     simulate,
 )
-from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.seeding import forked_generators
 from sbi_active.tasks import get_task  # pyright: ignore
 
 BEFORE = MixtureDensity(
@@ -57,7 +57,7 @@ class Problem:
     simulator: Callable[[Tensor, Tensor], Tensor]
     prior: Any
     actions: Any
-    real: Callable[[Tensor, int], Tensor]
+    real_system: Callable[..., Tensor]
 
 
 def oscillation(theta: Tensor, action: Tensor) -> Tensor:
@@ -71,18 +71,12 @@ def oscillation(theta: Tensor, action: Tensor) -> Tensor:
     return both + 0.05 * torch.randn_like(both)
 
 
-def problems() -> dict[str, Problem]:
+def problems() -> dict[str, Any]:
     """Return the numerical task, 20 x 2 numbers, and eight parameters of a chain."""
-    found = {}
-    for name in ("numerical", "chain"):
-        task = get_task(name)
-        found[name] = Problem(
-            *(task.simulator, task.prior, task.actions),
-            lambda action, seed, task=task: task.real_system(action, seed=seed),
-        )
+    found: dict[str, Any] = {name: get_task(name) for name in ("numerical", "chain")}
     truth = torch.tensor([[0.4, 0.6, 0.5]])
 
-    def real(action: Tensor, seed: int) -> Tensor:
+    def real(action: Tensor, *, seed: int) -> Tensor:
         with forked_generators(seed):
             return oscillation(truth, action[None])[0]
 
@@ -95,7 +89,7 @@ def problems() -> dict[str, Problem]:
     return found
 
 
-def score(own: Problem, settings: MixtureDensity, seed: int) -> tuple[float, float]:
+def score(own: Any, settings: MixtureDensity, seed: int) -> tuple[float, float]:
     """Return the mean log density of fresh rows and the CPU seconds of training."""
     with forked_generators(seed):
         theta = own.prior.sample((NUM_ROWS + NUM_FRESH,))
@@ -113,19 +107,10 @@ def score(own: Problem, settings: MixtureDensity, seed: int) -> tuple[float, flo
         return -float(network.loss(theta[fresh], condition).mean()), spent
 
 
-def cost(own: Problem, settings: MixtureDensity, seed: int) -> dict[str, float]:
+def cost(own: Any, settings: MixtureDensity, seed: int) -> dict[str, float]:
     """Return CPU seconds of the second round of a campaign, by stage."""
     options = CampaignOptions(density_estimator=settings)
-    campaign = Campaign(
-        own.simulator, own.prior, own.actions, seed=seed, options=options
-    )
-    spent = 0.0
-    for index in range(2):
-        start = time.process_time()
-        trial = campaign.ask()
-        campaign.tell(own.real(trial.action, derive_seed(seed, "real", index)))
-        campaign.update()
-        spent = time.process_time() - start
+    _, (campaign, spent) = played(own, seed, 2, options=options)
     return {"round": spent, **campaign.history[-1].cpu_seconds}
 
 

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from benchmarks.criticism.problem import Problem
-from benchmarks.criticism.refit import residual_sum_of_squares
 from benchmarks.criticism.worlds import World
+from benchmarks.fitting import residual_sum_of_squares
 from sbi_active.criticism import (
     Context,
     Effect,

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import copy
+import functools
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 from sbi.utils import BoxUniform
+from torch import Tensor
 
 from sbi_active import DiscreteActions, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Report, Trials, close_loop
+
+Row = dict[str, object]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,3 +46,35 @@ class Problem:
         given = {"effects": self.effects, "actions": self.actions, "seed": seed}
         given |= options
         return close_loop(self.model, self.prior, self.trials, **given)
+
+    def attempt(self, seed: int, **options: Any) -> tuple[Report | None, Row]:
+        """Return the report and what it cost, or none and why it failed."""
+        model, count = counted(self.model)
+        start = time.process_time()
+        try:
+            report = replace(self, model=model).report(seed, **options)
+        except Exception as error:  # a crash is a result of the benchmark
+            return None, {"failure": f"{type(error).__name__}: {error}"[:300]}
+        seconds = time.process_time() - start
+        return report, {"trial_simulations": count(), "cpu_seconds": seconds}
+
+
+def counted(model: SimulatorModel) -> tuple[SimulatorModel, Callable[[], int]]:
+    """Return a copy of the model that counts its rows, and how to read the count."""
+    rows, fn = 0, model.fn
+
+    @functools.wraps(fn)
+    def counting(theta: Tensor, *arguments: Any, **keywords: Any) -> Any:
+        nonlocal rows
+        rows += len(theta)
+        return fn(theta, *arguments, **keywords)
+
+    twin = copy.copy(model)
+    twin.fn = counting
+    return twin, lambda: rows
+
+
+def named(report: Report) -> tuple[str, ...]:
+    """Return the effects given as a cause; of a model that fits, those that help."""
+    tracing = report.tracing
+    return tracing.chosen if tracing.misfit is None else tracing.misfit.named

@@ -8,10 +8,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from benchmarks.criticism.active import DETECTABLE
+from benchmarks.criticism.active import DETECTABLE, SCORES, Curves, merged, true_name
 from benchmarks.criticism.cases import SUPPORTED
-from benchmarks.criticism.curves import SCORES, Curves
-from benchmarks.criticism.equivalence import merged, true_name
 from benchmarks.criticism.intervals import brier_score, rate, reliability
 from benchmarks.criticism.worlds import World
 from sbi_active.criticism.under_misfit import UNDECLARED

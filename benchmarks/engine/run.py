@@ -18,11 +18,9 @@ process. CPU times are read by psutil, which comes with Dask.
 from __future__ import annotations
 
 import os
-import random
 import signal
 import time
 import warnings
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -34,7 +32,7 @@ import torch
 from joblib import Parallel, delayed
 from torch import Tensor
 
-from benchmarks.rows import keep
+from benchmarks.rows import in_turn, keep
 from benchmarks.table import leaves
 from sbi_active.seeding import row_normals, row_seeds
 from sbi_active.simulation import MissingRowsWarning, Workers, simulate
@@ -94,24 +92,6 @@ def cpu_time() -> float:
     return time.process_time() + sum(t.user + t.system for t in times)
 
 
-def in_turn(
-    variants: Mapping[str, Callable[[], Any]],
-    repetitions: int,
-    clock: Callable[[], float] = time.perf_counter,
-) -> dict[str, list[float]]:
-    """Return how long each variant took in each repetition."""
-    for run in variants.values():
-        run()  # starts what it needs
-    order = random.Random(0)
-    seconds: dict[str, list[float]] = {name: [] for name in variants}
-    for _ in range(repetitions):
-        for name in order.sample([*variants], len(variants)):
-            start = clock()
-            variants[name]()
-            seconds[name].append(clock() - start)
-    return seconds
-
-
 def summary(values: list[float]) -> dict[str, float]:
     """Return the median and the quartiles."""
     low, _, high = quantiles(values, n=4, method="inclusive")
@@ -151,15 +131,26 @@ def overhead(
     clock = cpu_time if burns else time.perf_counter
     seconds = in_turn({"plain": loop, "engine": engine}, repetitions, clock)
     relative = [r - 1 for r in ratios(seconds["engine"], seconds["plain"])]
+    where = "in one worker process" if elsewhere else "in this process"
+    own = described(burns, "CPU" if burns else "wall", num_rows, batch_size, seconds)
+    return {"where": where, **own, "overhead": summary(relative)}
+
+
+def described(
+    burns: bool,
+    clock: str,
+    num_rows: int,
+    batch_size: int,
+    seconds: dict[str, list[float]],
+) -> dict[str, Any]:
+    """Return what was run, and the seconds of each variant."""
     return {
-        "where": "in one worker process" if elsewhere else "in this process",
         "simulator": "burns the CPU" if burns else "waits",
-        "clock": "CPU time" if burns else "wall time",
+        "clock": f"{clock} time",
         "rows": num_rows,
         "batch_size": batch_size,
-        "repetitions": repetitions,
+        "repetitions": len(next(iter(seconds.values()))),
         "seconds": {name: summary(values) for name, values in seconds.items()},
-        "overhead": summary(relative),
     }
 
 
@@ -178,14 +169,7 @@ def workers(
         )
 
     def by_engine(num: int) -> None:
-        simulate(
-            simulator,
-            theta,
-            theta,
-            seed=0,
-            workers=num,
-            batch_size=batch_size,
-        )
+        simulate(simulator, theta, theta, seed=0, workers=num, batch_size=batch_size)
 
     variants = {
         f"{name}_{num}": lambda run=run, num=num: run(num)
@@ -196,12 +180,7 @@ def workers(
     ours = ratios(seconds["engine_1"], seconds["engine_2"])
     theirs = ratios(seconds["joblib_1"], seconds["joblib_2"])
     return {
-        "simulator": "burns the CPU" if burns else "waits",
-        "clock": "wall time",
-        "rows": num_rows,
-        "batch_size": batch_size,
-        "repetitions": repetitions,
-        "seconds": {name: summary(values) for name, values in seconds.items()},
+        **described(burns, "wall", num_rows, batch_size, seconds),
         "speedup_engine": summary(ours),
         "speedup_joblib": summary(theirs),
     }

@@ -25,7 +25,7 @@ Array = NDArray[Any]
 #: Acceleration from parameters, positions, speeds, the drive and generalized forces.
 Law = Callable[[Array, Array, Array, Array, Array], Array]
 
-NUM_SAMPLES = 20
+NUM_SAMPLES, NUM_STEPS = 20, 100
 GRAVITY = 9.81
 
 
@@ -168,25 +168,25 @@ def _pushed(act: Array, t: float) -> Array:
     return act[:, 1] * (float(forth) - float(back))
 
 
-def _model(function: Stepped, sd: Any) -> tuple[SimulatorModel, Any]:
-    model = SimulatorModel(
-        function, noise=GaussianNoise(sd), batched=True, sample_times=function.times
-    )
-    return model, sd
+def _stepped(
+    name: str, law: Law, *, start: Any, drive: Any, step: float, sd: Any, **known: Any
+) -> Machine:
+    """Return a machine of a law, arguments as for :class:`Stepped` and ``Machine``."""
+    function = Stepped(law, start, drive, step=step, steps=NUM_STEPS)
+    noise, times = GaussianNoise(sd), function.times
+    model = SimulatorModel(function, noise=noise, batched=True, sample_times=times)
+    return Machine(name, model, sd, **known)
 
 
 def pendulum() -> Machine:
     """Return a pendulum under a torque that oscillates."""
-    function = Stepped(
-        _swinging,
-        lambda act: act[:, :1].copy(),
-        lambda act, t: act[:, 1] * np.sin(act[:, 2] * t),
-        step=0.02,
-        steps=100,
-    )
-    return Machine(
+    return _stepped(
         "pendulum",
-        *_model(function, 0.003),
+        _swinging,
+        start=lambda act: act[:, :1].copy(),
+        drive=lambda act, t: act[:, 1] * np.sin(act[:, 2] * t),
+        step=0.02,
+        sd=0.003,
         low=(5.0, 0.0, 0.5),
         high=(15.0, 1.0, 2.0),
         joints=("hinge",),
@@ -198,16 +198,13 @@ def pendulum() -> Machine:
 
 def cart_pole() -> Machine:
     """Return a cart with a hanging pole, pushed forth and back."""
-    function = Stepped(
-        _carried,
-        lambda act: np.stack([np.zeros(len(act)), act[:, 0]], 1),
-        _pushed,
-        step=0.025,
-        steps=100,
-    )
-    return Machine(
+    return _stepped(
         "cart-pole",
-        *_model(function, torch.tensor([0.005, 0.01])),
+        _carried,
+        start=lambda act: np.stack([np.zeros(len(act)), act[:, 0]], 1),
+        drive=_pushed,
+        step=0.025,
+        sd=torch.tensor([0.005, 0.01]),
         low=(0.5, 0.25, 0.1, 0.005),
         high=(2.0, 1.0, 1.5, 0.06),
         joints=("rail", "hinge"),
@@ -218,16 +215,13 @@ def cart_pole() -> Machine:
 
 def spring_mass() -> Machine:
     """Return a mass on a spring under a force that oscillates."""
-    function = Stepped(
-        _sprung,
-        lambda act: np.zeros((len(act), 1)),
-        lambda act, t: act[:, 0] * np.sin(act[:, 1] * t),
-        step=0.04,
-        steps=100,
-    )
-    return Machine(
+    return _stepped(
         "spring-mass",
-        *_model(function, 0.01),
+        _sprung,
+        start=lambda act: np.zeros((len(act), 1)),
+        drive=lambda act, t: act[:, 0] * np.sin(act[:, 1] * t),
+        step=0.04,
+        sd=0.01,
         low=(0.5, 10.0, 0.1, -0.1),
         high=(2.0, 40.0, 1.5, 0.1),
         joints=("slide",),

@@ -32,8 +32,14 @@ from pyro.contrib.oed.eig import (
 )
 from torch import Tensor
 
-from benchmarks.information_gain.guides import conditional, marginal, posterior
-from benchmarks.information_gain.worlds import NUM_PILOT, World, worlds
+from benchmarks.information_gain.worlds import (
+    NUM_PILOT,
+    World,
+    conditional,
+    marginal,
+    posterior,
+    worlds,
+)
 from benchmarks.rows import frame, write
 from sbi_active import InformationGainDesigner
 from sbi_active.seeding import forked_generators
@@ -108,45 +114,37 @@ def variational(
     return run
 
 
+STARTED = {"started": True}
+MIXTURE = {"batch": 50, "started": True, "num_components": 4}
 #: Name, what it is given, method.
 METHODS: dict[str, tuple[str, Method]] = {
-    "designer, plain function": ("simulator", ours(1_500, declared=False)),
-    "designer, plain function, 6,000": ("simulator", ours(6_000, declared=False)),
-    "designer, plain function, 15,000": ("simulator", ours(15_000, declared=False)),
-    "designer, plain function, 20,000": ("simulator", ours(20_000, declared=False)),
+    **{
+        f"designer, plain function{words}": ("simulator", ours(num, declared=False))
+        for words, num in (
+            *(("", 1_500), (", 6,000", 6_000), (", 15,000", 15_000)),
+            (", 20,000", 20_000),
+        )
+    },
     "designer, noise declared": ("noise", ours(1_500, declared=True)),
-    "posterior_eig, Gaussian, 1,000 steps": (
-        "simulator",
-        variational("posterior", 1_000, 0.03),
-    ),
-    "posterior_eig, Gaussian, 3,000 steps": (
-        "simulator",
-        variational("posterior", 3_000, 0.03),
-    ),
-    "posterior_eig, Gaussian started, 0 steps": (
-        "simulator",
-        variational("posterior", 0, 0.0, started=True),
-    ),
-    "posterior_eig, Gaussian started, 1,000 steps": (
-        "simulator",
-        variational("posterior", 1_000, 1e-3, started=True),
-    ),
-    "posterior_eig, mixture started, 1,000 steps": (
-        "simulator",
-        variational("posterior", 1_000, 5e-3, batch=50, started=True, num_components=4),
-    ),
-    "posterior_eig, mixture started, 3,000 steps": (
-        "simulator",
-        variational("posterior", 3_000, 5e-3, batch=50, started=True, num_components=4),
-    ),
+    **{
+        f"posterior_eig, {guide}, {num:,} steps": (
+            "simulator",
+            variational("posterior", num, rate, **options),
+        )
+        for guide, num, rate, options in (
+            ("Gaussian", 1_000, 0.03, {}),
+            ("Gaussian", 3_000, 0.03, {}),
+            ("Gaussian started", 0, 0.0, STARTED),
+            ("Gaussian started", 1_000, 1e-3, STARTED),
+            ("mixture started", 1_000, 5e-3, MIXTURE),
+            ("mixture started", 3_000, 5e-3, MIXTURE),
+        )
+    },
     "marginal_likelihood_eig, linear started, 1,000 steps": (
         "simulator",
-        variational("marginal_likelihood", 1_000, 3e-3, started=True),
+        variational("marginal_likelihood", 1_000, 3e-3, **STARTED),
     ),
-    "marginal_eig, 1,000 steps": (
-        "likelihood",
-        variational("marginal", 1_000, 0.03),
-    ),
+    "marginal_eig, 1,000 steps": ("likelihood", variational("marginal", 1_000, 0.03)),
     "nmc_eig, M = 10,000": ("likelihood", nested(100, 10_000)),
     "nmc_eig, M = 100,000": ("likelihood", nested(30, 100_000)),
 }

@@ -32,7 +32,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.measured.least_squares import Fit, effect_bounds, fit_record, run_rows
+from benchmarks.fitting import Fit, effect_bounds, fit_record, run_rows
 from benchmarks.measured.record_stages import Bench, Settings, run_settings, with_error
 from sbi_active.criticism import Effect, Trials
 from sbi_active.tasks import ball_and_hoop  # pyright: ignore

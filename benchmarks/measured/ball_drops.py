@@ -25,8 +25,8 @@ from benchmarks.measured.ball_forecast import (
     forecast_error,
     second_drop_error,
 )
-from benchmarks.measured.verdicts import row_of
-from benchmarks.rows import keep, measured, stages
+from benchmarks.measured.record_stages import row_of
+from benchmarks.rows import add, measured, stages
 from sbi_active.criticism import Criticism
 from sbi_active.criticism.results import NONE, ModelKey, Tracing
 from sbi_active.display.table import Table
@@ -157,15 +157,11 @@ def main(
         ball: pair for ball, pair in by_ball.items() if ball in (balls or by_ball)
     }
     for ball, pair in wanted.items():
-        for key in (ball, f"{ball} 1", f"{ball} 2"):
-            if key in rows:
-                continue
-            if key == ball:
-                rows[key] = judge(pair, seed=seed)
-            else:
-                tested = int(key[-1]) - 1
-                rows[key], _ = score(pair[1 - tested], pair[tested], seed=seed)
-            keep(out, rows)
+        if ball not in rows:
+            add(out, rows, ball, judge(pair, seed=seed))
+        for k in (0, 1):
+            if (key := f"{ball} {k + 1}") not in rows:
+                add(out, rows, key, score(pair[1 - k], pair[k], seed=seed)[0])
     print(tables([*rows.values()]))
     if figures is not None:
         _draw(rows, by_ball, figures, seed=seed)
@@ -174,7 +170,7 @@ def main(
 def _draw(
     rows: dict[str, Row], by_ball: dict[str, list[Drop]], folder: Path, *, seed: int
 ) -> None:
-    from benchmarks.measured.ball_figures import draw_exponents, draw_forecasts
+    from benchmarks.measured.ball_forecast import draw_exponents, draw_forecasts
 
     folder.mkdir(parents=True, exist_ok=True)
     judged = [row for row in rows.values() if "alarm" in row]

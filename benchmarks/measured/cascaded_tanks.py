@@ -20,9 +20,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.measured.least_squares import Fit, effect_bounds, fit_record, run_rows
+from benchmarks.fitting import Fit, batched_fits, effect_bounds, fit_record, run_rows
 from benchmarks.measured.record_stages import Bench, Settings, run_settings, with_error
-from benchmarks.misfit.refit import least_squares
 from sbi_active.criticism import Effect, Trials
 from sbi_active.tasks import cascaded_tanks  # pyright: ignore
 from sbi_active.tasks.cascaded_tanks import (  # pyright: ignore
@@ -111,7 +110,7 @@ def score(
 
     best, least = None, torch.full((num,), torch.inf, dtype=torch.float64)
     for upper in (-3.0, 0.0, 3.0):
-        z, residual = least_squares(
+        z, residual = batched_fits(
             predict,
             torch.from_numpy(begin.output).expand(num, -1),
             row(upper, 0.0).expand(num, 2),

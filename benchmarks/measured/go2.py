@@ -28,11 +28,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.criticism.scores import counted
+from benchmarks.criticism.problem import counted
 from benchmarks.fitting import local_fit
 from benchmarks.measured.go2_leg import DATA, LEGS, Leg, read_leg, usual_parameters
-from benchmarks.measured.verdicts import causes, center, row_of, said
-from benchmarks.rows import keep, measured, stages
+from benchmarks.measured.record_stages import causes, center, row_of, said
+from benchmarks.rows import add, measured, stages
 from sbi_active.criticism import Criticism, Effect
 from sbi_active.criticism.report.summary import misfit_line
 from sbi_active.criticism.results import ModelKey, Tracing
@@ -132,12 +132,10 @@ def main(arguments: Settings) -> None:
     rows = stages(arguments.out)
     for leg in legs:
         for name, row in _stages(leg, rows, arguments):
-            rows[name] = row
-            keep(arguments.out, rows)
-            print(f"{name}: {row.get('line', '')}", flush=True)
+            add(arguments.out, rows, name, row)
     print(tables(rows))
     if arguments.figures is not None:
-        from benchmarks.measured.go2_figures import draw
+        from benchmarks.measured.go2_leg import draw
 
         for leg in legs:
             draw(rows[leg.name], leg, arguments.figures)

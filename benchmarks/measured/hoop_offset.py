@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.measured.ball_and_hoop import make_bench
-from benchmarks.measured.record_stages import judge
-from benchmarks.measured.verdicts import said
-from benchmarks.rows import keep, measured, stages
+from benchmarks.measured.record_stages import judge, said
+from benchmarks.rows import add, measured, stages
 from sbi_active.display.table import Table
 from sbi_active.tasks.ball_and_hoop import (  # pyright: ignore
     DATA,
@@ -59,6 +58,5 @@ def main(*, data: Path = DATA, out: Path = RESULT) -> None:
     for name, (sd, every) in missing.items():
         bench = make_bench(records, every=every)
         row = judge(replace(bench, prior=make_prior(offset_sd=sd)))
-        rows[name] = {"offset_sd": sd, "every": every, **row}
-        keep(out, rows)
+        add(out, rows, name, {"offset_sd": sd, "every": every, **row})
     print(table({name: rows[name] for name in wanted}))

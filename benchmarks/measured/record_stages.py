@@ -5,13 +5,16 @@
 - ``without NAME + ...``: the same with effects removed from the library.
 - ``clean 2000``, ``clean 2001``, ...: the pieces simulated by the bare model at its
   least-squares fit, with the sensor's error alone, by their seeds.
+
+What the loop says of recorded trials: the one place that knows a report's layout.
 """
 
 from __future__ import annotations
 
+import re
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,13 +23,88 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.criticism.scores import counted
-from benchmarks.measured.verdicts import causes, center, read_report, said, shares_left
-from benchmarks.rows import keep, measured, stages
+from benchmarks.criticism.problem import counted
+from benchmarks.rows import add, keep, measured, stages
 from sbi_active import SimulatorModel
-from sbi_active.criticism import Effect, Trials, close_loop
-from sbi_active.criticism.results import NONE
+from sbi_active.criticism import Effect, Report, Trials, close_loop
+from sbi_active.criticism.results import NONE, Evidence, Tracing
 from sbi_active.display.table import Table
+
+#: What a report's first paragraph says of an effect that is named.
+SHARE_LEFT = re.compile(r"\d+ %\s+of\s+the\s+excess")
+
+
+def row_of(tracing: Tracing) -> dict[str, Any]:
+    """Return a verdict as plain figures."""
+    misfit, helps = tracing.misfit, tracing.chosen
+    support = {} if misfit is None else misfit.support
+    model = tracing.evidences.get(" + ".join(helps) or NONE, tracing.evidences[NONE])
+    return {
+        "verdict": tracing.verdict,
+        "named": [*(helps if misfit is None else misfit.named)],
+        "helps": [*helps],
+        "open_forms": {} if misfit is None else misfit.open_forms,
+        "inclusion": {name: float(p) for name, p in tracing.inclusion.items()},
+        "support": {
+            name: [own.inclusion, own.gained, own.remains]
+            for name, own in support.items()
+        },
+        "probabilities": {n: float(p) for n, p in tracing.probabilities.items()},
+        "credible_set": [*tracing.credible_set],
+        "near": [sorted(group) for group in tracing.near],
+        "log_evidence": {k: e.log_evidence for k, e in tracing.evidences.items()},
+        "parameters": spreads(model),
+    }
+
+
+def read_report(report: Report) -> dict[str, Any]:
+    """Return what a report says as plain figures."""
+    return row_of(report.tracing) | {
+        "line": str(report).splitlines()[0],
+        "text": str(report).split("\n\n")[0],
+        "alarm": bool(report.detection.alarm),
+        "log_bayes_factor": float(report.detection.log_bayes_factor),
+        "warnings": [*report.warnings],
+    }
+
+
+def spreads(evidence: Evidence) -> dict[str, list[float]]:
+    """Return mean and standard deviation of each parameter of a model."""
+    pairs = zip(evidence.names, evidence.draws.T, strict=True)
+    return {name: [float(z.mean()), float(z.std())] for name, z in pairs}
+
+
+def center(evidence: Evidence, columns: int | None = None) -> Tensor:
+    """Return the best fit where every model misses, as the library predicts by it.
+
+    Draws as wide as misfit asks leave the valley that the best fit lies in.
+
+    Args:
+        evidence: Evidence of the model.
+        columns: Number of its parameters and strengths; None for all, (1, columns).
+    """
+    best = evidence.draws.mean(0) if evidence.best is None else evidence.best
+    return torch.from_numpy(best[None, :columns]).double()
+
+
+def said(row: Mapping[str, Any]) -> str:
+    """Return the verdict of a row, and what else helps to predict."""
+    beside = [name for name in row["helps"] if name not in row["named"]]
+    forms = [f"{n}: {family}" for n, family in row.get("open_forms", {}).items()]
+    told = row["verdict"] + (f" (form open, {', '.join(forms)})" if forms else "")
+    return told + (f", {' + '.join(beside)} helps" if beside else "")
+
+
+def causes(row: Mapping[str, Any]) -> str:
+    """Return the share of the excess that each effect that helps leaves."""
+    support = row.get("support", {})
+    return ", ".join(f"{n} {100 * left:.0f} %" for n, (*_, left) in support.items())
+
+
+def shares_left(row: Mapping[str, Any]) -> bool:
+    """Return whether a row's text says which share of the excess is left."""
+    return SHARE_LEFT.search(row["text"]) is not None
+
 
 Errors = dict[str, float]
 #: Seed of the first replay; nothing was chosen by those from here on.
@@ -134,9 +212,7 @@ def run_stages(
         is_clean = name not in judged
         trials = bench.replay(int(name.split(" ")[1])) if is_clean else None
         row = judge(bench, gone=judged.get(name, ()), trials=trials, seed=seed)
-        rows[name] = row
-        keep(path, rows)
-        print(f"{name}: {row['line']}, {row['cpu_seconds']:.0f} CPU s", flush=True)
+        add(path, rows, name, row)
     fits = rows.setdefault("least squares", {})
     wanted = {(), *[(*rows[name]["helps"],) for name in judged]}
     for given in sorted(wanted):

@@ -26,8 +26,8 @@ from typing import Any, Literal
 
 from benchmarks.measured.ball_drops import DATA as BALLS
 from benchmarks.measured.ball_drops import jobs_without_drag
-from benchmarks.measured.verdicts import causes, read_report, said, shares_left
-from benchmarks.rows import keep, measured, stages
+from benchmarks.measured.record_stages import causes, read_report, said, shares_left
+from benchmarks.rows import add, measured, stages
 from sbi_active.criticism import Criticism, Effect
 from sbi_active.display.table import Table
 from sbi_active.tasks.servo_pendulum import ServoPendulumTask  # pyright: ignore
@@ -158,7 +158,6 @@ def main(arguments: Settings) -> None:
         for which, name, *parts in measured(lambda: [*jobs(arguments.data or data)]):
             key = f"{which}: {name}"
             if key not in rows:
-                rows[key] = removed(*parts, seed=arguments.seed)
-                keep(arguments.out, rows)
-                print(f"{key}: {rows[key]['verdict']}", flush=True)
+                row = removed(*parts, seed=arguments.seed)
+                add(arguments.out, rows, key, row)
     print(table(rows))

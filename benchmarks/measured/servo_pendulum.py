@@ -27,9 +27,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.measured.least_squares import best_in_box
-from benchmarks.measured.verdicts import causes, read_report, said, spreads
-from benchmarks.rows import keep, measured, stages
+from benchmarks.fitting import best_in_box
+from benchmarks.measured.record_stages import causes, read_report, said, spreads
+from benchmarks.rows import add, measured, stages
 from sbi_active.criticism import Criticism
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED
 from sbi_active.display.table import Table
@@ -273,9 +273,7 @@ def main(arguments: Settings) -> None:
     task = measured(lambda: ServoPendulumTask(data=arguments.data))
     rows = stages(arguments.out)
     for name, row in missing(task, rows, arguments):
-        rows[name] = row
-        keep(arguments.out, rows)
-        print(f"{name}: {row['verdict']}, {row['seconds']:.0f} CPU s", flush=True)
+        add(arguments.out, rows, name, row)
     print(tables(rows, task.recordings))
 
 

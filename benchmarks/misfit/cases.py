@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import count
 from typing import Literal, get_args
 
@@ -20,11 +21,11 @@ from torch import Tensor
 from torch.distributions import Uniform
 
 from benchmarks.criticism.problem import Problem
-from benchmarks.misfit.discrepancies import Discrepancy, draw_discrepancy
+from benchmarks.misfit.discrepancies import draw_discrepancy
 from benchmarks.misfit.machines import GROUPS, LAYOUTS, Machine, get_machine
 from benchmarks.misfit.machines.machine import is_positive, scale_of
-from benchmarks.misfit.truth import LARGEST, Truth, excess, respond, sized
-from sbi_active.criticism import Effect, Trials
+from benchmarks.misfit.truth import LARGEST, Setup, Truth
+from sbi_active.criticism import Effect
 from sbi_active.seeding import derive_seed, forked_generators
 
 Kind = Literal["E", "R", "M", "P", "C", "CE"]
@@ -74,12 +75,7 @@ def draw_case(group: str, kind: Kind, number: int) -> Case:
     if kind == "R":
         gone = frozenset().union(*[machine.equivalent(n) for n in truth.names])
         library = [effect for effect in library if effect.name not in gone]
-    trials = Trials(
-        truth.action[truth.fitted],
-        truth.measured(truth.fitted),
-        index=truth.fitted,
-        sample_times=machine.times if machine.declares_times else None,
-    )
+    trials = truth.trials(times=machine.times if machine.declares_times else None)
     problem = Problem(
         model=machine.model(), prior=machine.prior, trials=trials, effects=library
     )
@@ -97,6 +93,7 @@ def _drawn(machine: Machine, kind: Kind, *, is_judged: bool) -> Truth | None:
     theta = machine.prior.sample((1,)).double()
     action = machine.draw_actions(num)
     fitted = torch.randperm(num)[: machine.num_trials].sort().values
+    setup = Setup(machine=machine, theta=theta, action=action, fitted=fitted)
     visible = [e for e in machine.library if e.name not in machine.equivalent("none")]
     effects: tuple[Effect, ...] = ()
     if kind in ("E", "R", "CE"):
@@ -107,86 +104,41 @@ def _drawn(machine: Machine, kind: Kind, *, is_judged: bool) -> Truth | None:
     if kind not in ("C", "CE"):
         size = _log_between(*SIZES)
         discrepancy = draw_discrepancy(machine, action, is_judged=is_judged)
-        found = _sized_discrepancy(machine, theta, action, fitted, size, discrepancy)
-        if found is None:
+        largest = FARTHEST if discrepancy.kind == "wandering" else torch.inf
+        readings = partial(setup.readings, discrepancy=discrepancy)
+        strength = setup.sized(size, readings, largest=largest)
+        if strength is None:
             return None
-        strength = found
     strengths, sizes = [], []
     for effect in effects:
-        target = (size or 1.0) * _log_between(*RATIO)
-        phi = _sized_effect(machine, theta, action, fitted, target, effect)
-        if phi is None:
+        sizes.append((size or 1.0) * _log_between(*RATIO))
+        strengths.append(_sized_effect(setup, sizes[-1], effect))
+        if strengths[-1] is None:
             return None
-        strengths.append(phi)
-        sizes.append(target)
     shape = machine.fn(theta, action[:1]).shape[1:]
     truth = Truth(
-        machine=machine,
+        **vars(setup),
         kind=kind,
-        theta=theta,
         effects=effects,
         strengths=tuple(strengths),
         sizes=tuple(sizes),
         discrepancy=discrepancy,
         strength=strength,
         size=size,
-        action=action,
-        fitted=fitted,
         error=machine.noise_sd * torch.randn(num, *shape, dtype=torch.float64),
     )
     every = torch.arange(num)
-    moved = truth.clean(every) - respond(machine, theta.expand(num, -1), action, every)
+    moved = truth.clean(every) - truth.respond(every)
     calm = moved.isfinite().all() and moved.abs().max() < MOST * machine.noise_sd
     return truth if bool(calm) or machine.name == "A" else None
 
 
-def _sized_discrepancy(
-    machine: Machine,
-    theta: Tensor,
-    action: Tensor,
-    fitted: Tensor,
-    size: float,
-    discrepancy: Discrepancy,
-) -> float | None:
-    def readings(strength: Tensor) -> Tensor:
-        rows = fitted.repeat(len(strength))
-        each = strength.repeat_interleave(len(fitted))
-        x = respond(
-            machine,
-            theta.expand(len(rows), -1),
-            action,
-            rows,
-            discrepancy=discrepancy,
-            strength=each,
-        )
-        return x.reshape(len(strength), -1) / machine.noise_sd
-
-    largest = FARTHEST if discrepancy.kind == "wandering" else torch.inf
-    return sized(machine, theta, action, fitted, size, readings, largest=largest)
-
-
-def _sized_effect(
-    machine: Machine,
-    theta: Tensor,
-    action: Tensor,
-    fitted: Tensor,
-    size: float,
-    effect: Effect,
-) -> Tensor | None:
+def _sized_effect(setup: Setup, size: float, effect: Effect) -> Tensor | None:
+    readings = partial(setup.readings, effects=(effect,))
     prior = getattr(effect.prior, "base_dist", effect.prior)
-
-    def readings(phi: Tensor) -> Tensor:
-        rows = fitted.repeat(len(phi))
-        each = phi.repeat_interleave(len(fitted), 0)
-        x = respond(
-            machine, theta.expand(len(rows), -1), action, rows, (effect,), (each,)
-        )
-        return x.reshape(len(phi), -1) / machine.noise_sd
-
     if isinstance(prior, Uniform):  # it has no null to grow from
         drawn = effect.sample(NUM_DRAWS)
-        found = excess(machine, theta, action, fitted, readings(drawn))
-        off = (found / size).log().abs()
+        off = (setup.left(readings(drawn)) / size).log().abs()
         best = int(off.argmin())
         return drawn[best][None] if float(off[best]) < np.log(1.5) else None
     unit = scale_of(effect)
@@ -195,15 +147,8 @@ def _sized_effect(
     if is_positive(effect):
         direction = direction.abs()
     direction = unit * direction
-
-    strength = sized(
-        machine,
-        theta,
-        action,
-        fitted,
-        size,
-        lambda s: readings(s[:, None] * direction),
-        largest=LARGEST,
+    strength = setup.sized(
+        size, lambda s: readings(s[:, None] * direction), largest=LARGEST
     )
     return None if strength is None else strength * direction[None]
 

@@ -28,12 +28,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from benchmarks.criticism.problem import named
 from benchmarks.criticism.worlds.world import effect, normal
 from benchmarks.misfit.cases import Case, Kind, Problem, draw_case
 from benchmarks.misfit.machines import GROUPS, get_machine
-from benchmarks.misfit.verdicts import Outcome, read_report
 from benchmarks.rows import benchmark
-from sbi_active.criticism import Effect, Trials
+from sbi_active.criticism import Effect
 from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
 
@@ -74,9 +74,7 @@ def units(case: Case) -> Problem:
     scaled.__signature__ = inspect.signature(fn)  # type: ignore[attr-defined]
     sd = UNIT * truth.machine.noise_sd
     model = replace(truth.machine, fn=scaled, noise_sd=sd).model()
-    trials = Trials(
-        t.action, UNIT * t.x, index=t.index, sample_times=problem.model.sample_times
-    )
+    trials = truth.trials(UNIT * t.x, problem.model.sample_times)
     effects = [_in_units(own) for own in problem.effects]
     return replace(problem, model=model, trials=trials, effects=effects)
 
@@ -109,16 +107,10 @@ def denser(case: Case) -> Problem | None:
         error=error,
         effects=tuple(machine.effect(name) for name in truth.names),
     )
-    trials = Trials(
-        truth.action[truth.fitted],
-        more.measured(truth.fitted),
-        index=truth.fitted,
-        sample_times=machine.times,
-    )
     return Problem(
         model=machine.model(),
         prior=machine.prior,
-        trials=trials,
+        trials=more.trials(times=machine.times),
         effects=[own for own in machine.library if own.name in kept],
     )
 
@@ -147,12 +139,6 @@ def _in_units(own: Effect) -> Effect:
         return UNIT * own.apply(x / UNIT, phi, action, context)
 
     return replace(own, apply=apply)
-
-
-def judged(problem: Problem, seed: int) -> Outcome:
-    """Return what the loop says of a problem."""
-    report = problem.report(seed, evaluate=False, plan=False)
-    return read_report(report, [])
 
 
 def table(rows: Sequence[Mapping[str, str]]) -> str:
@@ -191,10 +177,10 @@ def row_of(number: int, change: str) -> Sequence[Mapping[str, object]]:
     group, kind, case = drawn(number)
     if (problem := CHANGES[change](case)) is None:
         return []
-    found = judged(problem, number)
+    report = problem.report(number, evaluate=False, plan=False)
+    found = {"named": named(report), "helps": report.tracing.chosen}
     row = {"group": group, "machine": case.truth.machine.name, "kind": kind}
-    names = {k: json.dumps(sorted(getattr(found, k))) for k in ("named", "helps")}
-    return [row | names]
+    return [row | {k: json.dumps(sorted(names)) for k, names in found.items()}]
 
 
 main = benchmark(RESULT, row_of, table, case=range(5_200, 5_240), change=CHANGES)

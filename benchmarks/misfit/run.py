@@ -18,19 +18,135 @@ be tuned on them.
 Resumable: a case that stands in the CSV is not run again. One row a case, one file a
 group and kind, in benchmarks/misfit/results. Give each command a core of its own
 (OMP_NUM_THREADS=1) and another --first, which writes its own file.
+
+Scores of one case, from the public report and the truth alone.
 """
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from benchmarks.misfit.cases import FIRST_JUDGED, KINDS, Kind, draw_case
+import numpy as np
+
+from benchmarks.criticism.problem import named
+from benchmarks.misfit.cases import FIRST_JUDGED, KINDS, Case, Kind, draw_case
 from benchmarks.misfit.machines import GROUPS
-from benchmarks.misfit.scores import score_case
 from benchmarks.misfit.summary import summary
+from benchmarks.misfit.truth import Truth
 from benchmarks.rows import read, resumed
+from sbi_active.criticism import Effect
+from sbi_active.criticism.results import NONE, Tracing
+
+LEVEL = 0.9  # of intervals
+COLUMNS = [
+    *["case", "machine", "trials", "kind", "true", "equivalent", "sizes", "strengths"],
+    *["discrepancy", "detail", "size", "excess", "theta"],
+    *["held_bare", "held_true", "held_single", "held_verdict"],
+    *["verdict", "alarm", "named", "helps", "instead", "support"],
+    *["theta_covered", "phi_covered", "trial_simulations", "cpu_seconds", "failure"],
+]
+
+
+def score_case(case: Case, number: int) -> dict[str, object]:
+    """Run the loop on a case and return its row of the results.
+
+    Held-out trials have no part in the verdict. Their errors are those of plain
+    least-squares fits of the bare model, of the true effects and of the effects that
+    the verdict says help, against readings without the sensor's error.
+
+    Args:
+        case: The case.
+        number: Its number, also the loop's seed.
+    """
+    problem, truth = case.problem, case.truth
+    row = dict.fromkeys(COLUMNS, "") | _known(truth) | {"case": number}
+    # The truth has the held-out trials.
+    report, cost = problem.attempt(number, evaluate=False, plan=False)
+    row |= cost
+    if report is None:
+        return row
+    tracing, misfit = report.tracing, report.tracing.misfit
+    support = {} if misfit is None else misfit.support
+    instead = {} if misfit is None else misfit.instead
+    found = [truth.machine.effect(name) for name in tracing.chosen]
+    return row | {
+        "held_verdict": truth.held_out_error(found),
+        "verdict": str(report).splitlines()[0],
+        "alarm": bool(report.detection.alarm),
+        "named": json.dumps([*named(report)]),
+        "helps": json.dumps([*tracing.chosen]),
+        "instead": json.dumps({k: [*names] for k, names in instead.items()}),
+        "support": json.dumps(
+            {
+                k: [round(v, 4) for v in (s.inclusion, s.gained, s.remains, s.guessed)]
+                for k, s in support.items()
+            }
+        ),
+        **_covered(truth, tracing),
+    }
+
+
+def _known(truth: Truth) -> dict[str, object]:
+    """Return what is known without the loop."""
+    what, machine = truth.discrepancy, truth.machine
+    bare = truth.held_out_error(())
+    return {
+        "machine": machine.name,
+        "trials": machine.num_trials,
+        "kind": truth.kind,
+        "true": json.dumps([*truth.names]),
+        "equivalent": json.dumps(
+            sorted(frozenset().union(*[machine.equivalent(n) for n in truth.names]))
+        ),
+        "sizes": " ".join(f"{size:.3g}" for size in truth.sizes),
+        "strengths": " ".join(
+            f"{value:.5g}" for phi in truth.strengths for value in phi[0].tolist()
+        ),
+        "discrepancy": "" if what is None else what.kind,
+        "detail": "" if what is None else what.detail,
+        "size": truth.size,
+        "excess": truth.excess(),
+        "theta": " ".join(f"{value:.5g}" for value in truth.theta[0].tolist()),
+        "held_bare": bare,
+        "held_true": truth.held_out_error(truth.effects) if truth.effects else bare,
+        "held_single": _singles(truth, truth.effects),
+    }
+
+
+def _singles(truth: Truth, effects: Sequence[Effect]) -> float | str:
+    """Return the error of the better one of two effects."""
+    if len(effects) < 2:
+        return ""
+    return min(truth.held_out_error([effect]) for effect in effects)
+
+
+def _covered(truth: Truth, tracing: Tracing) -> dict[str, object]:
+    """Return how many true numbers lie within their 90 % intervals, "k/n"."""
+    library = [effect.name for effect in truth.machine.library]
+    true = sorted(truth.names, key=library.index)
+    evidence = tracing.evidences.get(" + ".join(true) or NONE)
+    if evidence is None:
+        return {}
+    ends = np.quantile(evidence.draws, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
+    intervals = dict(zip(evidence.names, ends.T, strict=True))
+    values = zip(truth.machine.parameter_names, truth.theta[0].tolist(), strict=True)
+    phi = [
+        pair
+        for effect, strength in zip(truth.effects, truth.strengths, strict=True)
+        for pair in zip(effect.phi_names, strength[0].tolist(), strict=True)
+    ]
+
+    def share(known: Sequence[tuple[str, float]]) -> str:
+        hits = [intervals[n][0] <= v <= intervals[n][1] for n, v in known]
+        return f"{sum(hits)}/{len(hits)}"
+
+    covered: dict[str, object] = {"theta_covered": share([*values])}
+    return covered | ({"phi_covered": share(phi)} if phi else {})
+
 
 RESULTS = Path(__file__).parent / "results"
 

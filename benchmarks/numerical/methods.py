@@ -32,13 +32,15 @@ from torch import Tensor
 from benchmarks.numerical.run import (
     REPORTED,
     RESULTS,
+    STAGES,
+    errors,
     exact_limits,
     make_task,
+    medians,
     reference,
-    round_row,
 )
-from benchmarks.published import published
-from benchmarks.rows import column, resumed
+from benchmarks.numerical.run import run_trial as by_round
+from benchmarks.rows import column, published, resumed
 from sbi_active import Campaign, CampaignOptions, RefinementOptions
 from sbi_active.campaign.learning.methods import METHODS, faithful_options
 from sbi_active.display.table import Table
@@ -71,27 +73,11 @@ def options_of(setting: str, method: str) -> CampaignOptions:
 
 def run_trial(task: Task, method: str, setting: str, seed: int) -> list[dict[str, Any]]:
     """Return one row a round of one campaign."""
-    campaign = Campaign(
-        task.simulator,
-        task.prior,
-        task.actions,
-        method=method,
-        seed=seed,
-        options=options_of(setting, method),
-    )
-    rows = []
-    for index in range(NUM_ROUNDS):
-        before = reference(task, campaign.history)
-        gain = before.expected_information_gain(task.actions.values)
-        trial = campaign.ask()
-        real_seed = derive_seed(seed, "real", index)
-        campaign.tell(task.real_system(trial.action, seed=real_seed))
-        campaign.update()
-        rows.append(
-            {"round": index + 1, "c2st": compared(task, campaign, index)}
-            | round_row(task, campaign, gain, index)
-        )
-    return rows
+    made = by_round(task, method, options_of(setting, method), seed, rounds=NUM_ROUNDS)
+    return [
+        row | {"c2st": compared(task, campaign, index)}
+        for index, (row, campaign) in enumerate(made)
+    ]
 
 
 def compared(task: Task, campaign: Campaign, index: int) -> Tensor | str:
@@ -127,20 +113,13 @@ def run_method(
 def summary(name: str, rows: list[dict[str, str]]) -> list[str]:
     """Return the table's row of a method."""
     last = NUM_ROUNDS
-    medians = [np.median(column(rows, "log_prob_true", r + 1)) for r in range(last)]
     gap = column(rows, "gap", last)
     regret = [column(rows, "regret", r + 1).mean() for r in range(last)]
-    cpu = sum(
-        column(rows, f"cpu_{stage}").mean()
-        for stage in ("simulation", "training", "design", "update")
-    )
+    cpu = sum(column(rows, f"cpu_{stage}").mean() for stage in STAGES)
     return [
         f"{name} ({len(gap)})",
-        " / ".join(f"{m:.2f}" for m in medians),
-        *[
-            f"{error.mean():.3g} +- {error.std():.2g}"
-            for error in (column(rows, f"rep_err_{a:g}", last) for a in REPORTED)
-        ],
+        medians(rows, "log_prob_true", last),
+        *errors(rows, last),
         f"{np.median(gap):.2f} {gap.mean():.2f}",
         " / ".join(f"{r:.2f}" for r in regret),
         f"{np.median(column(rows, 'c2st', last)):.2f}",

@@ -11,7 +11,7 @@ setting, in benchmarks/numerical/results; the table is printed at the end.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.published import published
-from benchmarks.rows import column, read, resumed
+from benchmarks.rounds import played
+from benchmarks.rows import column, published, read, resumed
 from sbi_active import Campaign, CampaignOptions, RefinementOptions
 from sbi_active.campaign import Trial
 from sbi_active.display.table import Table
@@ -86,34 +86,40 @@ class Settings:
 
 
 def run_trial(
-    task: Task, method: str, setting: str, seed: int, arguments: Settings
-) -> list[dict[str, object]]:
-    """Return one row a round of one campaign."""
-    campaign = Campaign(
-        task.simulator,
-        task.prior,
-        task.actions,
-        method=method,
-        seed=seed,
-        options=SETTINGS[setting],
-    )
-    rows: list[dict[str, object]] = []
-    for index in range(arguments.rounds):
+    task: Task,
+    method: str,
+    options: CampaignOptions,
+    seed: int,
+    *,
+    rounds: int,
+    jitter: float = 0.0,
+) -> Iterator[tuple[dict[str, object], Campaign]]:
+    """Yield the row of each round of one campaign, and the campaign.
+
+    Args:
+        task: What is asked.
+        method: Name of the method.
+        options: Of the campaign.
+        seed: Its seed.
+        rounds: How many.
+        jitter: Relative error of executed actions.
+    """
+
+    def executed(action: Tensor, seed: int) -> Tensor:
+        if not jitter:
+            return action
+        # The robot does not do quite what it was asked.
+        generator = torch.Generator().manual_seed(seed)
+        return action * (1 + jitter * torch.randn(action.shape, generator=generator))
+
+    own = {"method": method, "options": options, "executed": executed}
+    for index, (campaign, _) in enumerate(played(task, seed, rounds, **own)):
         gain = None
         if task.name == "numerical":
-            before = reference(task, campaign.history)
+            before = reference(task, campaign.history[:-1])
             gain = before.expected_information_gain(task.actions.values)
-        trial = campaign.ask()
-        real_seed = derive_seed(seed, "real", index)
-        executed = trial.action
-        if arguments.jitter:  # the robot does not do quite what it was asked
-            generator = torch.Generator().manual_seed(real_seed)
-            off = torch.randn(executed.shape, generator=generator)
-            executed = executed * (1 + arguments.jitter * off)
-        campaign.tell(task.real_system(executed, seed=real_seed), action=executed)
-        campaign.update()
-        rows.append({"round": index + 1} | round_row(task, campaign, gain, index))
-    return rows
+        row = {"round": index + 1} | round_row(task, campaign, gain, index)
+        yield row, campaign
 
 
 def round_row(
@@ -167,7 +173,8 @@ def run_setting(arguments: Settings, method: str, setting: str) -> list[dict]:
 
     def trial(seed: int) -> list[dict[str, object]]:
         task = make_task(arguments.task, arguments.truth, seed)
-        return run_trial(task, method, setting, seed, arguments)
+        given = {"rounds": arguments.rounds, "jitter": arguments.jitter}
+        return [r for r, _ in run_trial(task, method, SETTINGS[setting], seed, **given)]
 
     seeds = [(s,) for s in range(arguments.trials) if not arguments.summary]
     path = RESULTS / f"{name}.csv"
@@ -189,27 +196,36 @@ def exact_limits() -> dict[str, tuple[str, ...]]:
     return found
 
 
+def medians(rows: list[dict[str, str]], key: str, rounds: int) -> str:
+    """Return the median of a column by round."""
+    each = [np.median(column(rows, key, r + 1)) for r in range(rounds)]
+    return " / ".join(f"{m:.2f}" for m in each)
+
+
+def errors(rows: list[dict[str, str]], last: int) -> list[str]:
+    """Return mean and deviation of the errors of reproduction."""
+    each = [column(rows, f"rep_err_{action:g}", last) for action in REPORTED]
+    return [f"{error.mean():.3g} +- {error.std():.2g}" for error in each]
+
+
 def summary(name: str, rows: list[dict[str, str]]) -> list[str]:
     """Return the table's row of a setting."""
     last = max(int(r["round"]) for r in rows)
-    medians = [np.median(column(rows, "log_prob_true", r + 1)) for r in range(last)]
     gap, kl = column(rows, "gap", last), column(rows, "kl", last)
     hpd, exact_hpd = column(rows, "hpd", last), column(rows, "exact_hpd", last)
     regret = [column(rows, "regret", r).mean() for r in (1, 2)]
-    cells = [
+    cpu = sum(column(rows, f"cpu_{stage}").mean() for stage in STAGES)
+    return [
         f"{name} ({len(gap)})",
-        " / ".join(f"{m:.2f}" for m in medians),
+        medians(rows, "log_prob_true", last),
         f"{np.median(gap):.2f} {gap.mean():.2f} {np.percentile(gap, 95):.2f}",
         f"{np.median(kl):.3f}",
         f"{regret[0]:.2f} / {regret[1]:.2f}",
         f"{np.mean(hpd < 0.5):.2f} {np.mean(hpd < 0.9):.2f}",
         f"{np.mean(exact_hpd < 0.5):.2f} {np.mean(exact_hpd < 0.9):.2f}",
+        *errors(rows, last),
+        f"{column(rows, 'num_simulations').mean():.0f}, {cpu:.2f}",
     ]
-    for action in REPORTED:
-        error = column(rows, f"rep_err_{action:g}", last)
-        cells.append(f"{error.mean():.3g} +- {error.std():.2g}")
-    cpu = sum(column(rows, f"cpu_{stage}").mean() for stage in STAGES)
-    return [*cells, f"{column(rows, 'num_simulations').mean():.0f}, {cpu:.2f}"]
 
 
 def main(arguments: Settings) -> None:

@@ -22,11 +22,15 @@ has an error. Resumable; one row a campaign, in ``results/around.csv``.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 from scipy.special import logsumexp
+from torch import Tensor
 
-from benchmarks.pouring.grid_belief import GridBelief
-from benchmarks.pouring.power import best_power, told_by
+from benchmarks.pouring.campaign import GridBelief
+from benchmarks.pouring.learned import best_power, told_by
 from benchmarks.pouring.reference import (
     Campaign,
     Reference,
@@ -34,7 +38,7 @@ from benchmarks.pouring.reference import (
     belief_of,
     run,
 )
-from benchmarks.rows import column
+from benchmarks.rows import column, grouped
 from sbi_active.display.table import Table
 
 NUM_FOLDS = 5
@@ -51,17 +55,29 @@ def nearest(cells: np.ndarray, theta: np.ndarray) -> int:
     return int(((cells - theta) ** 2).sum(1).argmin())
 
 
+def densities(
+    log_p: np.ndarray, power: float, at: np.ndarray, volume: float
+) -> np.ndarray:
+    """Return log densities of cells to a power, one a row, shape (n,)."""
+    pairs = zip(power * log_p, at, strict=True)
+    return np.array([density(row, place, volume) for row, place in pairs])
+
+
+def of_bank(
+    known: Reference, own: Campaign, images: list[Tensor], theta: np.ndarray
+) -> float:
+    """Return the log density within the box that the campaign's own belief has."""
+    middles = GridBelief.middles().double().numpy()
+    inside = known.box.holds(middles)
+    log_p = belief_of(known.learned, own, images).log_density.numpy()[inside]
+    return density(log_p, nearest(middles[inside], theta), known.box.volume)
+
+
 def row_of(own: Campaign, known: Reference) -> dict[str, object]:
     """Return a campaign's row."""
     learned, box, pours, task = known.learned, known.box, known.pours, known.task
     cells, middles = box.cells(), GridBelief.middles().double().numpy()
-    inside, truth = box.holds(middles), task.theta_true.double().numpy()
-    distinct = [own.places.index(place) for place in dict.fromkeys(own.places)]
-    few = Campaign(
-        own.seed,
-        [own.places[k] for k in distinct],
-        [own.deltas[k] for k in distinct],
-    )
+    few = own.once()
     theta = pours[few.places[0]].theta
     judged = np.arange(min(NUM_JUDGED, len(theta)))
     log_p = np.zeros((len(judged), len(cells)))
@@ -72,31 +88,28 @@ def row_of(own: Campaign, known: Reference) -> dict[str, object]:
             fitted = pours[place].learn(rest)
             log_p[out] += fitted.at(cells, pours[place].images[judged[out]])
     at = np.array([nearest(cells, one) for one in theta[judged]])
-    power = best_power(log_p, log_p[np.arange(len(judged)), at])
-    _, mass = told_by(power * log_p, power * log_p[np.arange(len(judged)), at])
-    reference = [
-        density(power * row, k, box.volume) for row, k in zip(log_p, at, strict=True)
+    true = log_p[np.arange(len(judged)), at]
+    power = best_power(log_p, true)
+    _, mass = told_by(power * log_p, power * true)
+    reference = densities(log_p, power, at, box.volume)
+    ours = [
+        of_bank(known, few, [pours[p].images[i] for p in few.places], theta[i])
+        for i in judged
     ]
-    ours = []
-    for i in judged:
-        belief = belief_of(learned, few, [pours[p].images[i] for p in few.places])
-        own_p = belief.log_density.numpy()[inside]
-        ours.append(density(own_p, nearest(middles[inside], theta[i]), box.volume))
-    images = own.images(task, learned.actions)
+    images, truth = own.images(task, learned.actions), task.theta_true.double().numpy()
     belief = belief_of(learned, own, images).log_density.numpy()
     everything = np.arange(len(theta))
     by_place = {place: pours[place].learn(everything) for place in few.places}
-    whole = np.zeros(len(cells))
-    for place, image in zip(own.places, images, strict=True):
-        whole += by_place[place].at(cells, image[None])[0]
-    gap = np.array(reference) - np.array(ours)
+    pairs = zip(own.places, images, strict=True)
+    whole = np.sum([by_place[p].at(cells, image[None]) for p, image in pairs], 0)
+    gap = reference - np.array(ours)
     return {
         "num_pours": len(theta),
         "volume": box.volume,
-        "inside": float(np.exp(belief)[inside].sum() / len(belief)),
+        "inside": float(np.exp(belief)[box.holds(middles)].sum() / len(belief)),
         "power": power,
-        "ours": density(belief[inside], nearest(middles[inside], truth), box.volume),
-        "reference": density(power * whole, nearest(cells, truth), box.volume),
+        "ours": of_bank(known, own, images, truth),
+        "reference": density(power * whole[0], nearest(cells, truth), box.volume),
         "left_out_ours": np.mean(ours),
         "left_out_reference": np.mean(reference),
         "left_out_se": gap.std(ddof=1) / np.sqrt(len(gap)),
@@ -106,24 +119,23 @@ def row_of(own: Campaign, known: Reference) -> dict[str, object]:
     }
 
 
+def by_target(rows: list[dict[str, str]]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield each target with its columns."""
+    for (target,), own in sorted(grouped(rows, "target").items()):
+        yield target, {k: column(own, k) for k in own[0]}
+
+
 def summarize(rows: list[dict[str, str]]) -> str:
     """Return one line a target."""
-    if not rows:
-        return "no campaigns yet"
     table = []
-    for target in sorted({row["target"] for row in rows}):
-        own = [row for row in rows if row["target"] == target]
-        value = {k: column(own, k) for k in own[0]}
+    for target, value in by_target(rows):
         gap = value["left_out_reference"] - value["left_out_ours"]
-        at_truth = value["reference"] - value["ours"]
-        error = np.sqrt((value["left_out_se"] ** 2).mean() / len(own))
+        at_truth, num = value["reference"] - value["ours"], len(value["ours"])
+        error = np.sqrt((value["left_out_se"] ** 2).mean() / num)
+        medians = (value["ours"], value["reference"], at_truth)
         table.append(
             [
-                target,
-                len(own),
-                f"{np.median(value['ours']):.2f}",
-                f"{np.median(value['reference']):.2f}",
-                f"{np.median(at_truth):.2f}",
+                *(target, num, *(f"{np.median(v):.2f}" for v in medians)),
                 f"{gap.mean():.2f} +- {error:.2f}",
                 f"{value['in_half'].mean():.2f}, {value['in_most'].mean():.2f}",
                 f"{value['num_pours'][0]:.0f} in {value['volume'][0]:.3f}",

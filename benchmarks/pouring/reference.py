@@ -13,19 +13,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.pouring.bank import ROWS_A_FILE, Drawn, fill
+from benchmarks.pouring.bank import ROWS_A_FILE, Drawn, Rows, fill
 from benchmarks.pouring.bank import read as read_bank
-from benchmarks.pouring.campaign import TEMPERED
-from benchmarks.pouring.grid_belief import SIDE, GridBelief
+from benchmarks.pouring.campaign import SIDE, TEMPERED, GridBelief
 from benchmarks.pouring.learned import (
     ByAction,
     Earlier,
     components,
+    grid,
     learn,
     looked_at,
 )
 from benchmarks.pouring.likelihood import ImageLikelihood, observed
-from benchmarks.pouring.power import grid
 from benchmarks.pouring.run import RESULTS
 from benchmarks.rows import read, resumed
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
@@ -83,6 +82,15 @@ class Campaign:
             task.real_system(actions[place], seed=derive_seed(self.seed, "real", k))
             for k, place in enumerate(self.places)
         ]
+
+    def once(self) -> Campaign:
+        """Return a campaign with the first trial of each action alone."""
+        first = [self.places.index(place) for place in dict.fromkeys(self.places)]
+        return Campaign(
+            self.seed,
+            [self.places[k] for k in first],
+            [self.deltas[k] for k in first],
+        )
 
 
 def campaigns(target: str, actions: Tensor, folder: Path) -> list[Campaign]:
@@ -188,12 +196,14 @@ def pour_around(
     files = -(-num // ROWS_A_FILE) * len(actions)
     fill(bank, part, files * ROWS_A_FILE, (0, 1), task.pours, drawn)
     rows = read_bank(bank, part)
-    found = []
-    for action in actions:
-        mine = (rows.action == action).all(1).numpy()
-        images = images_of(rows.poses[mine], task.pours.particles)
-        found.append(Pours(rows.theta[mine].double().numpy(), images))
-    return found
+    return [at_action(rows, action, task) for action in actions]
+
+
+def at_action(rows: Rows, action: Tensor, task: Any) -> Pours:
+    """Return the stored pours at an action."""
+    mine = (rows.action == action).all(1).numpy()
+    images = images_of(rows.poses[mine], task.pours.particles)
+    return Pours(rows.theta[mine].double().numpy(), images)
 
 
 @dataclass(frozen=True)

@@ -19,40 +19,35 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from benchmarks.pouring.around import NUM_JUDGED, density, nearest
-from benchmarks.pouring.bank import Rows, read_parts
+from benchmarks.pouring.around import (
+    NUM_JUDGED,
+    by_target,
+    densities,
+    density,
+    nearest,
+    of_bank,
+)
 from benchmarks.pouring.bank import read as read_bank
-from benchmarks.pouring.grid_belief import GridBelief
-from benchmarks.pouring.learned import PARTS
-from benchmarks.pouring.power import best_power
+from benchmarks.pouring.bank import read_parts
+from benchmarks.pouring.learned import PARTS, best_power
 from benchmarks.pouring.reference import (
     Campaign,
     Pours,
     Reference,
     ReferenceSettings,
+    at_action,
     belief_of,
     box_around,
     pour_around,
     run,
 )
-from benchmarks.rows import column
 from sbi_active.display.table import Table
-from sbi_active.tasks.pouring import images_of
 
 NUM_FOLDS = 3
-
-
-def of_bank(rows: Rows, action: Tensor, task: Any) -> Pours:
-    """Return the bank's pours at an action."""
-    mine = (rows.action == action).all(1).numpy()
-    images = images_of(rows.poses[mine], task.pours.particles)
-    return Pours(rows.theta[mine].double().numpy(), images)
 
 
 def joined(first: Pours, second: Pours) -> Pours:
@@ -90,21 +85,17 @@ def row_of(own: Campaign, judge: Reference, bank: Path, num: int) -> dict[str, o
         bank: Folder of pours.
         num: Number of fresh pours an action.
     """
-    learned, box, task = judge.learned, judge.box, judge.task
-    known, target = judge.pours, task.target
-    images = own.images(task, learned.actions)
-    belief = belief_of(learned, own, images)
-    narrow = box_around([belief])
-    places = list(dict.fromkeys(own.places))
-    deltas = [own.deltas[own.places.index(place)] for place in places]
-    part = f"{target}_{own.seed}"
+    learned, box, task, known = judge.learned, judge.box, judge.task, judge.pours
+    images, alone = own.images(task, learned.actions), own.once()
+    narrow, places = box_around([belief_of(learned, own, images)]), alone.places
+    part = f"{task.target}_{own.seed}"
     fresh = pour_around(bank, part, narrow, learned.actions[places], num, task)
     spent = read_bank(bank, f"around_{part}").cpu_seconds
     stored = read_parts(bank, PARTS)
     theta, cells = known[places[0]].theta, box.cells()
     judged = np.nonzero(narrow.holds(theta[:NUM_JUDGED]))[0]
     rest = np.arange(NUM_JUDGED, len(theta))
-    by_bank_too = [of_bank(stored, learned.actions[place], task) for place in places]
+    by_bank_too = [at_action(stored, learned.actions[p], task) for p in places]
     refined_power = power_of(fresh, by_bank_too, narrow.cells())
     refined, reference, left_refined, left_reference = (
         np.zeros((n, len(cells))) for n in (1, 1, len(judged), len(judged))
@@ -122,33 +113,25 @@ def row_of(own: Campaign, judge: Reference, bank: Path, num: int) -> dict[str, o
         left_reference += other.at(cells, known[place].images[judged])
     at = np.array([nearest(cells, theta[i]) for i in judged])
     power = best_power(left_reference, left_reference[np.arange(len(at)), at])
-    truth = nearest(cells, task.theta_true.double().numpy())
-    told = [
-        [density(scale * row, k, box.volume) for row, k in zip(rows, at, strict=True)]
-        for scale, rows in ((refined_power, left_refined), (power, left_reference))
-    ]
-    middles = GridBelief.middles().double().numpy()
-    inside = box.holds(middles)
-
-    def by_bank(campaign: Campaign, some: list[Tensor], parameters: Any) -> float:
-        log_p = belief_of(learned, campaign, some).log_density.numpy()[inside]
-        return density(log_p, nearest(middles[inside], parameters), box.volume)
-
-    alone = Campaign(own.seed, places, deltas)
+    truth = task.theta_true.double().numpy()
+    place = nearest(cells, truth)
+    told = densities(left_refined, refined_power, at, box.volume)
+    told_reference = densities(left_reference, power, at, box.volume)
     bank_told = [
-        by_bank(alone, [known[p].images[i] for p in places], theta[i]) for i in judged
+        of_bank(judge, alone, [known[p].images[i] for p in places], theta[i])
+        for i in judged
     ]
-    gap = np.array(told[1]) - np.array(told[0])
+    gap = told_reference - told
     return {
         "num_pours": sum(len(pours.theta) for pours in fresh),
         "cpu_pours": spent,
         "power": refined_power,
-        "ours": by_bank(own, images, task.theta_true.double().numpy()),
-        "refined": density(refined_power * refined[0], truth, box.volume),
-        "reference": density(power * reference[0], truth, box.volume),
+        "ours": of_bank(judge, own, images, truth),
+        "refined": density(refined_power * refined[0], place, box.volume),
+        "reference": density(power * reference[0], place, box.volume),
         "left_out_ours": float(np.mean(bank_told)),
-        "left_out_refined": float(np.mean(told[0])),
-        "left_out_reference": float(np.mean(told[1])),
+        "left_out_refined": float(told.mean()),
+        "left_out_reference": float(told_reference.mean()),
         "gap": float(gap.mean()),
         "gap_se": float(gap.std(ddof=1) / np.sqrt(len(gap))),
         "num_left_out": len(gap),
@@ -157,18 +140,13 @@ def row_of(own: Campaign, judge: Reference, bank: Path, num: int) -> dict[str, o
 
 def summarize(rows: list[dict[str, str]]) -> str:
     """Return one line a target."""
-    if not rows:
-        return "no campaigns yet"
     table = []
-    for target in sorted({row["target"] for row in rows}):
-        own = [row for row in rows if row["target"] == target]
-        value = {k: column(own, k) for k in own[0]}
-        names = ("ours", "refined", "reference")
-        error = np.sqrt((value["gap_se"] ** 2).mean() / len(own))
+    for target, value in by_target(rows):
+        names, num = ("ours", "refined", "reference"), len(value["ours"])
+        error = np.sqrt((value["gap_se"] ** 2).mean() / num)
         table.append(
             [
-                target,
-                len(own),
+                *(target, num),
                 " / ".join(f"{np.median(value[k]):.2f}" for k in names),
                 " / ".join(f"{value[f'left_out_{k}'].mean():.2f}" for k in names),
                 f"{value['gap'].mean():.2f} +- {error:.2f}",

@@ -2,6 +2,11 @@
 
 Seeds from 9,000 on belong to the record: nothing else is run on them, and nothing may
 be tuned on them.
+
+Measured sets, as problems of the closed loop.
+
+Their files stand beside the project, see each task's ``DATA``; where they are absent, a
+case of the record says so.
 """
 
 from __future__ import annotations
@@ -11,6 +16,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from types import SimpleNamespace
 from typing import Any, get_args
 
 import numpy as np
@@ -18,14 +24,59 @@ import torch
 
 from benchmarks.criticism import cases as letters
 from benchmarks.criticism.worlds import get_world
+from benchmarks.measured import ball_and_hoop, ball_drops, cascaded_tanks
 from benchmarks.misfit import cases as misfit
 from benchmarks.oracles.calibration import drawn
-from benchmarks.record.measured import MEASURED
 from sbi_active import BoxActions, Campaign, CampaignOptions
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.criticism import Trials, close_loop, identify
+from sbi_active.tasks import ball_and_hoop as hoop_task  # pyright: ignore
+from sbi_active.tasks import cascaded_tanks as tanks_task  # pyright: ignore
+from sbi_active.tasks.servo_pendulum import ServoPendulumTask  # pyright: ignore
 from tests.oracles.problem import Problem
 from tests.oracles.ways import trials_of
+
+
+def servo(*, motor_off: int) -> SimpleNamespace:
+    """Return the servo, with so many trials whose motor is off."""
+    task = ServoPendulumTask()
+    off = np.flatnonzero(task.recordings.motor_off).tolist()
+    rows = [i for i in range(len(task.recordings)) if i not in off]
+    return SimpleNamespace(
+        model=task.simulator,
+        prior=task.prior,
+        trials=task.trials([*rows, *off[:motor_off]], []),
+        effects=task.effects(),
+    )
+
+
+def drops(ball: str) -> SimpleNamespace:
+    """Return the drops of a ball."""
+    task, every = ball_drops, ball_drops.read_drops(ball_drops.DATA)
+    return SimpleNamespace(
+        model=task.make_simulator(),
+        prior=task.make_prior(),
+        trials=task.trials_of([drop for drop in every if drop.ball == ball]),
+        effects=task.make_effects(),
+    )
+
+
+def bench(task: Any, make: Callable[..., Any]) -> Any:
+    """Return a machine with records."""
+    return make(task.read_recordings(task.DATA))
+
+
+MEASURED: dict[str, Callable[[], Any]] = {
+    "servo powered": partial(servo, motor_off=0),
+    "servo motor off": partial(servo, motor_off=1),
+    "hoop": partial(bench, hoop_task, ball_and_hoop.make_bench),
+    "tanks": partial(bench, tanks_task, cascaded_tanks.make_bench),
+    **{
+        f"drops {ball}": partial(drops, ball)
+        for ball in ("baseball", "blue_basketball", "golf_ball", "tennis_ball")
+    },
+}
+
 
 FIRST_SEED = 9_000
 NUM_DRAWS = 2_000

@@ -42,7 +42,7 @@ from torch import Tensor
 from benchmarks.robots.machines import go2_leg
 from benchmarks.robots.models import ARM
 from benchmarks.robots.signals import SHARE, Played, largest, plain
-from benchmarks.rows import benchmark
+from benchmarks.rows import benchmark, column, grouped
 from sbi_active import DiscreteActions, InformationGainDesigner, MixedActions
 from sbi_active.actions import SignalActions
 from sbi_active.criticism import Trials, identify
@@ -71,9 +71,9 @@ class Machine:
         last: Body whose mass is unknown.
         center: Of each joint's range of goals, rad.
         reach: Half of it.
+        bounds: Of damping, armature, dry friction and mass.
         speed: Largest, rad/s.
         torque: Largest, N m.
-        bounds: Of damping, armature, dry friction and mass.
     """
 
     spec: Callable[[], Any]
@@ -82,61 +82,40 @@ class Machine:
     last: str
     center: tuple[float, ...]
     reach: tuple[float, ...]
-    speed: float
-    torque: float
-    bounds: Mapping[str, tuple[float, float]]
+    bounds: tuple[tuple[float, float], ...]
+    speed: float = 8.0
+    torque: float = 20.0
 
     def parameters(self) -> dict[str, tuple[float, float, str]]:
         """Return the unknown ones, with their bounds and places."""
-        found = {}
+        found, (*of_joint, mass) = {}, self.bounds
+        fields = {"damping": "damping", "armature": "armature"}
+        fields |= {"friction": "frictionloss"}
         for joint in self.joints:
             short = joint.removeprefix("FL_").removesuffix("_joint")
-            for what, field in (
-                ("damping", "damping"),
-                ("armature", "armature"),
-                ("friction", "frictionloss"),
-            ):
-                found[f"{short} {what}"] = (*self.bounds[what], f"{joint}.{field}")
-        found["mass"] = (*self.bounds["mass"], f"{self.last}.mass")
-        return found
-
-
-def _arm() -> Any:
-    return mujoco_of().MjSpec.from_string(ARM)
+            for (what, field), ends in zip(fields.items(), of_joint, strict=True):
+                found[f"{short} {what}"] = (*ends, f"{joint}.{field}")
+        return found | {"mass": (*mass, f"{self.last}.mass")}
 
 
 MACHINES = {
     "arm": Machine(
-        _arm,
-        ("shoulder", "elbow"),
-        ("shoulder servo", "elbow servo"),
-        "lower",
-        (0.0, 0.0),
-        (0.8, 1.2),
-        8.0,
-        20.0,
-        {
-            "damping": (0.0, 1.0),
-            "armature": (0.0, 0.1),
-            "friction": (0.0, 1.0),
-            "mass": (0.2, 1.0),
-        },
+        lambda: mujoco_of().MjSpec.from_string(ARM),
+        joints=("shoulder", "elbow"),
+        drives=("shoulder servo", "elbow servo"),
+        last="lower",
+        center=(0.0, 0.0),
+        reach=(0.8, 1.2),
+        bounds=((0.0, 1.0), (0.0, 0.1), (0.0, 1.0), (0.2, 1.0)),
     ),
     "leg": Machine(
         go2_leg,
-        ("FL_hip_joint", "FL_thigh_joint", "FL_calf_joint"),
-        ("FL_hip", "FL_thigh", "FL_calf"),
-        "FL_calf",
-        (0.0, 0.9, -1.8),
-        (0.4, 0.5, 0.6),
-        8.0,
-        20.0,
-        {
-            "damping": (0.0, 2.0),
-            "armature": (0.0, 0.1),
-            "friction": (0.0, 1.5),
-            "mass": (0.1, 0.5),
-        },
+        joints=("FL_hip_joint", "FL_thigh_joint", "FL_calf_joint"),
+        drives=("FL_hip", "FL_thigh", "FL_calf"),
+        last="FL_calf",
+        center=(0.0, 0.9, -1.8),
+        reach=(0.4, 0.5, 0.6),
+        bounds=((0.0, 2.0), (0.0, 0.1), (0.0, 1.5), (0.1, 0.5)),
     ),
 }
 
@@ -281,31 +260,25 @@ def summary(rows: Sequence[Mapping[str, str]]) -> str:
     """Return the table: deviations beside those of the chirps."""
     lines = [
         "| machine | cases | signals | s | deviations, of the chirps' in 60 s: median, "
-        "largest | deviations at most the chirps' | 90 % intervals that cover | "
-        "CPU s |",
-        "|---|---|---|---|---|---|---|---|",
+        "largest | deviations at most the chirps' | 90 % intervals that cover | CPU s |"
     ]
-    for name in MACHINES:
-        own = [row for row in rows if row["machine"] == name]
-        base = {
-            r["case"]: np.array(json.loads(r["sds"]))
-            for r in own
-            if r["arm"] == "chirps"
-        }
-        kinds = dict.fromkeys((r["arm"], float(r["seconds"])) for r in own)
-        for arm, seconds in kinds:
-            some = [
-                r for r in own if r["arm"] == arm and float(r["seconds"]) == seconds
-            ]
-            ratio = np.array([json.loads(r["sds"]) / base[r["case"]] for r in some])
-            inside = sum(int(r["covered"]) for r in some)
-            cpu = np.median([float(r["cpu_seconds"]) for r in some])
-            lines.append(
-                f"| {name} | {len(some)} | {arm} | {seconds:g} | "
-                f"{np.median(ratio):.2f}, {ratio.max():.2f} | "
-                f"{int((ratio <= 1).sum())} of {ratio.size} | "
-                f"{inside} of {ratio.size} | {cpu:.0f} |"
-            )
+    lines.append("|---" * 8 + "|")
+    base = {
+        (r["machine"], r["case"]): np.array(json.loads(r["sds"]))
+        for r in rows
+        if r["arm"] == "chirps"
+    }
+    groups = grouped(rows, "machine", "arm", "seconds")
+    for name, arm, seconds in sorted(groups, key=lambda key: [*MACHINES].index(key[0])):
+        some = groups[name, arm, seconds]
+        ratio = np.array([json.loads(r["sds"]) / base[name, r["case"]] for r in some])
+        inside = sum(int(r["covered"]) for r in some)
+        lines.append(
+            f"| {name} | {len(some)} | {arm} | {float(seconds):g} | "
+            f"{np.median(ratio):.2f}, {ratio.max():.2f} | "
+            f"{int((ratio <= 1).sum())} of {ratio.size} | "
+            f"{inside} of {ratio.size} | {np.median(column(some, 'cpu_seconds')):.0f} |"
+        )
     return "\n".join(lines)
 
 

@@ -37,7 +37,7 @@ from scipy.optimize import least_squares
 from torch import Tensor
 
 from benchmarks.criticism.intervals import rate
-from benchmarks.criticism.scores import counted
+from benchmarks.criticism.problem import counted
 from benchmarks.robots.machines import sines
 from benchmarks.robots.public import PUBLIC, Public
 from benchmarks.rows import benchmark, column

@@ -25,7 +25,7 @@ import numpy as np
 import torch
 
 from benchmarks.robots.models import ARM, CART_POLE, PENDULUM, SPRING_MASS
-from benchmarks.rows import keep
+from benchmarks.rows import in_turn, keep
 from sbi_active import BoxActions
 from sbi_active.mujoco import from_mjcf
 from sbi_active.mujoco.models.spec import mujoco_of
@@ -87,12 +87,7 @@ def measured(models: dict[str, Any], num: int, repeats: int) -> dict[str, Any]:
     for name, given in models.items():
         xml, joint, low, high = given
         own = ways(xml, joint, low, high, num)
-        spent: dict[str, list[float]] = {way: [] for way in own["run"]}
-        for _ in range(repeats):
-            for way, run in own["run"].items():
-                start = time.process_time()
-                run()
-                spent[way].append(time.process_time() - start)
+        spent = in_turn(own["run"], repeats, time.process_time)
         result[name] = {
             "steps": own["steps"],
             "largest_difference_from_bare": own["difference"],

@@ -1,7 +1,6 @@
 r"""Linear-Gaussian problems with a closed form: the error of a belief and what it says.
 
     python -m benchmarks robustness.exact
-    python -m benchmarks robustness.exact --prior box
     python -m benchmarks robustness.exact --histories 200
     python -m benchmarks robustness.exact --summary
 
@@ -11,11 +10,9 @@ Three trials of
     x = (A_0 + \xi A_1) \theta + e, \qquad e \sim \mathcal N(0, .5^2 I),
 
 each passed to ``ASBI.update`` with the simulator, at 2 to 20 parameters and 2 to 200
-numbers. The prior is standard normal, so that the posterior is Gaussian; or a box
-(``--prior box``) wide enough for the posterior to be the Gaussian of the likelihood,
-which takes at least as many numbers as parameters. With ``--histories``, fewer
-simulations than by default, so that beliefs are wrong and shall say so. Columns of
-``results/exact.csv``:
+numbers. The prior is standard normal, so that the posterior is Gaussian. With
+``--histories``, fewer simulations than by default, so that beliefs are wrong and shall
+say so. Columns of ``results/exact.csv``:
 
 - ``kl``: KL(exact || belief) in nats, by 4,000 draws of the exact posterior;
   ``kl_error`` is its standard error;
@@ -35,7 +32,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from sbi.utils import BoxUniform
 from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal
 
@@ -49,7 +45,6 @@ SIZES = (2, 10, 30, 80, 200)
 ACTIONS = ((-1.0,), (0.0,), (1.0,))
 SD = 0.5
 NUM_DRAWS = 4_000
-BEYOND = 8.0  # posterior deviations from the middle to the edge of a box prior
 RESULTS = Path(__file__).parent / "results" / "exact.csv"
 
 
@@ -72,8 +67,8 @@ class Problem:
     exact: MultivariateNormal
 
     @staticmethod
-    def draw(prior: str, dim: int, size: int, seed: int) -> Problem:
-        """Return the problem of a seed; prior is "gaussian" or "box"."""
+    def draw(dim: int, size: int, seed: int) -> Problem:
+        """Return the problem of a seed."""
         with forked_generators(derive_seed(seed, "exact", dim, size)):
             base, slope = torch.randn(2, size, dim).double() / dim**0.5
             truth = torch.randn(1, dim).double()
@@ -87,17 +82,11 @@ class Problem:
 
             x = simulator(truth.expand(len(action), -1), action)
         design = torch.cat([base + a * slope for a in action.double()])
-        precision = design.T @ design / SD**2
-        if prior == "gaussian":
-            precision = precision + torch.eye(dim).double()
+        precision = design.T @ design / SD**2 + torch.eye(dim).double()
         covariance = torch.linalg.inv(precision)
         covariance = 0.5 * (covariance + covariance.T)
         mean = covariance @ design.T @ x.flatten() / SD**2
         exact = MultivariateNormal(mean, covariance)
-        if prior == "box":
-            reach = (BEYOND * exact.stddev).clamp_min(2.0)
-            box = BoxUniform((mean - reach).float(), (mean + reach).float())
-            return Problem(simulator, box, action, x, exact)
         normal = MultivariateNormal(torch.zeros(dim), torch.eye(dim))
         return Problem(simulator, normal, action, x, exact)
 
@@ -134,7 +123,7 @@ def row_of(
 ) -> Mapping[str, object]:
     """Return the error of a belief and what it says, with so many histories or all."""
     start = time.process_time()
-    problem = Problem.draw(prior, dim, size, seed)
+    problem = Problem.draw(dim, size, seed)
     belief = problem.infer(seed, int(histories) if histories else None)
     seconds = time.process_time() - start
     diagnostics = belief.diagnostics
@@ -189,9 +178,8 @@ main = benchmark(
     RESULTS,
     row_of,
     summary,
-    skip=lambda prior, histories, dim, size, seed: prior == "box" and size < dim,
     may_fail=True,
-    prior=("gaussian", "box"),
+    prior=("gaussian",),
     histories=("", "200"),
     dim=DIMS,
     size=SIZES,

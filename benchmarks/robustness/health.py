@@ -8,16 +8,15 @@ Each campaign draws its parameters from the prior and three trials from the simu
 itself, so that any alarm is false; at most 5 % may raise one. Simulators take turns:
 linear, nonlinear, noise that is correlated along the numbers. A fifth of the numbers is
 lost to the sensor, of which the simulator knows nothing (of trials of one number, a
-fifth, told as missing), or nothing is; or a fifth of the simulator's own rows end at
-half their length (those of one number have no measurement). Tests that do not count,
-as too few simulations leave the belief off, are listed as such. Resumable:
+fifth, told as missing), or nothing is. Tests that do not count, as too few simulations
+leave the belief off, are listed as such. Resumable:
 ``results/health.csv`` is appended to.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,7 +40,7 @@ from sbi_active.seeding import derive_seed, forked_generators
 
 RESULTS = Path(__file__).parent / "results" / "health.csv"
 NUMBERS = (1, 10, 50, 200, 500, 1_000)
-LOST = ("nothing", "sensor", "simulator")
+LOST = ("nothing", "sensor")
 MANY = 200  # numbers
 SHARE = 0.2  # of the numbers
 NOISE = 0.1
@@ -98,27 +97,13 @@ def correlated(theta: Tensor, action: Tensor, q: int) -> Tensor:
 SIMULATORS = (linear, nonlinear, correlated)
 
 
-def ends_early(simulator: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """Return a simulator of which a fifth of the numbers are lost."""
-
-    def simulate(theta: Tensor, action: Tensor, q: int) -> Tensor:
-        x = simulator(theta, action, q)
-        ends = torch.rand(len(x)) < SHARE
-        first = q // 2
-        x[ends, first:] = torch.nan
-        return x
-
-    return simulate
-
-
 def run_campaign(q: int, lost: str, index: int) -> dict[str, Any]:
     """Run one campaign and return its row."""
     truth, start = SIMULATORS[index % len(SIMULATORS)], time.process_time()
     seed = derive_seed(index, f"health {q} {lost}")
-    own = ends_early(truth) if lost == "simulator" else truth
 
     def simulator(theta: Tensor, action: Tensor) -> Tensor:
-        return own(theta, action, q)
+        return truth(theta, action, q)
 
     options = CHEAPER if q >= MANY else CHEAP
     run = Campaign(simulator, PRIOR, ACTIONS, method="nsbi", seed=seed, options=options)

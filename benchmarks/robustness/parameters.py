@@ -22,8 +22,8 @@ from torch.distributions import (
     Uniform,
 )
 
-from benchmarks.robustness.attacks import Attacks
 from benchmarks.robustness.exact import Problem
+from benchmarks.robustness.run import Attacks
 from sbi_active import ASBI, RefinementOptions
 from sbi_active.inference import Belief
 from sbi_active.seeding import forked_generators
@@ -93,6 +93,19 @@ def normal_prior(mean: Tensor, covariance: Tensor) -> MultivariateNormal:
     return MultivariateNormal(mean.float(), covariance.float())
 
 
+def check_gaussian(
+    weight: Tensor, sd: float, mean: Tensor | None = None, covariance: Any = None
+) -> Belief:
+    """Check the belief of x = A theta + sd e, theta standard normal by default."""
+    dim = weight.shape[1]
+    mean = torch.zeros(dim) if mean is None else mean
+    covariance = torch.eye(dim) if covariance is None else covariance
+    simulator, x, m, s = gaussian(weight, sd, mean, covariance)
+    belief = inferred(normal_prior(mean, covariance), simulator, x.float())
+    check(belief, m, s)
+    return belief
+
+
 def matrix(size: int, dim: int, seed: int = 3) -> Tensor:
     with forked_generators(seed):
         return torch.randn(size, dim).double() / dim**0.5
@@ -104,17 +117,14 @@ def matrix(size: int, dim: int, seed: int = 3) -> Tensor:
     seconds=600,
 )
 def three_trials(case: tuple[int, int]) -> None:
-    problem = Problem.draw("gaussian", *case, seed=50)
+    problem = Problem.draw(*case, seed=50)
     check(problem.infer(50), problem.exact.mean, problem.exact.stddev)
 
 
 @ATTACKS.add("hundreds of numbers", cases=((1, 1_000), (5, 500), (10, 200)))
 def many_numbers(case: tuple[int, int]) -> None:
     dim, size = case
-    mean, covariance = torch.zeros(dim), torch.eye(dim)
-    simulator, x, m, s = gaussian(matrix(size, dim), 0.5, mean, covariance)
-    belief = inferred(normal_prior(mean, covariance), simulator, x.float())
-    check(belief, m, s)
+    check_gaussian(matrix(size, dim), 0.5)
 
 
 #: One axis of a prior, and where its truth lies.
@@ -182,18 +192,14 @@ def correlated_prior(case: tuple[int, float]) -> None:
     dim, rho = case
     mean = torch.arange(dim).double()
     covariance = (1 - rho) * torch.eye(dim).double() + rho
-    weight = matrix(4, dim)
-    simulator, x, m, s = gaussian(weight, 0.5, mean, covariance)
-    check(inferred(normal_prior(mean, covariance), simulator, x.float()), m, s)
+    check_gaussian(matrix(4, dim), 0.5, mean, covariance)
 
 
 @ATTACKS.add("only the sum is measured", cases=(2, 4, 8, 12, 20), seconds=300)
 def ridge(dim: int) -> None:
-    mean, covariance = torch.zeros(dim), torch.eye(dim)
     weight = torch.ones(1, dim).double()
-    simulator, x, m, s = gaussian(weight, 0.05, mean, covariance)
-    belief = inferred(normal_prior(mean, covariance), simulator, x.float())
-    check(belief, m, s)
+    _, x, _, _ = gaussian(weight, 0.05, torch.zeros(dim), torch.eye(dim))
+    belief = check_gaussian(weight, 0.05)
     with forked_generators(1):
         total = belief.sample((4_000,)).double().sum(1)
     off = float((total.median() - x[0]).abs()) / 0.05
@@ -206,19 +212,16 @@ def ridge(dim: int) -> None:
 )
 def scales(case: tuple[int, float, float]) -> None:
     dim, of_theta, of_x = case
-    mean, covariance = torch.zeros(dim), of_theta**2 * torch.eye(dim).double()
+    covariance = of_theta**2 * torch.eye(dim).double()
     weight = of_x / of_theta * matrix(2 * dim, dim)
-    simulator, x, m, s = gaussian(weight, 0.3 * of_x, mean, covariance)
-    check(inferred(normal_prior(mean, covariance), simulator, x.float()), m, s)
+    check_gaussian(weight, 0.3 * of_x, covariance=covariance)
 
 
 @ATTACKS.add("each parameter of another scale", cases=(3, 7, 10, 14))
 def mixed_scales(dim: int) -> None:
     scale = torch.logspace(-5, 5, dim).double()
-    mean, covariance = 3 * scale, torch.diag(scale**2)
     weight = matrix(2 * dim, dim) / scale
-    simulator, x, m, s = gaussian(weight, 0.3, mean, covariance)
-    check(inferred(normal_prior(mean, covariance), simulator, x.float()), m, s)
+    check_gaussian(weight, 0.3, 3 * scale, torch.diag(scale**2))
 
 
 @ATTACKS.add("permuted parameters", cases=(3, 9))
@@ -227,10 +230,8 @@ def permuted(dim: int) -> None:
     order = torch.randperm(dim, generator=torch.Generator().manual_seed(0))
     weight = matrix(6, dim)
     for index in (torch.arange(dim), order):
-        covariance = torch.diag(scale[index] ** 2)
-        mean = scale[index]
-        simulator, x, m, s = gaussian(weight[:, index], 0.3, mean, covariance)
-        check(inferred(normal_prior(mean, covariance), simulator, x.float()), m, s)
+        own = scale[index]
+        check_gaussian(weight[:, index], 0.3, own, torch.diag(own**2))
 
 
 @ATTACKS.add("outcomes of other shapes and types", cases=("(2, 3)", "numpy", "float16"))
@@ -288,7 +289,7 @@ def same_seed(dim: int) -> None:
     seconds=300,
 )
 def few_simulations(case: tuple[int, int]) -> None:
-    problem = Problem.draw("gaussian", *case, seed=60)
+    problem = Problem.draw(*case, seed=60)
     belief = inferred(
         problem.prior, problem.simulator, problem.x[1].float(), num_histories=200
     )

@@ -17,8 +17,8 @@ from torch.distributions.transforms import (
     SigmoidTransform,
 )
 
-from benchmarks.robustness.attacks import Attacks
 from benchmarks.robustness.campaign_problem import OPTIONS
+from benchmarks.robustness.run import Attacks
 from sbi_active import (
     BoxActions,
     Campaign,

@@ -14,7 +14,7 @@ import os
 import subprocess
 import sys
 
-from benchmarks.robustness.attacks import ROOT, Attacks
+from benchmarks.robustness.run import ROOT, Attacks
 
 ATTACKS = Attacks()
 PLAIN = """

@@ -29,7 +29,7 @@ from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal
 
 from benchmarks.information_gain.run import ExactBelief, rounds
-from benchmarks.rows import grouped, resumed
+from benchmarks.rows import column, grouped, resumed
 from sbi_active import (
     BoxActions,
     DiscreteActions,
@@ -79,8 +79,9 @@ def numerical(num_seeds: int) -> Iterator[Case]:
             belief = ExactBelief(exact, task.prior) if trials else task.prior
             name = f"numerical {variant}, round {trials + 1}"
             best = float(gain(fine).max())
+            given = (box, task.simulator, belief)
             for seed in range(num_seeds):
-                yield Case(name, seed, box, task.simulator, belief, gain, best)
+                yield Case(name, seed, *given, gain, best)
             if trials or variant != "linear":
                 continue
 
@@ -88,20 +89,10 @@ def numerical(num_seeds: int) -> Iterator[Case]:
                 return gain(action) / dear(action)
 
             value = by_cost(fine)
-            scale = float(dear(fine)[value.argmax()])
-            best = float(value.max())
+            scale, name = float(dear(fine)[value.argmax()]), f"{name}, by cost"
             for seed in range(num_seeds):
-                yield Case(
-                    f"{name}, by cost",
-                    seed,
-                    box,
-                    task.simulator,
-                    belief,
-                    by_cost,
-                    best,
-                    scale,
-                    dear,
-                )
+                most = float(value.max())
+                yield Case(name, seed, *given, by_cost, most, scale, dear)
 
 
 def mixed(num_seeds: int) -> Iterator[Case]:
@@ -169,29 +160,23 @@ def table(rows: list[dict[str, Any]]) -> str:
     groups = grouped(rows, "case", "search")
     lines = []
     for (case, search), group in groups.items():
-        regret = torch.tensor([float(r["regret"]) for r in group])
-        error = torch.tensor([float(r["error"]) for r in group])
-        mean = [
-            sum(float(r[key]) for r in group) / len(group)
-            for key in ("num_simulations", "cpu_s")
-        ]
-        share = ""
-        if (case, "exhaustive") in groups:
-            full = groups[case, "exhaustive"]
-            total = sum(float(r["num_simulations"]) for r in full) / len(full)
-            share = f"{mean[0] / total:.1%}"
+        regret, error, spent, cpu = (
+            column(group, key)
+            for key in ("regret", "error", "num_simulations", "cpu_s")
+        )
+        full, share = groups.get((case, "exhaustive")), ""
+        if full:
+            share = f"{spent.mean() / column(full, 'num_simulations').mean():.1%}"
         lines.append(
             [
-                case,
-                search,
-                f"{len(group)}",
-                f"{float(regret.mean()):.3f}",
-                f"{float(regret.max()):.3f}",
-                f"{float((regret <= FOUND).double().mean()):.1%}",
-                f"{float(error.mean()):+.3f}",
-                f"{mean[0]:.0f}",
+                *(case, search, len(group)),
+                f"{regret.mean():.3f}",
+                f"{regret.max():.3f}",
+                f"{(regret <= FOUND).mean():.1%}",
+                f"{error.mean():+.3f}",
+                f"{spent.mean():.0f}",
                 share,
-                f"{mean[1]:.1f}",
+                f"{sum(cpu) / len(cpu):.1f}",
             ]
         )
     header = ["case", "search", "runs", "regret", "largest", "<= .05"]

@@ -8,8 +8,13 @@ from benchmarks.criticism.cases import (
     draw_case,
 )
 from benchmarks.criticism.worlds import get_world
-from benchmarks.criticism.worlds.block import EDGE, GRAVITY, slide
-from benchmarks.criticism.worlds.sliding_block import NOISE_SD, TIMES
+from benchmarks.criticism.worlds.sliding_block import (
+    EDGE,
+    GRAVITY,
+    NOISE_SD,
+    TIMES,
+    slide,
+)
 
 
 def exact_position(near: float, far: float, speed: float, time: float) -> float:

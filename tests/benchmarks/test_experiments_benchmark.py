@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from benchmarks.experiments.reality import Reality
+from benchmarks.experiments.run import Reality
 from benchmarks.misfit.cases import draw_case
 
 

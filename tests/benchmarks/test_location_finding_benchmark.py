@@ -16,7 +16,7 @@ from benchmarks.location_finding import run as run_module
 from benchmarks.location_finding.bounds import (
     contrastive_bounds,
 )
-from benchmarks.location_finding.summary import table
+from benchmarks.location_finding.run import table
 
 
 def normal(*shape: int, seed: int) -> Tensor:

@@ -3,7 +3,7 @@
 import json
 
 from benchmarks.misfit import run
-from benchmarks.misfit.scores import COLUMNS
+from benchmarks.misfit.run import COLUMNS
 from benchmarks.misfit.summary import summary
 
 

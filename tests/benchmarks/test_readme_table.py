@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import readme
+from benchmarks import table as readme
 from benchmarks.__main__ import main
 
 README = Path(__file__).parents[2] / "README.md"

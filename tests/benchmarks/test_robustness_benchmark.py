@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from benchmarks.robustness.attacks import Attacks, attempt
+from benchmarks.robustness.run import Attacks, attempt
 
 ATTACKS = Attacks()
 

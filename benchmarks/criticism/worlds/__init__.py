@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from benchmarks.criticism.worlds import box, numerical, sliding_block, trajectories
+from benchmarks.criticism.worlds import box, numerical, sliding_block
 from benchmarks.criticism.worlds.world import World
 
 __all__ = ["World", "get_world"]
@@ -10,7 +10,7 @@ __all__ = ["World", "get_world"]
 WORLDS = {
     "A": numerical.make_world,
     "B": sliding_block.make_world,
-    "C": trajectories.make_world,
+    "C": sliding_block.make_trajectories,
     "D": box.make_world,
 }
 

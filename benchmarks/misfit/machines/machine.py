@@ -142,12 +142,18 @@ def box(*ranges: tuple[float, float]) -> BoxUniform:
     return BoxUniform(low, high)
 
 
-def uniform_rows(num: int, *ranges: tuple[float, float]) -> Tensor:
-    """Return rows of uniform numbers by torch's generator, float64."""
+def uniform_rows(
+    num: int, *ranges: tuple[float, float], signed: bool = False
+) -> Tensor:
+    """Return rows of uniform numbers by torch's generator, float64.
+
+    Args:
+        num: Number of rows.
+        ranges: Ends of each number.
+        signed: Whether the first number may have either sign.
+    """
     low, high = torch.tensor(ranges, dtype=torch.float64).T
-    return low + (high - low) * torch.rand(num, len(low), dtype=torch.float64)
-
-
-def signs(num: int) -> Tensor:
-    """Return -1 or 1, shape (num,), by torch's generator, float64."""
-    return 2.0 * torch.randint(2, (num,)).double() - 1
+    rows = low + (high - low) * torch.rand(num, len(low), dtype=torch.float64)
+    if signed:
+        rows[:, 0] *= 2.0 * torch.randint(2, (num,)).double() - 1
+    return rows

@@ -150,7 +150,9 @@ def make_tanks(num_trials: int, num_samples: int) -> Machine:
         fn=partial(fill, times=times),
         prior=box((2.5, 5.0), (2.5, 5.0), (2.0, 4.0), (15.0, 50.0)),
         parameter_names=("upper outlet", "lower outlet", "pump gain", "lower area"),
-        draw_actions=draw_actions,
+        draw_actions=lambda num: uniform_rows(
+            num, (2.0, 5.0), (2.0, 5.0), (3.0, 20.0), (3.0, 20.0)
+        ),
         noise_sd=NOISE_SD,
         times=times,
         num_trials=num_trials,
@@ -177,8 +179,3 @@ def make_tanks(num_trials: int, num_samples: int) -> Machine:
         wandering=("wander upper", "wander lower"),
         num_steps=NUM_STEPS,
     )
-
-
-def draw_actions(num: int) -> Tensor:
-    """Return two voltages and two levels, shape (num, 4)."""
-    return uniform_rows(num, (2.0, 5.0), (2.0, 5.0), (3.0, 20.0), (3.0, 20.0))

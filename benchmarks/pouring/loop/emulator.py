@@ -20,6 +20,8 @@ the variance, the share that the process takes for noise is divided by their num
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -152,9 +154,7 @@ class Emulator:
             for effect in poured_effects(world)
         }
         strengths = [effects[name] / scale for name, scale in scales.items()]
-        inputs = np.concatenate(
-            [2 * theta.double().numpy() - 1, np.stack(strengths, 1)], 1
-        )
+        inputs = _inputs(theta, strengths)
         size = np.square(strengths).sum(0)
         processes, roots, widened = [], [], []
         for own in world.actions:
@@ -197,15 +197,8 @@ class Emulator:
             for name, value in phi.items()
         }
         none = np.zeros(num)
-        inputs = np.concatenate(
-            [
-                2 * theta.detach().double().numpy() - 1,
-                np.stack(
-                    [strength.get(k, none) / s for k, s in self.scales.items()], 1
-                ),
-            ],
-            1,
-        )
+        own = [strength.get(k, none) / s for k, s in self.scales.items()]
+        inputs = _inputs(theta, own)
         weight = interpolation(strength.get("camera_offset", none))
         gain = np.sqrt(np.maximum(1 + strength.get("camera_gain", none), 1e-3))
         found = np.empty((num, NUM_NUMBERS))
@@ -214,9 +207,7 @@ class Emulator:
             mine = np.nonzero(near.numpy() == number)[0]
             if not len(mine):
                 continue
-            mean = process.mean(inputs[mine]).reshape(
-                len(mine), len(SHIFTS), NUM_NUMBERS
-            )
+            mean = process.mean(inputs[mine]).reshape(-1, len(SHIFTS), NUM_NUMBERS)
             x = (weight[mine][..., None] * mean).sum(1)
             x[:, VOLUME[0]] *= gain[mine]
             x[:, VOLUME[1]] *= gain[mine] ** 2
@@ -226,56 +217,36 @@ class Emulator:
     def model(self) -> SimulatorModel:
         """Return the simulator of the loop, with noise of unit size."""
 
-        def numbers(
-            theta: Tensor,
-            action: Tensor,
-            *,
-            linear_damping: Any = 0.0,
-            angular_damping: Any = 0.0,
-            tilt: Any = 0.0,
-            bucket_y: Any = 0.0,
-            bucket_height: Any = 0.0,
-            cohesion: Any = 0.0,
-            lag: Any = 0.0,
-            camera_offset: Any = 0.0,
-            camera_gain: Any = 0.0,
-        ) -> Tensor:
-            return self(
-                theta,
-                action,
-                linear_damping=linear_damping,
-                angular_damping=angular_damping,
-                tilt=tilt,
-                bucket_y=bucket_y,
-                bucket_height=bucket_height,
-                cohesion=cohesion,
-                lag=lag,
-                camera_offset=camera_offset,
-                camera_gain=camera_gain,
-            )
+        def numbers(theta: Tensor, action: Tensor, **phi: Any) -> Tensor:
+            return self(theta, action, **phi)
 
+        # A model knows its effects by the signature of its function.
+        keywords = [*self.scales, "camera_offset", "camera_gain"]
+        kinds = inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY
+        numbers.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+            [inspect.Parameter(name, kinds[0]) for name in ("theta", "action")]
+            + [inspect.Parameter(name, kinds[1], default=0.0) for name in keywords]
+        )
         names = list(self.world.task.pours.parameter_names)
         return SimulatorModel(numbers, noise=GaussianNoise(1.0), parameter_names=names)
 
     def effects(self) -> list[Effect]:
         """Return the task's effects, as arguments of :meth:`model`."""
         found = []
-        for effect in self.world.task.effects():
-            keyword = effect.name.replace(" ", "_")
-            if effect.hook == "dynamics":
-                keyword = effect.apply.names[0]
-            found.append(
-                Effect.keyword(
-                    effect.name,
-                    keyword,
-                    prior=effect.prior,
-                    units=effect.units,
-                    family=effect.family,
-                )
-            )
+        for own in self.world.task.effects():
+            is_poured = own.hook == "dynamics"
+            keyword = own.apply.names[0] if is_poured else own.name.replace(" ", "_")
+            given = {"prior": own.prior, "units": own.units, "family": own.family}
+            found.append(Effect.keyword(own.name, keyword, **given))
         return found
 
 
 def side_of(world: World) -> float:
     """Return the mean side of the model's particles, mm."""
     return float(2e3 * world.task.pours.particles.half.mean())
+
+
+def _inputs(theta: Tensor, strengths: Sequence[Array]) -> Array:
+    """Return what the processes take, parameters and then strengths."""
+    own = 2 * theta.detach().double().numpy() - 1
+    return np.concatenate([own, np.stack(strengths, 1)], 1)

@@ -22,11 +22,11 @@ from benchmarks.pouring.bank import read, read_parts
 from benchmarks.pouring.learned import (
     ByAction,
     Learned,
+    best_power,
     both_summaries,
     summaries_of,
 )
 from benchmarks.pouring.likelihood import ImageLikelihood, observed
-from benchmarks.pouring.power import best_power
 from sbi_active.inference.sampling.gaussian_process import (
     GaussianProcess,
     ProcessSettings,
