@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from sbi_active.inference.sampling.student_mixture import (
+from sbi_active.inference.sampling.mixtures import (
     Defended,
     Proposal,
     StudentMixture,

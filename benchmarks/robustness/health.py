@@ -36,7 +36,7 @@ from sbi_active import (
 )
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.diagnostics.verdict import clopper_pearson
-from sbi_active.inference.refinement.regression_error import LARGE
+from sbi_active.inference.refinement.checks import LARGE
 from sbi_active.seeding import derive_seed, forked_generators
 
 RESULTS = Path(__file__).parent / "results" / "health.csv"

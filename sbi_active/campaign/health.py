@@ -20,7 +20,7 @@ from sbi_active.diagnostics.beliefs import check_belief
 from sbi_active.diagnostics.check import check_calibration
 from sbi_active.inference.beliefs.belief import UnchangedBelief
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
-from sbi_active.inference.refinement.regression_error import LARGE
+from sbi_active.inference.refinement.checks import LARGE
 from sbi_active.seeding import derive_seed
 
 Health = Literal["ok", "watch", "alarm"]

@@ -9,7 +9,7 @@ import pyro.distributions as dist
 import torch
 from torch import Tensor
 
-from sbi_active.inference.sampling.gaussian_mixture import fitted_normals
+from sbi_active.inference.sampling.mixtures import fitted_normals
 
 
 @dataclass(frozen=True)

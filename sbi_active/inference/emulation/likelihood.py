@@ -36,7 +36,7 @@ from sbi_active.inference.sampling.gaussian_process import (
     Kind,
     ProcessSettings,
 )
-from sbi_active.inference.sampling.student_mixture import log_student
+from sbi_active.inference.sampling.mixtures import log_student
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation.noise.base import NoiseModel
 from sbi_active.simulation.noise.gaussian import GaussianNoise

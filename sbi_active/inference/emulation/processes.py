@@ -25,17 +25,13 @@ from sbi_active.inference.emulation.summaries import Summary
 from sbi_active.inference.engine.importance import fitted
 from sbi_active.inference.engine.learned import CHEAP
 from sbi_active.inference.engine.pool import PriorDraws
-from sbi_active.inference.refinement.course import Stage, StageSettings
-from sbi_active.inference.refinement.stages import Stages
+from sbi_active.inference.refinement.stages import Stage, Stages, StageSettings
 from sbi_active.inference.regression.outcomes import TrialOutcome
 from sbi_active.inference.regression.regions import Region, whole_space
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.gaussian_process import (
-    GaussianProcess,
-    num_features,
-)
-from sbi_active.inference.sampling.student_mixture import Defended
+from sbi_active.inference.sampling.gaussian_process import GaussianProcess, num_features
+from sbi_active.inference.sampling.mixtures import Defended
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.noise.base import NoiseModel
 

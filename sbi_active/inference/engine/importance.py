@@ -35,11 +35,11 @@ from sbi_active.inference.engine.potential import Density, Potential
 from sbi_active.inference.engine.ridges import Ridge, along_ridges
 from sbi_active.inference.engine.search import Found
 from sbi_active.inference.engine.settings import Settings
-from sbi_active.inference.sampling.gaussian_mixture import fitted_normals
-from sbi_active.inference.sampling.student_mixture import (
+from sbi_active.inference.sampling.mixtures import (
     Defended,
     Proposal,
     StudentMixture,
+    fitted_normals,
 )
 from sbi_active.inference.sampling.weights import (
     effective_sample_size,

@@ -12,8 +12,8 @@ from scipy.special import logsumexp
 from sbi_active.inference.engine.potential import Density, SimulatedPotential
 from sbi_active.inference.engine.search import Found
 from sbi_active.inference.engine.settings import Settings
+from sbi_active.inference.sampling.mixtures import Proposal
 from sbi_active.inference.sampling.smc import Bridged
-from sbi_active.inference.sampling.student_mixture import Proposal
 from sbi_active.inference.sampling.weights import effective_sample_size
 
 Array = NDArray[Any]

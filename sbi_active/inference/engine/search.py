@@ -19,7 +19,7 @@ from scipy.stats import chi2
 
 from sbi_active.inference.engine.potential import Potential
 from sbi_active.inference.sampling.least_squares import Whitener, descend, floored
-from sbi_active.inference.sampling.student_mixture import StudentMixture, lower_factors
+from sbi_active.inference.sampling.mixtures import StudentMixture, lower_factors
 
 Array = NDArray[Any]
 

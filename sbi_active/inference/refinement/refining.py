@@ -20,15 +20,15 @@ from sbi_active.inference.beliefs.enumerated import (
 )
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.declared.contradiction import MAX_INFLATIONS
-from sbi_active.inference.declared.refining import refine_declared
-from sbi_active.inference.declared.settings import RefinementOptions
-from sbi_active.inference.declared.simulated_belief import (
+from sbi_active.inference.declared.refining import (
     DeclaredRecord,
     SimulatedBelief,
+    refine_declared,
 )
-from sbi_active.inference.refinement.course import StageSettings
-from sbi_active.inference.refinement.learned_belief import LearnedBelief
+from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.engine.learned import LearnedBelief
 from sbi_active.inference.refinement.regional import Regions
+from sbi_active.inference.refinement.stages import StageSettings
 from sbi_active.inference.regression.histories import HistoryRecord
 from sbi_active.seeding import derive_seed
 from sbi_active.support import parameter_dim

@@ -15,16 +15,16 @@ from torch.distributions import Distribution
 from sbi_active.inference.declared.contradiction import Contradiction, compared
 from sbi_active.inference.declared.diagnosing import Doubt
 from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.engine.learned import LearnedBelief
 from sbi_active.inference.refinement.checks import (
     Fresh,
     compared_with_fresh,
+    expected_error,
     noise_tails,
     outcomes_at,
+    widened,
 )
-from sbi_active.inference.refinement.course import LIVE, Stage, StageSettings
-from sbi_active.inference.refinement.learned_belief import LearnedBelief
-from sbi_active.inference.refinement.regression_error import expected_error, widened
-from sbi_active.inference.refinement.stages import Stages
+from sbi_active.inference.refinement.stages import LIVE, Stage, Stages, StageSettings
 from sbi_active.inference.regression.histories import Histories, HistoryRecord
 from sbi_active.inference.regression.regions import around, cover, whole_space
 from sbi_active.inference.regression.surrogate import MISFIT, Surrogate, fewest_rows

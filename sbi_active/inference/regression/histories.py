@@ -22,9 +22,7 @@ from sbi_active.inference.regression.surrogate import (
 from sbi_active.inference.rounds.rows import rows_of
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.seeding import derive_seed
-from sbi_active.simulation.outcomes import (
-    Outcome,
-)
+from sbi_active.simulation.outcomes import Outcome
 from sbi_active.simulation.simulator import require_noise
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi, chi2
 
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.gaussian_mixture import fitted_normals
+from sbi_active.inference.sampling.mixtures import fitted_normals
 
 Array = NDArray[Any]
 

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sbi_active.inference.sampling.student_mixture import Proposal, log_normal
+from sbi_active.inference.sampling.mixtures import Proposal, log_normal
 from sbi_active.inference.sampling.weights import (
     effective_sample_size,
     largest_power,

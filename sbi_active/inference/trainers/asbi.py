@@ -25,6 +25,7 @@ from sbi_active.inference.beliefs.belief import (
     compare,
 )
 from sbi_active.inference.beliefs.priors import require_support
+from sbi_active.inference.engine.learned import LearnedBelief
 from sbi_active.inference.models.posterior import ActionPosterior
 from sbi_active.inference.networks.mixture_density import (
     MixtureDensity,
@@ -32,14 +33,10 @@ from sbi_active.inference.networks.mixture_density import (
     train_mixture_density,
 )
 from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
-from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.refinement.refining import refine
 from sbi_active.inference.rounds.condition import pack
 from sbi_active.inference.rounds.rows import Observation
-from sbi_active.inference.trainers.action_rounds import (
-    require_likelihood_loss,
-    takes,
-)
+from sbi_active.inference.trainers.action_rounds import require_likelihood_loss, takes
 from sbi_active.inference.trainers.base import Told, is_finite_somewhere
 from sbi_active.inference.trainers.mixture_rounds import MixtureRounds, training_budget
 from sbi_active.messages import warn

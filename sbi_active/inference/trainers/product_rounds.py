@@ -14,17 +14,17 @@ from torch.distributions import Distribution
 from typing_extensions import Self
 
 from sbi_active.inference.beliefs.belief import Belief
-from sbi_active.inference.beliefs.kernel_belief import KernelBelief
 from sbi_active.inference.beliefs.priors import require_support
+from sbi_active.inference.beliefs.weighted import KernelBelief
 from sbi_active.inference.declared.settings import RefinementOptions
-from sbi_active.inference.models.factors import ActionFactor
-from sbi_active.inference.models.product import (
+from sbi_active.inference.models.factors import (
+    ActionFactor,
     Product,
     TrainedRegion,
     sample_product,
     widened,
 )
-from sbi_active.inference.refinement.course import StageSettings
+from sbi_active.inference.refinement.stages import StageSettings
 from sbi_active.inference.rounds.rows import Observation, require_whole, rows_of
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.trainers.action_rounds import ActionRounds
