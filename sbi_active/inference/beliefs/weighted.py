@@ -8,18 +8,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.arrays import Array
 from sbi_active.inference.beliefs.belief import Belief, within_prior
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.weights import scott
 from sbi_active.seeding import forked_generators
 from sbi_active.support import within_support
-
-Array = NDArray[Any]
 
 
 class WeightedBelief(Belief):
@@ -86,9 +84,6 @@ class WeightedBelief(Belief):
         prior = self._coordinates.sample_prior(num_prior, rng)
         z = rng.permutation(np.concatenate([drawn, prior]))
         return self._coordinates.to_theta(z)
-
-
-BLOCK = 4_000_000  # pairs of a kernel and a row held in memory at once
 
 
 class KernelBelief(Belief):
@@ -161,9 +156,9 @@ class KernelBelief(Belief):
     def _sample(self, num_samples: int) -> Tensor:
         return within_prior(self.prior, self._draw, num_samples, self._kept)
 
-    def _log_prob(self, theta: Tensor) -> Tensor:
+    def _log_prob(self, theta: Tensor, *, block: int = 4_000_000) -> Tensor:
         places = self._draws @ self._inverse.mT
-        size = max(BLOCK // len(places), 1)
+        size = max(block // len(places), 1)  # so many pairs are held in memory at once
         log_weight, parts = self._weight.log(), []
         for rows in (theta.double() @ self._inverse.mT).split(size):
             gap = torch.cdist(rows, places).square()

@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.arrays import Array
 from sbi_active.inference.beliefs.weighted import WeightedBelief
 from sbi_active.inference.declared.contradiction import (
-    MAX_INFLATIONS,
     Contradiction,
     find_contradiction,
 )
@@ -31,26 +30,23 @@ from sbi_active.inference.engine import (
 from sbi_active.inference.engine.infer import share_cut
 from sbi_active.inference.engine.pool import Pool
 from sbi_active.inference.engine.potential import (
-    STEP,
     MeanTable,
     SimulatedLikelihood,
     declares_noise,
     unchanged,
 )
-from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
+from sbi_active.inference.rounds.rows import (
+    NOTHING_EXPLAINS,
+    UnexplainedOutcomeError,
+    warn_missing,
+)
 from sbi_active.inference.sampling.coordinates import (
     NormalCoordinates,
     PriorCoordinates,
 )
 from sbi_active.inference.sampling.mixtures import fitted_normals
 from sbi_active.inference.sampling.weights import normalized, systematic
-from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation.outcomes import MissingRowsWarning
-
-Array = NDArray[Any]
-
-BEYOND = 20.0  # nats below the defensive share at which a density is given up
 
 
 @dataclass(frozen=True)
@@ -136,8 +132,11 @@ class SimulatedBelief(WeightedBelief):
         )
         return torch.from_numpy(density)
 
-    def _log_likelihood(self, theta: Tensor, z: Array) -> Array:
-        floor = self.log_evidence + np.log(self._defensive) - BEYOND
+    def _log_likelihood(
+        self, theta: Tensor, z: Array, *, beyond: float = 20.0
+    ) -> Array:
+        # So many nats below the defensive share a density is given up.
+        floor = self.log_evidence + np.log(self._defensive) - beyond
         return self._likelihood(theta, floor=floor)
 
     def _sample(self, num_samples: int) -> Tensor:
@@ -200,13 +199,12 @@ def refine_declared(
         fit = _gone_on(before.pool, potential, own, rng)
     if fit is None:
         near = _near(hints, coordinates, seed)
-        potential, found, contradiction = _searched(potential, near, own, rng)
+        potential, found, contradiction = _searched(
+            potential, near, own, settings.max_inflations, rng
+        )
         fit = infer(potential, rng, found=found, near=near, settings=own)
     if not len(fit.u):
-        raise UnexplainedOutcomeError(
-            "expected outcomes that some parameters may explain; got none with a "
-            "likelihood; correct the outcome, or leave the trial out"
-        )
+        raise UnexplainedOutcomeError(NOTHING_EXPLAINS)
     belief = SimulatedBelief(prior, potential, fit, defensive=settings.defensive)
     known = diagnose_fit(fit, potential, declared, seed)
     if contradiction is not None:
@@ -220,13 +218,7 @@ def refine_declared(
     if contradiction is not None:  # its likelihood is of another noise
         pool = Pool.empty(potential.dim, len(action))
     belief.histories = DeclaredRecord((action, x), coordinates, table, pool)
-    if num_missing:
-        warn(
-            f"SA301 {num_missing} of {num_simulations} simulations of the refinement "
-            "are missing, by faults of the simulator; their draws were left out",
-            MissingRowsWarning,
-            stacklevel=5,
-        )
+    warn_missing(num_missing, num_simulations, "their draws", stacklevel=5)
     return belief
 
 
@@ -249,13 +241,8 @@ def _near(
     num: int = 250,
 ) -> Array | None:
     """Return draws of all hints, shape (n, d), those first that stand for each."""
-    drawn, base = [], coordinates.base
-    for hint in hints[:2]:
-        with forked_generators(derive_seed(seed, "start")):
-            z = base.to_z(hint.sample(torch.Size([num])).float())
-        inside = base.inside(z)
-        if inside.any():
-            drawn.append(coordinates.from_z(z[inside]))
+    places = coordinates.base.drawn_from(hints[:2], num, seed=seed)
+    drawn = [coordinates.from_z(z) for z in places]
     if not drawn:
         return None
     return np.concatenate([*[u[:1] for u in drawn], *[u[1:] for u in drawn]])
@@ -296,6 +283,7 @@ def _searched(
     potential: SimulatedPotential,
     near: Array | None,
     own: Settings,
+    max_inflations: int,
     rng: np.random.Generator,
     *,
     num_around: int = 64,
@@ -310,11 +298,11 @@ def _searched(
     declared, c = potential.likelihood, potential.coordinates
     points = None if near is None else near[:2]
     found, contradiction = search(potential, rng, points, own.search), None
-    for _ in range(MAX_INFLATIONS):
+    for _ in range(max_inflations):
         if found is None:
             break
         likelihood, best = potential.likelihood, found.modes[:1]
-        residual, jacobian = potential.jacobian(best, unchanged, STEP)
+        residual, jacobian = potential.jacobian(best, unchanged, potential.step)
         around = best + wide * (found.guess.sample(num_around, rng) - best)
         around = np.clip(around, c.low, c.high)
         now = find_contradiction(

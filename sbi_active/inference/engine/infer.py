@@ -11,11 +11,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.inference.engine.bounded import LinearResponse, LineMoves, led_between
 from sbi_active.inference.engine.importance import (
     fitted,
@@ -25,13 +26,11 @@ from sbi_active.inference.engine.importance import (
 )
 from sbi_active.inference.engine.pool import Fit, Pool, PriorDraws
 from sbi_active.inference.engine.potential import Density, Potential
-from sbi_active.inference.engine.search import WIDER, Found
+from sbi_active.inference.engine.search import Found
 from sbi_active.inference.engine.settings import Settings
 from sbi_active.inference.sampling.mixtures import Defended, Proposal, StudentMixture
 from sbi_active.inference.sampling.smc import Bridged, bridge
 from sbi_active.inference.sampling.weights import log_sum_exp, normalized
-
-Array = NDArray[Any]
 
 
 def infer(
@@ -160,7 +159,7 @@ def _around(found: Found, potential: Potential, settings: Settings) -> StudentMi
     """
     c, guess = potential.coordinates, found.guess
     k, d = found.modes.shape
-    cov = guess.factors @ np.swapaxes(guess.factors, 1, 2) / WIDER**2
+    cov = guess.factors @ np.swapaxes(guess.factors, 1, 2) / found.wider**2
     values, vectors = np.linalg.eigh(cov)
     axes = vectors * np.sqrt(np.maximum(values, 1e-24))[:, None]
     length = np.abs(axes).max(1)  # (k, d), in deviations of the prior
@@ -360,17 +359,20 @@ def _log_free(
     rng: np.random.Generator,
     *,
     num: int = 4_000,
+    wider: float = 1.1,
 ) -> float:
     r"""Return the prior's log density of the free coordinates at zero.
 
     Independent of the others, which stay at zero, it is
 
     .. math::
-        p_F(0) = p(0) \Big/ \int p(0, u_F)\, du_F .
+        p_F(0) = p(0) \Big/ \int p(0, u_F)\, du_F ,
+
+    by draws from a normal density a little wider than the prior.
     """
     u = np.zeros((num, potential.dim))
-    u[:, free] = WIDER * rng.standard_normal((len(u), int(free.sum())))
-    square = ((u[:, free] / WIDER) ** 2 + np.log(2 * np.pi * WIDER**2)).sum(1)
+    u[:, free] = wider * rng.standard_normal((len(u), int(free.sum())))
+    square = ((u[:, free] / wider) ** 2 + np.log(2 * np.pi * wider**2)).sum(1)
     log_w = potential.log_prior(u) + 0.5 * square
     integral = log_sum_exp(log_w) - np.log(len(u))
     return float(potential.log_prior(u[:1] * 0)[0] - integral)

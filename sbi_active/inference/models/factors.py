@@ -14,15 +14,14 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
 
+from sbi_active.arrays import Array
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.engine.learned import LearnedBelief, learned_fit
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows, pack
-from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeError
+from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.sampling.mixtures import StudentMixture, fitted_normals
 from sbi_active.threads import single_thread
-
-Array = NDArray[Any]
 
 
 class ActionFactor(ABC):
@@ -125,14 +124,7 @@ class ActionRatio(ActionFactor):
         action = action_rows(action, self.action_dim, num_rows=len(rows))
         return self.estimator(theta.float(), pack(rows, action)).reshape(-1)
 
-    @override
-    def log_factor(self, theta: Tensor, x: Tensor, action: Tensor) -> Tensor:
-        return self.log_ratio(theta, x, action)  # its marginal knows no theta
-
-
-BATCH_SIZE = 20_000  # rows at once, which bounds the memory
-#: Effective draws below which the normalizer is off by more than a tenth of a nat.
-ENOUGH = 100.0
+    log_factor = log_ratio  # its marginal knows no theta
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -249,15 +241,15 @@ class Product:
             total = total + self.model.log_factor(theta, rows, action).double()
         return total
 
-    def log_likelihood(self, z: Array) -> Array:
-        """Return the log likelihood, (n, d) -> (n,)."""
+    def log_likelihood(self, z: Array, *, batch_size: int = 20_000) -> Array:
+        """Return the log likelihood, (n, d) -> (n,), so many rows in memory at once."""
         total = np.full(len(z), -np.inf)
         inside = np.ones(len(z), dtype=bool)
         if self.region is not None:
             inside = self.region.contains(z)
         theta = self.coordinates.to_theta(z[inside])
         with torch.no_grad(), single_thread():
-            parts = [self._evaluate(part) for part in theta.split(BATCH_SIZE)]
+            parts = [self._evaluate(part) for part in theta.split(batch_size)]
         total[inside] = torch.cat(parts).numpy()
         return total
 
@@ -277,6 +269,7 @@ def sample_product(
     *,
     num_effective: float,
     defensive: float,
+    enough: float = 100.0,
 ) -> LearnedBelief:
     r"""Return the belief of a product, sampled by :func:`.infer`.
 
@@ -292,14 +285,11 @@ def sample_product(
         rng: Source of randomness.
         num_effective: Number of effective draws.
         defensive: Share of the prior in the belief.
+        enough: Effective draws below which the normalizer is off by more than a tenth
+            of a nat.
     """
     near = None if hint is None else product.coordinates.to_z(hint)
     fit = learned_fit(product, rng, near=near, num_effective=num_effective)
-    if fit is None:
-        raise UnexplainedOutcomeError(
-            "expected outcomes that some parameters may explain; got none with a "
-            "density under the network; correct the outcome, or leave the trial out"
-        )
     belief = LearnedBelief(prior, fit, defensive=defensive)
     belief.label = "product over trials"
     effective = fit.effective_sample_size
@@ -308,7 +298,7 @@ def sample_product(
         likelihood="learned",
         log_normalizer=fit.log_evidence,
     )
-    if effective < ENOUGH:
+    if effective < enough:
         belief.diagnostics = belief.diagnostics.warned(
             f"SA114 the belief rests on {effective:.0f} effective draws; raise "
             "num_particles"

@@ -20,21 +20,15 @@ References:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2, kurtosis
 
-from sbi_active.inference.refinement.stages import LIVE, Stage, StageSettings
+from sbi_active.arrays import Array
+from sbi_active.inference.refinement.stages import Stage, StageSettings
 from sbi_active.inference.regression.histories import Histories
 from sbi_active.inference.regression.regions import around
-from sbi_active.inference.regression.surrogate import MISFIT, LocalRegression, Surrogate
-
-Array = NDArray[Any]
-
-LARGE = 0.2  # nats that the belief is off
-NUM_REPEATS = 20  # of the coefficients
+from sbi_active.inference.regression.surrogate import LocalRegression, Surrogate
 
 
 def expected_error(
@@ -44,20 +38,23 @@ def expected_error(
     *,
     explained: bool = False,
     num_places: int = 400,
+    num_repeats: int = 20,
 ) -> float:
     """Return the expected divergence from the belief of endless simulations, in nats.
 
     Over draws of the belief (n, d). Where they shall be ``explained``, observations
     that lie further out than simulations are moved to where those lie, so that the
-    error is that of the simulations alone.
+    error is that of the simulations alone. Numbers of places and of repeated
+    coefficients are a choice.
     """
     draws = draws[:: max(len(draws) // num_places, 1)]
     label = surrogate.assign(draws)
-    change = np.zeros((NUM_REPEATS, len(draws)))
+    change = np.zeros((num_repeats, len(draws)))
     for k, fit in enumerate(surrogate.regressions):
         rows = np.flatnonzero(label == k)
         if len(rows):
-            change[:, rows] = _changes(fit, draws[rows], rng, explained=explained)
+            own = rng, num_repeats, explained
+            change[:, rows] = _changes(fit, draws[rows], *own)
     return _nats(change[:, label >= 0])
 
 
@@ -104,7 +101,7 @@ def widened(
     for regions, factors in wider:
         for factor in factors if best is surrogate else ():
             fits = [histories.regress(region.wider(factor)) for region in regions]
-            wide = [fit for fit in fits if fit is not None and fit.excess <= MISFIT]
+            wide = [fit for fit in fits if fit is not None and not fit.has_misfit]
             if len(wide) < len(fits):
                 break
             other = Surrogate(surrogate.coordinates, wide, surrogate.is_cautious)
@@ -120,7 +117,11 @@ def widened(
 
 
 def _changes(
-    fit: LocalRegression, z: Array, rng: np.random.Generator, *, explained: bool
+    fit: LocalRegression,
+    z: Array,
+    rng: np.random.Generator,
+    num_repeats: int,
+    explained: bool,
 ) -> Array:
     """Return what other coefficients would add to log likelihoods, (repeats, n)."""
     features = fit.basis(fit.region.scaled(z))
@@ -134,7 +135,7 @@ def _changes(
         length = np.linalg.norm(error, axis=1)
         error *= (usual / np.maximum(length, usual))[:, None]
     changes = []
-    for _ in range(NUM_REPEATS):
+    for _ in range(num_repeats):
         step = rotated @ (rng.standard_normal((p, q)) * fit.used)
         variance = rng.standard_normal(q) * (2 / freedom) ** 0.5
         square = (step * (step + 2 * error)).sum(1) + error**2 @ variance
@@ -147,10 +148,9 @@ def _nats(change: Array) -> float:
     return 0.5 * float(change.var(-1).mean()) if change.size else np.inf
 
 
-LEAST = 2e-5  # tail probability that so few simulations may tell
-
-
-def noise_tails(stages: list[Stage], *, light: float = -0.3) -> tuple[float, bool]:
+def noise_tails(
+    stages: list[Stage], own: StageSettings, *, light: float = -0.3
+) -> tuple[float, bool]:
     r"""Return the excess kurtosis of residuals, and whether they may have hard edges.
 
     Of all stages: a few hundred numbers tell by it (-1.2 for uniform noise, 0 for
@@ -163,7 +163,7 @@ def noise_tails(stages: list[Stage], *, light: float = -0.3) -> tuple[float, boo
         fit.standardized[:, fit.standardized.var(0) > 1e-6].ravel()
         for stage in stages
         for fit, mass in zip(stage.surrogate.regressions, stage.mass, strict=True)
-        if mass > LIVE and not fit.has_misfit
+        if mass > own.live and not fit.has_misfit
     ]
     values = np.concatenate([np.zeros(0), *residuals])
     if values.size < 100:
@@ -192,7 +192,13 @@ class Fresh:
 
 
 def compared_with_fresh(
-    surrogate: Surrogate, z: Array, x: Array, num_trials: int, own: StageSettings
+    surrogate: Surrogate,
+    z: Array,
+    x: Array,
+    num_trials: int,
+    own: StageSettings,
+    *,
+    least: float = 2e-5,
 ) -> Fresh:
     r"""Compare a surrogate with simulations at draws of its belief.
 
@@ -210,6 +216,7 @@ def compared_with_fresh(
         x: Outcomes there less the observed ones, shape (n, q).
         num_trials: Trials stacked in q.
         own: Settings of the check.
+        least: Tail probability that so few simulations may tell.
 
     References:
         Gelman, Meng & Stern, Statistica Sinica 1996 (realized discrepancies).
@@ -238,7 +245,7 @@ def compared_with_fresh(
         errors.append(error / np.sqrt(widening)[:, None])
     observed, simulated, error, move = map(np.concatenate, (real, known, errors, moves))
     pairs = zip(simulated.T, observed.T, strict=True)
-    tail = [float(_exceedance(*pair).mean().clip(LEAST, 1.0)) for pair in pairs]
+    tail = [float(_exceedance(*pair).mean().clip(least, 1.0)) for pair in pairs]
     worst = int(np.abs(move.mean(0)).argmax())
     deviation = float(move[:, worst].std() / np.sqrt(len(move)))
     return Fresh(
@@ -298,7 +305,7 @@ def _squares(whitened: Array, num_trials: int) -> Array:
 
 
 def outcomes_at(
-    surrogate: Surrogate, draws: Array, pool: Histories
+    surrogate: Surrogate, draws: Array, pool: Histories, own: StageSettings
 ) -> tuple[list[float], float]:
     r"""Return the probability of each trial's outcome, and how blurred that is.
 
@@ -317,6 +324,6 @@ def outcomes_at(
         z = draws[label == k]
         for outcome in fit.outcomes:
             total[outcome.trial] += np.exp(outcome.log_prob(z)).sum()
-            if len(z) > LIVE * len(draws):
+            if len(z) > own.live * len(draws):
                 blur = max(blur, outcome.blur)
     return [float(p) for p in total / len(draws)], float(blur)

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -19,7 +18,6 @@ from sbi_active.inference.beliefs.enumerated import (
     enumerated,
 )
 from sbi_active.inference.beliefs.priors import require_support
-from sbi_active.inference.declared.contradiction import MAX_INFLATIONS
 from sbi_active.inference.declared.refining import (
     DeclaredRecord,
     SimulatedBelief,
@@ -33,8 +31,6 @@ from sbi_active.inference.regression.histories import HistoryRecord
 from sbi_active.seeding import derive_seed
 from sbi_active.support import parameter_dim
 from sbi_active.threads import single_thread
-
-Array = NDArray[Any]
 
 
 def refine(
@@ -161,7 +157,7 @@ def _learned(
         return belief
     histories, sds = belief.histories, regions.histories.noise_sds
     now, inflation = first, 1.0
-    for number in range(MAX_INFLATIONS):
+    for number in range(regions.settings.max_inflations):
         inflation *= now.inflation
         wider = learned(
             seed=derive_seed(seed, "inflated", number),

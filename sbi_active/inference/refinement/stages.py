@@ -13,9 +13,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from torch.distributions import Distribution
 
+from sbi_active.arrays import Array
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.declared.diagnosing import Doubt, judged
 from sbi_active.inference.declared.settings import RefinementOptions
@@ -26,13 +26,9 @@ from sbi_active.inference.engine.learned import (
     learned_fit,
 )
 from sbi_active.inference.regression.residuals import ShapeSettings
-from sbi_active.inference.regression.surrogate import MISFIT
+from sbi_active.inference.regression.surrogate import is_misfit
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
-
-Array = NDArray[Any]
-
-LIVE = 0.01  # mass below which a region is left out of the checks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,6 +80,7 @@ class StageSettings:
         blurred: Share of repeated simulations that would differ, beyond those that do.
         rare: Probability of a trial's outcome, a measurement or none, below which the
             simulator is doubted.
+        live: Mass below which a region is left out of the checks (a choice).
         effective: Share of the particles that must count at each stage, or a
             mode may be lost.
     """
@@ -111,6 +108,7 @@ class StageSettings:
     correlated: float = 0.25
     blurred: float = 0.05
     rare: float = 0.01
+    live: float = 0.01
     effective: float = 0.05
 
 
@@ -119,8 +117,7 @@ class Stage:
     """One stage: learned likelihood, its sample and its normalized log density.
 
     Attributes:
-        surrogate: Learned likelihood.
-        fit: Posterior of the surrogate.
+        fit: Posterior of a learned likelihood.
         defensive: Share of the prior in the density.
         draws: Equally weighted particles, shape (n, d).
         excess: Worst misfit of a region with mass.
@@ -130,7 +127,6 @@ class Stage:
         shrinkage: Nats by which the belief's entropy fell.
     """
 
-    surrogate: Any
     fit: LearnedFit
     defensive: float
     draws: Array
@@ -139,6 +135,11 @@ class Stage:
     error: float
     change: float = np.inf
     shrinkage: float = np.inf
+
+    @property
+    def surrogate(self) -> Any:
+        """The learned likelihood."""
+        return self.fit.potential.learned
 
     def log_prob(self, z: Array) -> Array:
         """Return the log density of the belief at this stage, shape (n,)."""
@@ -162,7 +163,7 @@ class Stage:
 
     def is_settled(self, own: StageSettings) -> bool:
         """Return whether residuals are noise and the stage changed nothing."""
-        if self.excess > MISFIT or self.error > own.small:
+        if is_misfit(self.excess) or self.error > own.small:
             return False
         most = self.draws.shape[1] * np.array([own.settled, 0.1])
         return not np.isfinite(own.settled) or bool(
@@ -281,14 +282,9 @@ class Stages(ABC):
         """Return the stage of a likelihood, its density sampled."""
         num = self.own.oversampling * self.settings.effective_of(self.coordinates.dim)
         fit = learned_fit(surrogate, self.rng, near=near, num_effective=num)
-        if fit is None:
-            raise UnexplainedOutcomeError(
-                "expected outcomes that some parameters may explain; got none with a "
-                "likelihood; correct the outcome, or leave the trial out"
-            )
         draws = fit.draws(1_000, self.rng)
         judged = self.judged(surrogate, draws)
-        return Stage(surrogate, fit, self.settings.defensive, draws, *judged)
+        return Stage(fit, self.settings.defensive, draws, *judged)
 
     def _diagnosed(self) -> Diagnostics:
         """Return figures about the last stage, what it assumes, and warnings."""

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 from typing_extensions import override
 
+from sbi_active.arrays import Array
 from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.weights import log_sum_exp, systematic
-
-Array = NDArray[Any]
 
 
 class Proposal(Protocol):
@@ -229,7 +228,8 @@ def fitted_normals(
     whitening = spread[:, None] * root
     z = np.linalg.solve(whitening, (points - center).T).T
     n, d = z.shape
-    k = max(1, min(num_components, n // max(2 * d + 2, _num_moments(d))))
+    num_moments = d * (d + 3) // 2  # of a mean and a covariance
+    k = max(1, min(num_components, n // max(2 * d + 2, num_moments)))
     share = _spread_responsibility(z, k, rng)
     previous = -np.inf
     for _ in range(num_iterations if k > 1 else 1):
@@ -249,11 +249,6 @@ def fitted_normals(
     return replace(
         mixture, means=mean @ whitening.T + center, factors=whitening @ factor
     )
-
-
-def _num_moments(dim: int) -> int:
-    """Return the numbers in a mean and a covariance."""
-    return dim * (dim + 3) // 2
 
 
 def _spread_responsibility(z: Array, k: int, rng: np.random.Generator) -> Array:
