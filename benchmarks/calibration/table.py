@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from benchmarks.rows import column, grouped
-from sbi_active.diagnostics.verdict import clopper_pearson
+from sbi_active.diagnostics.calibration import clopper_pearson
 
 
 def shares(rows: list[dict[str, str]]) -> str:
