@@ -54,8 +54,7 @@ class MixtureRounds(ActionRounds):
         """Train; for :class:`MixtureDensity` with actions, by the lean loop."""
         trainer: Any = self
         if not (self.has_actions and self._has_settings):
-            sbi_trainer: Any = super()
-            return sbi_trainer._run_training_loop(
+            return self._sbi._run_training_loop(
                 train_loader, val_loader, train_config, loss_args, summarization_kwargs
             )
         self._neural_net.to(self._device)

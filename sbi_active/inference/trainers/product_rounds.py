@@ -116,8 +116,7 @@ class ProductRounds(ActionRounds):
         """
         if not self._is_round(action, belief):
             named = {} if algorithm is None else {"algorithm": algorithm}
-            sbi_trainer: Any = super()
-            return sbi_trainer.append_simulations(
+            return self._sbi.append_simulations(
                 theta,
                 x,
                 exclude_invalid_x=bool(exclude_invalid_x),
