@@ -7,7 +7,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+
+#: An array of numbers of any kind.
+Array = NDArray[Any]
 
 
 def own_tensor(

@@ -10,8 +10,6 @@ from typing import Any, TypeVar
 
 Taking = TypeVar("Taking", bound=Callable[..., Any])
 
-SHOWN = 6  # names or numbers of a list in a repr
-
 
 def require(holds: bool, expected: str, got: Any, advice: str) -> None:
     """Raise if a setting is not what it has to be.
@@ -116,11 +114,11 @@ class Shown:
         return f"{type(self).__name__}({', '.join(parts)})"
 
 
-def _short(value: Any) -> str:
-    """Return a value in a few words."""
+def _short(value: Any, *, most: int = 6) -> str:
+    """Return a value in a few words, of a list at most so many."""
     if isinstance(value, list | tuple):
-        names = [str(getattr(entry, "name", entry)) for entry in value[:SHOWN]]
-        left = [f"{len(value) - SHOWN} more"] if len(value) > SHOWN else []
+        names = [str(getattr(entry, "name", entry)) for entry in value[:most]]
+        left = [f"{len(value) - most} more"] if len(value) > most else []
         return f"[{', '.join([*names, *left])}]"
     if getattr(value, "ndim", 0) == 1 and len(value) > 1:
         return f"{len(value)} from {float(value[0]):g} to {float(value[-1]):g}"

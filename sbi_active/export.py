@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from sbi_active.campaign import Campaign
     from sbi_active.criticism import Report
 
-NUM_CHAINS = 4
-
 
 @suggests
 def to_inference_data(
@@ -30,7 +28,7 @@ def to_inference_data(
     *,
     parameter_names: Sequence[str] | None = None,
     num_samples: int = 2_000,
-    num_chains: int = NUM_CHAINS,
+    num_chains: int = 4,
     model: str | None = None,
     simulator: Callable[..., Any] | None = None,
     action: Tensor | None = None,
@@ -92,7 +90,7 @@ def to_datatree(
     *,
     parameter_names: Sequence[str] | None = None,
     num_samples: int = 2_000,
-    num_chains: int = NUM_CHAINS,
+    num_chains: int = 4,
     model: str | None = None,
     simulator: Callable[..., Any] | None = None,
     action: Tensor | None = None,

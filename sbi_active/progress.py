@@ -7,16 +7,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, ClassVar
 
 #: Says what takes long; the program that uses the library decides where to.
 LOGGER = logging.getLogger("sbi_active")
 LOGGER.addHandler(logging.NullHandler())
-
-LONG = 2.0  # seconds from which a stage is worth a line of the log
-SHOWN = 0.3  # seconds from which it is worth a bar, which otherwise flickers
-TICK = 0.1  # seconds between two looks at the clock
-SIGN = 30.0  # seconds between two lines of one stage
 
 #: How many of how many steps, alike in length, are done; None where nobody knows of
 #: how many.
@@ -61,7 +56,18 @@ class News:
         before: Place where that was, such as "trial 3".
         has_bar: Whether to draw a bar.
         count: Steps done, from which the seconds are estimated in place of that.
+
+    Attributes:
+        long: Seconds from which a stage is worth a line of the log.
+        shown: Seconds from which it is worth a bar, which otherwise flickers.
+        tick: Seconds between two looks at the clock.
+        sign: Seconds between two lines of one stage.
     """
+
+    long: ClassVar[float] = 2.0
+    shown: ClassVar[float] = 0.3
+    tick: ClassVar[float] = 0.1
+    sign: ClassVar[float] = 30.0
 
     def __init__(
         self,
@@ -94,7 +100,7 @@ class News:
 
     def _begin(self) -> None:
         """Say how long it will take where that is known to be long."""
-        if self._expected is not None and self._expected > LONG:
+        if self._expected is not None and self._expected > self.long:
             self._say(f"about {in_words(self._expected)}, as in {self._before}")
         self._thread.start()
 
@@ -116,13 +122,13 @@ class News:
         LOGGER.info("%s, %s", self._what, text)
 
     def _follow(self) -> None:
-        while not self._over.wait(TICK):
+        while not self._over.wait(self.tick):
             seconds = self._seconds
             self._look(seconds)
-            due = LONG if self._said_at is None else self._said_at + SIGN
+            due = self.long if self._said_at is None else self._said_at + self.sign
             if seconds > due:
                 self._say(f"{in_words(seconds)} so far; {self._outlook(seconds)}")
-            if self._has_bar and (seconds > SHOWN or self._bar is not None):
+            if self._has_bar and (seconds > self.shown or self._bar is not None):
                 self._draw(seconds)
 
     def _look(self, seconds: float) -> None:

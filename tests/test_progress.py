@@ -7,9 +7,9 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import SimulatorModel, StudentTNoise, progress
+from sbi_active import SimulatorModel, StudentTNoise
 from sbi_active.criticism import Trials, close_loop
-from sbi_active.progress import stage
+from sbi_active.progress import News, stage
 from tests.effects import BIAS
 
 SOON = 0.05
@@ -18,9 +18,9 @@ SOON = 0.05
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch):
     """Call long what takes a twentieth of a second."""
-    for name in ("LONG", "SHOWN", "SIGN"):
-        monkeypatch.setattr(progress, name, SOON)
-    monkeypatch.setattr(progress, "TICK", 0.01)
+    for name in ("long", "shown", "sign"):
+        monkeypatch.setattr(News, name, SOON)
+    monkeypatch.setattr(News, "tick", 0.01)
 
 
 def lines(caplog):

@@ -33,9 +33,9 @@ from sbi_active import (
     MixtureDensity,
     RefinementOptions,
 )
+from sbi_active.campaign.health import is_off
 from sbi_active.campaign.options import CampaignDetails
-from sbi_active.diagnostics.verdict import clopper_pearson
-from sbi_active.inference.refinement.regression_error import LARGE
+from sbi_active.diagnostics.calibration import clopper_pearson
 from sbi_active.seeding import derive_seed, forked_generators
 
 RESULTS = Path(__file__).parent / "results" / "health.csv"
@@ -127,7 +127,7 @@ def run_campaign(q: int, lost: str, index: int) -> dict[str, Any]:
             p = getattr(trial, name)
             row[f"{name}_{trial.index + 1}"] = "" if p is None else f"{p:.3g}"
         if trial.status == "ok":
-            off = (trial.belief_error or 0.0) > LARGE
+            off = is_off(trial.belief_error or 0.0)
             untested += off + (trial.misfit is None)
     seconds = time.process_time() - start
     row |= {"health": run.health, "untested": untested, "seconds": f"{seconds:.1f}"}

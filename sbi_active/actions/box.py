@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -12,8 +13,6 @@ from typing_extensions import override
 from sbi_active.actions.space import ActionSpace
 from sbi_active.arrays import own_tensor
 from sbi_active.seeding import forked_generators
-
-ROUNDING = 1e-6  # of the width, by which a float32 may leave the box
 
 
 class BoxActions(ActionSpace):
@@ -25,6 +24,9 @@ class BoxActions(ActionSpace):
         names: Names of the entries of the action.
         units: Units of the entries of the action.
 
+    Attributes:
+        leeway: Share of the width by which a float32 may leave the box.
+
     Raises:
         ValueError: If the limits differ in shape, are not finite, or leave no room.
 
@@ -35,6 +37,8 @@ class BoxActions(ActionSpace):
         >>> actions.contains(torch.tensor([[1.0, 0.5], [3.0, 0.5]]))
         tensor([ True, False])
     """
+
+    leeway: ClassVar[float] = 1e-6
 
     def __init__(
         self,
@@ -82,5 +86,5 @@ class BoxActions(ActionSpace):
     @override
     def contains(self, action: Tensor) -> Tensor:
         action = torch.as_tensor(action, dtype=torch.float32)
-        slack = ROUNDING * (self.high - self.low)
+        slack = self.leeway * (self.high - self.low)
         return ((action >= self.low - slack) & (action <= self.high + slack)).all(-1)

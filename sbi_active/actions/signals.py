@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -14,11 +14,6 @@ from typing_extensions import override
 from sbi_active.actions.box import BoxActions
 from sbi_active.arrays import own_tensor
 from sbi_active.seeding import forked_generators
-
-#: Draws at once, and batches without a permitted one after which it is an error.
-BATCH, PATIENCE = 256, 40
-#: Relative excess over a limit that is rounding.
-ROUNDING = 1e-4
 
 Limit = float | tuple[float, float]
 
@@ -50,6 +45,12 @@ class SignalActions(BoxActions):
         duration: Limits in s of the time from the first to the last value that is not
             0, a number for the longest or (shortest, longest).
 
+    Attributes:
+        batch: Number of draws at once.
+        patience: Number of such batches without a permitted action after which it is an
+            error.
+        rounding: Relative excess over a limit that is rounding.
+
     Raises:
         ValueError: If the grid is not uniform, limits are none, or no action is
             permitted.
@@ -68,6 +69,10 @@ class SignalActions(BoxActions):
         >>> space.inputs(torch.tensor([3.0, 0.5, 4.0]))["voltage"].shape
         torch.Size([201])
     """
+
+    batch: ClassVar[int] = 256
+    patience: ClassVar[int] = 40
+    rounding: ClassVar[float] = 1e-4
 
     def __init__(
         self,
@@ -95,7 +100,7 @@ class SignalActions(BoxActions):
         super().__init__(low, high, names=names, units=units)
         if input_times is None:
             input_times = getattr(generator, "input_times", None)
-        self.input_times = _grid(input_times)
+        self.input_times = _grid(input_times, self.rounding)
         self._step = float(self.input_times[1] - self.input_times[0])
         self._amplitude, self._rate, self._duration = amplitude, rate, duration
         self._require_names()
@@ -158,18 +163,18 @@ class SignalActions(BoxActions):
             return self._values[at].reshape(*sample_shape, self.action_dim)
         kept, left = [torch.empty(0, self.action_dim)], num
         with forked_generators(seed):
-            for tries in range(PATIENCE + num):
-                drawn = super().sample((max(BATCH, left),))
+            for tries in range(self.patience + num):
+                drawn = super().sample((max(self.batch, left),))
                 drawn = drawn[self.permits(drawn)][:left]
                 kept.append(drawn)
                 left -= len(drawn)
-                if left == 0 or (tries >= PATIENCE and left == num):
+                if left == 0 or (tries >= self.patience and left == num):
                     break
         if left:
             raise ValueError(
                 f"expected actions whose signals keep their limits; got none among "
-                f"{PATIENCE * BATCH} of {self}; loosen amplitude, rate or duration, or "
-                "narrow low and high to about what is permitted"
+                f"{self.patience * self.batch} of {self}; loosen amplitude, rate or "
+                "duration, or narrow low and high to about what is permitted"
             )
         return torch.cat(kept).reshape(*sample_shape, self.action_dim)
 
@@ -191,18 +196,18 @@ class SignalActions(BoxActions):
             return inside
         for name, u in self.inputs(action.double()).items():
             low, high = _both(_of(self._amplitude, name))
-            slack = ROUNDING * max(
+            slack = self.rounding * max(
                 abs(x) if math.isfinite(x) else 0 for x in (low, high)
             )
             inside &= (u >= low - slack).all(1) & (u <= high + slack).all(1)
             most = _of(self._rate, name)
             if most is not None:
                 change = u.diff(dim=1).abs().amax(1) / self._step
-                inside &= change <= (1 + ROUNDING) * most
+                inside &= change <= (1 + self.rounding) * most
         if self._duration is not None:
             short, long = _both(self._duration)
             time = self._durations(action)
-            slack = ROUNDING * self._step
+            slack = self.rounding * self._step
             inside &= (time >= short - slack) & (time <= long + slack)
         return inside
 
@@ -243,7 +248,7 @@ def _both(limit: Limit | None) -> tuple[float, float]:
     return limit if isinstance(limit, tuple) else (-limit, limit)
 
 
-def _grid(times: Any) -> Tensor:
+def _grid(times: Any, rounding: float) -> Tensor:
     """Return a uniform grid, or raise where it is none."""
     if times is None:
         raise ValueError(
@@ -257,7 +262,7 @@ def _grid(times: Any) -> Tensor:
             f"expected input_times (m,) that increase; got shape {tuple(grid.shape)}; "
             "pass two or more times"
         )
-    if bool(((steps - steps.mean()).abs() > ROUNDING * steps.mean()).any()):
+    if bool(((steps - steps.mean()).abs() > rounding * steps.mean()).any()):
         raise ValueError(
             f"expected input_times with one step; got {float(steps.min()):g} to "
             f"{float(steps.max()):g}; pass a uniform grid"

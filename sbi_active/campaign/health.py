@@ -20,7 +20,6 @@ from sbi_active.diagnostics.beliefs import check_belief
 from sbi_active.diagnostics.check import check_calibration
 from sbi_active.inference.beliefs.belief import UnchangedBelief
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
-from sbi_active.inference.refinement.regression_error import LARGE
 from sbi_active.seeding import derive_seed
 
 Health = Literal["ok", "watch", "alarm"]
@@ -91,7 +90,7 @@ class _Tests:
 
     def add(self, trial: Trial) -> None:
         """Take a trial that the model scored."""
-        if trial.surprise is not None and (trial.belief_error or 0.0) <= LARGE:
+        if trial.surprise is not None and not is_off(trial.belief_error or 0.0):
             self._bet += log_e_value(trial.surprise)
             self._largest_bet = max(self._largest_bet, self._bet)
         self._add_misfit(trial.misfit)
@@ -136,9 +135,19 @@ def misfit(diagnostics: Diagnostics) -> float | None:
             simulator can bear.
     """
     each, joint = diagnostics.tail_probability_of_trial, diagnostics.tail_probability
-    if joint is None or error_nats(diagnostics) > LARGE:
+    if joint is None or is_off(error_nats(diagnostics)):
         return None
     return min(1.0, 2 * min(joint, len(each) * min(each)))
+
+
+def is_off(error: float, *, most: float = 0.2) -> bool:
+    """Return whether a belief is off by more nats than a test by it can bear.
+
+    Args:
+        error: Expected divergence from the belief of endless simulations, nats.
+        most: Number of nats that a test can bear (a choice).
+    """
+    return error > most
 
 
 def error_nats(diagnostics: Diagnostics) -> float:

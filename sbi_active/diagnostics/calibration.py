@@ -1,11 +1,16 @@
-"""Results of a calibration check, stratum by stratum, and the verdict."""
+"""Results of a calibration check: figures, intervals and a verdict by stratum."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Literal
 
+import numpy as np
+import torch
+from sbi.diagnostics.sbc import check_uniformity_frequentist
+from scipy.stats import beta, norm
 from torch import Tensor
 
 if TYPE_CHECKING:
@@ -122,10 +127,9 @@ class Calibration:
 
     def plot(self) -> Figure:
         """Draw ranks as sbi does, coverage, and gaps and coverage by stratum."""
-        from sbi_active.diagnostics.figure import plot_calibration
         from sbi_active.display.figures import legible
 
-        return legible(plot_calibration(self))
+        return legible(_plotted(self))
 
 
 def describe(stratum: Stratum) -> str:
@@ -143,3 +147,191 @@ def worst(verdicts: Sequence[Verdict]) -> Verdict:
     """Return the strictest of verdicts."""
     order: tuple[Verdict, ...] = ("trust", "refine", "stop")
     return order[max((order.index(v) for v in verdicts), default=0)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tolerance:
+    """Tolerances of a verdict.
+
+    Attributes:
+        coverage: Error of the coverage of the 90 % regions.
+        excluded: Shortfall of that coverage beyond which the verdict is "stop".
+        rank_distance: Distance of the ranks' distribution from uniform.
+        lost: Share of what outcomes tell.
+        gap: Nats below which no share counts.
+    """
+
+    coverage: float = 0.05
+    excluded: float = 0.1
+    rank_distance: float = 0.08
+    lost: float = 0.4
+    gap: float = 0.1
+
+
+def judge(
+    name: str,
+    round_: int,
+    ranks: Tensor,
+    gap: Tensor,
+    gained: Tensor,
+    *,
+    num_posterior_samples: int,
+    level: float,
+    tolerance: Tolerance,
+    names: Sequence[str],
+    levels: tuple[float, ...] = (0.5, 0.8, 0.9, 0.95),
+    num_kinds: int = 4,
+) -> Stratum:
+    r"""Return the figures of a stratum.
+
+    Args:
+        name: Name of the stratum.
+        round_: Round of the network.
+        ranks: Ranks, shape (n, d + 1), the last by density.
+        gap: Terms of the log-score gap, shape (n,), nats.
+        gained: log q - log b at the truths, shape (n,), nats.
+        num_posterior_samples: Number of posterior draws L.
+        level: Level of error of one stratum, shared among its figures.
+        tolerance: Tolerance of the figures.
+        names: Names of the parameters.
+        levels: Levels of the smallest regions, .9 among them.
+        num_kinds: Number of kinds of figures beside the ranks of each parameter.
+    """
+    n, dim = len(ranks), ranks.shape[1] - 1
+    each = level / (num_kinds + dim)
+    # The smallest region that holds the truth has the draws of a higher density.
+    credible = 1 - (ranks[:, -1].double() + 0.5) / (num_posterior_samples + 1)
+    coverage, intervals = {}, {}
+    for c in levels:
+        inside = int((credible <= c).sum())
+        coverage[c] = inside / n
+        intervals[c] = clopper_pearson(inside, n, each)
+    uniform = (ranks[:, :dim].double() + 0.5) / (num_posterior_samples + 1)
+    distance = [ks_distance(uniform[:, k].numpy()) for k in range(dim)]
+    margin = math.sqrt(math.log(2 / each) / (2 * n))
+    ranged = [(max(v - margin, 0.0), min(v + margin, 1.0)) for v in distance]
+    p_value = check_uniformity_frequentist(ranks[:, :dim], num_posterior_samples)
+    mean = float(gap.mean())
+    information = float((gap + gained).mean())
+    excess = gap - tolerance.lost * (gap + gained).clamp_min(-20)
+    reasons: list[tuple[Verdict, str]] = []
+    low, high = intervals[0.9]
+    if high < 0.9 - tolerance.excluded:
+        text = (
+            f"90 % regions hold {coverage[0.9]:.0%} of the truths, at most {high:.0%}"
+        )
+        reasons.append(("stop", f"{text}: it excludes the truth too often"))
+    elif high < 0.9 - tolerance.coverage:
+        text = (
+            f"90 % regions hold {coverage[0.9]:.0%} of the truths, at most {high:.0%}"
+        )
+        reasons.append(("refine", f"{text}: it is too sure"))
+    elif low > 0.9 + tolerance.coverage:
+        text = (
+            f"90 % regions hold {coverage[0.9]:.0%} of the truths, at least {low:.0%}"
+        )
+        reasons.append(("refine", f"{text}: it is too wide"))
+    for k, (least, _) in enumerate(ranged):
+        if least > tolerance.rank_distance:
+            text = f"ranks of {names[k]} are {distance[k]:.2f} from uniform"
+            reasons.append(("refine", f"{text}, at least {least:.2f}"))
+    if _interval(gained, each)[1] < 0:
+        text = f"it has {gained.mean():.2f} nats about the truth"
+        reasons.append(("stop", f"{text}: the belief before the outcome knew more"))
+    if _interval(gap, each)[0] > tolerance.gap and _interval(excess, each)[0] > 0:
+        text = f"the log score is {mean:.2f} nats short of {information:.2f}"
+        reasons.append(("refine", f"{text} that outcomes tell: it is blunt"))
+    return Stratum(
+        name=name,
+        round=round_,
+        num_rows=n,
+        coverage=coverage,
+        coverage_interval=intervals,
+        rank_distance=(*distance,),
+        rank_interval=(*ranged,),
+        p_value=(*p_value.tolist(),),
+        gap=mean,
+        gap_interval=_interval(gap, each),
+        information=information,
+        lost=mean / information if information > 0 else float("nan"),
+        verdict=worst([v for v, _ in reasons]),
+        reasons=(*(text for _, text in reasons),),
+    )
+
+
+def clopper_pearson(successes: int, n: int, level: float) -> Interval:
+    """Return the exact binomial interval of a share (Clopper & Pearson 1934)."""
+    k = successes
+    low = 0.0 if k == 0 else float(beta.ppf(level / 2, k, n - k + 1))
+    high = 1.0 if k == n else float(beta.ppf(1 - level / 2, k + 1, n - k))
+    return low, high
+
+
+def ks_distance(values: np.ndarray) -> float:
+    """Return the largest distance of a sample's distribution from uniform."""
+    ordered = np.sort(values)
+    steps = np.arange(len(ordered) + 1) / len(ordered)
+    return float(max((steps[1:] - ordered).max(), (ordered - steps[:-1]).max()))
+
+
+def _interval(values: Tensor, level: float) -> Interval:
+    """Return the normal interval of a mean, without the farthest of terms.
+
+    Single terms of a log score may be tens of nats; they are cut at the 1 % and 99 %
+    points, which moves a lower bound of the gap down.
+    """
+    values = values.double()
+    if len(values) >= 50:
+        ends = values.quantile(torch.tensor([0.01, 0.99], dtype=torch.float64))
+        values = values.clamp(ends[0], ends[1])
+    half = float(norm.isf(level / 2)) * float(values.std()) / len(values) ** 0.5
+    mean = float(values.mean())
+    return mean - half, mean + half
+
+
+def _plotted(found: Calibration) -> Figure:
+    """Draw ranks, TARP, and coverage and gap of each stratum with their intervals."""
+    import matplotlib.pyplot as plt
+    from sbi.analysis.plot import sbc_rank_plot
+
+    figure, axes = plt.subplots(2, 2, figsize=(11, 8), layout="constrained")
+    figure.suptitle(f"calibration: {found.verdict}")
+    for k in range(len(found.parameter_names)):
+        sbc_rank_plot(
+            found.ranks[:, k : k + 1],
+            found.num_posterior_samples,
+            plot_type="cdf",
+            ranks_labels=[found.parameter_names[k]],
+            colors=[f"C{k}"],
+            fig=figure,
+            ax=axes[0, 0],
+        )
+    axes[0, 0].set_title("ranks of the truth")
+    coverage, credibility = found.tarp
+    axes[0, 1].plot(credibility, coverage, color="blue", label="TARP")
+    levels = [*found.overall.coverage]
+    middle = [found.overall.coverage[c] for c in levels]
+    ends = np.array([found.overall.coverage_interval[c] for c in levels]).T
+    axes[0, 1].errorbar(
+        levels, middle, abs(ends - middle), fmt="o", label="smallest regions"
+    )
+    axes[0, 1].plot([0, 1], [0, 1], "k--", label="ideal")
+    axes[0, 1].set(xlabel="credibility level", ylabel="expected coverage")
+    axes[0, 1].legend()
+    place = np.arange(len(found.strata))
+    color = {"trust": "C2", "refine": "C1", "stop": "C3"}
+    for i, s in zip(place, found.strata, strict=True):
+        for ax, value, (low, high) in (
+            (axes[1, 0], s.coverage[0.9], s.coverage_interval[0.9]),
+            (axes[1, 1], s.gap, s.gap_interval),
+        ):
+            error = [[max(value - low, 0)], [max(high - value, 0)]]
+            ax.errorbar(i, value, error, fmt="o", color=color[s.verdict])
+    axes[1, 0].axhline(0.9, color="k", ls="--")
+    axes[1, 0].set_ylabel("coverage of 90 % regions")
+    axes[1, 1].axhline(0.0, color="k", ls="--")
+    axes[1, 1].set_ylabel("log-score gap [nats]")
+    for ax in axes[1]:
+        names = [s.name for s in found.strata]
+        ax.set_xticks(place, names, rotation=90, fontsize=7)
+    return figure

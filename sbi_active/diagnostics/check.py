@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,15 +15,19 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.actions.discrete import Actions, action_space
-from sbi_active.diagnostics.calibration import Calibration, Stratum, worst
+from sbi_active.diagnostics.calibration import (
+    Calibration,
+    Stratum,
+    Tolerance,
+    judge,
+    worst,
+)
 from sbi_active.diagnostics.log_score import (
     gap_by_classifier,
     gap_by_likelihood,
     smooth,
 )
-from sbi_active.diagnostics.rows import RowPosterior
-from sbi_active.diagnostics.strata import stratified_actions
-from sbi_active.diagnostics.verdict import Tolerance, judge
+from sbi_active.diagnostics.rows import RowPosterior, stratified_actions
 from sbi_active.expected import suggests
 from sbi_active.inference.engine.potential import declares_noise
 from sbi_active.inference.models.posterior import ActionPosterior
@@ -31,9 +35,6 @@ from sbi_active.inference.rounds.condition import action_rows, outcome_rows, pac
 from sbi_active.seeding import derive_seed, forked_generators, kept_generators
 from sbi_active.simulation import Simulations, SimulatorModel, simulate
 from sbi_active.threads import single_thread
-
-FEWEST = 100  # rows, as sbi asks for
-TIES = 1e-5  # nats within which densities are ranked at random
 
 
 @dataclass(frozen=True)
@@ -115,11 +116,7 @@ def check_calibration(
         Talts et al. 2018, arXiv:1804.06788; Deistler et al. 2022, arXiv:2210.04815;
         Lemos et al. 2023, arXiv:2302.03026; Linhart et al. 2023, arXiv:2306.03580.
     """
-    if num_simulations < FEWEST or num_posterior_samples < FEWEST:
-        raise ValueError(
-            f"expected at least {FEWEST} simulations and posterior samples; got "
-            f"{num_simulations} and {num_posterior_samples}; use 1000 and 200"
-        )
+    _require_rows(num_simulations, num_posterior_samples)
     if gap not in ("auto", "likelihood", "classifier"):
         raise ValueError(
             f"expected gap 'auto', 'likelihood' or 'classifier'; got {gap!r}; pass one "
@@ -213,6 +210,15 @@ def check_calibration(
     )
 
 
+def _require_rows(num: int, num_draws: int, *, fewest: int = 100) -> None:
+    """Raise if simulations or posterior samples are fewer than sbi asks for."""
+    if min(num, num_draws) < fewest:
+        raise ValueError(
+            f"expected at least {fewest} simulations and posterior samples; got "
+            f"{num} and {num_draws}; use 1000 and 200"
+        )
+
+
 def _figures(rounds: Sequence[_Round]) -> tuple[list[Tensor], ...]:
     parts = [(one.ranks, one.gap, one.gained) for one in rounds]
     return tuple([*part] for part in zip(*parts, strict=True))
@@ -248,7 +254,9 @@ def _check_round(
     sizes: tuple[int, int, int],
     max_strata: int,
     seed: int,
+    ties: float = 1e-5,
 ) -> _Round:
+    """Return the figures of a network, densities within ``ties`` ranked at random."""
     num, num_draws, num_contrastive = sizes
     belief = posterior.belief if belief is None else belief
     if belief is None:
@@ -274,7 +282,7 @@ def _check_round(
     if not hasattr(direct.posterior_estimator, "knows"):
         kept &= condition.isfinite().all(1)  # sbi's networks take no NaN
     num_invalid = int((~kept).sum())
-    rows = replace_rows(rows, kept)
+    rows = rows.at(kept)
     condition, label = condition[kept], label[kept]
     at_rows, index = RowPosterior.of(direct, condition)
     network: Any = at_rows.posterior_estimator
@@ -282,7 +290,7 @@ def _check_round(
 
     def log_density(values: Tensor, row: Tensor) -> Tensor:
         density = network.log_prob(values[:, None], row.reshape(1, 1))[:, 0]
-        return density.double() + TIES * torch.rand(len(density))  # a flat one has ties
+        return density.double() + ties * torch.rand(len(density))  # a flat one has some
 
     fns: list[Any] = [_Coordinate(k) for k in range(dim)]
     with forked_generators(derive_seed(seed, "draws")), torch.no_grad():
@@ -333,14 +341,6 @@ class _Coordinate:
 
     def __call__(self, theta: Tensor, x: Tensor) -> Tensor:
         return theta[:, self.k]
-
-
-def replace_rows(rows: Simulations, kept: Tensor) -> Simulations:
-    """Return the rows that are kept."""
-    parts = {
-        name: getattr(rows, name)[kept] for name in ("theta", "action", "x", "status")
-    }
-    return replace(rows, **parts)
 
 
 def _tarp(rounds: Sequence[_Round], num_draws: int, seed: int) -> tuple[Tensor, Tensor]:

@@ -34,8 +34,6 @@ from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import SimulatorModel, simulate
 from sbi_active.support import within_support
 
-LARGEST = 6.0  # of a classifier's log ratio: what thousands of rows can tell
-
 
 def smooth(belief: Distribution, theta: Tensor) -> Tensor:
     """Return a belief's log density without simulations, (..., d) -> (...)."""
@@ -149,7 +147,8 @@ def gap_by_classifier(
     return torch.from_numpy(terms)
 
 
-def _log_ratio(model: Any, rows: np.ndarray) -> np.ndarray:
+def _log_ratio(model: Any, rows: np.ndarray, *, largest: float = 6.0) -> np.ndarray:
+    """Return a classifier's log ratios, at most what thousands of rows can tell."""
     probability = model.predict_proba(rows)[:, 1]
     ratio = np.log(probability) - np.log1p(-probability)
-    return np.clip(ratio, -LARGEST, LARGEST)
+    return np.clip(ratio, -largest, largest)

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from sbi_active.arrays import Array
 
-SHOWN = 4  # terms of a formula that are written out
 SIMPLE = (1.0, 2.0, 0.5, 3.0, 1.5)  # weights and exponents, the simplest first
 
 
@@ -81,9 +78,14 @@ class Combination:
         first, *others = self.terms
         return Combination((first, *(replace(t, weight=-t.weight) for t in others)))
 
-    def text(self, names: Sequence[str]) -> str:
-        """Return the formula, with the names of all parameters of the simulator."""
-        shown = sorted(self.terms, key=lambda t: not t.log)[:SHOWN]
+    def text(self, names: Sequence[str], *, most: int = 4) -> str:
+        """Return the formula, with the names of all parameters of the simulator.
+
+        Args:
+            names: The names.
+            most: Number of terms that are written out.
+        """
+        shown = sorted(self.terms, key=lambda t: not t.log)[:most]
         if self.is_product:
             text = "".join(_factor(t, names[t.index], i) for i, t in enumerate(shown))
             return text + " * ..." * (len(shown) < len(self.terms))

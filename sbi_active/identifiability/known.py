@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.stats import entropy
 from torch.distributions import Distribution
 
+from sbi_active.arrays import Array
 from sbi_active.identifiability.formula import Combination, Term, linked
-from sbi_active.identifiability.search import KNOWN, search, width
+from sbi_active.identifiability.search import FormulaSettings, search, width
 from sbi_active.seeding import forked_generators
-
-Array = NDArray[Any]
-
-AS_PRIOR = 0.9
-SHOWN = 3  # combinations that are written out
-LEVEL = 0.9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +39,7 @@ class CombinationSettings:
         named: Number of parameters that are named.
         outliers: Share of draws left out: a belief may hold a little of the
             prior.
+        formulas: Settings of the search for formulas.
     """
 
     num_draws: int = 2_000
@@ -55,6 +50,7 @@ class CombinationSettings:
     enough: int = 10
     named: int = 6
     outliers: float = 0.01
+    formulas: FormulaSettings = field(default_factory=FormulaSettings)
 
 
 @dataclass(frozen=True)
@@ -68,8 +64,10 @@ class KnownCombination:
         high: Other end of that interval.
         width: Standard deviation of the sum, or of a product's logarithm, in those of
             the prior.
+        level: Level of the interval.
     """
 
+    level: ClassVar[float] = 0.9
     text: str
     value: float
     low: float
@@ -84,7 +82,7 @@ class KnownCombination:
         value, low, high = (
             f"{v:.{digits}g}" for v in (self.value, self.low, self.high)
         )
-        return f"{self.text} = {value} [{low}, {high}] ({LEVEL:.0%})"
+        return f"{self.text} = {value} [{low}, {high}] ({self.level:.0%})"
 
 
 @dataclass(frozen=True)
@@ -96,14 +94,16 @@ class UnknownCombination:
         width: Width as in :class:`KnownCombination`; the smallest of several
             parameters.
         several: Whether these are parameters, each by itself.
+        as_prior: Width above which it is as wide as the prior, in words.
     """
 
+    as_prior: ClassVar[float] = 0.9
     text: str
     width: float
     several: bool = False
 
     def __str__(self) -> str:
-        if self.width > AS_PRIOR:
+        if self.width > self.as_prior:
             return f"{self.text} (as wide as the prior)"
         least = "at least " if self.several else ""
         return f"{self.text} ({least}{self.width:.0%} as wide as the prior)"
@@ -119,8 +119,10 @@ class Combinations:
     Attributes:
         known: Combinations with their intervals.
         unknown: Combinations that are left open.
+        most_shown: Number of known ones that are written out.
     """
 
+    most_shown: ClassVar[int] = 3
     known: tuple[KnownCombination, ...] = ()
     unknown: tuple[UnknownCombination, ...] = ()
 
@@ -130,9 +132,9 @@ class Combinations:
     def __str__(self) -> str:
         parts = []
         if self.known:
-            known = [*map(str, self.known[:SHOWN])]
-            if len(self.known) > SHOWN:
-                known.append(f"and {len(self.known) - SHOWN} combinations more")
+            known = [*map(str, self.known[: self.most_shown])]
+            if len(self.known) > len(known):
+                known.append(f"and {len(self.known) - len(known)} combinations more")
             parts.append(f"known: {', '.join(known)}")
         if self.unknown:
             parts.append(f"not known: {', '.join(map(str, self.unknown))}")
@@ -212,7 +214,8 @@ def combinations_of_draws(
     own = kept.std(0) / np.maximum(before.std(0), 1e-300)
     filled = _filled(after, before, settings.bins)
     is_open = (own > settings.open) & (filled > settings.filled * own.clip(max=1.0))
-    found = search(moments, np.flatnonzero(is_open).tolist(), low, span)
+    formulas = settings.formulas
+    found = search(moments, np.flatnonzero(is_open).tolist(), low, span, formulas)
     widths = dict(found)
     groups = linked([*widths])
     known = [_known(c, widths[c], after, names) for g in groups for c in g]
@@ -220,7 +223,7 @@ def combinations_of_draws(
     named = {i for c in widths for i in c.index}
     best = min([*own[~is_open].tolist(), *widths.values()], default=np.inf)
     for i in np.flatnonzero(is_open & (own > settings.wide)).tolist():
-        if i not in named and best < KNOWN * own[i]:
+        if i not in named and best < formulas.known * own[i]:
             unknown.append(UnknownCombination(names[i], float(own[i])))
     return Combinations(tuple(known), tuple(unknown))
 
@@ -265,7 +268,7 @@ def _filled(draws: Array, prior: Array, bins: int) -> Array:
 def _known(
     combination: Combination, own: float, draws: Array, names: Sequence[str]
 ) -> KnownCombination:
-    tail = 0.5 * (1 - LEVEL)
+    tail = 0.5 * (1 - KnownCombination.level)
     value = combination.value(draws)
     low, middle, high = np.quantile(value, [tail, 0.5, 1 - tail]).tolist()
     return KnownCombination(combination.text(names), middle, low, high, own)

@@ -4,40 +4,57 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.optimize import minimize_scalar
 
+from sbi_active.arrays import Array
 from sbi_active.identifiability.formula import SIMPLE, Combination, Term
-
-Array = NDArray[Any]
-
-#: A combination is known where it is at least so much narrower, in prior deviations,
-#: than each of its parameters: a tenth, so that three decimals of sampling error or a
-#: strong correlation (.99) are not taken for it.
-KNOWN = 0.1
-#: A formula may be wider than the best one by this factor and be preferred as simpler.
-AS_GOOD = 1.1
-#: Factor of the smallest width within which formulas of different kinds are as good.
-ABOUT_AS_GOOD = 1.3
-#: Width of the best pair from which a shift, as in a * (b + 0.5), is looked for.
-WORTH_A_SHIFT = 0.5
-SHIFTS = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0, 2.0, 4.0)  # in ranges of the parameter
-MOST_TRIPLES = 20  # parameters up to which all triples are tried
-DEPENDENT = 0.1  # share of a direction that is new, below which it is none
-#: Width, in prior deviations, that a combination of known ones may have: rounded
-#: weights leave each of them slightly off what is known, and the differences of many
-#: would add up to a direction of which nothing is.
-TOGETHER = 0.5
-
 
 #: Returns the covariance of the terms, not weighed, and that under the prior: (m, m).
 Moments = Callable[[Sequence[Term]], tuple[Array, Array]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FormulaSettings:
+    """Settings of the search for formulas.
+
+    Attributes:
+        known: Width of a combination that is known, in prior deviations, over that of
+            each of its parameters: a tenth, so that three decimals of sampling error
+            or a strong correlation (.99) are not taken for it.
+        as_good: Factor by which a formula may be wider than the best one and be
+            preferred as simpler.
+        about_as_good: Factor of the smallest width within which formulas of different
+            kinds are as good.
+        worth_a_shift: Width of the best pair from which a shift, as in a * (b + 0.5),
+            is looked for.
+        shifts: Shifts that are tried, in ranges of the parameter.
+        most_shifted: Number of pairs of which a shift is looked for at most, the
+            narrowest first: all of twelve parameters. Each takes some 50 ms, where it
+            may be known.
+        most_triples: Number of parameters up to which all triples are tried.
+        dependent: Share of a direction that is new, below which it is none.
+        together: Width, in prior deviations, that a combination of known ones may have:
+            rounded weights leave each of them slightly off what is known, and the
+            differences of many would add up to a direction of which nothing is.
+        floor: Width below which combinations are as good as each other.
+    """
+
+    known: float = 0.1
+    as_good: float = 1.1
+    about_as_good: float = 1.3
+    worth_a_shift: float = 0.5
+    shifts: tuple[float, ...] = (0.03, 0.06, 0.12, 0.25, 0.5, 1.0, 2.0, 4.0)
+    most_shifted: int = 66
+    most_triples: int = 20
+    dependent: float = 0.1
+    together: float = 0.5
+    floor: float = 0.0
 
 
 def search(
@@ -45,9 +62,7 @@ def search(
     open_parameters: Sequence[int],
     low: Array,
     span: Array,
-    *,
-    floor: float = 0.0,
-    most_shifted: int = 66,
+    limits: FormulaSettings = FormulaSettings(),  # noqa: B008  (frozen)
 ) -> list[tuple[Combination, float]]:
     r"""Return combinations that are known though their parameters are not.
 
@@ -63,9 +78,7 @@ def search(
         open_parameters: Indices of those that are not known by themselves.
         low: Smallest value of each parameter under the prior, shape (d,).
         span: Range of each under the prior, shape (d,).
-        floor: Width below which combinations are as good as each other.
-        most_shifted: Pairs of which a shift is looked for at most, the narrowest first:
-            all of twelve parameters. Each takes some 50 ms, where it may be known.
+        limits: Settings of what counts as known, and as simpler.
 
     Returns:
         Each with its width; empty if there are none.
@@ -83,38 +96,39 @@ def search(
 
     def keep(combination: Combination, own: float) -> None:
         at = [place[i] for i in combination.index]
-        if own > KNOWN * alone[at].min():
+        if own > limits.known * alone[at].min():
             return
         row = np.zeros(len(plain))
         slopes = [float(t.slope(middle[None])[0]) for t in combination.terms]
         row[at] = combination.weight * slopes * deviation[at]
         row /= np.linalg.norm(row)
         rest = row - sum((r @ row) * r for r in rows)
-        if np.linalg.norm(rest) <= DEPENDENT:
+        if np.linalg.norm(rest) <= limits.dependent:
             return
-        if _widest([*(c for c, _ in found), combination], moments) <= TOGETHER:
+        together = [*(c for c, _ in found), combination]
+        if _widest(together, moments) <= limits.together:
             rows.append(rest / np.linalg.norm(rest))
             found.append((combination, own))
 
-    sizes = (2, 3) if len(plain) <= MOST_TRIPLES else (2,)
+    sizes = (2, 3) if len(plain) <= limits.most_triples else (2,)
     for size in sizes:
         ranked = _ranked(moments, open_parameters, size, low)
         for rank, (best, subset) in enumerate(ranked):
             if len(rows) >= len(plain) - 1:
                 return found
-            worth = WORTH_A_SHIFT if size == 2 and rank < most_shifted else KNOWN
-            if best > worth:
+            is_shifted = size == 2 and rank < limits.most_shifted
+            if best > (limits.worth_a_shift if is_shifted else limits.known):
                 break
             known_pair = any({*c.index} <= {*subset} for c, _ in found)
             if not known_pair:
-                needed = KNOWN * alone[[place[i] for i in subset]].min()
-                keep(*_best_formula(moments, subset, low, span, floor, needed))
+                needed = limits.known * alone[[place[i] for i in subset]].min()
+                keep(*_best_formula(moments, subset, low, span, limits, needed))
     for log in (False, True):
         if len(plain) > 3 and (not log or (low[list(open_parameters)] > 0).all()):
             terms = [Term(i, log=log) for i in open_parameters]
             c, s = moments(terms)
             for vector in _eigenvectors(c, s)[1].T:
-                combination = rounded(terms, vector, c, s, floor)
+                combination = rounded(terms, vector, c, s, limits)
                 keep(combination, _own_width(combination, moments))
     return found
 
@@ -166,7 +180,7 @@ def _best_formula(
     subset: tuple[int, ...],
     low: Array,
     span: Array,
-    floor: float,
+    limits: FormulaSettings,
     needed: float,
 ) -> tuple[Combination, float]:
     """Return the simplest formula about as narrow as the best, and its width.
@@ -175,19 +189,16 @@ def _best_formula(
     """
     tried: list[tuple[Combination, float]] = []
 
-    def attempt(terms: Sequence[Term], limit: float) -> None:
+    for terms in _forms(subset, low):
         c, s = moments(terms)
         weight = _eigenvectors(c, s)[1][:, 0]
-        combination = rounded(terms, weight, c, s, limit)
+        combination = rounded(terms, weight, c, s, limits)
         tried.append((combination, _own_width(combination, moments)))
-
-    for terms in _forms(subset, low):
-        attempt(terms, floor)
-    limit = AS_GOOD * max(needed, floor)
-    if len(subset) == 2 and _least_shifted(moments, subset, low, span) <= limit:
-        shifted = _shifted(moments, subset, low, span, floor)
+    limit = limits.as_good * max(needed, limits.floor)
+    if len(subset) == 2 and _least_shifted(moments, subset, low, span, limits) <= limit:
+        shifted = _shifted(moments, subset, low, span, limits)
         tried += [(c, _own_width(c, moments)) for c in shifted]
-    limit = max(ABOUT_AS_GOOD * min(own for _, own in tried), floor)
+    limit = max(limits.about_as_good * min(own for _, own in tried), limits.floor)
     good = [pair for pair in tried if pair[1] <= limit]
     return min(good, key=lambda pair: (pair[0].complexity, pair[1]))
 
@@ -207,6 +218,7 @@ def _least_shifted(
     subset: tuple[int, ...],
     low: Array,
     span: Array,
+    limits: FormulaSettings,
     *,
     refined: int = 3,
 ) -> float:
@@ -217,7 +229,7 @@ def _least_shifted(
     """
     least = np.inf
     for i, other in (subset, subset[::-1]):
-        shifts = _shifts(low[i], span[i])
+        shifts = _shifts(low[i], span[i], limits)
         for _ in range(1 + refined if low[other] > 0 else 0):
             moved = [Term(i, log=True, shift=float(shift)) for shift in shifts]
             parts = moments([Term(other, log=True), *moved])
@@ -227,19 +239,23 @@ def _least_shifted(
             best = int(widths.argmin())
             least = min(least, float(widths[best]))
             ends = shifts[max(best - 1, 0)], shifts[min(best + 1, len(shifts) - 1)]
-            shifts = np.linspace(*ends, 2 * len(SHIFTS))
+            shifts = np.linspace(*ends, 2 * len(limits.shifts))
     return least
 
 
-def _shifts(low: float, span: float) -> Array:
+def _shifts(low: float, span: float, limits: FormulaSettings) -> Array:
     """Return the shifts that are tried of a parameter, ascending."""
-    sizes = span * np.array(SHIFTS)
+    sizes = span * np.array(limits.shifts)
     shifts = np.sort(np.concatenate([-sizes, sizes]))
     return shifts[shifts > -low + 0.02 * span]
 
 
 def _shifted(
-    moments: Moments, subset: tuple[int, ...], low: Array, span: Array, floor: float
+    moments: Moments,
+    subset: tuple[int, ...],
+    low: Array,
+    span: Array,
+    limits: FormulaSettings,
 ) -> Iterator[Combination]:
     """Products in which one of two parameters has a number added, at its best.
 
@@ -254,14 +270,14 @@ def _shifted(
             terms = [Term(j, log=True, shift=moved.get(j, 0.0)) for j in subset]
             if is_free:
                 c, s = moments(terms)
-                return rounded(terms, _eigenvectors(c, s)[1][:, 0], c, s, floor)
+                return rounded(terms, _eigenvectors(c, s)[1][:, 0], c, s, limits)
             product = Combination(tuple(terms))
             both = (product, product.mirrored())
             return min(both, key=lambda one: _own_width(one, moments))
 
         for is_free in (True, False):
             product = partial(made, is_free)
-            best = _best_shift(product, moments, low[i], span[i], floor)
+            best = _best_shift(product, moments, low[i], span[i], limits)
             if best is not None:
                 yield best
 
@@ -271,20 +287,20 @@ def _best_shift(
     moments: Moments,
     low: float,
     span: float,
-    floor: float,
+    limits: FormulaSettings,
 ) -> Combination | None:
     """Return the product of the roundest shift that is about as narrow as the best."""
 
     def narrowest(shift: float) -> float:
         return _own_width(made(shift), moments)
 
-    grid = _shifts(low, span)
+    grid = _shifts(low, span, limits)
     at = int(np.argmin([narrowest(shift) for shift in grid]))
     ends = grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)]
     best: Any = minimize_scalar(
         narrowest, bounds=ends, method="bounded", options={"xatol": 1e-4 * span}
     )
-    limit = max(AS_GOOD * best.fun, floor)
+    limit = max(limits.as_good * best.fun, limits.floor)
     for shift in roundings(float(best.x)):
         if shift > -low + 0.01 * span and narrowest(shift) <= limit:
             return made(shift)
@@ -298,14 +314,18 @@ def width(weight: Array, covariance: Array, prior: Array) -> float:
 
 
 def rounded(
-    terms: Sequence[Term], weight: Array, covariance: Array, prior: Array, floor: float
+    terms: Sequence[Term],
+    weight: Array,
+    covariance: Array,
+    prior: Array,
+    limits: FormulaSettings,
 ) -> Combination:
     """Return the combination of the roundest weights that are about as narrow.
 
     The first weight is 1; each of the others is rounded in turn, and those after it are
     fitted again.
     """
-    limit = max(AS_GOOD * width(weight, covariance, prior), floor)
+    limit = max(limits.as_good * width(weight, covariance, prior), limits.floor)
     size = np.abs(weight) * np.sqrt(prior.diagonal())
     first = 0 if size[0] > 0.1 * size.max() else int(size.argmax())
     weight = weight / weight[first]

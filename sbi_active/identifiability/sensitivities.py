@@ -3,35 +3,73 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.arrays import Array
+from sbi_active.identifiability.formula import Combination
 from sbi_active.seeding import forked_generators
 from sbi_active.support import within_support
 
-Array = NDArray[Any]
 #: Returns x (n, ...) of parameters (n, theta_dim) and actions (n, action_dim), row i
 #: with the same random numbers whatever the parameters; others for another key.
 Simulate = Callable[[Tensor, Tensor, str], Tensor]
 
-STEP = 0.01  # of a derivative, in prior deviations
-#: Share of the largest singular value below which one is an error of the differences:
-#: these are cut off at STEP**2 / 6 of what turns within a deviation, and rounded in
-#: float32.
-NUMERIC = 5e-4
-#: Trials of each action with which a parameter that is not known is hardly determined.
-TRIALS = 100.0
-#: Standard deviations of the noise by which x may differ at places that are said not to
-#: be told apart; TRIALS trials of an action see that at one standard error.
-SAME = 0.1
-EQUAL = 1e-3  # of them, which no number of trials that is ever run sees
-NUM_DRAWS = 2_000
 EPS = float(np.finfo(np.float32).eps)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProbeSettings:
+    """Settings of the search for parameters that no action tells apart.
+
+    Attributes:
+        num_draws: Number of draws of the prior behind its deviations.
+        step: Step of a derivative, in prior deviations.
+        numeric: Share of the largest singular value below which one is an error of the
+            differences: these are cut off at a sixth of the squared step of what turns
+            within a deviation, and rounded in float32.
+        trials: Trials of each action with which a parameter that is not known is hardly
+            determined.
+        same: Standard deviations of the noise by which x may differ at places that are
+            said not to be told apart; that many trials of an action see it at one
+            standard error.
+        equal: Such deviations that no number of trials that is ever run sees.
+        moves: Sizes of moves that are tried, in prior deviations.
+        fewest_moved: Prior deviations that places lie apart to be compared at all.
+        newton_steps: Number of steps back (a choice: Newton's method takes a handful
+            where it converges).
+        open: Deviations above which a parameter is open, as in the belief's.
+        alone: Deviations above which it is said to be so by itself.
+        floor: Width of a formula, in prior deviations, below which differences are no
+            better.
+        fewest_sets: Number of parameter sets that say anything about the others.
+        most_actions: Number of actions at most (a choice).
+        most_sets: Number of parameter sets at each of them (a choice).
+        most_numbers: Number of derivatives that are held in memory.
+    """
+
+    num_draws: int = 2_000
+    step: float = 0.01
+    numeric: float = 5e-4
+    trials: float = 100.0
+    same: float = 0.1
+    equal: float = 1e-3
+    moves: tuple[float, ...] = (1.0, 0.6, 0.35, 0.2)
+    fewest_moved: float = 0.25
+    newton_steps: int = 30
+    open: float = 0.3
+    alone: float = 0.5
+    floor: float = 3e-3
+    fewest_sets: int = 3
+    most_actions: int = 16
+    most_sets: int = 32
+    most_numbers: int = 8_000_000
 
 
 class Sensitivities:
@@ -45,14 +83,16 @@ class Sensitivities:
         free: Sequence[int],
         num_theta: int,
         seed: int,
+        own: ProbeSettings,
     ) -> None:
+        self.own = own
         self.simulate, self.prior, self.actions = simulate, prior, actions
         self.free, self.seed = list(free), seed
         with forked_generators(seed, "identifiability"):
-            draws = prior.sample(torch.Size([NUM_DRAWS])).float()
+            draws = prior.sample(torch.Size([own.num_draws])).float()
         self.draws = draws.double().numpy()
         self.deviation = self.draws.std(0)
-        steps = torch.from_numpy(np.diag(STEP * self.deviation)).float()
+        steps = torch.from_numpy(np.diag(own.step * self.deviation)).float()
         inside = within_support(prior, draws)
         for i in self.free:
             inside &= within_support(prior, draws + steps[i])
@@ -100,17 +140,17 @@ class Sensitivities:
         stacked = self.jacobian.reshape(k, -1, d)
         _, size, vectors = np.linalg.svd(stacked, full_matrices=True)
         size = np.pad(size, ((0, 0), (0, d - size.shape[1])))
-        off = np.sqrt(((self.rounding / self.noise) ** 2).sum((1, 2))) / STEP
-        limit = np.maximum(NUMERIC * size.max(1), off)
+        off = np.sqrt(((self.rounding / self.noise) ** 2).sum((1, 2))) / self.own.step
+        limit = np.maximum(self.own.numeric * size.max(1), off)
         return np.where(size > limit[:, None], size, 0.0), vectors.swapaxes(1, 2)
 
     def covariances(self, practical: bool) -> Array:
         """Return covariances that many trials leave, in prior deviations, (k, d, d)."""
         size, vectors = self.singular()
         largest = np.maximum(size.max(1, keepdims=True), 1e-300)
-        known = (size / (NUMERIC * largest)) ** 2
+        known = (size / (self.own.numeric * largest)) ** 2
         if practical:
-            known = np.minimum(known, TRIALS * size**2)
+            known = np.minimum(known, self.own.trials * size**2)
         information = (vectors * known[:, None, :]) @ vectors.swapaxes(1, 2)
         prior = np.corrcoef(self.draws[:, self.free].T).reshape(2 * [len(self.free)])
         prior = prior + 1e-9 * np.eye(len(prior))
@@ -123,8 +163,11 @@ class Sensitivities:
             return False, False
         gap = np.nan_to_num(np.abs(x - self.base))
         rounding = 2 * self.rounding
-        about = bool((gap <= SAME * self.noise + rounding).all())
-        return about, bool((gap <= EQUAL * self.noise + rounding).all())
+        about, exactly = (
+            bool((gap <= share * self.noise + rounding).all())
+            for share in (self.own.same, self.own.equal)
+        )
+        return about, exactly
 
 
 def _mean(values: Array, axis: Any) -> Array:
@@ -132,3 +175,73 @@ def _mean(values: Array, axis: Any) -> Array:
     there = np.isfinite(values)
     count = there.sum(axis, keepdims=True)
     return np.where(there, values, 0.0).sum(axis, keepdims=True) / np.maximum(count, 1)
+
+
+def moved_along(
+    probe: Sensitivities,
+    indices: Sequence[int],
+    group: Sequence[Combination],
+    turn: int,
+) -> Tensor | None:
+    """Return parameters far from the first at which the combinations are the same."""
+    rng = np.random.default_rng([probe.seed, turn])
+    theta = probe.theta.double().numpy()
+    at = list(indices)
+    scale = probe.deviation[at]
+    result = probe.theta.clone()
+    for _ in range(3):  # other directions for those that found no place inside
+        direction = rng.standard_normal((len(theta), len(at)))
+        gradient = _gradient(theta, group, at) * scale
+        direction -= _solved(gradient, np.einsum("kgi,ki->kg", gradient, direction))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True) + 1e-300
+        for size, sign in product(probe.own.moves, (1.0, -1.0)):
+            tried = theta.copy()
+            tried[:, at] += sign * size * direction * scale
+            tried = _back(tried, theta, group, at, scale, probe.own.newton_steps)
+            rows = torch.from_numpy(np.nan_to_num(tried)).float()
+            inside = within_support(probe.prior, rows)
+            inside &= torch.from_numpy(np.isfinite(tried).all(1))
+            inside &= (result == probe.theta).all(dim=1)
+            result = torch.where(inside[:, None], rows, result)
+    step = (result - probe.theta).double().numpy() / probe.deviation
+    far = np.sqrt((step**2).sum(1))
+    return result if np.median(far) > probe.own.fewest_moved else None
+
+
+def _back(
+    tried: Array,
+    theta: Array,
+    group: Sequence[Combination],
+    at: list[int],
+    scale: Array,
+    num_steps: int,
+) -> Array:
+    """Return the places next to some at which all combinations are as at theta."""
+    if not group:
+        return tried
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        aim = np.stack([c.coordinate(theta) for c in group], 1)
+        for _ in range(num_steps):
+            gap = np.stack([c.coordinate(tried) for c in group], 1) - aim
+            lost = np.asarray(~np.isfinite(gap).all(1))
+            gap[lost], safe = 0.0, np.where(lost[:, None], theta, tried)
+            tried = np.where(lost[:, None], np.nan, tried)
+            gradient = _gradient(safe, group, at) * scale
+            tried[:, at] -= _solved(gradient, gap) * scale
+    return tried
+
+
+def _gradient(theta: Array, group: Sequence[Combination], at: list[int]) -> Array:
+    """Return the derivatives of combinations by parameters, shape (k, g, len(at))."""
+    gradient = np.zeros((len(theta), len(group), len(at)))
+    for row, combination in enumerate(group):
+        for term in combination.terms:
+            gradient[:, row, at.index(term.index)] = term.weight * term.slope(theta)
+    return gradient
+
+
+def _solved(gradient: Array, gap: Array) -> Array:
+    """Return the shortest steps that change combinations by some, (k, g) -> (k, d)."""
+    if not gradient.shape[1]:
+        return np.zeros((len(gap), gradient.shape[2]))
+    return np.einsum("kig,kg->ki", np.linalg.pinv(gradient), gap)

@@ -4,39 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.arrays import Array
 from sbi_active.identifiability.formula import Combination, Term, linked
-from sbi_active.identifiability.level_sets import moved_along
-from sbi_active.identifiability.search import search
+from sbi_active.identifiability.search import FormulaSettings, search
 from sbi_active.identifiability.sensitivities import (
-    EQUAL,
-    SAME,
-    STEP,
+    ProbeSettings,
     Sensitivities,
     Simulate,
+    moved_along,
 )
 
-Array = NDArray[Any]
-
-OPEN = 0.3  # deviations, as in the belief's
-FLOOR = 3e-3  # width, in prior deviations, below which differences are no better
 #: What a direction does to x, exactly nothing or about.
 WHAT = {
     True: "changes nothing",
     False: "changes x by less than a tenth of the noise in a prior deviation",
 }
-FEW = 3  # parameter sets that say anything about the others
-#: Choices: at most so many of the actions, and so many parameter sets at each of them.
-MAX_ACTIONS = 16
-MAX_THETA = 32
-MOST_NUMBERS = 8_000_000  # derivatives that are held in memory
 
 
 @dataclass(frozen=True)
@@ -74,6 +62,7 @@ def find_undetermined(
     num_numbers: int = 1,
     num_permitted: int | None = None,
     seed: int = 0,
+    settings: ProbeSettings = ProbeSettings(),  # noqa: B008  (frozen)
 ) -> tuple[Undetermined, ...]:
     r"""Return parameters that no permitted action tells apart, and what it would see.
 
@@ -102,6 +91,7 @@ def find_undetermined(
         num_numbers: Number of an outcome's numbers; many of them get fewer rows.
         num_permitted: Actions that are permitted; None is endless.
         seed: Seed of the draws.
+        settings: Settings of what is tried, and of what counts as the same.
 
     Returns:
         One a group of parameters; empty if all are told apart.
@@ -111,12 +101,12 @@ def find_undetermined(
         Bioinformatics 2009; Gutenkunst et al., PLoS Comput. Biol. 2007.
     """
     free = [i for i in range(len(names)) if i not in skip]
-    actions = actions[:MAX_ACTIONS]
-    num_rows = min(num_rows, MOST_NUMBERS // (num_numbers * max(len(free), 1)))
-    num_theta = min(num_rows // len(actions), MAX_THETA)
-    if num_theta < FEW or not free:
+    own, actions = settings, actions[: settings.most_actions]
+    num_rows = min(num_rows, own.most_numbers // (num_numbers * max(len(free), 1)))
+    num_theta = min(num_rows // len(actions), own.most_sets)
+    if num_theta < own.fewest_sets or not free:
         return ()
-    probe = Sensitivities(simulate, prior, actions, free, num_theta, seed)
+    probe = Sensitivities(simulate, prior, actions, free, num_theta, seed, own)
     if not np.isfinite(probe.base).any():
         return ()
     where = _where(len(actions), num_permitted)
@@ -131,38 +121,38 @@ def _formulas(
     probe: Sensitivities, names: Sequence[str], where: str, practical: bool
 ) -> tuple[Undetermined, ...]:
     """Return groups with a formula that holds where it was tried."""
-    covariances = probe.covariances(practical)
+    covariances, own = probe.covariances(practical), probe.own
     place = {i: k for k, i in enumerate(probe.free)}
     theta = probe.theta.double().numpy()
     alone = np.sqrt(covariances.diagonal(axis1=1, axis2=2).mean(0))
-    open_parameters = [i for i in probe.free if alone[place[i]] > OPEN]
+    open_parameters = [i for i in probe.free if alone[place[i]] > own.open]
 
     def moments(terms: Sequence[Term]) -> tuple[Array, Array]:
         at = [place[t.index] for t in terms]
         slopes = np.stack([t.slope(theta) * probe.deviation[t.index] for t in terms], 1)
-        own = covariances[:, at][:, :, at] * slopes[:, :, None] * slopes[:, None, :]
+        known = covariances[:, at][:, :, at] * slopes[:, :, None] * slopes[:, None, :]
         prior = np.cov(np.stack([t.coordinate(probe.draws) for t in terms]))
-        return own.mean(0), prior.reshape(len(terms), len(terms))
+        return known.mean(0), prior.reshape(len(terms), len(terms))
 
     low, span = probe.draws.min(0), np.ptp(probe.draws, 0)
-    combinations = [
-        c for c, _ in search(moments, open_parameters, low, span, floor=FLOOR)
-    ]
+    formulas = FormulaSettings(floor=own.floor)
+    found = search(moments, open_parameters, low, span, formulas)
+    combinations = [c for c, _ in found]
     groups = linked(combinations)
     lonely = {*open_parameters} - {
         i for group in groups for c in group for i in c.index
     }
     candidates = [(sorted({i for c in g for i in c.index}), g) for g in groups]
-    candidates += [([i], []) for i in sorted(lonely) if alone[place[i]] > 0.5]
-    found = []
+    candidates += [([i], []) for i in sorted(lonely) if alone[place[i]] > own.alone]
+    told = []
     for indices, group in candidates:
         about, exactly = _holds(probe, indices, group)
         if about and len(indices) > len(group):
-            own = tuple(names[i] for i in indices)
+            each = tuple(names[i] for i in indices)
             known = tuple(c.text(names) for c in group)
-            text = _sentence(own, known, exactly, where)
-            found.append(Undetermined(own, known, exactly, text))
-    return tuple(found)
+            text = _sentence(each, known, exactly, where)
+            told.append(Undetermined(each, known, exactly, text))
+    return tuple(told)
 
 
 def _holds(
@@ -193,7 +183,7 @@ def _local(
         direction[np.arange(len(direction)), np.abs(direction).argmax(1)]
     )[:, None]
     step = np.zeros_like(probe.draws[: len(direction)])
-    small = 3 * STEP
+    small = 3 * probe.own.step
     step[:, probe.free] = small * direction * probe.deviation[probe.free]
     moves = torch.from_numpy(step).float()
     gap = probe.x(probe.theta + moves) - probe.x(probe.theta - moves)
@@ -201,12 +191,12 @@ def _local(
     gap = np.where(np.isfinite(gap), np.abs(gap), np.inf)
     about, exactly = (
         bool((gap <= 2 * small * share * probe.noise + 2 * probe.rounding)[there].all())
-        for share in (SAME, EQUAL)
+        for share in (probe.own.same, probe.own.equal)
     )
     if not about:
         return ()
     shares = np.sqrt((direction**2).mean(0))
-    at = [k for k in range(len(probe.free)) if shares[k] > SAME]
+    at = [k for k in range(len(probe.free)) if shares[k] > probe.own.same]
     if len(at) < 2:
         return ()
     indices = [probe.free[k] for k in at]

@@ -40,7 +40,7 @@ __getattr__ = former_names(
         "ActionLikelihood": "sbi_active.inference.models.factors:ActionLikelihood",
         "ActionRatio": "sbi_active.inference.models.factors:ActionRatio",
         "ChainedBelief": "sbi_active.inference.beliefs.belief:ChainedBelief",
-        "KernelBelief": "sbi_active.inference.beliefs.kernel_belief:KernelBelief",
+        "KernelBelief": "sbi_active.inference.beliefs.weighted:KernelBelief",
         "MixtureDensityNetwork": (
             "sbi_active.inference.networks.mixture_network:MixtureDensityNetwork"
         ),
@@ -48,7 +48,7 @@ __getattr__ = former_names(
         "RatioClassifier": (
             "sbi_active.inference.networks.ratio_network:RatioClassifier"
         ),
-        "RefinedBelief": "sbi_active.inference.refinement.learned_belief:LearnedBelief",
+        "RefinedBelief": "sbi_active.inference.engine.learned:LearnedBelief",
         "Refinement": "sbi_active:RefinementOptions",
         "SeqBED_C": "sbi_active:SeqBED",
         "information_gained": "sbi_active.inference.beliefs.belief:information_gained",

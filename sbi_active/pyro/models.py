@@ -12,7 +12,7 @@ import torch
 from pyro import poutine
 from pyro.poutine.subsample_messenger import _Subsample
 from torch import Tensor
-from torch.distributions import Distribution, Independent, Normal, StudentT, constraints
+from torch.distributions import Distribution, Normal, StudentT, constraints
 
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel, StudentTNoise
@@ -197,36 +197,28 @@ def _latent(trace: Any, outcome: str) -> dict[str, Distribution]:
 
 def _noise(found: list[Any]) -> GaussianNoise | StudentTNoise | None:
     """Return the noise of an outcome of constant scale; None for any other."""
-    bases = [_inner(d) for d in found]
-    kind = type(bases[0])
-    constant = all(
-        type(d) is kind
-        and d.batch_shape == bases[0].batch_shape
-        and torch.equal(getattr(d, "scale", torch.nan * torch.ones(1)), bases[0].scale)
-        for d in bases
-        if hasattr(bases[0], "scale")
-    )
-    if not constant or not isinstance(bases[0], (Normal, StudentT)):
+    first, *others = map(_inner, found)
+    if not isinstance(first, (Normal, StudentT)):
         return None
-    sd = bases[0].scale.reshape(-1)
-    sd = sd[:1] if bool((sd == sd[0]).all()) and len(sd) > 1 else sd
-    sd = sd[0] if len(sd) == 1 and bases[0].scale.numel() > 1 else sd
-    if isinstance(bases[0], Normal):
+    names = ("scale",) if isinstance(first, Normal) else ("scale", "df")
+    for d in others:
+        alike = type(d) is type(first) and d.batch_shape == first.batch_shape
+        if not alike or not all(
+            torch.equal(getattr(d, name), getattr(first, name)) for name in names
+        ):
+            return None
+    sd = first.scale.reshape(-1)
+    sd = sd[0] if len(sd) > 1 and bool((sd == sd[0]).all()) else sd
+    if isinstance(first, Normal):
         return GaussianNoise(sd)
-    df = bases[0].df.reshape(-1)
-    if not all(torch.equal(d.df, bases[0].df) for d in bases):
-        return None
+    df = first.df.reshape(-1)
     if not bool((df == df[0]).all()) or df[0] <= 2:
         return None
     return StudentTNoise(sd * (df[0] / (df[0] - 2)).sqrt(), df[0])
 
 
 def _inner(d: Any) -> Any:
-    while (
-        isinstance(d, Independent)
-        or hasattr(d, "base_dist")
-        and not hasattr(d, "transforms")
-    ):
+    while hasattr(d, "base_dist") and not hasattr(d, "transforms"):
         d = d.base_dist
     return d
 

@@ -21,9 +21,6 @@ from sbi_active.pyro.error_models import SpikeAndSlab
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 
-NUM_PREDICTIVE = 1_000  # simulations under the belief before the trial
-NUM_AVERAGED = 100  # denoised outcomes
-
 
 class RobustBelief(ChainedBelief):
     r"""The network's posterior, averaged over denoised outcomes.
@@ -88,16 +85,25 @@ class RobustASBI(ASBI):
         prior: Prior of the parameters; it and all that follows are those of
             :class:`ASBI`.
         error_model: p(x_o | x); None is :class:`SpikeAndSlab`.
+        num_predictive: Number of simulations under the belief before the trial.
+        num_averaged: Number of denoised outcomes.
 
     Attributes:
         denoised: Denoised outcome of each update.
     """
 
     def __init__(
-        self, prior: Any = None, *args: Any, error_model: Any = None, **kwargs: Any
+        self,
+        prior: Any = None,
+        *args: Any,
+        error_model: Any = None,
+        num_predictive: int = 1_000,
+        num_averaged: int = 100,
+        **kwargs: Any,
     ) -> None:
         super().__init__(prior, *args, **kwargs)
         self.error_model = SpikeAndSlab() if error_model is None else error_model
+        self.num_predictive, self.num_averaged = num_predictive, num_averaged
         self.denoised: list[Denoised] = []
 
     def update(
@@ -139,8 +145,8 @@ class RobustASBI(ASBI):
         assert previous is not None
         seed = int(torch.randint(2**62, ())) if seed is None else seed
         with forked_generators(seed, "predictive"):
-            theta = previous.sample(torch.Size([NUM_PREDICTIVE]))
-        actions = trial.action.expand(NUM_PREDICTIVE, -1)
+            theta = previous.sample(torch.Size([self.num_predictive]))
+        actions = trial.action.expand(self.num_predictive, -1)
         rows = simulate(simulator, theta, actions, seed=derive_seed(seed, "rows"))
         flat, x_o = rows.x.reshape(len(rows.x), -1), trial.x.reshape(-1)
         missing = x_o.isnan()
@@ -150,10 +156,10 @@ class RobustASBI(ASBI):
         rows_alike = (flat.isnan() == lacking).all(1) & ~flat.isinf().any(1)
         flat = torch.where(lacking, 0.0, flat[rows_alike])
         denoised = denoise(x_o, flat, self.error_model, seed=derive_seed(seed, "nuts"))
-        pick = torch.linspace(0, len(denoised.x) - 1, NUM_AVERAGED).long()
+        pick = torch.linspace(0, len(denoised.x) - 1, self.num_averaged).long()
         x = torch.where(lacking, torch.nan, denoised.x[pick].float())
-        x = x.reshape(NUM_AVERAGED, *trial.x.shape)
-        condition = pack(x, trial.action.expand(NUM_AVERAGED, -1)).to(self._device)
+        x = x.reshape(len(pick), *trial.x.shape)
+        condition = pack(x, trial.action.expand(len(pick), -1)).to(self._device)
         prior = require_support(self._prior)
         belief = RobustBelief(deepcopy(network), condition, prior, previous, denoised)
         named(belief, simulator)

@@ -15,11 +15,8 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
-from sbi_active.identifiability.undetermined import (
-    MAX_ACTIONS,
-    Undetermined,
-    find_undetermined,
-)
+from sbi_active.identifiability.sensitivities import ProbeSettings
+from sbi_active.identifiability.undetermined import Undetermined, find_undetermined
 from sbi_active.renamed import takes_loose
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.simulation.model import SimulatorModel, takes_seeds
@@ -263,7 +260,7 @@ def _undetermined(
     actions, num = run.actions.listed(), None
     if actions is None:
         seed = derive_seed(run.seed, "undetermined")
-        actions = run.actions.sample((MAX_ACTIONS,), seed=seed)
+        actions = run.actions.sample((ProbeSettings().most_actions,), seed=seed)
     else:
         num = len(actions)
         with forked_generators(run.seed, "undetermined"):

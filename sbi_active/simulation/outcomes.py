@@ -70,14 +70,15 @@ class Simulations:
     def __len__(self) -> int:
         return len(self.theta)
 
+    def at(self, mask: Tensor) -> Simulations:
+        """Return some rows, by a mask of shape (n,), without tracebacks."""
+        parts = self.theta, self.action, self.x, self.status
+        return Simulations(*(part[mask] for part in parts))
+
     def without_missing(self) -> Simulations:
         """Return the rows that tell something: those not missing."""
         keep = self.status != Outcome.MISSING
-        if bool(keep.all()):
-            return self
-        return Simulations(
-            self.theta[keep], self.action[keep], self.x[keep], self.status[keep]
-        )
+        return self if bool(keep.all()) else self.at(keep)
 
 
 class SimulationError(Explained, RuntimeError):

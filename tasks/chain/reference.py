@@ -11,8 +11,8 @@ from sbi_active.inference.sampling.coordinates import (
     NormalCoordinates,
     PriorCoordinates,
 )
+from sbi_active.inference.sampling.mixtures import StudentMixture
 from sbi_active.inference.sampling.smc import bridge
-from sbi_active.inference.sampling.student_mixture import StudentMixture
 from sbi_active.inference.sampling.weights import (
     effective_sample_size,
     log_sum_exp,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sbi_active.identifiability.formula import Combination, Term
-from sbi_active.identifiability.search import KNOWN, search
+from sbi_active.identifiability.search import FormulaSettings, search
 
 NAMES = [*"abcdef"]
 
@@ -73,5 +73,5 @@ def test_what_is_found_is_known_and_new(num, share):
             row /= np.linalg.norm(row)
             assert own == pytest.approx(np.sqrt(row @ covariance @ row), rel=1e-6)
             alone = np.sqrt(covariance.diagonal()[[*combination.index]])
-            assert own <= KNOWN * alone.min()
+            assert own <= FormulaSettings().known * alone.min()
         assert np.linalg.matrix_rank(rows, tol=1e-4) == len(found) <= num_trials

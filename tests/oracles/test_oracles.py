@@ -16,7 +16,7 @@ import torch
 
 from sbi_active import Campaign, DiscreteActions, RefinementOptions
 from sbi_active.inference import refine
-from sbi_active.inference.declared.simulated_belief import SimulatedBelief
+from sbi_active.inference.declared.refining import SimulatedBelief
 from tests.oracles import controls
 from tests.oracles.judging import Found, Judged, judged
 from tests.oracles.problem import gauss

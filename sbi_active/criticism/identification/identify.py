@@ -21,7 +21,7 @@ from sbi_active.criticism.identification.settings import IdentifySettings
 from sbi_active.criticism.identification.spread import spread
 from sbi_active.expected import suggests
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
-from sbi_active.inference.beliefs.kernel_belief import KernelBelief
+from sbi_active.inference.beliefs.weighted import KernelBelief
 from sbi_active.inference.engine.importance import pareto_shape
 from sbi_active.inference.sampling.weights import (
     effective_sample_size,

@@ -27,7 +27,7 @@ from sbi_active.design.estimators.densities import (
 )
 from sbi_active.design.estimators.emulator import NUM_CHOOSING, kernel, linear
 from sbi_active.design.estimators.entropy import nearest_neighbor_entropy
-from sbi_active.inference.sampling.gaussian_mixture import fitted_normals
+from sbi_active.inference.sampling.mixtures import fitted_normals
 from sbi_active.seeding import forked_generators
 
 

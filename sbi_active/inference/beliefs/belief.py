@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
@@ -19,12 +19,6 @@ from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.messages import warn
 from sbi_active.seeding import forked_generators
 from sbi_active.support import parameter_dim, support_of, within_support
-
-#: Numbers of draws at once: networks take some hundred bytes for each.
-MOST_NUMBERS = 10_000_000
-#: Draws behind moments and a chained belief's normalizer: a hundredth of a deviation.
-NUM_DRAWS = 20_000
-NUM_SHOWN = 2_000  # draws behind the page of a notebook
 
 
 class Belief(Distribution, ABC):
@@ -42,10 +36,13 @@ class Belief(Distribution, ABC):
         label: Label that says how the belief was made, for reports.
         parameter_names: Names of the parameters, where the simulator names them; else
             None.
+        num_draws: Number of draws behind moments and a chained belief's normalizer:
+            they are known to a hundredth of a deviation.
         diagnostics: Diagnostics of its quality.
     """
 
     arg_constraints = {}  # pyright: ignore
+    num_draws: ClassVar[int] = 20_000
     label: str = "belief"
     parameter_names: tuple[str, ...] | None = None
 
@@ -75,7 +72,7 @@ class Belief(Distribution, ABC):
             draws = self._sample(shape.numel()).float()
             return draws.reshape(*shape, *self.event_shape)
 
-    def quick_sample(self, num_samples: int, *, seed: int) -> Tensor:
+    def quick_sample(self, num_samples: int = 2_000, *, seed: int) -> Tensor:
         """Return draws of a seed of their own, (n, theta_dim), for pictures and tables.
 
         Args:
@@ -90,30 +87,30 @@ class Belief(Distribution, ABC):
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Return the log density, (..., theta_dim) -> (...); -inf off the support."""
-        theta = torch.as_tensor(value, dtype=torch.float32)
-        rows = theta.reshape(-1, theta.shape[-1])
-        inside = within_support(self.prior, rows)
-        log_prob = torch.where(inside, self._log_prob(rows).float(), -torch.inf)
-        return log_prob.reshape(theta.shape[:-1])
+        return self._by_rows(self._log_prob, value)
 
     def smooth_log_prob(self, value: Tensor) -> Tensor:
         """Return a log density that costs no simulations, for many places (..., d).
 
         It is :meth:`log_prob` except for beliefs that simulate it.
         """
-        theta = torch.as_tensor(value, dtype=torch.float32)
-        rows = theta.reshape(-1, theta.shape[-1])
-        inside = within_support(self.prior, rows)
-        log_prob = self._smooth_log_prob(rows).float()
-        return torch.where(inside, log_prob, -torch.inf).reshape(theta.shape[:-1])
+        return self._by_rows(self._smooth_log_prob, value)
 
     def _smooth_log_prob(self, theta: Tensor) -> Tensor:
         return self._log_prob(theta)
 
+    def _by_rows(self, density: Callable[[Tensor], Tensor], value: Tensor) -> Tensor:
+        """Return a log density of rows at places of any shape; -inf off the support."""
+        theta = torch.as_tensor(value, dtype=torch.float32)
+        rows = theta.reshape(-1, theta.shape[-1])
+        inside = within_support(self.prior, rows)
+        log_prob = torch.where(inside, density(rows).float(), -torch.inf)
+        return log_prob.reshape(theta.shape[:-1])
+
     @cached_property
     def _moments(self) -> tuple[Tensor, Tensor]:
         with forked_generators(0):  # the same belief, the same moments
-            draws = self.sample((NUM_DRAWS,)).double()
+            draws = self.sample((self.num_draws,)).double()
         return draws.mean(0).float(), draws.var(0).float()
 
     @property
@@ -144,7 +141,7 @@ class Belief(Distribution, ABC):
         return f"{type(self).__name__}({self.label}: {', '.join(cells)})"
 
     def _repr_html_(self) -> str:
-        draws = self.quick_sample(NUM_SHOWN, seed=0)
+        draws = self.quick_sample(seed=0)
         return card(
             f"Belief: {self.label}",
             table(Table.of_parameters(names_of(self, draws.shape[1]), draws)),
@@ -183,7 +180,7 @@ class ChainedBelief(Belief):
         self._estimator = estimator.eval()
         self._condition = condition
         with torch.no_grad():
-            inside = within_support(prior, self._raw(NUM_DRAWS))
+            inside = within_support(prior, self._raw(self.num_draws))
         acceptance = float(inside.double().mean())
         self.diagnostics = self.diagnostics.extended(mass_inside_prior=acceptance)
         self._particles: Tensor | None = None
@@ -201,12 +198,13 @@ class ChainedBelief(Belief):
 
     def _resample(self, previous: Distribution) -> None:
         """Represent the belief by weighted draws of the one before."""
-        draws = previous.sample((NUM_DRAWS,))
+        num = self.num_draws
+        draws = previous.sample((num,))
         log_q = self._log_density(draws)
         log_weight = log_q - previous.log_prob(draws)
-        log_number = torch.tensor(float(NUM_DRAWS)).log()
+        log_number = torch.tensor(float(num)).log()
         self._log_normalizer = torch.logsumexp(log_weight, 0) - log_number
-        index = torch.multinomial(log_weight.softmax(0), NUM_DRAWS, replacement=True)
+        index = torch.multinomial(log_weight.softmax(0), num, replacement=True)
         self._particles = draws[index]
 
     def _sample(self, num_samples: int) -> Tensor:
@@ -232,6 +230,8 @@ def within_prior(
     draw: Callable[[int], Tensor],
     num_samples: int,
     acceptance: float,
+    *,
+    most_numbers: int = 10_000_000,
 ) -> Tensor:
     """Return draws that lie within a prior's support, shape (num_samples, d).
 
@@ -240,9 +240,10 @@ def within_prior(
         draw: Function of a number that returns so many draws, shape (num, d).
         num_samples: Number of draws to return.
         acceptance: Share of draws within the support.
+        most_numbers: Numbers of draws at once: networks take some hundred bytes each.
     """
     kept: list[Tensor] = []
-    missing, most = num_samples, MOST_NUMBERS // max(parameter_dim(prior), 10)
+    missing, most = num_samples, most_numbers // max(parameter_dim(prior), 10)
     while missing > 0:
         draws = draw(min(int(1.1 * missing / acceptance) + 20, most)).float()
         draws = draws[within_support(prior, draws)]

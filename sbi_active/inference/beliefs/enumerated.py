@@ -8,7 +8,7 @@ import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -23,10 +23,6 @@ from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation.model import SimulatorModel
 
-#: Combinations of values at most: each has a posterior of its own. Half refuses seven
-#: switches, twice takes twice as long.
-MOST_VALUES = 64
-
 
 @dataclass(frozen=True)
 class Enumeration:
@@ -38,8 +34,11 @@ class Enumeration:
         log_prob: Log prior probabilities, shape (k,).
         others: Columns of theta that are continuous, shape (d - m,).
         rest: Prior of these, independent of the discrete ones.
+        most_values: Number of combinations at most: each has a posterior of its own.
+            Half refuses seven switches, twice takes twice as long.
     """
 
+    most_values: ClassVar[int] = 64
     places: Tensor
     values: Tensor
     log_prob: Tensor
@@ -66,7 +65,7 @@ class Enumeration:
             if values is not None:
                 rows = torch.tensor([*product(values.tolist(), repeat=size)])
                 chosen.append((rows, part.log_prob(rows).reshape(len(rows), -1).sum(1)))
-        if math.prod(len(rows) for rows, _ in chosen) > MOST_VALUES:
+        if math.prod(len(rows) for rows, _ in chosen) > Enumeration.most_values:
             return None
         pairs = [*product(*(zip(*both, strict=True) for both in chosen))]
         values = torch.stack([torch.cat([row for row, _ in own]) for own in pairs])

@@ -10,7 +10,7 @@ from sbi.utils.torchutils import set_validate_args
 from torch import Tensor
 from torch.distributions import Distribution, MixtureSameFamily, constraints
 
-from sbi_active.inference.beliefs.enumerated import MOST_VALUES, Enumeration
+from sbi_active.inference.beliefs.enumerated import Enumeration
 from sbi_active.seeding import forked_generators
 from sbi_active.support import parts_of, within_support
 
@@ -49,9 +49,10 @@ def require_support(
     if any(map(is_discrete, parts_of(support))) and not may_be:
         raise ValueError(
             "expected a prior of continuous parameters; got a discrete one, "
-            f"{_shown_prior(prior)}; put parameters of up to {MOST_VALUES} combined "
-            "values beside continuous ones with sbi's MultipleIndependent and the "
-            "method asbi or nsbi, or declare the choice as an Effect"
+            f"{_shown_prior(prior)}; put parameters of up to "
+            f"{Enumeration.most_values} combined values beside continuous ones with "
+            "sbi's MultipleIndependent and the method asbi or nsbi, or declare the "
+            "choice as an Effect"
         )
     if _is_constrained(support):
         raise ValueError(

@@ -28,22 +28,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.stats import chi2
 from torch import Tensor
 
+from sbi_active.arrays import Array
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.engine.potential import SimulatedLikelihood
 from sbi_active.simulation.noise.whitening import whitened
-
-Array = NDArray[Any]
-
-MAX_INFLATIONS = 3  # a better fit may be found once the noise is wider
-NUM_NAMED = 3  # trials that a sentence lists
-#: Tail probability of the best fit's residuals under the declared noise, below which
-#: trials contradict. A right simulator crosses it once in a million updates; half and
-#: twice are the same in practice, since contradictions lie far below.
-LEVEL = 1e-6
 
 
 @dataclass(frozen=True)
@@ -84,7 +75,6 @@ def find_contradiction(
     residual: Array,
     jacobian: Array | None = None,
     *,
-    level: float = LEVEL,
     rng: np.random.Generator,
     informed_above: float = 1e-3,
 ) -> Contradiction | None:
@@ -97,7 +87,6 @@ def find_contradiction(
         jacobian: Derivatives of the residuals in coordinates of a standard normal
             prior, (N, d); None counts every parameter, and infers no inflation from
             their spread.
-        level: Tail probability below which trials contradict.
         rng: Source of the draws of the noise.
         informed_above: Derivative below which no trial informs a parameter.
     """
@@ -113,7 +102,6 @@ def find_contradiction(
         lambda gap: whitened(likelihood.noise, gap),
         squares,
         num_fitted=informed,
-        level=level,
     )
     if found is None or not _beyond_noise(likelihood, theta, rng):
         return None
@@ -136,7 +124,7 @@ def compared(
     squares: Array,
     *,
     num_fitted: int,
-    level: float = LEVEL,
+    level: float = 1e-6,
 ) -> Contradiction | None:
     """Return the contradiction by the squares alone; None if there is none.
 
@@ -147,7 +135,9 @@ def compared(
             deviations of the noise.
         squares: Sum of squared whitened residuals of each trial, shape (t,).
         num_fitted: Number of parameters that the best fit adapts.
-        level: Tail probability below which trials contradict.
+        level: Tail probability of the best fit's residuals, below which trials
+            contradict. A right simulator crosses it once in a million updates; half and
+            twice are the same in practice, since contradictions lie far below.
     """
     count = x.isfinite().flatten(1).sum(1).numpy()
     freedom = int(count.sum()) - num_fitted
@@ -221,21 +211,21 @@ def _repeats(
 
 def _worst(squares: Array, count: Array) -> str:
     size = np.sqrt(squares / np.maximum(count, 1))
-    order = np.argsort(-size)[:NUM_NAMED]
-    listed = ", ".join(f"trial {k} by {size[k]:.3g}" for k in order)
+    listed = _listed([f"trial {k} by {size[k]:.3g}" for k in np.argsort(-size)])
     return f"the best fit misses {listed} deviations of the noise (root mean square)"
 
 
 def _trials(numbers: list[int]) -> str:
-    listed = ", ".join(map(str, numbers[:NUM_NAMED]))
-    more = len(numbers) - NUM_NAMED
-    return (
-        f"trial{'s' * (len(numbers) > 1)} {listed}"
-        f"{f' and {more} more' if more > 0 else ''}"
-    )
+    listed = _listed([*map(str, numbers)], " and {} more")
+    return f"trial{'s' * (len(numbers) > 1)} {listed}"
 
 
 def _shown(values: Tensor) -> str:
-    numbers = values.flatten().tolist()
-    listed = ", ".join(f"{v:.4g}" for v in numbers[:NUM_NAMED])
-    return listed if len(numbers) == 1 else f"[{listed}{', ...' * (len(numbers) > 3)}]"
+    listed = _listed([f"{v:.4g}" for v in values.flatten().tolist()], ", ...")
+    return listed if values.numel() == 1 else f"[{listed}]"
+
+
+def _listed(texts: list[str], others: str = "", *, most: int = 3) -> str:
+    """Return the first few texts, and of how many others there are."""
+    left = len(texts) - most
+    return ", ".join(texts[:most]) + (others.format(left) if left > 0 else "")

@@ -11,13 +11,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sbi_active.arrays import Array
 from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.engine import Fit, Settings, SimulatedPotential
 from sbi_active.inference.engine.potential import SimulatedLikelihood
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.noise.whitening import is_known_gaussian
-
-Array = NDArray[Any]
 
 #: Whether something that is taken for granted holds, its figure, and what to say with
 #: that where it does not.
@@ -151,33 +150,11 @@ def judged(
         known: Further diagnostics.
     """
     warnings = [text.format(f) for holds, f, text in doubts.values() if not holds]
-    warnings += misplaced(*tails, edge_mass, own)
-    return Diagnostics(
-        trustworthy=not warnings,
-        warnings=(*warnings,),
-        assumptions={
-            name: Assumption(bool(holds), float(figure))
-            for name, (holds, figure, _) in doubts.items()
-        },
-        tail_probability=tails[1],
-        tail_probability_of_trial=(*tails[0],),
-        **known,
-    )
-
-
-def misplaced(
-    tail: list[float], joint: float, edge_mass: float, own: FitChecks = FitChecks()
-) -> list[str]:
-    """Return warnings of a belief that may be far from the truth.
-
-    They rest on the tail probability of each trial and of all, and the belief's mass
-    near the edge of one parameter.
-    """
-    warnings = []
-    if joint < own.rare or min(tail) < own.rare / len(tail):
+    each, joint = tails
+    if joint < own.rare or min(each) < own.rare / len(each):
         warnings.append(
             "SA102 the observations are unlike anything simulated (tail probability "
-            f"{min(joint, *tail):.1g}): the simulator lacks something, the prior "
+            f"{min(joint, *each):.1g}): the simulator lacks something, the prior "
             "excludes the truth, or a measurement is wrong"
         )
     if edge_mass > own.edge:
@@ -185,7 +162,17 @@ def misplaced(
             f"SA103 {edge_mass:.0%} of the belief lies within 1 % of the prior's "
             "edge: the prior may exclude the truth"
         )
-    return warnings
+    return Diagnostics(
+        trustworthy=not warnings,
+        warnings=(*warnings,),
+        assumptions={
+            name: Assumption(bool(holds), float(figure))
+            for name, (holds, figure, _) in doubts.items()
+        },
+        tail_probability=joint,
+        tail_probability_of_trial=(*each,),
+        **known,
+    )
 
 
 def _tail_probability(

@@ -1,28 +1,24 @@
-"""The posterior of trials under declared noise."""
+"""The posterior of trials under declared noise: draws, and a simulated density."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.arrays import Array
+from sbi_active.inference.beliefs.weighted import WeightedBelief
 from sbi_active.inference.declared.contradiction import (
-    MAX_INFLATIONS,
     Contradiction,
     find_contradiction,
 )
 from sbi_active.inference.declared.diagnosing import diagnose_fit
 from sbi_active.inference.declared.settings import RefinementOptions
-from sbi_active.inference.declared.simulated_belief import (
-    DeclaredRecord,
-    SimulatedBelief,
-)
 from sbi_active.inference.engine import (
     Fit,
     Found,
@@ -31,26 +27,124 @@ from sbi_active.inference.engine import (
     infer,
     search,
 )
-from sbi_active.inference.engine.particles import share_cut
+from sbi_active.inference.engine.infer import share_cut
 from sbi_active.inference.engine.pool import Pool
 from sbi_active.inference.engine.potential import (
-    STEP,
     MeanTable,
     SimulatedLikelihood,
     declares_noise,
     unchanged,
 )
-from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
+from sbi_active.inference.rounds.rows import (
+    NOTHING_EXPLAINS,
+    UnexplainedOutcomeError,
+    warn_missing,
+)
 from sbi_active.inference.sampling.coordinates import (
     NormalCoordinates,
     PriorCoordinates,
 )
+from sbi_active.inference.sampling.mixtures import fitted_normals
 from sbi_active.inference.sampling.weights import normalized, systematic
-from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation.outcomes import MissingRowsWarning
 
-Array = NDArray[Any]
+
+@dataclass(frozen=True)
+class DeclaredRecord:
+    """The record that a belief goes on from when a further trial is known.
+
+    Attributes:
+        trials: Actions and outcomes in the likelihood of the draws.
+        coordinates: Coordinates that they are in.
+        table: Noise-free outcomes so far.
+        pool: The draws.
+    """
+
+    trials: tuple[Tensor, Tensor]
+    coordinates: NormalCoordinates
+    table: MeanTable
+    pool: Pool
+
+    def leads_to(self, simulator: Any, action: Tensor, x: Tensor) -> bool:
+        """Return whether its trials are the first of these, of the same simulator."""
+        t = len(self.trials[0])
+        return (
+            self.table.simulator is simulator
+            and torch.equal(self.trials[0], action[:t])
+            and torch.equal(self.trials[1].nan_to_num(), x[:t].nan_to_num())
+            and torch.equal(self.trials[1].isnan(), x[:t].isnan())
+        )
+
+
+class SimulatedBelief(WeightedBelief):
+    r"""The posterior of all trials, with the likelihood simulated and not learned.
+
+    .. math::
+        L(\theta) = \prod_k p\big(x_k \mid f(\theta, \xi_k)\big)
+
+    Parameters that no trial informs, and that are independent of the others under the
+    prior, are drawn from the prior afresh. ``log_prob`` elsewhere costs a simulation a
+    trial and row; ``smooth_log_prob`` has a mixture fitted to the draws in place of the
+    likelihood, and misses what the response does within its width.
+
+    Args:
+        prior: The original prior.
+        potential: Potential of all trials.
+        fit: Weighted draws, and the evidence.
+        defensive: Share of the prior.
+        num_fitted: Number of draws behind the smooth density.
+
+    Attributes:
+        free: Parameters that keep their prior, shape (d,).
+    """
+
+    histories: DeclaredRecord
+
+    def __init__(
+        self,
+        prior: Distribution,
+        potential: SimulatedPotential,
+        fit: Fit,
+        *,
+        defensive: float,
+        num_fitted: int = 1_000,
+    ) -> None:
+        coordinates = potential.coordinates
+        super().__init__(prior, coordinates.base, fit.log_evidence, defensive=defensive)
+        self._z, self._weight = coordinates.to_z(fit.u), fit.weight
+        self._likelihood, rng = potential.likelihood, np.random.default_rng(0)
+        self._normal = NormalCoordinates(coordinates.base, rng, keeps_edges=False)
+        self.free = fit.free
+        u = self._normal.from_z(self._z[systematic(self._weight, num_fitted, 0.5)])
+        self._fitted = fitted_normals(u, 4, rng)
+
+    def _drawn(self, num: int, rng: np.random.Generator) -> Array:
+        # Resampled: a further likelihood would cost a simulation a trial.
+        return self._z[rng.choice(len(self._z), size=num, p=self._weight)]
+
+    def _smooth_log_prob(self, theta: Tensor) -> Tensor:
+        z = self._coordinates.to_z(theta)
+        u = self._normal.from_z(z)
+        log_volume = self._normal.log_slope(u) - self._coordinates.log_jacobian(z)
+        density = np.logaddexp(
+            np.log1p(-self._defensive) + self._fitted.log_prob(u) + log_volume,
+            np.log(self._defensive) + self._log_prior(z),
+        )
+        return torch.from_numpy(density)
+
+    def _log_likelihood(
+        self, theta: Tensor, z: Array, *, beyond: float = 20.0
+    ) -> Array:
+        # So many nats below the defensive share a density is given up.
+        floor = self.log_evidence + np.log(self._defensive) - beyond
+        return self._likelihood(theta, floor=floor)
+
+    def _sample(self, num_samples: int) -> Tensor:
+        theta = super()._sample(num_samples)
+        if self.free.any():
+            fresh = self.prior.sample(torch.Size([num_samples])).to(theta)
+            theta = torch.where(torch.from_numpy(self.free), fresh, theta)
+        return theta
 
 
 def refine_declared(
@@ -105,13 +199,12 @@ def refine_declared(
         fit = _gone_on(before.pool, potential, own, rng)
     if fit is None:
         near = _near(hints, coordinates, seed)
-        potential, found, contradiction = _searched(potential, near, own, rng)
+        potential, found, contradiction = _searched(
+            potential, near, own, settings.max_inflations, rng
+        )
         fit = infer(potential, rng, found=found, near=near, settings=own)
     if not len(fit.u):
-        raise UnexplainedOutcomeError(
-            "expected outcomes that some parameters may explain; got none with a "
-            "likelihood; correct the outcome, or leave the trial out"
-        )
+        raise UnexplainedOutcomeError(NOTHING_EXPLAINS)
     belief = SimulatedBelief(prior, potential, fit, defensive=settings.defensive)
     known = diagnose_fit(fit, potential, declared, seed)
     if contradiction is not None:
@@ -125,13 +218,7 @@ def refine_declared(
     if contradiction is not None:  # its likelihood is of another noise
         pool = Pool.empty(potential.dim, len(action))
     belief.histories = DeclaredRecord((action, x), coordinates, table, pool)
-    if num_missing:
-        warn(
-            f"SA301 {num_missing} of {num_simulations} simulations of the refinement "
-            "are missing, by faults of the simulator; their draws were left out",
-            MissingRowsWarning,
-            stacklevel=5,
-        )
+    warn_missing(num_missing, num_simulations, "their draws", stacklevel=5)
     return belief
 
 
@@ -154,13 +241,8 @@ def _near(
     num: int = 250,
 ) -> Array | None:
     """Return draws of all hints, shape (n, d), those first that stand for each."""
-    drawn, base = [], coordinates.base
-    for hint in hints[:2]:
-        with forked_generators(derive_seed(seed, "start")):
-            z = base.to_z(hint.sample(torch.Size([num])).float())
-        inside = base.inside(z)
-        if inside.any():
-            drawn.append(coordinates.from_z(z[inside]))
+    places = coordinates.base.drawn_from(hints[:2], num, seed=seed)
+    drawn = [coordinates.from_z(z) for z in places]
     if not drawn:
         return None
     return np.concatenate([*[u[:1] for u in drawn], *[u[1:] for u in drawn]])
@@ -201,6 +283,7 @@ def _searched(
     potential: SimulatedPotential,
     near: Array | None,
     own: Settings,
+    max_inflations: int,
     rng: np.random.Generator,
     *,
     num_around: int = 64,
@@ -215,11 +298,11 @@ def _searched(
     declared, c = potential.likelihood, potential.coordinates
     points = None if near is None else near[:2]
     found, contradiction = search(potential, rng, points, own.search), None
-    for _ in range(MAX_INFLATIONS):
+    for _ in range(max_inflations):
         if found is None:
             break
         likelihood, best = potential.likelihood, found.modes[:1]
-        residual, jacobian = potential.jacobian(best, unchanged, STEP)
+        residual, jacobian = potential.jacobian(best, unchanged, potential.step)
         around = best + wide * (found.guess.sample(num_around, rng) - best)
         around = np.clip(around, c.low, c.high)
         now = find_contradiction(

@@ -9,12 +9,6 @@ import numpy as np
 from sbi_active.expected import require, suggests
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
-#: Number of parameters beyond which draws are more in proportion: a covariance of d
-#: parameters is off by about d (d + 3) / (4 n) nats for n effective draws. At ten, half
-#: as many (no more than at six) gives a divergence of .07 in place of .05 nats for
-#: three quarters of the simulations.
-MANY = 6
-
 
 @suggests
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +33,8 @@ class RefinementOptions:
             by an error of the surrogate: a truth that it misses costs log(1 / share)
             nats and not infinitely many. Moments see the share too: .01 of a wide
             prior outweighs a sharp posterior.
+        max_inflations: Number of times at most that the noise is inflated where trials
+            contradict one another: once it is wider, a better fit may be found.
         workers: Workers that run the simulations; in a campaign, its own are taken. A
             history of which a row stays lost is left out.
     """
@@ -47,11 +43,20 @@ class RefinementOptions:
     num_effective: float = 200
     num_draws: int | None = None
     defensive: float = 1e-5
+    max_inflations: int = 3
     workers: Workers = IN_PROCESS
 
-    def effective_of(self, dim: int) -> float:
-        """Return the number of effective draws of so many parameters."""
-        return self.num_effective * max(1.0, dim / MANY)
+    def effective_of(self, dim: int, *, many: int = 6) -> float:
+        """Return the number of effective draws of so many parameters.
+
+        Args:
+            dim: Number of parameters.
+            many: Number beyond which draws are more in proportion: a covariance of d
+                parameters is off by about d (d + 3) / (4 n) nats for n effective draws.
+                At ten, half as many (no more than at six) gives a divergence of .07 in
+                place of .05 nats for three quarters of the simulations.
+        """
+        return self.num_effective * max(1.0, dim / many)
 
     def __post_init__(self) -> None:
         for name, low, high in (

@@ -12,13 +12,13 @@ from the residuals r of left-out rows.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sbi_active.arrays import Array
 from sbi_active.inference.emulation.likelihood import (
     correlation_root,
     declared_process,
@@ -27,14 +27,10 @@ from sbi_active.inference.emulation.likelihood import (
 )
 from sbi_active.inference.emulation.pool import Pool
 from sbi_active.inference.emulation.processes import nearest
-from sbi_active.inference.emulation.summaries import FEW, Summary
+from sbi_active.inference.emulation.summaries import Summary, is_short
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation.noise.base import NoiseModel
-
-Array = NDArray[Any]
-
-NUM_OUTER, NUM_INNER = 160, 1_000
 
 
 def candidate_gains(
@@ -47,6 +43,8 @@ def candidate_gains(
     *,
     seed: int,
     most_rows: int = 600,
+    num_outer: int = 160,
+    num_inner: int = 1_000,
 ) -> tuple[Array, Array]:
     """Return contributions to the gain and the share of measurements.
 
@@ -63,6 +61,8 @@ def candidate_gains(
         seed: Seed of the outcomes.
         most_rows: Number of rows, those nearest to the belief, that the processes rest
             on.
+        num_outer: Number m of parameters that outcomes are drawn at.
+        num_inner: Number of further parameters that each is compared with.
 
     Returns:
         Shapes (a, K, m), nats, and (a,).
@@ -72,7 +72,7 @@ def candidate_gains(
     near, region = nearest(z, np.ones(len(z), dtype=bool), reference, most_rows)
     near = np.sort(near)
     rng = np.random.default_rng(derive_seed(seed, "outcomes"))
-    draws = reference[rng.integers(len(reference), size=NUM_OUTER + NUM_INNER)]
+    draws = reference[rng.integers(len(reference), size=num_outer + num_inner)]
     places = candidates.double().numpy()
     center, scale = places.mean(0), places.std(0)
     varied = scale > 0
@@ -96,6 +96,7 @@ def candidate_gains(
             _gains(
                 *(inputs[full], z[near][full], numbers[full], same[full]),
                 *(region.scaled(draws), unit, noise, tuple(raw.shape[1:])),
+                num_outer=num_outer,
                 rng=np.random.default_rng(derive_seed(seed, "noise")),
                 seed=seed,
             )
@@ -120,13 +121,14 @@ def _gains(
     noise: NoiseModel | None,
     x_shape: tuple[int, ...],
     *,
+    num_outer: int,
     rng: np.random.Generator,
     seed: int,
     own_rows: float = 8.0,
 ) -> Array:
-    """Return contributions of one summary at each action, shape (a, NUM_OUTER)."""
+    """Return contributions of one summary at each action, shape (a, m)."""
     if len(inputs) < z.shape[1] + 4:
-        return np.zeros((len(unit), NUM_OUTER))
+        return np.zeros((len(unit), num_outer))
     if noise is not None:
         processes = (declared_process(inputs, numbers, ("rough",)),)
         zeros = torch.zeros(max(400, 4 * numbers.shape[1]), *x_shape).double()
@@ -137,7 +139,7 @@ def _gains(
         roots = [root] * len(unit)
     else:
         dim, features = z.shape[1], numbers
-        if numbers.shape[1] > FEW * dim and inputs.shape[1] > dim:
+        if not is_short(numbers.shape[1], dim) and inputs.shape[1] > dim:
             crossed = [numbers * inputs[:, [j]] for j in range(dim, inputs.shape[1])]
             features = np.concatenate([numbers, *crossed, inputs[:, dim:]], 1)
         _, processes, left_out = learned_processes(inputs, features, z, seed=seed)
@@ -146,13 +148,13 @@ def _gains(
         sd = np.sqrt(total / (own_rows + same.sum(0))[:, None])
         root = correlation_root(left_out)
         roots = [s[:, None] * root for s in sd]
-    normal = rng.standard_normal((NUM_OUTER, len(roots[0])))
-    result = np.zeros((len(unit), NUM_OUTER))
+    normal = rng.standard_normal((num_outer, len(roots[0])))
+    result = np.zeros((len(unit), num_outer))
     for k, place in enumerate(unit):
         at = np.concatenate(
             [draws, np.broadcast_to(place, (len(draws), len(place)))], 1
         )
         parts = [process.predict(at) for process in processes]
         mean, variance = (np.concatenate(p, 1) for p in zip(*parts, strict=True))
-        result[k] = mixture_gain(mean, variance, roots[k], normal, NUM_OUTER)
+        result[k] = mixture_gain(mean, variance, roots[k], normal, num_outer)
     return result

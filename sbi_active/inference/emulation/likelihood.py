@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -27,6 +26,7 @@ from scipy.special import logsumexp
 from scipy.stats import chi2
 from torch import Tensor
 
+from sbi_active.arrays import Array
 from sbi_active.inference.emulation.summaries import Statistic, learned_statistic
 from sbi_active.inference.regression.outcomes import TrialOutcome
 from sbi_active.inference.regression.regions import Region
@@ -36,12 +36,10 @@ from sbi_active.inference.sampling.gaussian_process import (
     Kind,
     ProcessSettings,
 )
-from sbi_active.inference.sampling.student_mixture import log_student
+from sbi_active.inference.sampling.mixtures import log_student
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation.noise.base import NoiseModel
 from sbi_active.simulation.noise.gaussian import GaussianNoise
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

@@ -88,11 +88,8 @@ class Pool:
 
     def at(self, action: Tensor) -> Simulations:
         """Return the rows of one action, shape (action_dim,)."""
-        rows = self.rows
-        near = torch.isclose(rows.action, action.float(), rtol=1e-5, atol=1e-7).all(1)
-        return Simulations(
-            rows.theta[near], rows.action[near], rows.x[near], rows.status[near]
-        )
+        near = torch.isclose(self.rows.action, action.float(), rtol=1e-5, atol=1e-7)
+        return self.rows.at(near.all(1))
 
     def weights(self, belief: Distribution) -> Tensor:
         r"""Return weights of all rows for a belief, shape (n,), that sum to one.

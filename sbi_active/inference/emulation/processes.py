@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.arrays import Array
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.emulation.likelihood import (
     PooledLikelihood,
@@ -25,21 +25,15 @@ from sbi_active.inference.emulation.summaries import Summary
 from sbi_active.inference.engine.importance import fitted
 from sbi_active.inference.engine.learned import CHEAP
 from sbi_active.inference.engine.pool import PriorDraws
-from sbi_active.inference.refinement.course import Stage, StageSettings
-from sbi_active.inference.refinement.stages import Stages
+from sbi_active.inference.refinement.stages import Stage, Stages, StageSettings
 from sbi_active.inference.regression.outcomes import TrialOutcome
 from sbi_active.inference.regression.regions import Region, whole_space
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.gaussian_process import (
-    GaussianProcess,
-    num_features,
-)
-from sbi_active.inference.sampling.student_mixture import Defended
+from sbi_active.inference.sampling.gaussian_process import GaussianProcess, num_features
+from sbi_active.inference.sampling.mixtures import Defended
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.noise.base import NoiseModel
-
-Array = NDArray[Any]
 
 #: The loop of few simulations. It begins with rows that are there, and ends where the
 #: processes' own errors are small: no stage is spent on seeing that one more changes
@@ -53,8 +47,6 @@ FEW_ROWS = StageSettings(
     untrusted=0.2,
     checked_share=0.0,
 )
-NUM_REFERENCE = 400  # draws of a belief that say where simulations matter
-MOST_ROWS = {True: 160, False: 400}  # behind a trial, with declared noise and without
 
 
 @dataclass(frozen=True)
@@ -84,6 +76,7 @@ class Processes(Stages):
         settings: Settings of the belief.
         before: The belief before the last trial; it says where to look first.
         seed: Seed of everything random here.
+        num_reference: Number of draws of a belief that say where simulations matter.
     """
 
     def __init__(
@@ -97,14 +90,15 @@ class Processes(Stages):
         before: Distribution,
         *,
         seed: int,
+        num_reference: int = 400,
     ) -> None:
         rng = np.random.default_rng(derive_seed(seed, "pooled"))
         coordinates = PriorCoordinates(prior, np.random.default_rng(0))
         super().__init__(prior, settings, FEW_ROWS, 0, rng, coordinates)
-        self.pool, self.noise = pool, noise
+        self.pool, self.noise, self.num_reference = pool, noise, num_reference
         self.x_shape, self.summaries, self.seed = x_shape, summaries, seed
         with forked_generators(derive_seed(seed, "reference")):
-            theta = before.sample(torch.Size([NUM_REFERENCE]))
+            theta = before.sample(torch.Size([num_reference]))
         self.near: Array = self.coordinates.to_z(theta.float())
         self.trials: Sequence[PooledTrial] = ()
         self.labels: list[str] = []
@@ -162,9 +156,23 @@ class Processes(Stages):
         return self.summaries[int(np.argmax(gains))].label
 
     def fit_trial(
-        self, trial: PooledTrial, label: str, reference: Array
+        self,
+        trial: PooledTrial,
+        label: str,
+        reference: Array,
+        *,
+        most_declared: int = 160,
+        most_learned: int = 400,
     ) -> TrialLikelihood:
-        """Return the likelihood of a trial from the rows of its action."""
+        """Return the likelihood of a trial from the rows of its action.
+
+        Args:
+            trial: The trial.
+            label: Label of its summary.
+            reference: Draws of a belief that say where it matters, shape (n, d).
+            most_declared: Number of rows at most where noise is declared.
+            most_learned: Number where it is learned.
+        """
         rows = self.pool.at(trial.action)
         summary = next(s for s in self.summaries if s.label == label)
         z = self.coordinates.to_z(rows.theta)
@@ -190,7 +198,7 @@ class Processes(Stages):
                 " more simulations, or leave the trial out"
             )
         if used.any():
-            most = MOST_ROWS[self.noise is not None]
+            most = most_learned if self.noise is None else most_declared
             near, region = nearest(z, valid, reference, most)
             inputs, values = region.scaled(z[near]), numbers[near][:, used]
             if self.noise is not None:
@@ -235,7 +243,7 @@ class Processes(Stages):
             return
         stage = self.stages[-1]
         own, potential = CHEAP, stage.fit.potential
-        c, draws = potential.coordinates, stage.draws[:NUM_REFERENCE]
+        c, draws = potential.coordinates, stage.draws[: self.num_reference]
         weight = np.full(len(draws), 1 / len(draws))
         near = fitted(c.from_z(draws), weight, own.num_components, own, self.rng)
         where = Defended(near, PriorDraws(potential), share_of_prior)

@@ -21,16 +21,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from sklearn.linear_model import Ridge, RidgeCV
 from torch import Tensor
 
 from sbi_active.actions.summaries import SummaryAction, is_fitted
-
-Array = NDArray[Any]
+from sbi_active.arrays import Array
 
 PENALTIES = 10.0 ** np.arange(-4.0, 3.1, 0.5)  # of features of unit variance, by row
-FEW = 2  # numbers an outcome may have for each parameter and stay as it is
 
 
 @dataclass(frozen=True)
@@ -145,6 +142,11 @@ class Statistic:
         return self.offset + features @ self.weight
 
 
+def is_short(num_numbers: int, dim: int, *, few: int = 2) -> bool:
+    """Return whether an outcome stays as it is: a few numbers for each parameter."""
+    return num_numbers <= few * dim
+
+
 def learned_statistic(
     summary: Array, z: Array, *, seed: int, num_folds: int = 10
 ) -> tuple[Statistic, Array]:
@@ -164,7 +166,7 @@ def learned_statistic(
     floor = 1e-7 * np.abs(summary).max(0, initial=0.0)
     # What never varies says nothing, and its rounding must not.
     scale = np.where(scale > floor, scale, np.inf)
-    if q <= FEW * z.shape[1] or not np.isfinite(scale).any():
+    if is_short(q, z.shape[1]) or not np.isfinite(scale).any():
         varies = np.where(np.isfinite(scale), scale, np.maximum(np.abs(center), 1e-30))
         plain = Statistic(center, varies, None, np.zeros(q))
         return plain, plain(summary)

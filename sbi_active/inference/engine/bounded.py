@@ -15,19 +15,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.inference.engine.potential import Potential
-from sbi_active.inference.engine.search import WIDER, Found
+from sbi_active.inference.engine.search import Found
+from sbi_active.inference.sampling.mixtures import Proposal
 from sbi_active.inference.sampling.smc import Bridged, Moves, bridge
-from sbi_active.inference.sampling.student_mixture import Proposal
 from sbi_active.inference.sampling.truncated import truncated_normal
 from sbi_active.inference.sampling.weights import log_sum_exp
 
-Array = NDArray[Any]
 Density = Callable[[Array], Array]
 
 
@@ -87,7 +86,7 @@ class LinearResponse:
     ) -> None:
         whiten = potential.whitener(found.modes[:1])
         residual, jacobian = potential.jacobian(found.modes, whiten, potential.step)
-        self.modes = []
+        self.modes, self.wider = [], found.wider
         for mode, r, jac in zip(found.modes, residual, jacobian, strict=True):
             basis, slope = np.linalg.qr(jac[:, axes])
             along = basis.T @ r
@@ -97,7 +96,7 @@ class LinearResponse:
     def __call__(self, u: Array) -> Array:
         """Return log likelihoods, shape (n,)."""
         squares = np.stack([mode.square(u) for mode in self.modes])
-        return log_sum_exp(-0.5 * squares / WIDER**2, axis=0)
+        return log_sum_exp(-0.5 * squares / self.wider**2, axis=0)
 
 
 @dataclass(frozen=True)
@@ -158,7 +157,7 @@ class LineMoves(Moves):
         """Take the normal density of each mode at a power of its likelihood."""
         self._normals, self._lines = [], {}
         for mode in self._response.modes:
-            pull = power / WIDER**2 * mode.slope.T
+            pull = power / self._response.wider**2 * mode.slope.T
             precision = pull @ mode.slope + np.diag(self._prior)
             center = pull @ (mode.slope @ mode.mode - mode.along)
             self._normals.append((np.linalg.solve(precision, center), precision))

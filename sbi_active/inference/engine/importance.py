@@ -25,21 +25,21 @@ References:
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.inference.engine.pool import Pool
 from sbi_active.inference.engine.potential import Density, Potential
 from sbi_active.inference.engine.ridges import Ridge, along_ridges
 from sbi_active.inference.engine.search import Found
 from sbi_active.inference.engine.settings import Settings
-from sbi_active.inference.sampling.gaussian_mixture import fitted_normals
-from sbi_active.inference.sampling.student_mixture import (
+from sbi_active.inference.sampling.mixtures import (
     Defended,
     Proposal,
     StudentMixture,
+    fitted_normals,
 )
 from sbi_active.inference.sampling.weights import (
     effective_sample_size,
@@ -47,10 +47,6 @@ from sbi_active.inference.sampling.weights import (
     normalized,
     systematic,
 )
-
-Array = NDArray[Any]
-
-SHRINKS, LEAST = 0.8, 1e-10  # of powers that are tried in turn, and the least of them
 
 
 def importance_sample(
@@ -302,11 +298,19 @@ def _flattened(pool: Pool, settings: Settings) -> Array:
     return normalized(log_rest + power * pool.log_likelihood)
 
 
-def _largest_power(log_rest: Array, log_new: Array, needed: float) -> float:
+def _largest_power(
+    log_rest: Array,
+    log_new: Array,
+    needed: float,
+    *,
+    shrinks: float = 0.8,
+    least: float = 1e-10,
+) -> float:
     """Return the largest power of a likelihood that leaves enough draws effective.
 
     Downward from 1: where most draws are near the posterior, a few of the prior
-    outweigh them at lower powers, and fewer are effective there.
+    outweigh them at lower powers, and fewer are effective there. Each power that is
+    tried is so much less than the last, down to the least.
     """
     needed = min(needed, 0.5 * effective_sample_size(log_rest))
 
@@ -314,8 +318,8 @@ def _largest_power(log_rest: Array, log_new: Array, needed: float) -> float:
         return effective_sample_size(log_rest + power * log_new) >= needed
 
     high = 1.0
-    while high > LEAST and not suffices(high):
-        high *= SHRINKS
-    if high == 1 or high <= LEAST:
-        return max(high, LEAST)
-    return largest_power(suffices, start=high, end=min(high / SHRINKS, 1.0))
+    while high > least and not suffices(high):
+        high *= shrinks
+    if high == 1 or high <= least:
+        return max(high, least)
+    return largest_power(suffices, start=high, end=min(high / shrinks, 1.0))

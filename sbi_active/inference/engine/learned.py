@@ -1,23 +1,25 @@
-"""The posterior of a likelihood that was learned: it costs no simulation."""
+"""The posterior of a likelihood that was learned, and its belief: no simulations."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from torch import Tensor
+from torch.distributions import Distribution
 
+from sbi_active.arrays import Array
+from sbi_active.inference.beliefs.weighted import WeightedBelief
 from sbi_active.inference.engine.infer import infer
 from sbi_active.inference.engine.settings import Settings
+from sbi_active.inference.rounds.rows import NOTHING_EXPLAINS, UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import (
     NormalCoordinates,
     PriorCoordinates,
 )
-from sbi_active.inference.sampling.student_mixture import Proposal
+from sbi_active.inference.sampling.mixtures import Proposal
 from sbi_active.inference.sampling.weights import normalized, systematic
-
-Array = NDArray[Any]
 
 #: Settings of :func:`.infer` where a likelihood is cheap. On four modes and on a peak
 #: of six parameters half of the draws, and twice, are as right; twice takes up to 1.5
@@ -142,8 +144,8 @@ def learned_fit(
     *,
     near: Array | None = None,
     num_effective: float = 3_000.0,
-) -> LearnedFit | None:
-    """Return the posterior of a learned likelihood; None if nothing has any.
+) -> LearnedFit:
+    """Return the posterior of a learned likelihood.
 
     Args:
         learned: Learned likelihood of all trials.
@@ -151,13 +153,16 @@ def learned_fit(
         near: Prior's coordinates of draws of a guess, shape (n, d).
         num_effective: Number of effective draws to end with; a log density is off by
             about its inverse root, in nats.
+
+    Raises:
+        UnexplainedOutcomeError: If nothing has a likelihood.
     """
     potential = LearnedPotential(learned)
     own = replace(CHEAP, num_effective=num_effective)
     places = None if near is None else potential.coordinates.from_z(near)
     fit = infer(potential, rng, near=places, settings=own)
     if not np.isfinite(fit.log_evidence):
-        return None
+        raise UnexplainedOutcomeError(NOTHING_EXPLAINS)
     effective = fit.effective_sample_size
     return LearnedFit(
         potential,
@@ -166,3 +171,28 @@ def learned_fit(
         effective_sample_size=effective,
         log_evidence=fit.log_evidence,
     )
+
+
+class LearnedBelief(WeightedBelief):
+    r"""The posterior of all trials, by a learned likelihood.
+
+    A likelihood costs nothing, so that draws are fresh ones.
+
+    Args:
+        prior: Original prior.
+        fit: Posterior of the learned likelihood.
+        defensive: Share of the prior.
+    """
+
+    def __init__(
+        self, prior: Distribution, fit: LearnedFit, *, defensive: float
+    ) -> None:
+        self._fit, self._learned = fit, fit.potential.learned
+        coordinates = self._learned.coordinates
+        super().__init__(prior, coordinates, fit.log_evidence, defensive=defensive)
+
+    def _drawn(self, num: int, rng: np.random.Generator) -> Array:
+        return self._fit.draws(num, rng)
+
+    def _log_likelihood(self, theta: Tensor, z: Array) -> Array:
+        return self._learned.log_likelihood(z)

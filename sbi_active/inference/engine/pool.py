@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from sbi_active.arrays import Array
 from sbi_active.inference.engine.potential import Density, SimulatedPotential
 from sbi_active.inference.engine.search import Found
 from sbi_active.inference.engine.settings import Settings
+from sbi_active.inference.sampling.mixtures import Proposal
 from sbi_active.inference.sampling.smc import Bridged
-from sbi_active.inference.sampling.student_mixture import Proposal
 from sbi_active.inference.sampling.weights import effective_sample_size
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sbi_active.arrays import Array
 from sbi_active.inference.rounds.rows import rows_of
 from sbi_active.inference.sampling.coordinates import NormalCoordinates
 from sbi_active.inference.sampling.least_squares import LeastSquares, Whitener
@@ -26,15 +27,6 @@ from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.noise.whitening import whitened
 from sbi_active.simulation.outcomes import Outcome
 from sbi_active.simulation.workers.settings import Workers
-
-Array = NDArray[Any]
-
-BATCH = 64  # rows a call: the same ones whatever the number of workers
-DEEP = 30.0  # nats below the peak that count as any more do
-FORGETTING = 0.3  # share of the latest call in the mean that orders trials
-#: Bound on a whitened residual, which keeps sums of squares finite.
-LARGEST = 1e6
-STEP = 3e-3  # of differences, in deviations of the prior
 
 
 def declares_noise(
@@ -85,13 +77,16 @@ class MeanTable:
         mean = np.stack([gap if x is None else x for x in found])
         return mean.astype(np.float64), lost
 
-    def _simulate(self, theta: Tensor, action: Tensor) -> list[Array | None]:
+    def _simulate(
+        self, theta: Tensor, action: Tensor, *, batch_size: int = 64
+    ) -> list[Array | None]:
+        # The same rows a call whatever the number of workers.
         self.num_simulations += len(theta)
         actions = action.expand(len(theta), -1)
         rows = rows_of(
             *(self._bare, theta, actions, 0, self.workers),
             is_first=False,
-            batch_size=BATCH,
+            batch_size=batch_size,
         )
         if rows is None:
             self.num_missing += len(theta)
@@ -116,10 +111,20 @@ class SimulatedLikelihood:
         action: Executed actions, shape (t, action_dim).
         x: Observed outcomes, shape (t, *x_shape); NaN where nothing was measured.
         inflation: Factor of the noise's standard deviation.
+        deep: Nats below the peak that count as any more do, where trials are ordered.
+        forgetting: Share of the latest call in the mean that orders trials (a choice:
+            another changes rows that are given up, and no density).
     """
 
     def __init__(
-        self, table: MeanTable, action: Tensor, x: Tensor, *, inflation: float = 1.0
+        self,
+        table: MeanTable,
+        action: Tensor,
+        x: Tensor,
+        *,
+        inflation: float = 1.0,
+        deep: float = 30.0,
+        forgetting: float = 0.3,
     ) -> None:
         noise = table.simulator.noise
         assert noise is not None
@@ -130,7 +135,8 @@ class SimulatedLikelihood:
         without = self.x.flatten(1).isnan().all(1)
         #: Largest value of each trial's term, shape (t,).
         self.peak = torch.where(without, 0.0, peak).numpy()
-        self._cost = np.full(len(x), DEEP)  # nats below the peak, on average
+        self._cost = np.full(len(x), deep)  # nats below the peak, on average
+        self._deep, self._forgetting = deep, forgetting
 
     def __len__(self) -> int:
         return len(self.action)
@@ -182,8 +188,8 @@ class SimulatedLikelihood:
             if len(rows) == 0:
                 break
             term = self.terms(theta[torch.from_numpy(rows)], k)
-            depth = float(np.minimum(self.peak[k] - term, DEEP).mean())
-            self._cost[k] += FORGETTING * (depth - self._cost[k])
+            depth = float(np.minimum(self.peak[k] - term, self._deep).mean())
+            self._cost[k] += self._forgetting * (depth - self._cost[k])
             total[rows] += term
         total[total < floor] = -np.inf
         return total
@@ -259,22 +265,29 @@ class SimulatedPotential:
     Args:
         likelihood: Likelihood of all trials, whose simulations are kept.
         coordinates: Coordinates of the prior.
+        step: Step of finite differences, in deviations of the prior.
+        largest: Bound on a whitened residual, which keeps sums of squares finite.
 
     Attributes:
         dim: Number of parameters.
         searched: Coordinates that a search may move, shape (d,).
-        step: Step of finite differences.
         num_trials: Number of trials.
         num_observed: Number of observed numbers of all trials.
     """
 
     def __init__(
-        self, likelihood: SimulatedLikelihood, coordinates: NormalCoordinates
+        self,
+        likelihood: SimulatedLikelihood,
+        coordinates: NormalCoordinates,
+        *,
+        step: float = 3e-3,
+        largest: float = 1e6,
     ) -> None:
         self.likelihood, self.coordinates = likelihood, coordinates
         self.dim = coordinates.dim
         self.searched = np.ones(self.dim, dtype=bool)
-        self.step, self.num_trials = STEP, len(likelihood)
+        self.step, self._largest = step, largest
+        self.num_trials = len(likelihood)
         self.num_observed = int(likelihood.x.isfinite().sum())
         self._spread: Array | None = None
 
@@ -350,7 +363,7 @@ class SimulatedPotential:
                 spread = np.sqrt(np.nanmean(filled**2, 0)) if len(r) else np.ones(1)
             self._spread = np.where(np.isfinite(spread), spread, 0.0)
         r = np.where(np.isfinite(r), r, self._spread)
-        return (np.clip(r, -LARGEST, LARGEST),)
+        return (np.clip(r, -self._largest, self._largest),)
 
     def jacobian(
         self, u: Array, whiten: Whitener, step: float | Array

@@ -11,19 +11,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.inference.engine.potential import Potential
 from sbi_active.inference.engine.search import Found
 from sbi_active.inference.engine.settings import Settings
 from sbi_active.inference.sampling.least_squares import descend, floored
-from sbi_active.inference.sampling.student_mixture import StudentMixture, lower_factors
+from sbi_active.inference.sampling.mixtures import StudentMixture, lower_factors
 from sbi_active.inference.sampling.weights import systematic
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

@@ -11,19 +11,15 @@ Where the error has unknowns, C is what the best place so far makes most probabl
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from sbi_active.arrays import Array
 from sbi_active.inference.engine.potential import Potential
 from sbi_active.inference.sampling.least_squares import Whitener, descend, floored
-from sbi_active.inference.sampling.student_mixture import StudentMixture, lower_factors
-
-Array = NDArray[Any]
-
-WIDER = 1.1  # than the Laplace approximation
+from sbi_active.inference.sampling.mixtures import StudentMixture, lower_factors
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,6 +46,7 @@ class SearchSettings:
         num_kept: Searches that go on.
         later: Steps of each.
         progress: Fall of the cost that is worth another phase.
+        wider: Factor of the widths of the Laplace approximation (a choice).
         faint: Derivative, which rounding may give, below which a coordinate moves no
             trial.
     """
@@ -67,6 +64,7 @@ class SearchSettings:
     later: int = 10
     progress: float = 0.5
     faint: float = 0.1
+    wider: float = 1.1
 
 
 @dataclass(frozen=True)
@@ -81,6 +79,7 @@ class Found:
         num_found: Searches that ended at the best mode.
         num_starts: Searches in all.
         screened: Draws of the prior that were looked at, shape (n, d).
+        wider: Factor of the components' widths, which a Laplace approximation has not.
     """
 
     guess: StudentMixture
@@ -89,6 +88,7 @@ class Found:
     num_found: int
     num_starts: int
     screened: Array
+    wider: float
 
 
 def search(
@@ -150,7 +150,7 @@ def search(
     mass = np.exp(log_mass - log_mass.max())
     # A mode that is worth little is still visited.
     mass = 0.9 * mass / mass.sum() + 0.1 / len(mass)
-    factors = WIDER * lower_factors(np.linalg.inv(precision[modes]))
+    factors = own.wider * lower_factors(np.linalg.inv(precision[modes]))
     return Found(
         StudentMixture(u[modes], factors, mass, np.inf),
         u[modes],
@@ -158,6 +158,7 @@ def search(
         int((cost - cost.min() < own.same).sum()),
         num,
         np.concatenate(looked),
+        own.wider,
     )
 
 

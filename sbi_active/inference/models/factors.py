@@ -1,16 +1,27 @@
-"""Learned factors that a trial of an action contributes to the belief."""
+"""Learned factors of trials, and the belief of the prior times their product."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
 
+from sbi_active.arrays import Array
+from sbi_active.inference.beliefs.diagnostics import Diagnostics
+from sbi_active.inference.engine.learned import LearnedBelief, learned_fit
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows, pack
+from sbi_active.inference.rounds.rows import Observation
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.inference.sampling.mixtures import StudentMixture, fitted_normals
+from sbi_active.threads import single_thread
 
 
 class ActionFactor(ABC):
@@ -113,6 +124,183 @@ class ActionRatio(ActionFactor):
         action = action_rows(action, self.action_dim, num_rows=len(rows))
         return self.estimator(theta.float(), pack(rows, action)).reshape(-1)
 
-    @override
-    def log_factor(self, theta: Tensor, x: Tensor, action: Tensor) -> Tensor:
-        return self.log_ratio(theta, x, action)  # its marginal knows no theta
+    log_factor = log_ratio  # its marginal knows no theta
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegionSettings:
+    """Settings of the region where a network is trained and trusted.
+
+    Attributes:
+        num_components: Number of components of the mixture whose level set is a
+            region: enough for a few modes.
+        num_fitted: Number of rows that a region is fitted to.
+        lost: Share of the rows that may lie outside.
+        margin: Nats below the density of the last row inside.
+        spread: Deviations of rows to learn from, in those of a component.
+    """
+
+    num_components: int = 6
+    num_fitted: int = 2_000
+    lost: float = 2e-3
+    margin: float = 3.0
+    spread: float = 2.0
+
+
+@dataclass(frozen=True)
+class TrainedRegion:
+    """Region where a network was trained; its values elsewhere mean nothing.
+
+    Attributes:
+        mixture: Mixture fitted to the rows.
+        floor: Log density of the mixture at the edge.
+    """
+
+    mixture: StudentMixture
+    floor: float
+
+    @staticmethod
+    def of(
+        z: Array, rng: np.random.Generator, own: RegionSettings = RegionSettings()
+    ) -> TrainedRegion:
+        """Return the region of rows, coordinates of shape (n, d)."""
+        some = rng.permutation(z)[: own.num_fitted]
+        mixture = fitted_normals(some, own.num_components, rng)
+        floor = np.quantile(mixture.log_prob(z), own.lost) - own.margin
+        return TrainedRegion(mixture, float(floor))
+
+    def contains(self, z: Array) -> NDArray[np.bool_]:
+        """Return whether coordinates lie inside, (n, d) -> (n,)."""
+        return self.mixture.log_prob(z) >= self.floor
+
+
+def widened(
+    z: Array,
+    num_samples: int,
+    coordinates: PriorCoordinates,
+    rng: np.random.Generator,
+    own: RegionSettings = RegionSettings(),
+) -> Array:
+    """Return draws spread up to twice as wide as those of a belief, within the support.
+
+    The error of a belief may be as large as its width; a likelihood can be learned from
+    parameters of any distribution. Each component of a Gaussian mixture of z, shape (n,
+    d), is doubled, so that modes stay apart.
+    """
+    mixture = fitted_normals(z[: own.num_fitted], own.num_components, rng)
+    factor = mixture.factors[mixture.log_parts(z).argmax(0)]
+    kept, missing = [], num_samples
+    while missing > 0:
+        i = rng.integers(len(z), size=2 * num_samples)
+        normal = rng.standard_normal((len(i), z.shape[1]))
+        step = np.sqrt(own.spread**2 - 1) * np.einsum("nij,nj->ni", factor[i], normal)
+        drawn = z[i] + step
+        kept.append(drawn[coordinates.inside(drawn)][:missing])
+        missing -= len(kept[-1])
+    return np.concatenate(kept)
+
+
+class Product:
+    r"""The learned likelihood of all trials, where it was learned.
+
+    .. math::
+        \hat L(\theta) = 1[\theta \in R] \prod_k q(x_k | \theta, \xi_k)
+
+    with R the region of the training rows, which were drawn from a belief that holds
+    the posterior. The factors are exact products; only q is learned.
+
+    Args:
+        coordinates: Coordinates of the prior.
+        model: q, up to factors without theta.
+        trials: The history.
+        region: R; None is the whole support.
+        previous: Belief that takes the prior's place, where beliefs are chained.
+    """
+
+    def __init__(
+        self,
+        coordinates: PriorCoordinates,
+        model: ActionFactor,
+        trials: Sequence[Observation],
+        region: TrainedRegion | None = None,
+        previous: Distribution | None = None,
+    ) -> None:
+        self.coordinates, self.model, self.region = coordinates, model, region
+        self._previous = previous
+        self.trials = [*trials]
+
+    def log_factors(self, theta: Tensor) -> Tensor:
+        r"""Return :math:`\sum_k \log q(x_k | \theta, \xi_k)`, (n, d) -> (n,), float64.
+
+        Gradients flow to theta.
+        """
+        total = torch.zeros(len(theta), dtype=torch.float64)
+        for trial in self.trials:
+            rows = trial.x.expand(len(theta), *trial.x.shape)
+            action = trial.action.expand(len(theta), -1)
+            total = total + self.model.log_factor(theta, rows, action).double()
+        return total
+
+    def log_likelihood(self, z: Array, *, batch_size: int = 20_000) -> Array:
+        """Return the log likelihood, (n, d) -> (n,), so many rows in memory at once."""
+        total = np.full(len(z), -np.inf)
+        inside = np.ones(len(z), dtype=bool)
+        if self.region is not None:
+            inside = self.region.contains(z)
+        theta = self.coordinates.to_theta(z[inside])
+        with torch.no_grad(), single_thread():
+            parts = [self._evaluate(part) for part in theta.split(batch_size)]
+        total[inside] = torch.cat(parts).numpy()
+        return total
+
+    def _evaluate(self, theta: Tensor) -> Tensor:
+        total = self.log_factors(theta)
+        if self._previous is not None:
+            ratio = self._previous.log_prob(theta)
+            total = total + (ratio - self.coordinates.prior.log_prob(theta)).double()
+        return total
+
+
+def sample_product(
+    prior: Distribution,
+    product: Product,
+    hint: Tensor | None,
+    rng: np.random.Generator,
+    *,
+    num_effective: float,
+    defensive: float,
+    enough: float = 100.0,
+) -> LearnedBelief:
+    r"""Return the belief of a product, sampled by :func:`.infer`.
+
+    .. math::
+        b(\theta) = (1 - \epsilon)\, \frac{p(\theta)}{Z} \prod_k q(x_k | \theta, \xi_k)
+        + \epsilon\, p(\theta)
+
+    Args:
+        prior: The original prior.
+        product: The learned likelihood of all trials.
+        hint: Draws around the posterior, shape (n, theta_dim), such as those of the
+            belief before; None begins at the prior.
+        rng: Source of randomness.
+        num_effective: Number of effective draws.
+        defensive: Share of the prior in the belief.
+        enough: Effective draws below which the normalizer is off by more than a tenth
+            of a nat.
+    """
+    near = None if hint is None else product.coordinates.to_z(hint)
+    fit = learned_fit(product, rng, near=near, num_effective=num_effective)
+    belief = LearnedBelief(prior, fit, defensive=defensive)
+    belief.label = "product over trials"
+    effective = fit.effective_sample_size
+    belief.diagnostics = Diagnostics().extended(
+        effective_sample_size=effective,
+        likelihood="learned",
+        log_normalizer=fit.log_evidence,
+    )
+    if effective < enough:
+        belief.diagnostics = belief.diagnostics.warned(
+            f"SA114 the belief rests on {effective:.0f} effective draws; raise "
+            "num_particles"
+        )
+    return belief

@@ -12,8 +12,6 @@ from torch import Tensor, nn
 
 LOG_NORMAL_MEAN = 0.6351814227  # -E log|e| of a standard normal e
 SMALLEST_SCALE = 1e-6  # of the scale over all actions: float32 ends there
-WILD = 10.0  # residuals beyond so many medians count as that many
-NUM_ITERATIONS = 4  # a choice: of location and scale in turn, from the median
 
 
 class Polynomials(nn.Module):
@@ -128,7 +126,7 @@ def fit_location_and_scale(
     y: Tensor,
     test: Tensor,
     *,
-    num_iterations: int = NUM_ITERATIONS,
+    num_iterations: int = 4,
 ) -> tuple[Tensor, Tensor]:
     r"""Regress location and scale of y by iterated weighted least squares.
 
@@ -149,7 +147,7 @@ def fit_location_and_scale(
         noise_sizes: Numbers of leading columns of G to choose from.
         y: Shape (n, m).
         test: Mask of held-out rows, shape (n,).
-        num_iterations: Number of iterations of the pair of regressions.
+        num_iterations: Number of iterations of the pair of regressions (a choice).
 
     Returns:
         beta, shape (p, m), and gamma, shape (q, m).
@@ -175,8 +173,9 @@ def _fit_log_scale(
     log_size = size.log() + LOG_NORMAL_MEAN
     gamma = _least_squares(design, sizes, log_size, torch.zeros_like(size), test)
     z = (log_size - LOG_NORMAL_MEAN - design @ gamma).exp()
-    z = torch.minimum(z, WILD * z.median(0).values)
-    gamma[0] += 0.5 * z.square().mean(0).log()  # the root mean square becomes one
+    gamma[0] += (
+        0.5 * _tamed(z, z.median(0).values).square().mean(0).log()
+    )  # the root mean square becomes one
     return gamma
 
 
@@ -203,6 +202,11 @@ def _least_squares(
     return beta
 
 
+def _tamed(size: Tensor, median: Tensor, *, wild: float = 10.0) -> Tensor:
+    """Return sizes in which those beyond so many medians count as that many."""
+    return torch.minimum(size, wild * median)
+
+
 def best_prefix(
     design: Tensor, sizes: Sequence[int], y: Tensor, test: Tensor
 ) -> Tensor:
@@ -220,8 +224,8 @@ def best_prefix(
             factor[:size, :size], factor[:size, p:], upper=True
         )
         error = (unseen[:, p:] - unseen[:, :size] @ solution).abs()
-        wild = WILD * error.median(0).values.clamp_min(1e-300)
-        error = torch.minimum(error, wild).square().mean(0)
+        error = _tamed(error, error.median(0).values.clamp_min(1e-300))
+        error = error.square().mean(0)
         better = error < 0.999 * best
         beta = torch.where(better, 0.0, beta)
         beta[:size] = torch.where(better, solution, beta[:size])

@@ -10,17 +10,23 @@ from torch import Tensor, nn
 
 from sbi_active.inference.networks.action_scaling import ActionScaling, held_out
 from sbi_active.inference.networks.baseline import Baseline, Frames, local
-from sbi_active.inference.networks.response import STRAIGHT
 
-BLOCK = 512  # rows in double precision at once, and rows behind principal directions
 BaselineKind = Literal["none", "linear", "curved"]
-#: Numbers in x beyond which no regression is tried: each has coefficients of its own.
-MAX_OUTCOMES = 32
-MIN_ROWS = 40  # with a measurement, of which a fifth is held out
 KINDS: tuple[Literal["linear", "curved"], ...] = ("linear", "curved")
-#: Nats by which a baseline must beat the simpler one: its frames and what the network
-#: sees of them are more to overfit.
-MARGIN = {"linear": 0.0, "curved": 0.25}
+
+
+def can_regress(
+    valid: Tensor, num_outcomes: int, *, fewest: int = 40, most: int = 32
+) -> bool:
+    """Return whether a regression of the outcome is tried.
+
+    Args:
+        valid: Mask of the rows with a measurement, shape (n,).
+        num_outcomes: Number of numbers in an outcome.
+        fewest: Number of these rows at least, of which a fifth is held out.
+        most: Number of numbers at most: each has coefficients of its own.
+    """
+    return int(valid.sum()) >= fewest and num_outcomes <= most
 
 
 class Directions(nn.Module):
@@ -36,13 +42,17 @@ class Directions(nn.Module):
         x: Outcomes, shape (n, m), all finite.
         action: Actions, shape (n, action_dim).
         num: Number of directions, fewer where rows or numbers are.
+        block: Number of rows in double precision at once, and of those behind principal
+            directions.
     """
 
     mean: Tensor
     scale: Tensor
     rows: Tensor
 
-    def __init__(self, u: Tensor, x: Tensor, action: Tensor, *, num: int) -> None:
+    def __init__(
+        self, u: Tensor, x: Tensor, action: Tensor, *, num: int, block: int = 512
+    ) -> None:
         super().__init__()
         mean, scale = x.mean(0, dtype=torch.float64), x.std(0).double()
         scale = torch.where(scale > 1e-12 * (1 + mean.abs()), scale, 1.0)
@@ -50,22 +60,22 @@ class Directions(nn.Module):
         self.register_buffer("scale", scale)
         features = _products(u, action)
         moved = x.new_zeros(features.shape[1], x.shape[1]).double()
-        for row in range(0, len(x), BLOCK):
-            part = slice(row, row + BLOCK)
+        for row in range(0, len(x), block):
+            part = slice(row, row + block)
             moved += features[part].T @ self._standardized(x[part])
         rows = torch.linalg.svd(moved, full_matrices=False)[2][: num // 2]
-        rest = self._standardized(x[:BLOCK])
+        rest = self._standardized(x[:block])
         rest = rest - (rest @ rows.T) @ rows
         largest = torch.linalg.svd(rest, full_matrices=False)[2][: num - len(rows)]
         rows = torch.linalg.qr(torch.cat([rows, largest]).T).Q.T
         self.register_buffer("rows", rows.contiguous())
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Tensor, *, block: int = 512) -> Tensor:
         """Return summaries, shape (n, k).
 
         A number that is missing counts as the mean; an outcome without any is NaN.
         """
-        parts = [self._summaries(part) for part in x.split(BLOCK)]
+        parts = [self._summaries(part) for part in x.split(block)]
         return torch.cat(parts)
 
     def _summaries(self, x: Tensor) -> Tensor:
@@ -120,6 +130,8 @@ class Conditioning(nn.Module):
             :class:`.Directions` stand for them. Half of it summarizes what a network
             learns as well in ten times the time.
         num_directions: Number of these; a baseline takes 32 at most.
+        margin: Nats by which a curved baseline must beat the simpler one: its frames
+            and what the network sees of them are more to overfit.
 
     Attributes:
         baseline_kind: The baseline in use.
@@ -143,7 +155,8 @@ class Conditioning(nn.Module):
         whiten: bool,
         baseline: Literal["best", "none", "linear", "curved"],
         most_numbers: float = 200,
-        num_directions: int = MAX_OUTCOMES,
+        num_directions: int = 32,
+        margin: float = 0.25,
     ) -> None:
         super().__init__()
         self.x_dim = condition.shape[1] - action_dim
@@ -154,11 +167,11 @@ class Conditioning(nn.Module):
         x, action = condition.split([self.x_dim, action_dim], 1)
         valid = x.isfinite().all(1)
         self.directions: Directions | None = None
-        if self.x_dim > most_numbers and int(valid.sum()) >= MIN_ROWS:
+        if self.x_dim > most_numbers and can_regress(valid, num_directions):
             own = self.whiten(theta[valid]), x[valid], action[valid]
             self.directions = Directions(*own, num=num_directions)
         x, action = self._summarized(x), action.double()
-        few = int(valid.sum()) < MIN_ROWS or x.shape[1] > MAX_OUTCOMES
+        few = not can_regress(valid, x.shape[1])
         self.register_buffer("action_mean", action.mean(0))
         self.register_buffer("action_scale", scale_of(action))
         columns = [x[row, j] for j, row in enumerate(x.isfinite().mT)]
@@ -173,7 +186,7 @@ class Conditioning(nn.Module):
         self.scores: dict[str, float] = {}
         if baseline != "none" and not few:
             u = self.whiten(theta[valid])
-            self._choose(u, y, action[valid], baseline)
+            self._choose(u, y, action[valid], baseline, margin)
         self.x_scaling: ActionScaling | None = None
         if scaling == "action" and not few and self.baseline is None:
             self.x_scaling = ActionScaling(y, action[valid])
@@ -191,20 +204,22 @@ class Conditioning(nn.Module):
         y: Tensor,
         action: Tensor,
         baseline: Literal["best", "linear", "curved"],
+        margin: float,
     ) -> None:
         test = held_out(len(u))
         best = -math.inf
         if baseline == "best":
             best = self.scores["none"] = float(log_normal(u[test]).mean())
         for kind in KINDS if baseline == "best" else (baseline,):
-            bends = self.baseline is None or self.baseline.bend(u, y, action) > STRAIGHT
+            bends = self.baseline is None or self.baseline.bends(u, y, action)
             if kind == "curved" and baseline == "best" and not bends:
                 continue
             candidate = Baseline(u, y, action, kind=kind)
             frames = _with_global(candidate(y[test], action[test]))
             score = float(_log_mixture(u[test], frames).mean())
             self.scores[kind] = score
-            if score > best + (MARGIN[kind] if baseline == "best" else 0.0):
+            is_margin = baseline == "best" and kind == "curved"
+            if score > best + is_margin * margin:
                 best, self.baseline, self.baseline_kind = score, candidate, kind
 
     @property

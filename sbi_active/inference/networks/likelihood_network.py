@@ -13,8 +13,7 @@ from typing_extensions import override
 
 from sbi_active.inference.networks.action_scaling import ActionScaling
 from sbi_active.inference.networks.conditioning import (
-    MAX_OUTCOMES,
-    MIN_ROWS,
+    can_regress,
     covariance_factor,
     log_normal,
     scale_of,
@@ -130,7 +129,7 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
 
         self.response: Response | None = None
         self.x_scaling: ActionScaling | None = None
-        few = len(y) < MIN_ROWS or y.shape[1] > MAX_OUTCOMES
+        few = not can_regress(valid, y.shape[1])
         if settings.baseline != "none" and not few:
             kind = settings.baseline
             self.response = (

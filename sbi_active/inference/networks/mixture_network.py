@@ -14,18 +14,6 @@ from typing_extensions import override
 from sbi_active.inference.networks.baseline import Frames, local
 from sbi_active.inference.networks.conditioning import BaselineKind, Conditioning
 
-#: Bounds of the log-precision of a component in units of the standardized parameter:
-#: wide enough for seven decimal digits, where float32 ends.
-LOG_PRECISION_RANGE = (-10.0, 16.0)
-#: Where components of local frames are, one of the global frame starts with a twentieth
-#: of the weight of each.
-GLOBAL_LOGIT = -3.0
-#: Numbers of parameters beyond which correlations of a component are the same for all
-#: conditions, in its frame: their number grows with the square, and thousands of rows
-#: do not tell how each depends on the condition.
-FEW_DIMENSIONS = 12
-#: Numbers of the factors of draws in memory at once, 40 MB.
-MOST_FACTORS = 10_000_000
 ACTIVATIONS = {"silu": nn.SiLU, "relu": nn.ReLU}
 
 
@@ -91,6 +79,11 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         num_components: Gaussian components K.
         embedding_net: Embedding network of the condition, which is then scaled over all
             rows, without a baseline.
+        global_logit: Logit of a component of the global frame at the start, where
+            others are of local frames: a twentieth of the weight of each.
+        few: Number of parameters beyond which correlations of a component are the same
+            for all conditions, in its frame: their number grows with the square, and
+            thousands of rows do not tell how each depends on the condition.
     """
 
     condition_mean: Tensor
@@ -112,6 +105,8 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         hidden_features: Sequence[int] = (128, 128),
         num_components: int = 5,
         embedding_net: nn.Module | None = None,
+        global_logit: float = -3.0,
+        few: int = 12,
     ) -> None:
         dim, num = theta.shape[1], num_components
         missing = ~condition.isfinite()
@@ -147,7 +142,7 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         for hidden in hidden_features:
             layers += [nn.Linear(width, hidden), ACTIVATIONS[activation]()]
             width = hidden
-        num_upper = dim * dim if dim <= FEW_DIMENSIONS else 0
+        num_upper = dim * dim if dim <= few else 0
         last = nn.Linear(width, num * (1 + 2 * dim + num_upper))
         super().__init__(
             nn.Sequential(*layers, last), theta.shape[1:], condition.shape[1:]
@@ -168,7 +163,7 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         self._frame_of = _frame_of_components(num, self.num_frames)
         if self.num_frames > 1 and num > 1:
             with torch.no_grad():
-                last.bias[num - 1] = GLOBAL_LOGIT
+                last.bias[num - 1] = global_logit
         some = slice(0 if conditioning is not None else None)  # else not used
         mean, scale = _location_and_scale(condition[some], ~missing[some])
         self.register_buffer("condition_mean", mean)
@@ -248,9 +243,11 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         u = frames.mean[row, frame] + _solved(frames.factor, row, frame, v.double())
         return self.conditioning.unwhiten(u).to(logits.dtype)
 
-    def prepare(self, theta: Tensor, condition: Tensor) -> tuple[Tensor, Tensor]:
+    def prepare(
+        self, theta: Tensor, condition: Tensor, *, most_factors: int = 10_000_000
+    ) -> tuple[Tensor, Tensor]:
         """Return rows for :class:`PreparedLoss`: all that no weight changes."""
-        most = max(1, MOST_FACTORS // (self.num_frames * self._dim**2))
+        most = max(1, most_factors // (self.num_frames * self._dim**2))
         prepared, inputs = [], []
         with torch.no_grad():
             for part, own in zip(theta.split(most), condition.split(most), strict=True):
@@ -292,11 +289,10 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         """Return the log density of v, shape (..., n, K or 1, d), up to a constant."""
         logits, mean, log_diagonal, upper = self._mixture(seen)
         error = v - mean
-        if self._dim <= FEW_DIMENSIONS:  # a product and a sum are faster
+        if upper.ndim == 4:  # by row; a product and a sum are faster
             above = (upper * error[..., None, :]).sum(-1)
         else:
-            own = "kij" if upper.ndim == 3 else "nkij"  # of earlier versions: by row
-            above = torch.einsum(f"{own},...nkj->...nki", upper, error)
+            above = torch.einsum("kij,...nkj->...nki", upper, error)
         z = log_diagonal.exp() * error + above
         component = log_diagonal.sum(-1) - 0.5 * z.square().sum(-1)
         return (logits + component + log_det).logsumexp(-1) - logits.logsumexp(-1)
@@ -314,10 +310,14 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         z = self._embedding(z.nan_to_num(0.0, 0.0, 0.0))
         return torch.cat([z, mask], -1), frames
 
-    def _mixture(self, seen: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _mixture(
+        self, seen: Tensor, *, log_precision: tuple[float, float] = (-10.0, 16.0)
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return logits, means, log-diagonals and factors above them, (n, K, ...).
 
         The factors are of shape (K, d, d) where they do not depend on the condition.
+        Bounds of the log-precision of a standardized parameter are wide enough for
+        seven decimal digits, where float32 ends.
         """
         logits, mean, log_diagonal, upper = self.net(seen).split(self._sections, -1)
         shape = (len(seen), self._num_components, self._dim)
@@ -325,7 +325,7 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         return (
             logits,
             mean.reshape(shape),
-            log_diagonal.reshape(shape).clamp(*LOG_PRECISION_RANGE),
+            log_diagonal.reshape(shape).clamp(*log_precision),
             upper * self.strict_upper,
         )
 
@@ -370,16 +370,28 @@ def _location_and_scale(rows: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     return mean.float(), scale.float()
 
 
-def _solved(factor: Tensor, row: Tensor, which: Tensor, right: Tensor) -> Tensor:
-    """Return solutions (..., d) of upper factors [row, which] for right sides."""
+def _solved(
+    factor: Tensor,
+    row: Tensor,
+    which: Tensor,
+    right: Tensor,
+    *,
+    few: int = 12,
+    most_factors: int = 10_000_000,
+) -> Tensor:
+    """Return solutions (..., d) of upper factors [row, which] for right sides.
+
+    Beyond a few dimensions a factor serves many draws; otherwise, as in ``prepare``, so
+    many numbers of the factors are in memory at once, 40 MB.
+    """
     dim = right.shape[-1]
-    if len(factor) == 1 and dim > FEW_DIMENSIONS:  # a factor serves many draws
+    if len(factor) == 1 and dim > few:
         found = torch.empty_like(right)
         for k, own in enumerate(factor[0]):
             at = which == k
             found[at] = torch.linalg.solve_triangular(own, right[at].mT, upper=True).mT
         return found
-    most = max(1, MOST_FACTORS // (row[0].numel() * dim**2))
+    most = max(1, most_factors // (row[0].numel() * dim**2))
     parts = [part.split(most) for part in (row, which, right[..., None])]
     solve = torch.linalg.solve_triangular
     steps = [solve(factor[r, k], e, upper=True) for r, k, e in zip(*parts, strict=True)]

@@ -11,15 +11,12 @@ from torch import Tensor, nn
 from sbi_active.expected import require
 from sbi_active.inference.networks.action_scaling import ActionScaling
 from sbi_active.inference.networks.conditioning import (
-    MAX_OUTCOMES,
-    MIN_ROWS,
+    can_regress,
     covariance_factor,
     scale_of,
     whitened,
 )
 from sbi_active.inference.networks.response import Response
-
-FAR = 4.0  # noise deviations, beyond which a residual is squashed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,9 +87,7 @@ class RatioNetwork(RatioEstimator):
         x_dim, dim = condition.shape[1] - action_dim, theta.shape[1]
         x, action = condition.double().split([x_dim, action_dim], 1)
         valid = x.isfinite().all(1)
-        with_baseline = (
-            settings.baseline and int(valid.sum()) >= MIN_ROWS and x_dim <= MAX_OUTCOMES
-        )
+        with_baseline = settings.baseline and can_regress(valid, x_dim)
         width = dim + action_dim + x_dim * (2 if with_baseline else 1) + 1
         layers: list[nn.Module] = []
         for hidden in settings.hidden_features:
@@ -130,7 +125,10 @@ class RatioNetwork(RatioEstimator):
         rows = theta.reshape(-1, theta.shape[-1]), x.reshape(-1, x.shape[-1])
         return self._log_ratio(*rows).reshape(shape)
 
-    def _log_ratio(self, theta: Tensor, condition: Tensor) -> Tensor:
+    def _log_ratio(
+        self, theta: Tensor, condition: Tensor, *, far: float = 4.0
+    ) -> Tensor:
+        # Beyond so many deviations of the noise a residual is squashed.
         x, action = condition.double().tensor_split([self._x_dim], 1)
         valid = x.isfinite().all(1)
         y = (torch.where(valid[:, None], x, self.y_mean) - self.y_mean) / self.y_scale
@@ -145,7 +143,7 @@ class RatioNetwork(RatioEstimator):
             sharp, log_det = self.response.standardize(u, y, action)
             base = log_det + scale.log().sum(1)
             base = base + 0.5 * (wide.square().sum(1) - sharp.square().sum(1))
-            seen += [wide, FAR * torch.tanh(sharp / FAR)]
+            seen += [wide, far * torch.tanh(sharp / far)]
         inside = torch.cat(seen[2:], 1) * valid[:, None]
         parts = torch.cat([*seen[:2], inside, valid[:, None].double()], 1)
         correction = self.net(parts.float())[:, 0]

@@ -17,9 +17,6 @@ from sbi_active.inference.networks.action_scaling import (
     held_out,
 )
 
-MAX_DEGREE = 9  # of the parameters
-STRAIGHT = 0.01  # fraction of the residual below which f is taken to be linear
-
 
 class Response(nn.Module):
     r"""Polynomial regression of the outcome on the action and whitened parameters u.
@@ -36,6 +33,7 @@ class Response(nn.Module):
         y: Finite outcomes, of scale one over all actions, shape (n, m).
         action: Actions, shape (n, action_dim).
         kind: Whether f is linear in u.
+        max_degree: Largest degree of the parameters.
         max_features: Number of features of action and parameters at most.
         max_action_degree: Largest degree of the action that held-out rows choose from.
         max_noise_degree: Largest degree of the noise.
@@ -54,6 +52,7 @@ class Response(nn.Module):
         action: Tensor,
         *,
         kind: Literal["linear", "curved"],
+        max_degree: int = 9,
         max_features: int = 260,
         max_action_degree: int = 14,
         max_noise_degree: int = 8,
@@ -66,7 +65,7 @@ class Response(nn.Module):
         exponents, sizes = exponents_of(
             action, max_degree=max_action_degree, max_terms=max(1, most // (1 + dim))
         )
-        degree = MAX_DEGREE if kind == "curved" else 1
+        degree = max_degree if kind == "curved" else 1
         # A degree more than there is data for costs nothing: terms are cut off below.
         inner, _ = exponents_of(u, max_degree=degree, max_terms=max(1 + dim, most))
         self.action_basis = Polynomials(action, exponents)
@@ -75,7 +74,7 @@ class Response(nn.Module):
         degrees = min(len(sizes), max_noise_degree + 1)
         noise = phi[:, : sizes[degrees - 1]]
 
-        k, j, prefixes = _joint_terms(exponents, inner, most)
+        k, j, prefixes = _joint_terms(exponents, inner, most, max_degree)
         beta, gamma = fit_location_and_scale(
             phi[:, k] * psi[:, j],
             prefixes,
@@ -115,7 +114,7 @@ class Response(nn.Module):
         chance.
         """
         linear = Response(u, y, action, kind="linear")
-        if linear.bend(u, y, action) <= STRAIGHT:
+        if not linear.bends(u, y, action):
             return linear
         curved = Response(u, y, action, kind="curved")
         test = held_out(len(u))
@@ -154,8 +153,13 @@ class Response(nn.Module):
         constant = 0.5 * z.shape[1] * math.log(2 * math.pi)
         return log_det - 0.5 * z.square().sum(1) - constant
 
-    def bend(self, u: Tensor, y: Tensor, action: Tensor) -> float:
-        """Return the fraction of the held-out residual that u's powers explain."""
+    def bends(
+        self, u: Tensor, y: Tensor, action: Tensor, *, straight: float = 0.01
+    ) -> bool:
+        """Return whether powers of u explain more than a share of held-out residuals.
+
+        Below that f is taken to be linear.
+        """
         test = held_out(len(u))
         phi = self.action_basis(action)
         predicted = torch.einsum(
@@ -172,7 +176,8 @@ class Response(nn.Module):
         design = design.flatten(1)
         sizes = [size * few.shape[1] for size in sizes]
         left = z[test] - design[test] @ best_prefix(design, sizes, z, test)
-        return float((1 - left.square().mean(0) / z[test].square().mean(0)).max())
+        share = (1 - left.square().mean(0) / z[test].square().mean(0)).max()
+        return float(share) > straight
 
 
 def exceeds_chance(gain: Tensor) -> bool:
@@ -181,7 +186,7 @@ def exceeds_chance(gain: Tensor) -> bool:
 
 
 def _joint_terms(
-    outer: Tensor, inner: Tensor, most: int, *, joint_cost: float = 1.5
+    outer: Tensor, inner: Tensor, most: int, max_degree: int, *, joint_cost: float = 1.5
 ) -> tuple[Tensor, Tensor, list[int]]:
     """Return pairs of exponents from coarse to fine, and numbers to choose from.
 
@@ -189,7 +194,7 @@ def _joint_terms(
     action and parameters add up against one bound.
     """
     outer_degree, inner_degree = outer.sum(1), inner.sum(1)
-    ratio = MAX_DEGREE / max(int(outer_degree.max()), 1)
+    ratio = max_degree / max(int(outer_degree.max()), 1)
     joint = (inner.ne(0).sum(1) - 1).clamp_min(0) * joint_cost
     cost = outer_degree[:, None] * ratio + (inner_degree + joint)[None]
     order = cost.flatten().argsort(stable=True)[:most]

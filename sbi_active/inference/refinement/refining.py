@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -19,22 +18,19 @@ from sbi_active.inference.beliefs.enumerated import (
     enumerated,
 )
 from sbi_active.inference.beliefs.priors import require_support
-from sbi_active.inference.declared.contradiction import MAX_INFLATIONS
-from sbi_active.inference.declared.refining import refine_declared
-from sbi_active.inference.declared.settings import RefinementOptions
-from sbi_active.inference.declared.simulated_belief import (
+from sbi_active.inference.declared.refining import (
     DeclaredRecord,
     SimulatedBelief,
+    refine_declared,
 )
-from sbi_active.inference.refinement.course import StageSettings
-from sbi_active.inference.refinement.learned_belief import LearnedBelief
+from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.engine.learned import LearnedBelief
 from sbi_active.inference.refinement.regional import Regions
+from sbi_active.inference.refinement.stages import StageSettings
 from sbi_active.inference.regression.histories import HistoryRecord
 from sbi_active.seeding import derive_seed
 from sbi_active.support import parameter_dim
 from sbi_active.threads import single_thread
-
-Array = NDArray[Any]
 
 
 def refine(
@@ -161,7 +157,7 @@ def _learned(
         return belief
     histories, sds = belief.histories, regions.histories.noise_sds
     now, inflation = first, 1.0
-    for number in range(MAX_INFLATIONS):
+    for number in range(regions.settings.max_inflations):
         inflation *= now.inflation
         wider = learned(
             seed=derive_seed(seed, "inflated", number),

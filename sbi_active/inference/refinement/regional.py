@@ -8,33 +8,29 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.arrays import Array
 from sbi_active.inference.declared.contradiction import Contradiction, compared
 from sbi_active.inference.declared.diagnosing import Doubt
 from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.engine.learned import LearnedBelief
 from sbi_active.inference.refinement.checks import (
     Fresh,
     compared_with_fresh,
+    expected_error,
     noise_tails,
     outcomes_at,
+    widened,
 )
-from sbi_active.inference.refinement.course import LIVE, Stage, StageSettings
-from sbi_active.inference.refinement.learned_belief import LearnedBelief
-from sbi_active.inference.refinement.regression_error import expected_error, widened
-from sbi_active.inference.refinement.stages import Stages
+from sbi_active.inference.refinement.stages import Stage, Stages, StageSettings
 from sbi_active.inference.regression.histories import Histories, HistoryRecord
 from sbi_active.inference.regression.regions import around, cover, whole_space
-from sbi_active.inference.regression.surrogate import MISFIT, Surrogate, fewest_rows
-from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
+from sbi_active.inference.regression.surrogate import Surrogate, fewest_rows, is_misfit
+from sbi_active.inference.rounds.rows import UnexplainedOutcomeError, warn_missing
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.messages import warn
-from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation.outcomes import MissingRowsWarning
-
-Array = NDArray[Any]
+from sbi_active.seeding import derive_seed
 
 
 class Regions(Stages):
@@ -83,13 +79,8 @@ class Regions(Stages):
             *(coordinates, seed, past, settings.workers),
             further_noise=further_noise,
         )
-        self.regions = [whole_space(coordinates.dim)]
-        near: list[Array] = []
-        for hint in hints:
-            with forked_generators(derive_seed(seed, "start")):
-                z = coordinates.to_z(hint.sample(torch.Size([1_000])).float())
-            near.append(z[coordinates.inside(z)])
-            self.regions.append(around(near[-1]))
+        near = coordinates.drawn_from(hints, 1_000, seed=seed)
+        self.regions = [whole_space(coordinates.dim), *map(around, near)]
         self.near = np.concatenate(near) if near else None
         self.shape_change = 0.0
         self.least = max(own.fewest, 2 * fewest_rows(coordinates.dim))
@@ -110,14 +101,8 @@ class Regions(Stages):
             num_missing=histories.num_missing,
         )
         belief.histories = histories.record()
-        if histories.num_missing:
-            warn(
-                f"SA301 {histories.num_missing} of {histories.num_simulations} "
-                "simulations of the refinement are missing, by faults of the "
-                "simulator; the histories they belong to were left out",
-                MissingRowsWarning,
-                stacklevel=4,
-            )
+        spent, lost = histories.num_simulations, histories.num_missing
+        warn_missing(lost, spent, "the histories they belong to", stacklevel=4)
         return belief
 
     def _propose(self, stage: Stage, size: int) -> None:
@@ -128,7 +113,7 @@ class Regions(Stages):
             self.rng,
             max_regions=min(self.own.max_regions, limit),
             generous=stage.excess < 3,
-            wide=stage.excess <= MISFIT,
+            wide=not is_misfit(stage.excess),
         )
 
     def simulate(self, size: int) -> None:
@@ -180,7 +165,7 @@ class Regions(Stages):
         label, fits = surrogate.assign(draws), surrogate.regressions
         mass = np.bincount(label[label >= 0], minlength=len(fits))
         mass = mass / max(mass.sum(), 1)
-        live = [f.excess for f, m in zip(fits, mass, strict=True) if m > LIVE]
+        live = [f.excess for f, m in zip(fits, mass, strict=True) if m > self.own.live]
         error = expected_error(surrogate, draws, self.rng)
         return max(live, default=np.inf), mass, error
 
@@ -226,9 +211,11 @@ class Regions(Stages):
         """Return what the regressions take for granted."""
         last, fresh, own = self.stages[-1], self.fresh, self.own
         fits, dim = last.surrogate.regressions, self.coordinates.dim
-        live = [f.ratio for f, mass in zip(fits, last.mass, strict=True) if mass > LIVE]
+        live = [
+            f.ratio for f, mass in zip(fits, last.mass, strict=True) if mass > own.live
+        ]
         roughness = self.stages[0].surrogate.regressions[0].roughness
-        tails, has_edges = noise_tails(self.stages)
+        tails, has_edges = noise_tails(self.stages, own)
         known = 0.0
         if any(fit.shape is not None for fit in fits):
             # Of d parameters known to e nats, a mean is off by (2 e / d)^(1/2)
@@ -236,7 +223,7 @@ class Regions(Stages):
             allowed = 0.5 * dim * own.known**2
             known = self.shape_change / (own.unsettled * dim)
             known = max(last.error / allowed, known)
-        share, blur = outcomes_at(last.surrogate, last.draws, self.histories)
+        share, blur = outcomes_at(last.surrogate, last.draws, self.histories, own)
         self.probability_of_outcome = share
         rare = ", ".join(str(k) for k, p in enumerate(share) if p < own.rare)
         return {
@@ -275,7 +262,7 @@ class Regions(Stages):
                 "of the noise, so that the belief is too wide; raise num_histories",
             ),
             "independent_trials": (
-                fresh.correlation < own.correlated or last.excess > MISFIT,
+                fresh.correlation < own.correlated or is_misfit(last.excess),
                 fresh.correlation,
                 "SA104 simulated trials correlate at the same parameters ({:.2f}), yet "
                 "the likelihood is a product over trials; check how the simulator "

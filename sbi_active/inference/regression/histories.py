@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sbi_active.arrays import Array
 from sbi_active.inference.regression.outcomes import outcomes_of
 from sbi_active.inference.regression.regions import Region
 from sbi_active.inference.regression.residuals import ShapeSettings
@@ -22,13 +23,9 @@ from sbi_active.inference.regression.surrogate import (
 from sbi_active.inference.rounds.rows import rows_of
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.seeding import derive_seed
-from sbi_active.simulation.outcomes import (
-    Outcome,
-)
+from sbi_active.simulation.outcomes import Outcome
 from sbi_active.simulation.simulator import require_noise
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
-
-Array = NDArray[Any]
 
 LOST = np.inf  # marks the rows of a history that a fault hit
 

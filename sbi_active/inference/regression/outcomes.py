@@ -31,18 +31,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, log_expit
 
+from sbi_active.arrays import Array
 from sbi_active.inference.regression.regions import Basis, Region
-
-Array = NDArray[Any]
-
-INTERCEPT_DEVIATION = 8.0  # at least: an event may be rare all over a region
-DEGREES = (0, 1, 2, 3)  # of the polynomials that the evidence chooses among
 
 
 @dataclass(frozen=True)
@@ -75,7 +70,9 @@ class TrialOutcome:
         agrees: NDArray[np.bool_],
         pairs: NDArray[np.bool_],
         *,
+        degrees: tuple[int, ...] = (0, 1, 2, 3),
         deviations: tuple[float, ...] = (1.0, 4.0, 16.0, 64.0),
+        intercept: float = 8.0,
         rows_a_feature: int = 6,
         surprise: float = 0.01,
     ) -> TrialOutcome:
@@ -87,13 +84,16 @@ class TrialOutcome:
             z: Coordinates of simulations, shape (n, d).
             agrees: Whether their outcome is what was observed, shape (n,).
             pairs: Pairs of simulations at the same parameters, shape (r, 2).
+            degrees: Degrees of the polynomials that the evidence chooses among.
             deviations: Deviations of coefficients a priori that the evidence chooses
                 among.
+            intercept: Deviation of the intercept at least: an event may be rare all
+                over a region.
             rows_a_feature: Number of rows a feature at least.
             surprise: Probability below which an outcome is a slip.
         """
         u, n = region.scaled(z), len(z)
-        degrees = DEGREES if 0 < agrees.sum() < n else (0,)
+        degrees = degrees if 0 < agrees.sum() < n else (0,)
         best, evidence = (Basis.polynomial(0, u.shape[1]), np.zeros(1)), -np.inf
         for degree in degrees:
             basis = Basis.polynomial(degree, u.shape[1])
@@ -101,8 +101,10 @@ class TrialOutcome:
             if degree > 1 and n < rows_a_feature * features.shape[1]:
                 break
             coefficient = np.zeros(features.shape[1])
-            for deviation in deviations if degree > 0 else (INTERCEPT_DEVIATION,):
-                coefficient, value = _laplace(features, agrees, deviation, coefficient)
+            for deviation in deviations if degree > 0 else (intercept,):
+                scale = np.full(features.shape[1], deviation)
+                scale[0] = max(deviation, intercept)
+                coefficient, value = _laplace(features, agrees, scale, coefficient)
                 if value > evidence:
                     best, evidence = (basis, coefficient), value
         basis, coefficient = best
@@ -155,7 +157,7 @@ def outcomes_of(
 def _laplace(
     features: Array,
     agrees: NDArray[np.bool_],
-    deviation: float,
+    scale: Array,
     start: Array,
     *,
     num_steps: int = 40,
@@ -164,11 +166,11 @@ def _laplace(
 
     .. math::
         \log E = \log p(y | \hat\beta) - \frac{|\hat\beta|^2}{2 \tau^2}
-        - p \log \tau - \tfrac12 \log |H|.
+        - p \log \tau - \tfrac12 \log |H|,
+
+    with a deviation :math:`\tau` a coefficient, the scale.
     """
     sign = np.where(agrees, 1.0, -1.0)
-    scale = np.full(features.shape[1], deviation)
-    scale[0] = max(deviation, INTERCEPT_DEVIATION)
     prior = 1 / scale**2
 
     def objective(beta: Array) -> float:

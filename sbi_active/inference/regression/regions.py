@@ -4,29 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi, chi2
 
+from sbi_active.arrays import Array
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.gaussian_mixture import fitted_normals
-
-Array = NDArray[Any]
-
-#: Mass of a Gaussian posterior that its ellipsoid covers.
-COVERED = 0.9997
-#: Simulations spread wider than the posterior: its ellipsoid ends at 4 posterior
-#: deviations (in two dimensions) and at 2.2 deviations of the simulations.
-SPREAD = 2.2
-#: Radius of a wide region in that of the ellipsoid within. At 1 the noise of slopes
-#: moves a mean by .12 deviations of four parameters at 3,000 histories, which grows
-#: with the numbers in an outcome; at 2 by .08.
-WIDE = 2.0
-#: Spread of a region at least: parameters are simulated in single precision, and draws
-#: of a finer one would lie beside it.
-FINEST = 1e-6
+from sbi_active.inference.sampling.mixtures import fitted_normals
 
 
 @dataclass(frozen=True)
@@ -89,17 +74,20 @@ class Region:
             kept.append(z[coordinates.inside(z)])
         return np.concatenate(kept)
 
-    def _rays(self, num_samples: int, rng: np.random.Generator) -> Array:
+    def _rays(
+        self, num_samples: int, rng: np.random.Generator, *, spread: float = 2.2
+    ) -> Array:
         """Return normal draws cut at the edge, shape (n, d): a direction and a length.
 
         The length's distribution is inverted, since of twenty normal numbers hardly
-        any fall within the edge.
+        any fall within the edge. The edge lies at ``spread`` deviations of the draws,
+        and in two dimensions at 4 of the posterior, which is narrower.
         """
         d = len(self.center)
         normal = rng.standard_normal((num_samples, d))
         direction = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-        level = rng.random((num_samples, 1)) * chi.cdf(SPREAD, d)
-        length = self.radius / SPREAD * chi.ppf(level, d)
+        level = rng.random((num_samples, 1)) * chi.cdf(spread, d)
+        length = self.radius / spread * chi.ppf(level, d)
         if self.inner < 1:
             length *= rng.choice([self.inner, 1.0], (num_samples, 1))
         return self.center + (length * direction) @ self.factor.T
@@ -125,6 +113,7 @@ def cover(
     generous: bool,
     wide: bool = False,
     worth: float = 0.1,
+    further: float = 2.0,
 ) -> list[Region]:
     """Return ellipsoids around the clusters of a sample.
 
@@ -132,7 +121,9 @@ def cover(
     each needs simulations of its own. Generous ones reach four deviations of each
     cluster; else an ellipsoid just holds its particles, which a surrogate with misfit
     has spread already. Wide ones reach further: the further apart simulations are, the
-    better they tell slopes, if the basis still holds.
+    better they tell slopes, if the basis still holds. With a factor of 1 the noise of
+    slopes moves a mean by .12 deviations of four parameters at 3,000 histories, which
+    grows with the numbers in an outcome; with 2 by .08.
     """
     d = points.shape[1]
     counts = [k for k in (1, 2, 3, 4, 6, 8) if k <= max_regions]
@@ -144,7 +135,7 @@ def cover(
         if found > likelihood + worth * d:
             best, likelihood = other, found
     label = best.log_parts(points).argmax(0)
-    full = chi2.ppf(COVERED, d) ** 0.5
+    full = _radius(d)
     regions = []
     for k in range(len(best.means)):
         members = points[label == k]
@@ -155,19 +146,27 @@ def cover(
         farthest = shape.distance(members).max()
         radius = max(full, 1.1 * farthest) if generous else 1.2 * farthest
         region = Region(center, shape.factor, float(radius))
-        regions.append(region.wider(WIDE) if wide else region)
+        regions.append(region.wider(further) if wide else region)
     return regions or [around(points)]  # a sample of a few points has no clusters
 
 
 def around(draws: Array) -> Region:
     """Return the ellipsoid that covers draws, shape (n, d), as of a Gaussian."""
-    radius = float(chi2.ppf(COVERED, draws.shape[1]) ** 0.5)
-    return Region(draws.mean(0), _factor(draws), radius)
+    return Region(draws.mean(0), _factor(draws), _radius(draws.shape[1]))
 
 
-def _factor(draws: Array) -> Array:
-    """Return the lower Cholesky factor of the covariance of draws (n, d)."""
-    covariance = np.atleast_2d(np.cov(draws.T)) + FINEST**2 * np.eye(draws.shape[1])
+def _radius(dim: int, *, covered: float = 0.9997) -> float:
+    """Return the deviations within which a normal density has a mass."""
+    return float(chi2.ppf(covered, dim) ** 0.5)
+
+
+def _factor(draws: Array, *, finest: float = 1e-6) -> Array:
+    """Return the lower Cholesky factor of the covariance of draws (n, d).
+
+    Parameters are simulated in single precision, and draws of a spread below the
+    ``finest`` would lie beside it.
+    """
+    covariance = np.atleast_2d(np.cov(draws.T)) + finest**2 * np.eye(draws.shape[1])
     spread = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(spread, spread)
     return spread[:, None] * np.linalg.cholesky(

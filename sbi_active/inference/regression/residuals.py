@@ -42,10 +42,8 @@ from scipy.linalg import get_lapack_funcs
 from scipy.optimize import minimize_scalar
 from scipy.special import ndtr, ndtri
 
-from sbi_active.inference.sampling.gaussian_mixture import fitted_normals
-from sbi_active.inference.sampling.student_mixture import StudentMixture
-
-Array = NDArray[Any]
+from sbi_active.arrays import Array
+from sbi_active.inference.sampling.mixtures import StudentMixture, fitted_normals
 
 
 @dataclass(frozen=True)

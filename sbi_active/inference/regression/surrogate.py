@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, f
 
+from sbi_active.arrays import Array
 from sbi_active.inference.regression.outcomes import TrialOutcome
 from sbi_active.inference.regression.regions import Basis, Region, nearest_region
 from sbi_active.inference.regression.residuals import (
@@ -37,13 +38,6 @@ from sbi_active.inference.regression.residuals import (
     alike,
 )
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
-
-Array = NDArray[Any]
-
-CAUTION = 2.0  # at least, under misfit
-FREEDOM = 20  # degrees at least, which know a variance to a third
-MISFIT = 1.12  # residual over noise variance above which the basis misses something
-FLOAT32 = 2.0**-23  # outcomes are float32: their rounding is a floor of the noise
 
 
 @dataclass(frozen=True)
@@ -65,7 +59,8 @@ def estimate_noise(first: Array, second: Array, scale: Array) -> NoiseEstimate:
     The rounding of the largest size of each outcome, shape (q,), is a floor.
     """
     variance = 0.5 * ((first - second) ** 2).mean(0)
-    return NoiseEstimate(variance + (FLOAT32 * scale) ** 2 + 1e-300, len(first))
+    rounding = float(np.finfo(np.float32).eps) * scale  # outcomes are float32
+    return NoiseEstimate(variance + rounding**2 + 1e-300, len(first))
 
 
 @dataclass(frozen=True)
@@ -113,7 +108,7 @@ class LocalRegression:
     @property
     def has_misfit(self) -> bool:
         """Whether the residuals are larger than the noise."""
-        return self.excess > MISFIT
+        return is_misfit(self.excess)
 
     @staticmethod
     def fit(
@@ -128,6 +123,7 @@ class LocalRegression:
         observed: Array | None = None,
         shapes: ShapeSettings | None = None,
         gain: float = 0.005,
+        freedom: int = 20,
     ) -> LocalRegression | None:
         """Fit the basis with the smallest generalized cross-validation score.
 
@@ -142,6 +138,7 @@ class LocalRegression:
             observed: What was observed, shape (q,), for a noise that grows with it.
             shapes: Settings of noise that is not Gaussian; None takes it for Gaussian.
             gain: Nats an outcome that a larger basis must save.
+            freedom: Degrees of freedom at least, which know a variance to a third.
 
         Returns:
             The regression; None where simulations are too few.
@@ -157,7 +154,7 @@ class LocalRegression:
         is_inner = np.linalg.norm(u, axis=1) <= region.inner
         # Both intercepts are to be known.
         is_split = region.inner < 1
-        is_split &= min(is_inner.sum(), (~is_inner).sum()) >= 2 * FREEDOM
+        is_split &= min(is_inner.sum(), (~is_inner).sum()) >= 2 * freedom
         for basis in _candidates(u.shape[1], n):
             if is_split:
                 basis = replace(basis, inner=region.inner)
@@ -165,7 +162,7 @@ class LocalRegression:
             if is_wave and best is not None and _misfit(best[3], noise, best[2]) < 3:
                 break  # a cubic will do, or another stage makes it do
             p = basis.num_features
-            if n < p + max(FREEDOM, p // 2):
+            if n < p + max(freedom, p // 2):
                 continue
             features = basis(u)
             ridge = np.diag(np.full(p, 1e-4 if is_wave else 1e-9))
@@ -183,12 +180,12 @@ class LocalRegression:
         if best is None:
             return None
         _, basis, root, residual, coefficient = best
-        freedom = n - len(root)
-        ratio = (residual**2).sum(0) / freedom / noise.variance
-        deviation = np.sqrt((residual**2).sum(0) / freedom + 1e-9 * noise.variance)
+        left = n - len(root)
+        ratio = (residual**2).sum(0) / left / noise.variance
+        deviation = np.sqrt((residual**2).sum(0) / left + 1e-9 * noise.variance)
         standardized = residual / deviation
-        excess = _excess(ratio, alike(standardized, freedom), freedom, noise.num_pairs)
-        covariance = ResidualCovariance.of(standardized, deviation, freedom, trial)
+        excess = _excess(ratio, alike(standardized, left), left, noise.num_pairs)
+        covariance = ResidualCovariance.of(standardized, deviation, left, trial)
         shape = None
         if shapes is not None and observed is not None:
             shape = NoiseShape.fit(
@@ -230,19 +227,18 @@ class LocalRegression:
         p, q = self.coefficient.shape
         return self.coefficient if q <= p else np.linalg.qr(self.coefficient.T)[1].T
 
-    @property
-    def caution(self) -> float:
+    def caution(self, *, least: float = 2.0) -> float:
         """Factor of the variance that keeps what the misfit would wrongly exclude.
 
         Misfit is no noise: it is the same at each visit, and where the posterior lies
         it may be as large as anywhere in the region. So the largest residual shall
-        count as an ordinary one.
+        count as an ordinary one, and misfit for a factor of 2 at least (a choice).
         """
         if not self.has_misfit:
             return 1.0
         n = len(self.residual)
         square = (self.residual**2).sum(1) * n / (n - len(self.root))
-        return float(max(CAUTION, square.max() / chi2.ppf(0.9, self.used.sum())))
+        return float(max(least, square.max() / chi2.ppf(0.9, self.used.sum())))
 
     def log_likelihood(self, z: Array, caution: float = 1.0) -> Array:
         """Return the log likelihood of the observation, (n, d) -> (n,)."""
@@ -285,7 +281,7 @@ class Surrogate:
         for k, regression in enumerate(self.regressions):
             rows = np.flatnonzero(label == k)
             if len(rows):
-                caution = regression.caution if self.is_cautious else 1.0
+                caution = regression.caution() if self.is_cautious else 1.0
                 log_likelihood[rows] = regression.log_likelihood(z[rows], caution)
         return log_likelihood
 
@@ -294,9 +290,14 @@ class Surrogate:
         return nearest_region([r.region for r in self.regressions], z)
 
 
-def fewest_rows(dim: int) -> int:
+def fewest_rows(dim: int, *, freedom: int = 20) -> int:
     """Return the rows that a linear regression on so many parameters takes."""
-    return 1 + dim + FREEDOM
+    return 1 + dim + freedom
+
+
+def is_misfit(excess: float, *, most: float = 1.12) -> bool:
+    """Return whether a basis misses something, by residual over noise variance."""
+    return excess > most
 
 
 def _candidates(

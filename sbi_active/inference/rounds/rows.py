@@ -30,6 +30,12 @@ class UnexplainedOutcomeError(Explained, ValueError):
     code = "SA119"
 
 
+NOTHING_EXPLAINS = (
+    "expected outcomes that some parameters may explain; got none with a likelihood; "
+    "correct the outcome, or leave the trial out"
+)
+
+
 @dataclass(frozen=True)
 class Observation:
     """A real trial: the executed action, shape (action_dim,), and x, shape x_shape."""
@@ -138,6 +144,26 @@ def check_proposal(proposal: Any, belief: Distribution | None) -> None:
         f"proposal would take the belief's place; got {type(proposal).__name__}; "
         "pass belief= the distribution theta was drawn from"
     )
+
+
+def warn_missing(
+    num_missing: int, num_simulations: int, left_out: str, *, stacklevel: int
+) -> None:
+    """Warn that faults of a simulator took some of a refinement's simulations.
+
+    Args:
+        num_missing: Number of those.
+        num_simulations: Number of all.
+        left_out: What was left out, as the end of a sentence.
+        stacklevel: Stack level of the warning where it is raised.
+    """
+    if num_missing:
+        warn(
+            f"SA301 {num_missing} of {num_simulations} simulations of the refinement "
+            f"are missing, by faults of the simulator; {left_out} were left out",
+            MissingRowsWarning,
+            stacklevel=stacklevel + 1,
+        )
 
 
 def rows_of(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -12,19 +12,11 @@ from scipy.special import ndtr, ndtri
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.seeding import forked_generators
+from sbi_active.arrays import Array
+from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.support import support_bounds, support_of, within_support
 
-Array = NDArray[Any]
-
-#: Where the half-width 1 of an unbounded coordinate lies, in prior deviations.
-REACH = 2.5
-NUM_DRAWS = 2_000  # of the prior, behind its moments
-CHANCE = 5.0  # deviations of a correlation of independent draws that count as none
-SEARCHED = 8.0  # bound of a search, in deviations of the prior
 UNIFORM = 3**-0.5  # deviation of a uniform number between -1 and 1
-FLAT_ERROR = UNIFORM * (0.2 / NUM_DRAWS) ** 0.5  # of the deviation of its draws
-INSIDE = 1 - 1e-6  # bound of a search between -1 and 1, which single precision keeps
 
 
 class PriorCoordinates:
@@ -42,22 +34,32 @@ class PriorCoordinates:
     Args:
         prior: The prior p, with a support.
         rng: Source of the prior draws that give the scale.
+        reach: Prior deviations at which the half-width 1 of an unbounded coordinate
+            lies.
+        num_draws: Number of draws of the prior behind its moments, known to a fiftieth.
 
     Attributes:
         bounded: Axes with two bounds, shape (d,), bool.
     """
 
-    def __init__(self, prior: Distribution, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        prior: Distribution,
+        rng: np.random.Generator,
+        *,
+        reach: float = 2.5,
+        num_draws: int = 2_000,
+    ) -> None:
         self.prior = prior
         with forked_generators(int(rng.integers(2**31))):
-            theta = prior.sample(torch.Size([2_000])).double().numpy()
+            theta = prior.sample(torch.Size([num_draws])).double().numpy()
         self.dim = theta.shape[1]
         self.low, self.high = support_bounds(support_of(prior), self.dim)
         self.bounded = np.isfinite(self.low) & np.isfinite(self.high)
         # +1 for theta > low, -1 for theta < high, 0 for no logarithm.
         self._side = np.isfinite(self.low).astype(int) - np.isfinite(self.high)
         raw = self._forward(theta)
-        self._shift, self._scale = raw.mean(0), REACH * raw.std(0)
+        self._shift, self._scale = raw.mean(0), reach * raw.std(0)
         low, high = self.low[self.bounded], self.high[self.bounded]
         self._shift[self.bounded] = 0.5 * (low + high)
         self._scale[self.bounded] = 0.5 * (high - low)
@@ -119,6 +121,20 @@ class PriorCoordinates:
             theta = self.prior.sample(torch.Size([max(num_samples, 1)]))
         return self.to_z(theta[:num_samples])
 
+    def drawn_from(
+        self, others: Sequence[Distribution], num_samples: int, *, seed: int
+    ) -> list[Array]:
+        """Return coordinates of draws of other distributions, each of shape (n, d).
+
+        Draws outside the support are left out, and distributions that have no others.
+        """
+        found = []
+        for other in others:
+            with forked_generators(derive_seed(seed, "start")):
+                z = self.to_z(other.sample(torch.Size([num_samples])).float())
+            found.append(z[self.inside(z)])
+        return [z for z in found if len(z)]
+
     def _forward(self, theta: Array) -> Array:
         with np.errstate(invalid="ignore", divide="ignore"):
             above, below = np.log(theta - self.low), np.log(self.high - theta)
@@ -170,6 +186,10 @@ class NormalCoordinates:
         coordinates: Coordinates of the prior.
         rng: Source of the draws behind its moments.
         keeps_edges: Whether axes keep two bounds.
+        num_draws: Number of draws of the prior behind its moments.
+        chance: Standard errors of a moment of independent draws that count as chance.
+        searched: Bound of a search, in deviations of the prior.
+        inside: Bound of a search between -1 and 1, which single precision keeps.
 
     Attributes:
         low: Lower bounds of a search, shape (d,).
@@ -185,27 +205,30 @@ class NormalCoordinates:
         rng: np.random.Generator,
         *,
         keeps_edges: bool = True,
+        num_draws: int = 2_000,
+        chance: float = 5.0,
+        searched: float = 8.0,
+        inside: float = 1 - 1e-6,
     ) -> None:
         self.base, self.dim = coordinates, coordinates.dim
-        z, bounded = coordinates.sample_prior(NUM_DRAWS, rng), coordinates.bounded
+        z, bounded = coordinates.sample_prior(num_draws, rng), coordinates.bounded
         self.line = Unbounding(bounded)
-        correlation = _correlation(self.line.to_line(z))
+        correlation = _correlation(self.line.to_line(z), chance)
         apart = np.abs(correlation - np.eye(self.dim)).max(1) == 0
         kept = bounded & apart & keeps_edges
         self.line = Unbounding(bounded & ~kept)
         y = self.line.to_line(z)
         shift, spread = y.mean(0), y.std(0)
         # The moments of a uniform number are known.
-        is_flat = kept & (np.abs(spread - UNIFORM) < CHANCE * FLAT_ERROR)
+        error = UNIFORM * (0.2 / num_draws) ** 0.5  # of the deviation of its draws
+        is_flat = kept & (np.abs(spread - UNIFORM) < chance * error)
         self._shift = np.where(is_flat, 0.0, shift)
         spread = np.where(is_flat, UNIFORM, spread)
         self._factor = spread[:, None] * np.linalg.cholesky(correlation)
         self._log_volume = float(np.log(np.diag(self._factor)).sum())
-        low, high = ((end - self._shift) / spread for end in (-INSIDE, INSIDE))
-        self.low, self.high = (
-            np.where(kept, low, -SEARCHED),
-            np.where(kept, high, SEARCHED),
-        )
+        low, high = ((end - self._shift) / spread for end in (-inside, inside))
+        self.low = np.where(kept, low, -searched)
+        self.high = np.where(kept, high, searched)
         share = np.maximum(1 - (spread / UNIFORM) ** 2, 0.0)
         self.center, self.precision = np.zeros(self.dim), np.where(kept, share, 1.0)
 
@@ -257,10 +280,10 @@ class NormalCoordinates:
         return bool(torch.allclose(apart, together, rtol=1e-4, atol=1e-3))
 
 
-def _correlation(y: Array) -> Array:
+def _correlation(y: Array, chance: float) -> Array:
     """Return correlations of draws (n, d) without those that chance may give."""
     raw = np.atleast_2d(np.corrcoef(y.T))
-    found = np.where(np.abs(raw) < CHANCE * len(y) ** -0.5, 0.0, raw)
+    found = np.where(np.abs(raw) < chance * len(y) ** -0.5, 0.0, raw)
     np.fill_diagonal(found, 1.0)
     if np.linalg.eigvalsh(found)[0] < 1e-6:
         return raw + 1e-6 * np.eye(len(raw))

@@ -8,13 +8,11 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-Array = NDArray[Any]
-Kind = Literal["smooth", "rough"]
+from sbi_active.arrays import Array
 
-TREND = 3.0  # deviation of the trend's coefficients, outputs of unit size
+Kind = Literal["smooth", "rough"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,6 +26,7 @@ class ProcessSettings:
         kind: Kernel, a squared exponential ("smooth") or Matern 5/2 ("rough").
         degree: Degree of the trend, 0 for none; None takes a quadratic one where rows
             are twice its features, which of many inputs and much noise is too many.
+        trend: Deviation of the trend's coefficients.
         length: Mean and deviation of the log length of each input.
         amplitude: Mean and deviation of the log amplitude.
         noise: Mean and deviation of the log standard deviation of learned noise.
@@ -38,6 +37,7 @@ class ProcessSettings:
 
     kind: Kind = "smooth"
     degree: Literal[0, 1, 2] | None = None
+    trend: float = 3.0
     length: tuple[float, float] = (math.log(2.5), 1.0)
     amplitude: tuple[float, float] = (math.log(0.5), 1.5)
     noise: tuple[float, float] = (math.log(0.3), 1.5)
@@ -247,7 +247,7 @@ def _features(u: Tensor, settings: ProcessSettings) -> Tensor:
     if settings.degree == 2:
         row, column = torch.triu_indices(u.shape[1], u.shape[1])
         parts.append(0.5 * u[:, row] * u[:, column])
-    return TREND * torch.cat(parts, 1)
+    return settings.trend * torch.cat(parts, 1)
 
 
 def _amplitude(free: Tensor, settings: ProcessSettings) -> Tensor:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from sbi_active.arrays import Array
 
 #: Maps residuals (..., N) to (..., N) of unit variance.
 Whitener = Callable[[Array], Array]

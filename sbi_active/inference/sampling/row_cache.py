@@ -8,7 +8,8 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from sbi_active.arrays import Array
+
 T = TypeVar("T")
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sbi_active.inference.sampling.student_mixture import Proposal, log_normal
+from sbi_active.arrays import Array
+from sbi_active.inference.sampling.mixtures import Proposal, log_normal
 from sbi_active.inference.sampling.weights import (
     effective_sample_size,
     largest_power,
@@ -17,12 +17,6 @@ from sbi_active.inference.sampling.weights import (
     normalized,
     systematic,
 )
-
-Array = NDArray[Any]
-
-ACCEPTED = 0.35  # share of moves that the step's length is adapted to
-FORGOTTEN = 0.05  # correlation with the start after the moves of a step
-SHRUNK = 0.05  # share of the guess's covariance in that of the particles
 
 
 @dataclass(frozen=True)
@@ -62,7 +56,7 @@ def bridge(
     most: float = np.inf,
     moves: Moves | None = None,
     max_moves: int = 100,
-    forgotten: float = FORGOTTEN,
+    forgotten: float = 0.05,
     max_steps: int = 200,
     shared_least: float = 0.1,
 ) -> Bridged | None:
@@ -206,17 +200,23 @@ class NormalMoves:
 
     Args:
         start: Particles of the first density, shape (n, d).
+        accepted: Share of moves that the step's length is adapted to (a choice).
+        shrunk: Share of the first covariance in that of the particles (a choice).
     """
 
-    def __init__(self, start: Array) -> None:
+    def __init__(
+        self, start: Array, *, accepted: float = 0.35, shrunk: float = 0.05
+    ) -> None:
         self._guessed, self._length = np.atleast_2d(np.cov(start.T)), 1.0
+        self._accepted, self._shrunk = accepted, shrunk
 
     def begin(self, u: Array, weight: Array, power: float) -> None:
         """Take the moments of weighted particles."""
         self._mean = weight @ u
         off = u - self._mean
         cov, guessed = (weight[:, None] * off).T @ off, self._guessed
-        cov = (1 - SHRUNK) * cov + SHRUNK * guessed * min(1.0, _size(cov, guessed))
+        share, size = self._shrunk, min(1.0, _size(cov, guessed))
+        cov = (1 - share) * cov + share * guessed * size
         self._factor = np.linalg.cholesky(cov + 1e-14 * np.eye(u.shape[1]))
 
     def propose(self, u: Array, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -229,7 +229,7 @@ class NormalMoves:
     def remembered(self, before: Array, after: Array, acceptance: float) -> float:
         """Return the correlation across a move, and adapt its length."""
         kept = 1 - acceptance * (1 - np.sqrt(1 - self._length**2))
-        length = self._length * np.exp(acceptance - ACCEPTED)
+        length = self._length * np.exp(acceptance - self._accepted)
         self._length = float(np.clip(length, 0.02, 1.0))
         return float(kept)
 

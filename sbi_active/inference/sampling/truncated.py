@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr, ndtri
 
-Array = NDArray[Any]
+from sbi_active.arrays import Array
 
 
 def log_inside(mean: Array, sd: Array, low: Array, high: Array) -> Array:

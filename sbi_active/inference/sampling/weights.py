@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-Array = NDArray[Any]
+from sbi_active.arrays import Array
 
 
 def log_sum_exp(values: Array, axis: int | None = None) -> Any:

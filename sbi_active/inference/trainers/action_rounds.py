@@ -135,13 +135,12 @@ class ActionRounds(ActiveInference):
     _data_round_index: list[int]
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        sbi_trainer: Any = super()
-        given = given_arguments(sbi_trainer.__init__, args, kwargs)
+        given = given_arguments(self._sbi.__init__, args, kwargs)
         estimator = given.pop(self._sbi_name, None)
         ours = isinstance(estimator, self._settings)
         sbi_takes = estimator is not None and (callable(estimator) or not ours)
         given[self._sbi_name] = estimator if sbi_takes else self._sbi_default
-        sbi_trainer.__init__(**given)
+        self._sbi.__init__(**given)
         # A name stays one: the builder that sbi makes of it cannot be pickled.
         self._action_estimator = self._settings() if estimator is None else estimator
         self._trained_round: int | None = None
@@ -149,14 +148,17 @@ class ActionRounds(ActiveInference):
 
     def __getstate__(self) -> dict[str, Any]:
         # Builders of sbi's are local functions, which pickle refuses.
-        sbi_trainer: Any = super()
         estimator = cloudpickle.dumps(self._action_estimator)
-        return {**sbi_trainer.__getstate__(), "_action_estimator": estimator}
+        return {**self._sbi.__getstate__(), "_action_estimator": estimator}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         estimator = cloudpickle.loads(state["_action_estimator"])
-        sbi_trainer: Any = super()
-        sbi_trainer.__setstate__({**state, "_action_estimator": estimator})
+        self._sbi.__setstate__({**state, "_action_estimator": estimator})
+
+    @property
+    def _sbi(self) -> Any:
+        """What sbi's trainer does, behind the methods that override it."""
+        return super()
 
     @property
     def has_actions(self) -> bool:
@@ -194,10 +196,9 @@ class ActionRounds(ActiveInference):
             RuntimeError: If there are no simulations.
             ValueError: If training is to be resumed on other rows than it began with.
         """
-        sbi_trainer: Any = super()
-        given = given_arguments(sbi_trainer.train, args, kwargs)
+        given = given_arguments(self._sbi.train, args, kwargs)
         if not self.has_actions:
-            return sbi_trainer.train(**given)
+            return self._sbi.train(**given)
         resume = given.get("resume_training", False)
         if resume and self._trained_round != max(self._data_round_index):
             raise ValueError(
@@ -213,16 +214,14 @@ class ActionRounds(ActiveInference):
 
     def _train_round(self, **arguments: Any) -> Any:
         """Train on a round with actions."""
-        sbi_trainer: Any = super()
-        return sbi_trainer.train(**arguments)
+        return self._sbi.train(**arguments)
 
     def _initialize_neural_network(
         self, retrain_from_scratch: bool, start_idx: int
     ) -> None:
         if self.has_actions:
             self._build_neural_net = self._build_action_network
-        sbi_trainer: Any = super()
-        sbi_trainer._initialize_neural_network(retrain_from_scratch, start_idx)
+        self._sbi._initialize_neural_network(retrain_from_scratch, start_idx)
 
     def _build_action_network(self, theta: Tensor, x: Tensor) -> Any:
         if self._has_settings:
@@ -236,8 +235,7 @@ class ActionRounds(ActiveInference):
         """Return the estimator of a posterior and its device, sbi's hook."""
         if estimator is None and self.has_actions:
             self._require_trained()
-        sbi_trainer: Any = super()
-        return sbi_trainer._resolve_estimator(estimator)
+        return self._sbi._resolve_estimator(estimator)
 
     @abstractmethod
     def _model(self, estimator: Any, *arguments: Any) -> Any:
@@ -255,8 +253,7 @@ class ActionRounds(ActiveInference):
         arguments = (estimator, prior, sample_with, device, posterior_parameters)
         if self.has_actions:
             return self._model(*arguments)
-        sbi_trainer: Any = super()
-        return sbi_trainer._create_posterior(*arguments)
+        return self._sbi._create_posterior(*arguments)
 
     def _forget_round(self) -> None:
         self._trained_round = None

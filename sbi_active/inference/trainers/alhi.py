@@ -12,14 +12,10 @@ from torch import Tensor
 
 from sbi_active.inference.models.factors import ActionLikelihood
 from sbi_active.inference.networks.likelihood_network import LikelihoodNetwork
-from sbi_active.inference.networks.mixture_density import (
-    MixtureDensity,
-    TrainingRecord,
-    train_mixture_density,
-)
+from sbi_active.inference.networks.mixture_density import TrainingRecord
 from sbi_active.inference.rounds.rows import RoundRows
 from sbi_active.inference.trainers.action_rounds import extends, takes
-from sbi_active.inference.trainers.mixture_rounds import MixtureRounds, training_budget
+from sbi_active.inference.trainers.mixture_rounds import MixtureRounds
 from sbi_active.inference.trainers.product_rounds import ProductRounds
 
 
@@ -94,11 +90,8 @@ class ALHI(ProductRounds, MixtureRounds, NLE_A):
         assert self._action_dim is not None
         return LikelihoodNetwork(self._action_estimator, x, theta, self._action_dim)
 
-    def _train_mixture(
-        self, settings: MixtureDensity, config: TrainConfig, loss_args: Any
-    ) -> TrainingRecord:
+    def _train_mixture(self, config: TrainConfig, loss_args: Any) -> TrainingRecord:
         network = self._neural_net
-        optimizer = self._adam(network.mixture.parameters(), config)
         condition, x = self._round_rows()
         rows = [
             network.residual_rows(x[index], condition[index])
@@ -106,14 +99,10 @@ class ALHI(ProductRounds, MixtureRounds, NLE_A):
         ]
         residual, seen = (torch.cat(parts) for parts in zip(*rows, strict=True))
         order, num_train = torch.arange(len(residual)), len(rows[0][0])
-        record = train_mixture_density(
-            network.mixture,
-            optimizer,
-            residual,
-            seen,
+        record = self._trained(
+            *(network.mixture, config, residual, seen),
             train_rows=order[:num_train],
             held_out_rows=order[num_train:],
-            budget=training_budget(settings, config, num_train),
         )
         network.choose(*rows[1])
         network.eval()

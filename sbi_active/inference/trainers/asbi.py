@@ -25,23 +25,16 @@ from sbi_active.inference.beliefs.belief import (
     compare,
 )
 from sbi_active.inference.beliefs.priors import require_support
+from sbi_active.inference.engine.learned import LearnedBelief
 from sbi_active.inference.models.posterior import ActionPosterior
-from sbi_active.inference.networks.mixture_density import (
-    MixtureDensity,
-    TrainingRecord,
-    train_mixture_density,
-)
+from sbi_active.inference.networks.mixture_density import TrainingRecord
 from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
-from sbi_active.inference.refinement.learned_belief import LearnedBelief
 from sbi_active.inference.refinement.refining import refine
 from sbi_active.inference.rounds.condition import pack
 from sbi_active.inference.rounds.rows import Observation
-from sbi_active.inference.trainers.action_rounds import (
-    require_likelihood_loss,
-    takes,
-)
+from sbi_active.inference.trainers.action_rounds import require_likelihood_loss, takes
 from sbi_active.inference.trainers.base import Told, is_finite_somewhere
-from sbi_active.inference.trainers.mixture_rounds import MixtureRounds, training_budget
+from sbi_active.inference.trainers.mixture_rounds import MixtureRounds
 from sbi_active.messages import warn
 from sbi_active.seeding import kept_generators
 
@@ -182,17 +175,12 @@ class ASBI(MixtureRounds, NPE_C):
         # It does better where it knows which numbers are the action.
         return self._action_estimator.build(theta, x, self._action_dim)
 
-    def _train_mixture(
-        self, settings: MixtureDensity, config: TrainConfig, loss_args: Any
-    ) -> TrainingRecord:
-        network, kernel = self._neural_net, loss_args.calibration_kernel
-        return train_mixture_density(
-            network,
-            self._adam(network.parameters(), config),
-            *self._round_rows(),
+    def _train_mixture(self, config: TrainConfig, loss_args: Any) -> TrainingRecord:
+        kernel = loss_args.calibration_kernel
+        return self._trained(
+            *(self._neural_net, config, *self._round_rows()),
             train_rows=self.train_indices,
             held_out_rows=self.val_indices,
-            budget=training_budget(settings, config, len(self.train_indices)),
             calibration_kernel=None if kernel is _all_alike else kernel,
         )
 

@@ -26,7 +26,7 @@ class Told:
         trials: Trials, all of them, the new one last.
         simulator: If given, simulator to refine the belief with; otherwise use the
             network.
-        refinement: Budget of the refinement; None is ``RefinementOptions()``.
+        settings: Settings of the refinement.
         given_seed: Seed given by the caller; None for none.
         afresh: Whether to begin at the prior, without the belief before the last trial
             and without this round's network.
@@ -34,14 +34,9 @@ class Told:
 
     trials: Sequence[Observation]
     simulator: Callable[..., Any] | None
-    refinement: RefinementOptions | None
+    settings: RefinementOptions
     given_seed: int | None
     afresh: bool = False
-
-    @property
-    def settings(self) -> RefinementOptions:
-        """Settings of the refinement."""
-        return RefinementOptions() if self.refinement is None else self.refinement
 
     def seed(self) -> int:
         """Return the seed given, or else one from torch's global generator."""
@@ -153,7 +148,8 @@ class ActiveInference(ABC):
         """
         trial = self._observation(x_o, action)
         trials = (*self.trials, trial)
-        return self._conclude(Told(trials, simulator, refinement, seed))
+        settings = refinement or RefinementOptions()
+        return self._conclude(Told(trials, simulator, settings, seed))
 
     def update_all(
         self,
@@ -176,7 +172,8 @@ class ActiveInference(ABC):
         """
         if not trials:
             raise ValueError("expected at least one trial; got none; pass trials")
-        return self._conclude(Told((*trials,), simulator, refinement, seed, True))
+        settings = refinement or RefinementOptions()
+        return self._conclude(Told((*trials,), simulator, settings, seed, True))
 
     def resume(self, belief: Distribution, trials: Sequence[Observation]) -> None:
         """Go on from a belief that was inferred before.

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable
 from typing import Any
 
 import torch
 from sbi.inference.trainers._contracts import LossArgs, TrainConfig
 from torch import Tensor
-from torch.nn import Parameter
 from torch.utils.data import DataLoader
 
 from sbi_active.inference.networks.mixture_density import (
     MixtureDensity,
     TrainingBudget,
     TrainingRecord,
+    train_mixture_density,
 )
+from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
 from sbi_active.inference.trainers.action_rounds import NEVER, ActionRounds
 
 
@@ -33,9 +33,7 @@ class MixtureRounds(ActionRounds):
     _fused: bool | None = None  # whether Adam is one kernel
 
     @abstractmethod
-    def _train_mixture(
-        self, settings: MixtureDensity, config: TrainConfig, loss_args: Any
-    ) -> TrainingRecord:
+    def _train_mixture(self, config: TrainConfig, loss_args: Any) -> TrainingRecord:
         """Train the network on this round's rows."""
 
     def _training_defaults(self, given: dict[str, Any]) -> dict[str, Any]:
@@ -56,12 +54,11 @@ class MixtureRounds(ActionRounds):
         """Train; for :class:`MixtureDensity` with actions, by the lean loop."""
         trainer: Any = self
         if not (self.has_actions and self._has_settings):
-            sbi_trainer: Any = super()
-            return sbi_trainer._run_training_loop(
+            return self._sbi._run_training_loop(
                 train_loader, val_loader, train_config, loss_args, summarization_kwargs
             )
         self._neural_net.to(self._device)
-        record = self._train_mixture(self._action_estimator, train_config, loss_args)
+        record = self._train_mixture(train_config, loss_args)
         # What sbi's own loop would write.
         trainer._best_val_loss = best = min(record.validation_loss)
         summary = trainer._summary
@@ -75,33 +72,40 @@ class MixtureRounds(ActionRounds):
             print(trainer._describe_round(self._round, summary))
         return self._neural_net
 
-    def _adam(
-        self, parameters: Iterable[Parameter], config: TrainConfig
-    ) -> torch.optim.Adam:
-        """Return the optimizer, the one so far where training is resumed."""
+    def _trained(
+        self,
+        network: MixtureDensityNetwork,
+        config: TrainConfig,
+        theta: Tensor,
+        condition: Tensor,
+        **rows: Any,
+    ) -> TrainingRecord:
+        """Train a network, see :func:`.train_mixture_density`.
+
+        The optimizer is the one so far where training is resumed.
+        """
         if not config.resume_training:
             self.optimizer = torch.optim.Adam(
-                parameters, lr=config.learning_rate, fused=self._fused
+                network.parameters(), lr=config.learning_rate, fused=self._fused
             )
-        return self.optimizer
+        settings, size = self._action_estimator, config.training_batch_size
+        steps, patience = (
+            max(len(rows["train_rows"]) // size, 1),
+            config.stop_after_epochs,
+        )
+        budget = TrainingBudget(
+            num_iterations=min(settings.num_iterations, steps * config.max_num_epochs),
+            batch_size=size,
+            clip_max_norm=config.clip_max_norm,
+            anneal=settings.anneal,
+            patience=None if patience == NEVER else patience,
+        )
+        return train_mixture_density(
+            network, self.optimizer, theta, condition, budget=budget, **rows
+        )
 
     def _round_rows(self) -> tuple[Tensor, Tensor]:
         """Return this round's rows as sbi's trainer sees them, on the device."""
         trainer: Any = self
         theta, x, _ = trainer.get_simulations(self._round)
         return theta.to(self._device), x.to(self._device)
-
-
-def training_budget(
-    settings: MixtureDensity, config: TrainConfig, num_rows: int
-) -> TrainingBudget:
-    """Return the budget of training on so many rows."""
-    steps = max(num_rows // config.training_batch_size, 1)
-    patience = config.stop_after_epochs
-    return TrainingBudget(
-        num_iterations=min(settings.num_iterations, steps * config.max_num_epochs),
-        batch_size=config.training_batch_size,
-        clip_max_norm=config.clip_max_norm,
-        anneal=settings.anneal,
-        patience=None if patience == NEVER else patience,
-    )

@@ -14,17 +14,17 @@ from torch.distributions import Distribution
 from typing_extensions import Self
 
 from sbi_active.inference.beliefs.belief import Belief
-from sbi_active.inference.beliefs.kernel_belief import KernelBelief
 from sbi_active.inference.beliefs.priors import require_support
+from sbi_active.inference.beliefs.weighted import KernelBelief
 from sbi_active.inference.declared.settings import RefinementOptions
-from sbi_active.inference.models.factors import ActionFactor
-from sbi_active.inference.models.product import (
+from sbi_active.inference.models.factors import (
+    ActionFactor,
     Product,
     TrainedRegion,
     sample_product,
     widened,
 )
-from sbi_active.inference.refinement.course import StageSettings
+from sbi_active.inference.refinement.stages import StageSettings
 from sbi_active.inference.rounds.rows import Observation, require_whole, rows_of
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.trainers.action_rounds import ActionRounds
@@ -116,8 +116,7 @@ class ProductRounds(ActionRounds):
         """
         if not self._is_round(action, belief):
             named = {} if algorithm is None else {"algorithm": algorithm}
-            sbi_trainer: Any = super()
-            return sbi_trainer.append_simulations(
+            return self._sbi.append_simulations(
                 theta,
                 x,
                 exclude_invalid_x=bool(exclude_invalid_x),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from inspect import signature
 from typing import Any
 
 from sbi.inference import NRE_B, NRE_C
@@ -20,7 +21,6 @@ from sbi_active.inference.trainers.product_rounds import ProductRounds
 from sbi_active.inference.trainers.seqbed import SeqBED_LFIRE
 from sbi_active.messages import ChangedWarning, warn
 
-HELD_OUT = 0.1  # share of the rows, sbi's default
 #: Keywords of SeqBED in the last version alone.
 LFIRE_KEYWORDS = {"settings", "num_particles"}
 
@@ -72,7 +72,8 @@ class AmortizedRounds(ProductRounds, RatioEstimatorTrainer):
     def _training_defaults(self, given: dict[str, Any]) -> dict[str, Any]:
         settings: RatioClassifier = self._action_estimator
         num_rows = len(self._round_parameters())
-        num_rows -= int(num_rows * given.get("validation_fraction", HELD_OUT))
+        fraction = signature(NRE_B.train).parameters["validation_fraction"]
+        num_rows -= int(num_rows * given.get(fraction.name, fraction.default))
         steps = max(num_rows // settings.batch_size, 1)
         return {
             "training_batch_size": settings.batch_size,

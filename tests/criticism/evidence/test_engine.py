@@ -7,7 +7,6 @@ import pytest
 
 from sbi_active.criticism.evidence.settings import NESTED, THOROUGH, settings_of
 from sbi_active.inference.engine import infer, search
-from sbi_active.inference.engine.search import WIDER
 from tests.criticism.evidence.linear import exact, linear_rival
 
 FEW = settings_of(8, is_bare=False)
@@ -28,7 +27,7 @@ def test_the_mode_and_its_width_are_the_posterior_s(how):
     deviation = np.sqrt(np.diag(closed.covariance))
     # The prior's moments in the search are those of 1,000 draws.
     assert (abs(z - closed.mean) < 0.1 * deviation).all()
-    factor = rival.coordinates.scale[:, None] * found.guess.factors[0] / WIDER
+    factor = rival.coordinates.scale[:, None] * found.guess.factors[0] / found.wider
     assert factor @ factor.T == pytest.approx(closed.covariance, rel=0.05)
 
 

@@ -9,7 +9,7 @@ from torch.distributions import Independent, LogNormal
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.inference import refine
-from sbi_active.inference.declared.simulated_belief import SimulatedBelief
+from sbi_active.inference.declared.refining import SimulatedBelief
 from sbi_active.inference.engine import SimulatedPotential, search
 from sbi_active.inference.engine.potential import (
     MeanTable,

@@ -10,7 +10,7 @@ from sbi.utils import BoxUniform
 from torch import Tensor
 
 from sbi_active.inference import RefinementOptions, refine
-from sbi_active.inference.declared.simulated_belief import SimulatedBelief
+from sbi_active.inference.declared.refining import SimulatedBelief
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 

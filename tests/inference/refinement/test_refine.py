@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.inference import RefinementOptions, refine
-from sbi_active.inference.refinement.learned_belief import LearnedBelief
+from sbi_active.inference.engine.learned import LearnedBelief
 from sbi_active.seeding import forked_generators
 from tests.inference.refinement.refined_worlds import BOX, draws, numerical, observe
 from tests.oracles.judging import Found, judged

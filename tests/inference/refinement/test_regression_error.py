@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.distributions import MultivariateNormal
 
-from sbi_active.inference.refinement.regression_error import expected_error
+from sbi_active.inference.refinement.checks import expected_error
 from sbi_active.inference.regression.histories import Histories
 from sbi_active.inference.regression.regions import (
     whole_space,

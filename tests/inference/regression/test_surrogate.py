@@ -36,7 +36,7 @@ def test_likelihood_of_a_linear_model(q: int):
     error = np.sqrt(q / 2 / NUM) + np.sqrt(3 * square.max() / NUM)
     assert abs(fit.log_likelihood(z) - exact).max() < 4 * error
     assert not fit.has_misfit
-    assert fit.caution == 1
+    assert fit.caution() == 1
 
 
 def test_misfit_is_told_from_noise():
@@ -44,4 +44,4 @@ def test_misfit_is_told_from_noise():
     fit, _ = regress(lambda z: np.sign(z - 0.1))
     assert fit.has_misfit
     assert fit.ratio > 3
-    assert fit.caution >= 2
+    assert fit.caution() >= 2

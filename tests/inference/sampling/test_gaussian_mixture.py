@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sbi_active.inference.sampling.gaussian_mixture import fitted_normals
+from sbi_active.inference.sampling.mixtures import fitted_normals
 
 
 def test_mixture_handles_repeated_points():

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal, norm
 
+from sbi_active.inference.sampling.mixtures import StudentMixture
 from sbi_active.inference.sampling.smc import bridge
-from sbi_active.inference.sampling.student_mixture import StudentMixture
 
 
 def standard(u):

@@ -10,7 +10,7 @@ from sbi.inference.potentials import likelihood_estimator_based_potential
 from sbi.utils import BoxUniform
 
 from sbi_active import ALHI, MixtureDensity
-from sbi_active.inference.models.product import Product
+from sbi_active.inference.models.factors import Product
 from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from tests.linear_gaussian import DIM, PRIOR, simulator

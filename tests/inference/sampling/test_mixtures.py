@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_t
 
-from sbi_active.inference.sampling.student_mixture import (
+from sbi_active.inference.sampling.mixtures import (
     StudentMixture,
     lower_factors,
 )

@@ -1,25 +1,19 @@
-"""Mixtures of t and of normal distributions, and mixtures that defend themselves."""
+"""Mixtures of t and of normal distributions: densities, draws, and fits to points."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 from typing_extensions import override
 
+from sbi_active.arrays import Array
 from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.weights import log_sum_exp, systematic
-
-Array = NDArray[Any]
-
-#: Degrees of freedom: tails above any Gaussian's, and a covariance that exists.
-FREEDOM = 5.0
-#: Numbers of an array that are computed at a time.
-BLOCK = 100_000
 
 
 class Proposal(Protocol):
@@ -34,9 +28,7 @@ class Proposal(Protocol):
         ...
 
 
-def log_student(
-    square: Array, log_volume: Array, dim: int, freedom: float = FREEDOM
-) -> Array:
+def log_student(square: Array, log_volume: Array, dim: int, freedom: float) -> Array:
     r"""Return log densities of multivariate t distributions.
 
     .. math::
@@ -79,7 +71,8 @@ class StudentMixture(Proposal):
         factors: A, shape (k, d, d): lower Cholesky factors of the scale matrices, or
             axes of unit scale.
         weights: Sum to 1, shape (k,); none are equal ones.
-        freedom: Degrees of freedom; infinite has normal components.
+        freedom: Degrees of freedom; infinite has normal components. Five have tails
+            above any Gaussian's, and a covariance that exists.
         left: l, shape (k, d); None is 1.
         right: r, likewise.
 
@@ -90,7 +83,7 @@ class StudentMixture(Proposal):
     means: Array
     factors: Array
     weights: Array = field(default_factory=lambda: np.zeros(0))
-    freedom: float = FREEDOM
+    freedom: float = 5.0
     left: Array | None = None
     right: Array | None = None
 
@@ -130,9 +123,10 @@ class StudentMixture(Proposal):
             total += np.exp(parts - log_sum_exp(parts, axis=0)) @ weight[at]
         return total
 
-    def _blocks(self, z: Array) -> list[NDArray[np.intp]]:
-        # Hundreds of components by thousands of draws are more than memory holds.
-        num = 1 + self.means.size * len(z) // BLOCK
+    def _blocks(self, z: Array, *, most: int = 100_000) -> list[NDArray[np.intp]]:
+        # Hundreds of components by thousands of draws are more than memory holds: so
+        # many numbers at a time.
+        num = 1 + self.means.size * len(z) // most
         return np.array_split(np.arange(len(z)), num)
 
     def log_parts(self, z: Array) -> Array:
@@ -212,3 +206,65 @@ def log_normal(z: Array, mean: Array, factor: Array) -> Array:
     step = np.linalg.solve(factor, (z - mean).T)
     volume = np.log(np.diag(factor)).sum() + 0.5 * len(mean) * np.log(2 * np.pi)
     return -0.5 * (step**2).sum(0) - volume
+
+
+def fitted_normals(
+    points: Array,
+    num_components: int,
+    rng: np.random.Generator,
+    *,
+    num_iterations: int = 25,
+) -> StudentMixture:
+    """Return normal components, fitted by expectation-maximization to points (n, d).
+
+    They begin at seeds spread over the points. Repeated points count as often as they
+    occur; where points are few, components are fewer.
+    """
+    center = points.mean(0)
+    # A relative floor: a cluster may be 1e-5 of the cloud wide, or one point.
+    spread = points.std(0) + 1e-12 * (np.abs(center) + 1.0)
+    covariance = np.cov(((points - center) / spread).T, bias=True)
+    root = np.linalg.cholesky(np.atleast_2d(covariance) + 1e-12 * np.eye(len(spread)))
+    whitening = spread[:, None] * root
+    z = np.linalg.solve(whitening, (points - center).T).T
+    n, d = z.shape
+    num_moments = d * (d + 3) // 2  # of a mean and a covariance
+    k = max(1, min(num_components, n // max(2 * d + 2, num_moments)))
+    share = _spread_responsibility(z, k, rng)
+    previous = -np.inf
+    for _ in range(num_iterations if k > 1 else 1):
+        count = share.sum(0) + 1e-12
+        mean = (share.T @ z) / count[:, None]
+        second = (share.T[:, None] * z.T) @ z
+        covariance = second / count[:, None, None] - mean[:, :, None] * mean[:, None]
+        floor = 1e-9 + 1e-6 * (count < d + 1)[:, None, None]
+        factor = np.linalg.cholesky(_positive(covariance) + floor * np.eye(d))
+        mixture = StudentMixture(mean, factor, count / count.sum(), np.inf)
+        joint = mixture.log_parts(z).T
+        total = log_sum_exp(joint, axis=1)
+        share = np.exp(joint - total[:, None])
+        if total.mean() - previous < 1e-3:
+            break
+        previous = total.mean()
+    return replace(
+        mixture, means=mean @ whitening.T + center, factors=whitening @ factor
+    )
+
+
+def _spread_responsibility(z: Array, k: int, rng: np.random.Generator) -> Array:
+    """Return each point's nearest seed, the seeds far apart, shape (n, k)."""
+    seeds = z[[rng.integers(len(z))]]
+    square = ((z - seeds) ** 2).sum(1)
+    for _ in range(k - 1):
+        total = square.sum()
+        pick = rng.choice(len(z), p=square / total) if total > 0 else 0
+        seeds = np.concatenate([seeds, z[[pick]]])
+        square = np.minimum(square, ((z - z[pick]) ** 2).sum(1))
+    distance = ((z[:, None] - seeds) ** 2).sum(-1)
+    return np.eye(k)[distance.argmin(1)]
+
+
+def _positive(covariance: Array) -> Array:
+    """Return the nearest positive semi-definite matrices; rounding leaves -1e-16."""
+    value, vector = eigh(covariance)
+    return (vector * np.maximum(value, 0.0)[:, None]) @ np.swapaxes(vector, -1, -2)
