@@ -29,7 +29,7 @@ from sbi_active.campaign.storage.simulations import Storage, num_rows, stored
 from sbi_active.campaign.trials import CampaignTrials
 from sbi_active.design.target import Target
 from sbi_active.renamed import set_later
-from sbi_active.simulation.workers.meter import SimulationBudgetError, metering
+from sbi_active.simulation.workers.store import SimulationBudgetError, metering
 
 if TYPE_CHECKING:
     from sbi_active.criticism import Effect, Report

@@ -70,7 +70,7 @@ __getattr__ = lazy_names(
         __name__,
         {
             "ReusedRows": "sbi_active.simulation.bank:ReusedRows",
-            "RowStore": "sbi_active.simulation.workers:RowStore",
+            "RowStore": "sbi_active.simulation.workers.store:RowStore",
             "Simulator": "sbi_active.simulation.simulator:Simulator",
             "SimulatorReport": "sbi_active.simulation.report:SimulatorReport",
             "require_noise": "sbi_active.simulation.simulator:require_noise",

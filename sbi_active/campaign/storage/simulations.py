@@ -19,7 +19,7 @@ from sbi_active.simulation.bank.bank import Bank
 from sbi_active.simulation.bank.sqlite import NAME
 from sbi_active.simulation.bank.store import Store
 from sbi_active.simulation.model import SimulatorModel
-from sbi_active.simulation.workers.meter import metering
+from sbi_active.simulation.workers.store import metering
 
 OWN = "drawn"  # rows of the simulator itself
 Method = TypeVar("Method", bound=Callable[..., Any])
