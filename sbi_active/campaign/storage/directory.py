@@ -9,7 +9,7 @@ simulator's. ``campaign.toml`` says what the campaign is, for people alone.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,10 @@ from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.state import LOST, CampaignState, ModelVersion
 from sbi_active.campaign.storage.codec import NotStorableError, decode, encode
 from sbi_active.campaign.storage.manifest import read_manifest
+from sbi_active.campaign.storage.simulations import form_of
 from sbi_active.campaign.telling import LOG, STATE, SUMMARY, event_of, facts_in
 from sbi_active.messages import Explained
+from sbi_active.simulation.bank.bank import Bank
 from sbi_active.simulation.bank.sqlite import CorruptSegmentError, require, sensible
 from sbi_active.simulation.bank.store import Store
 
@@ -46,46 +48,94 @@ class LogChangedError(Explained, ValueError):
         )
 
 
-class CampaignDirectory:
-    """Keeps a campaign on the disk.
+class Storage:
+    """Keeps a campaign in a folder, its simulations in banks, or neither.
 
     Any number of processes may read. The first thing that is written takes the right to
-    write, which ends with :meth:`close` or the process.
+    write, which ends with :meth:`close` or the process. A row is never simulated twice:
+    what is asked for again, by the same seed, theta and action, is read. Rows of
+    rivals, simulators with effects that are compared and not used, are not stored.
 
     Args:
-        path: Folder with a campaign.
+        path: Folder with a campaign; None keeps it in memory alone.
         repair: Whether to give up what is damaged.
+        prior: Prior that the campaign began with; it may be set later.
 
     Attributes:
         path: The folder.
         store: Store of the campaign's records.
         manifest: Description of the campaign.
         notes: Notes on what was given up, a sentence each.
+        bank: Folder of the simulations, to be set; None keeps them in the campaign's
+            file.
+        prior: Prior that the campaign began with.
 
     Raises:
         ValueError: If the folder holds no campaign, or one of another schema.
         CorruptSegmentError: If the file does not hold what was written.
     """
 
-    def __init__(self, path: Path, *, repair: bool = False) -> None:
-        self.path, self.notes = path, []
-        self.store = Store(path, "campaign")
-        if repair and self.store.problems():
+    def __init__(
+        self, path: Path | None = None, *, repair: bool = False, prior: Any = None
+    ) -> None:
+        self.path, self.notes, self.manifest = path, [], {}
+        self.prior = prior
+        self.bank: str | None = None
+        self._entries: list[dict[str, Any]] = []
+        self._saved: dict[str, Any] | None = None
+        self._written: Any = None  # the belief that is on the disk
+        self._banks: dict[str, Bank] = {}
+        self._shared: Store | None = None  # the file of ``bank``
+        self._store = None if path is None else Store(path, "campaign")
+        if self._store is not None:
+            self._read(repair=repair)
+
+    def _read(self, *, repair: bool) -> None:
+        store = self.store
+        if repair and store.problems():
             self._give_up_lines()
-            self.store.salvage()
-            with self.store.writing():
-                self.store.delete(SUMMARY)
-            self.store.close()
-        self.manifest = read_manifest(self.store)
-        numbers = range(1, self.store.length(LOG) + 1)
-        self._entries = [self._line(number) for number in numbers]
+            store.salvage()
+            with store.writing():
+                store.delete(SUMMARY)
+            store.close()
+        self.manifest = read_manifest(store)
+        self._entries = [self._line(k + 1) for k in range(store.length(LOG))]
         self._saved = self._saved_state()
         if self._saved is not None:
-            with sensible(self.store.path):
+            with sensible(store.path):
                 self._require_whole(self._saved, repair=repair)
-        self._written: Any = None  # the belief that is on the disk
         for entry in self._changes:
             self.manifest["simulator"] = entry["simulator"]
+
+    @property
+    def store(self) -> Store:
+        """Store of the campaign's records, where it has a folder."""
+        assert self._store is not None
+        return self._store
+
+    def find_bank(
+        self, simulator: Callable[..., Any], current: Any, version: int
+    ) -> Bank | None:
+        """Return the bank of a form of the current simulator, open for writing.
+
+        Args:
+            simulator: Simulator whose rows are to be kept.
+            current: The current simulator of the campaign.
+            version: Number of its version.
+        """
+        is_kept = self._store is not None or self.bank is not None
+        form = form_of(simulator, current) if is_kept and current is not None else None
+        if form is None:
+            return None
+        changes = len(self._changes) if self.bank is None else 0
+        name = form + f"-model-{version}" * (version > 0)
+        name += f"-changed-{changes}" * (changes > 0)
+        if name not in self._banks:
+            if self.bank is not None and self._shared is None:
+                self._shared = Store(Path(self.bank), make=True)
+            place = self._shared or self.store
+            self._banks[name] = Bank(place, simulator=simulator, name=name)
+        return self._banks[name]
 
     def write(self, event: str, trial: Any = None, **entries: Any) -> None:
         """Add to the log; it is on the disk when this returns.
@@ -95,6 +145,8 @@ class CampaignDirectory:
             trial: The trial as it is afterwards, or its facts.
             **entries: JSON data.
         """
+        if self._store is None:
+            return
         line = {"line": len(self._entries) + 1, **event_of(event, trial, **entries)}
         self.acquire()
         with self.store.writing():
@@ -106,11 +158,6 @@ class CampaignDirectory:
     def events(self) -> Sequence[Mapping[str, Any]]:
         """The lines of the log so far."""
         return (*self._entries,)
-
-    @property
-    def num_changes(self) -> int:
-        """Number of times that another simulator took the place of the one before."""
-        return len(self._changes)
 
     def given(self, what: str, *, reads: bool) -> Any:
         """Return the prior, the actions or the options; None if they are not stored.
@@ -128,16 +175,19 @@ class CampaignDirectory:
                 return None
             return decode(content, known={})
 
-    def save(self, state: CampaignState, belief: Any, known: Mapping[str, Any]) -> None:
+    def save(self, state: CampaignState, learner: Any) -> None:
         """Write what follows from the log so far.
 
         A belief that cannot be stored is computed again after :meth:`restore`.
 
         Args:
             state: State of the campaign.
-            belief: Belief after ``state.processed``; None if that is the prior.
-            known: Objects that the reader has too, see :func:`.encode`.
+            learner: Learner of the campaign, whose belief is after ``state.processed``.
         """
+        if self._store is None:
+            return
+        belief = None if learner.belief is learner.prior else learner.belief
+        known = {"simulator": learner.simulator, "prior": self.prior}
         content = None
         if belief is not None and belief is not self._written:
             content = b""  # it has to be computed again, unless it can be stored
@@ -200,7 +250,11 @@ class CampaignDirectory:
 
     def close(self) -> None:
         """Let others write."""
-        self.store.close()
+        for bank in self._banks.values():
+            bank.close()
+        self._banks.clear()
+        if self._store is not None:
+            self._store.close()
 
     def acquire(self) -> None:
         """Take the right to write.
@@ -209,7 +263,7 @@ class CampaignDirectory:
             LockedError: If another process has it.
             LogChangedError: If another process wrote since the campaign was loaded.
         """
-        if self.store.held:
+        if self._store is None or self._store.held:
             return
         self.store.acquire()
         try:
