@@ -47,18 +47,9 @@ class CampaignDetails:
     num_scored: int = 2_000
 
     def __post_init__(self) -> None:
-        require(
-            self.design_on in ("fresh", "training"),
-            "design_on 'fresh' or 'training'",
-            repr(self.design_on),
-            "choose one of these",
-        )
-        require(
-            self.num_scored >= 100,
-            "num_scored >= 100",
-            self.num_scored,
-            "use about 2000, since no tail probability is below 1 / (num_scored + 1)",
-        )
+        _require_one_of(self, design_on=("fresh", "training"))
+        advice = "use about 2000: no tail probability is below 1 / (num_scored + 1)"
+        _require_least(self, num_scored=(100, advice))
 
 
 @suggests
@@ -267,21 +258,29 @@ class CampaignOptions:
             f"{self.refinement.workers} for them",
             "pass workers to CampaignOptions alone",
         )
-        require(
-            self.network in ("each round", "on demand"),
-            "network 'each round' or 'on demand'",
-            repr(self.network),
-            "pass one of these",
+        _require_one_of(self, network=("each round", "on demand"))
+        _require_least(
+            self,
+            num_simulations=(100, "use about 5000 a round"),
+            max_simulations=(100, "use some hundred a trial"),
+            planned_trials=(1, "pass the number of trials that you can run"),
+            check_every=(1, "use 2 or 3 where the simulator may lack something"),
         )
-        for name, least, advice in (
-            ("num_simulations", 100, "use about 5000 a round"),
-            ("max_simulations", 100, "use some hundred a trial"),
-            ("planned_trials", 1, "pass the number of trials that you can run"),
-            ("check_every", 1, "use 2 or 3 where the simulator may lack something"),
-        ):
-            value = getattr(self, name)
-            expected = f"{name} >= {least}"
-            if getattr(type(self), name) is None:
-                expected += " or None"
-                value = least if value is None else value
-            require(value >= least, expected, value, advice)
+
+
+def _require_one_of(settings: Any, **known: Sequence[str]) -> None:
+    """Raise if a field of settings is none of the values that it may have."""
+    for name, values in known.items():
+        value, choices = getattr(settings, name), " or ".join(map(repr, values))
+        expected = f"{name} {choices}"
+        require(value in values, expected, repr(value), "choose one of these")
+
+
+def _require_least(settings: Any, **limits: tuple[int, str]) -> None:
+    """Raise if a field of settings is below its limit; the advice stands beside it."""
+    for name, (least, advice) in limits.items():
+        value, expected = getattr(settings, name), f"{name} >= {least}"
+        if getattr(type(settings), name) is None:
+            expected += " or None"
+            value = least if value is None else value
+        require(value >= least, expected, value, advice)

@@ -231,12 +231,7 @@ class CampaignTrials(Telling[Trial]):
         trial had been used, missing where it was not; "seconds" and "cpu_seconds" over
         all stages. The index is the trial's. Units stand in ``attrs["units"]``.
         """
-        return to_dataframe(
-            self.state,
-            self.actions,
-            parameter_names=self.parameter_names,
-            channel_names=self.channel_names,
-        )
+        return to_dataframe(self)
 
     def plot(
         self, *, theta_true: Tensor | None = None, num_predicted: int = 64
@@ -256,15 +251,9 @@ class CampaignTrials(Telling[Trial]):
         Raises:
             ValueError: If ``theta_true`` has more numbers than there are parameters.
         """
-        figure = plot_campaign(
-            self.state,
-            None if self.simulator is None else self._learner.at,
-            self.prior,
-            parameter_names=self.parameter_names,
-            theta_true=theta_true,
-            num_predicted=0 if self.state.meter.limit else num_predicted,
-        )
-        return legible(figure)
+        num_predicted = 0 if self.state.meter.limit else num_predicted
+        how = {"theta_true": theta_true, "num_predicted": num_predicted}
+        return legible(plot_campaign(self, **how))
 
     tell = guarded(isolated(Telling.tell))
     attach = guarded(Telling.attach)
