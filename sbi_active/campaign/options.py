@@ -20,6 +20,24 @@ from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 
+def _require_one_of(settings: Any, **known: Sequence[str]) -> None:
+    """Raise if a field of settings is none of the values that it may have."""
+    for name, values in known.items():
+        value, choices = getattr(settings, name), " or ".join(map(repr, values))
+        expected = f"{name} {choices}"
+        require(value in values, expected, repr(value), "choose one of these")
+
+
+def _require_least(settings: Any, **limits: tuple[int, str]) -> None:
+    """Raise if a field of settings is below its limit; the advice stands beside it."""
+    for name, (least, advice) in limits.items():
+        value, expected = getattr(settings, name), f"{name} >= {least}"
+        if getattr(type(settings), name) is None:
+            expected += " or None"
+            value = least if value is None else value
+        require(value >= least, expected, value, advice)
+
+
 @suggests
 @dataclass(frozen=True, kw_only=True)
 class CampaignDetails:
@@ -266,21 +284,3 @@ class CampaignOptions:
             planned_trials=(1, "pass the number of trials that you can run"),
             check_every=(1, "use 2 or 3 where the simulator may lack something"),
         )
-
-
-def _require_one_of(settings: Any, **known: Sequence[str]) -> None:
-    """Raise if a field of settings is none of the values that it may have."""
-    for name, values in known.items():
-        value, choices = getattr(settings, name), " or ".join(map(repr, values))
-        expected = f"{name} {choices}"
-        require(value in values, expected, repr(value), "choose one of these")
-
-
-def _require_least(settings: Any, **limits: tuple[int, str]) -> None:
-    """Raise if a field of settings is below its limit; the advice stands beside it."""
-    for name, (least, advice) in limits.items():
-        value, expected = getattr(settings, name), f"{name} >= {least}"
-        if getattr(type(settings), name) is None:
-            expected += " or None"
-            value = least if value is None else value
-        require(value >= least, expected, value, advice)
