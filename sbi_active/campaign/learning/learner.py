@@ -111,10 +111,6 @@ class Learner:
         seed = derive_seed(self.state.seed, "index")
         return depends_on_index(self.simulator, self.prior, self.actions, seed=seed)
 
-    def forget(self) -> None:
-        """Have the next update compute everything again."""
-        self.state.is_stale = bool(self.state.processed)
-
     def resume(self, belief: Callable[[], Distribution]) -> None:
         """Go on where ``state.processed`` ends.
 

@@ -67,21 +67,15 @@ class StoredLearner:
         """The belief when the campaign was last brought up to date."""
         saved, self._saved = self._saved, None
         if saved is not None:
-            try:
-                self._belief = self._shown(saved())
-            except ValueError as error:
-                warn(
-                    f"SA601 the belief has to be computed again: {error}",
-                    stacklevel=3,
-                )
-                self.state.is_stale = True
+            self._belief = self._shown(saved() or self.first_prior)
         return self._belief
 
     def _shown(self, belief: Any) -> Distribution:
         """Return a belief as read; its draws where there is no density of the prior."""
         kept, processed = self.state.draws, self.state.processed
         known = [index for index in processed if index in kept]
-        if not isinstance(self.first_prior, DrawnPrior) or not known:
+        has_density = not isinstance(self.first_prior, DrawnPrior)
+        if has_density or belief is self.first_prior or not known:
             return belief
         shown: Any = DrawnPrior(kept[known[-1]])
         for name in ("prior", "label", "parameter_names", "diagnostics"):
@@ -143,8 +137,8 @@ def load(
     for note in storage.notes:
         warn(note, stacklevel=3)
     if simulator is None:
-        without = {"simulator": Absent(), "prior": prior}
-        saved = None if belief is None else lambda: decode(belief, known=without)
+        known = {"simulator": Absent(), "prior": prior}
+        saved = None if belief is None else lambda: _decoded(belief, known, state)
         return StoredLearner(prior, space, state, shape, saved)
     for what, limit in limits.items():
         if (limit is not None) != manifest[f"has_{what}"]:
@@ -174,18 +168,18 @@ def load(
     learner = make_learner(model, joint, space, state, x_shape=shape)
     if belief is not None and not state.is_stale:
         known = {"simulator": model, "prior": prior}
-        learner.resume(lambda: _belief(belief, known, learner))
+        learner.resume(lambda: _decoded(belief, known, state) or learner.prior)
     return learner
 
 
-def _belief(content: bytes, known: dict[str, Any], learner: Learner) -> Distribution:
-    """Return the belief, or the prior where all has to be computed again."""
+def _decoded(content: bytes, known: dict[str, Any], state: CampaignState) -> Any:
+    """Return the belief; None where all has to be computed again."""
     try:
         return decode(content, known=known)
     except ValueError as error:
-        warn(f"SA601 the belief is computed again: {error}", stacklevel=4)
-        learner.forget()
-        return learner.prior
+        warn(f"SA601 the belief has to be computed again: {error}", stacklevel=4)
+        state.is_stale = bool(state.processed)
+        return None
 
 
 def _given(what: str, given: Any, storage: Storage, *, reads: bool = False) -> Any:
