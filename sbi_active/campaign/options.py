@@ -12,30 +12,12 @@ import torch
 from torch.distributions import Distribution
 
 from sbi_active.design.design import Design
-from sbi_active.expected import require, suggests
+from sbi_active.expected import require, require_least, require_one_of, suggests
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.renamed import grouped, takes_loose
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
-
-
-def _require_one_of(settings: Any, **known: Sequence[str]) -> None:
-    """Raise if a field of settings is none of the values that it may have."""
-    for name, values in known.items():
-        value, choices = getattr(settings, name), " or ".join(map(repr, values))
-        expected = f"{name} {choices}"
-        require(value in values, expected, repr(value), "choose one of these")
-
-
-def _require_least(settings: Any, **limits: tuple[int, str]) -> None:
-    """Raise if a field of settings is below its limit; the advice stands beside it."""
-    for name, (least, advice) in limits.items():
-        value, expected = getattr(settings, name), f"{name} >= {least}"
-        if getattr(type(settings), name) is None:
-            expected += " or None"
-            value = least if value is None else value
-        require(value >= least, expected, value, advice)
 
 
 @suggests
@@ -65,9 +47,9 @@ class CampaignDetails:
     num_scored: int = 2_000
 
     def __post_init__(self) -> None:
-        _require_one_of(self, design_on=("fresh", "training"))
+        require_one_of(self, design_on=("fresh", "training"))
         advice = "use about 2000: no tail probability is below 1 / (num_scored + 1)"
-        _require_least(self, num_scored=(100, advice))
+        require_least(self, advice, num_scored=100)
 
 
 @suggests
@@ -276,11 +258,10 @@ class CampaignOptions:
             f"{self.refinement.workers} for them",
             "pass workers to CampaignOptions alone",
         )
-        _require_one_of(self, network=("each round", "on demand"))
-        _require_least(
-            self,
-            num_simulations=(100, "use about 5000 a round"),
-            max_simulations=(100, "use some hundred a trial"),
-            planned_trials=(1, "pass the number of trials that you can run"),
-            check_every=(1, "use 2 or 3 where the simulator may lack something"),
-        )
+        require_one_of(self, network=("each round", "on demand"))
+        require_least(self, "use about 5000 a round", num_simulations=100)
+        require_least(self, "use some hundred a trial", max_simulations=100)
+        advice = "pass the number of trials that you can run"
+        require_least(self, advice, planned_trials=1)
+        advice = "use 2 or 3 where the simulator may lack something"
+        require_least(self, advice, check_every=1)

@@ -14,8 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from sbi_active.campaign.options import CampaignOptions
-from sbi_active.campaign.state import LOST, CampaignState, ModelVersion
+from sbi_active.campaign.state import CampaignState, ModelVersion
 from sbi_active.campaign.storage.codec import NotStorableError, decode, encode
 from sbi_active.campaign.storage.manifest import read_manifest
 from sbi_active.campaign.storage.simulations import form_of
@@ -323,12 +322,9 @@ class Storage:
         reason = f"{len(self._entries)} lines of the log; the state counts"
         reason = f"{reason} {saved['lines']} with {len(told)} trials that were told"
         require(self.store.path, repair, reason)
-        state = CampaignState("asbi", 0, CampaignOptions())
-        for entry in self._entries:
-            if (facts := facts_in(entry)) is not None:
-                state.record(facts)
-        known = [t.index for t in state.trials if t.status != "pending"]
-        known = [k for k in known if state.trials[k].reason != LOST]
+        facts = [f for e in self._entries if (f := facts_in(e)) is not None]
+        last = {f.index: f.status for f in facts}
+        known = [index for index, status in last.items() if status != "pending"]
         self._saved = None
         with self.store.writing():
             self.store.delete(STATE)

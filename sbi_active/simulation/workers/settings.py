@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sbi_active.expected import require
+from sbi_active.expected import require, require_least
 
 
 @dataclass(frozen=True)
@@ -41,12 +41,7 @@ class Workers:
             self.time_limit,
             "use None to wait for ever",
         )
-        require(
-            self.num_retries >= 0,
-            "num_retries >= 0",
-            self.num_retries,
-            "use 0 to try once",
-        )
+        require_least(self, "use 0 to try once", num_retries=0)
 
     @classmethod
     def of(cls, workers: Workers | int | None) -> Workers:
