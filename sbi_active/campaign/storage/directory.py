@@ -99,7 +99,7 @@ class Storage:
             store.close()
         self.manifest = read_manifest(store)
         self._entries = [self._line(k + 1) for k in range(store.length(LOG))]
-        self._saved = self._saved_state()
+        self._saved = self._kept(STATE, lambda content: decode(content, known={}))
         if self._saved is not None:
             with sensible(store.path):
                 self._require_whole(self._saved, repair=repair)
@@ -147,10 +147,8 @@ class Storage:
         if self._store is None:
             return
         line = {"line": len(self._entries) + 1, **event_of(event, trial, **entries)}
-        self.acquire()
-        with self.store.writing():
-            if self.store.append(LOG, line) != line["line"]:
-                raise LogChangedError(self.store.path)
+        with self._writing():
+            self.store.append(LOG, line)
         self._entries.append(line)
 
     @property
@@ -238,11 +236,7 @@ class Storage:
             state.is_stale |= len(state.versions) > 1
         if saved is None or saved["belief"] in (None, False):
             return None
-        belief = None
-        try:
-            belief = self.store.get(BELIEF) if saved["belief"] else None
-        except CorruptSegmentError as error:
-            self.notes.append(f"SA601 the belief is computed again: {error}")
+        belief = self._kept(BELIEF, bytes)
         if not belief and state.processed:
             state.is_stale = True
         return belief or None
@@ -302,12 +296,13 @@ class Storage:
                     left = self.store.remains(LOG, number) or error.reason
                     self.notes.append(f"SA603 given up, tell it again: {left}")
 
-    def _saved_state(self) -> dict[str, Any] | None:
+    def _kept(self, what: str, read: Callable[[bytes], Any]) -> Any:
+        """Return what was computed; None where it has to be computed again."""
         try:
-            content = self.store.get(STATE)
-            return None if content is None else decode(content, known={})
+            content = self.store.get(what)
+            return None if content is None else read(content)
         except (CorruptSegmentError, ValueError) as error:
-            self.notes.append(f"SA601 {STATE} is computed again: {error}")
+            self.notes.append(f"SA601 the {what} is computed again: {error}")
             return None
 
     def _require_whole(self, saved: Mapping[str, Any], *, repair: bool) -> None:
