@@ -32,6 +32,43 @@ def require(holds: bool, expected: str, got: Any, advice: str) -> None:
         raise ValueError(f"expected {expected}; got {got}; {advice}")
 
 
+def require_least(settings: Any, advice: str, **limits: float) -> None:
+    """Raise if a field of settings is below its limit.
+
+    Args:
+        settings: Dataclass; a field may be None where that is its default, and of
+            several numbers the smallest counts.
+        advice: Advice on what to do.
+        **limits: Smallest value of each field.
+
+    Raises:
+        ValueError: If one is below, with its name.
+    """
+    for name, least in limits.items():
+        value, expected = getattr(settings, name), f"{name} >= {least}"
+        if getattr(type(settings), name) is None:
+            expected += " or None"
+            value = least if value is None else value
+        smallest = min(value, default=least) if isinstance(value, tuple) else value
+        require(smallest >= least, expected, smallest, advice)
+
+
+def require_one_of(settings: Any, **known: Iterable[Any]) -> None:
+    """Raise if a field of settings is none of the values that it may have.
+
+    Args:
+        settings: Dataclass.
+        **known: Values of each field.
+
+    Raises:
+        ValueError: If it has another value, with its name and those.
+    """
+    for name, values in known.items():
+        value, valid = getattr(settings, name), (*values,)
+        expected = f"{name} among {', '.join(map(repr, valid))}"
+        require(value in valid, expected, repr(value), "choose one of these")
+
+
 def did_you_mean(name: str, known: Iterable[str], otherwise: str) -> str:
     """Return the advice of an error about a name: the nearest ones that exist.
 

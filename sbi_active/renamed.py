@@ -48,7 +48,7 @@ def former_names(
 
 
 def lazy_names(
-    package: str, homes: Mapping[str, str], former: Callable[[str], Any]
+    package: str, homes: Mapping[str, str], former: Mapping[str, str] | None = None
 ) -> Callable[[str], Any]:
     """Return a ``__getattr__`` of a package that imports a name when it is used.
 
@@ -57,13 +57,14 @@ def lazy_names(
     Args:
         package: Name of the package.
         homes: Modules below it, and the names that each defines, apart by spaces.
-        former: Finds all other names, see :func:`former_names`.
+        former: Former names, see :func:`former_names`.
     """
     home = {name: where for where, names in homes.items() for name in names.split()}
+    find_former = former_names(package, former or {}, stacklevel=3)
 
     def find(name: str) -> Any:
         if name not in home:
-            return former(name)
+            return find_former(name)
         value = pkgutil.resolve_name(f"{package}.{home[name]}:{name}")
         setattr(sys.modules[package], name, value)
         return value

@@ -22,7 +22,7 @@ from torch import Tensor
 from benchmarks.rows import benchmark, column, grouped
 from sbi_active import ASBI, MixtureDensity
 from sbi_active.diagnostics import check_calibration
-from sbi_active.diagnostics.verdict import clopper_pearson
+from sbi_active.diagnostics.calibration import clopper_pearson
 from sbi_active.inference import ActionPosterior
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate

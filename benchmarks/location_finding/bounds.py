@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 from torch import Tensor
 
-from sbi_active.inference.sampling.student_mixture import (
+from sbi_active.inference.sampling.mixtures import (
     Defended,
     Proposal,
     StudentMixture,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sbi_active.renamed import former_names, lazy_names
+from sbi_active.renamed import lazy_names
 
 if TYPE_CHECKING:
     from sbi_active.campaign.campaign import Campaign
@@ -25,12 +25,8 @@ __getattr__ = lazy_names(
         "options": "CampaignOptions StopRules",
         "state": "Trial",
     },
-    former_names(
-        __name__,
-        {
-            "CampaignState": "sbi_active.campaign.state:CampaignState",
-            "ModelVersion": "sbi_active.campaign.state:ModelVersion",
-        },
-        stacklevel=3,
-    ),
+    {
+        "CampaignState": "sbi_active.campaign.state:CampaignState",
+        "ModelVersion": "sbi_active.campaign.state:ModelVersion",
+    },
 )

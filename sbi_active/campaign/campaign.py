@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.campaign.isolation import guarded, isolated
 from sbi_active.campaign.learning.methods import find_method
@@ -22,14 +21,14 @@ from sbi_active.campaign.learning.pooled import make_learner
 from sbi_active.campaign.learning.revision import recompute, revise
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.state import CampaignState, Trial
-from sbi_active.campaign.storage.directory import CampaignDirectory
+from sbi_active.campaign.storage.directory import Storage
 from sbi_active.campaign.storage.loading import load
 from sbi_active.campaign.storage.manifest import make_campaign
-from sbi_active.campaign.storage.simulations import Storage, num_rows, stored
+from sbi_active.campaign.storage.simulations import num_rows, stored
 from sbi_active.campaign.trials import CampaignTrials
 from sbi_active.design.target import Target
 from sbi_active.renamed import set_later
-from sbi_active.simulation.workers.meter import SimulationBudgetError, metering
+from sbi_active.simulation.workers.store import SimulationBudgetError, metering
 
 if TYPE_CHECKING:
     from sbi_active.criticism import Effect, Report
@@ -113,30 +112,29 @@ class Campaign(CampaignTrials):
         state = CampaignState(method, seed, options, num_earlier=num_rows(options.bank))
         with metering(state.meter):
             learner = make_learner(simulator, prior, actions, state)
-        state.show_progress = show_progress
-        planner = Planner(actions, state, effects, constraint=constraint, cost=cost)
-        self._begin(state, actions, learner, planner)
-        disk = None
-        if directory is not None:
+        limits = {"cost": cost, "constraint": constraint}
+        planner = Planner(actions, state, effects, **limits)
+        folder = None if directory is None else Path(directory)
+        if folder is not None:
             make_campaign(
-                Path(directory),
+                folder,
                 state,
                 {"prior": prior, "actions": actions, "options": options},
                 simulator,
                 x_shape=[*learner.x_shape],
                 effects=[effect.name for effect in effects],
-                has_cost=cost is not None,
-                has_constraint=constraint is not None,
+                **{f"has_{what}": limit is not None for what, limit in limits.items()},
             )
-            disk = CampaignDirectory(Path(directory))
-        self._storage = Storage(disk, options.bank, prior)
+        self._begin(learner, planner, Storage(folder, prior=prior), show_progress)
 
     def _begin(
-        self, state: CampaignState, actions: ActionSpace, learner: Any, planner: Planner
+        self, learner: Any, planner: Planner, storage: Storage, show_progress: bool
     ) -> None:
         self._guard = threading.RLock()
-        self.state, self.actions = state, actions
-        self._learner, self._planner = learner, planner
+        self.state, self.actions = learner.state, learner.actions
+        self._learner, self._planner, self._storage = learner, planner, storage
+        self.state.show_progress = show_progress
+        storage.bank = self.state.options.bank
 
     @classmethod
     @set_later("on_trial", "on_update")
@@ -186,26 +184,25 @@ class Campaign(CampaignTrials):
             ValueError: If there is no campaign, or one of another simulator or schema.
             CorruptSegmentError: If a file does not hold what was written.
         """
-        found = load(
-            directory,
-            simulator=simulator,
-            prior=prior,
-            actions=None if actions is None else action_space(actions),
+        given = {
+            "prior": prior,
+            "actions": None if actions is None else action_space(actions),
+            "options": None if options is None else CampaignOptions.of(options),
+        }
+        limits: Any = {"cost": cost, "constraint": constraint}
+        storage = Storage(Path(directory), repair=repair)
+        learner = load(
+            storage,
+            simulator,
+            given=given,
             effects=effects,
-            options=None if options is None else CampaignOptions.of(options),
-            has_cost=cost is not None,
-            has_constraint=constraint is not None,
+            limits=limits,
             simulator_changed=simulator_changed,
-            repair=repair,
         )
+        declared = [e for e in effects if e.name in storage.manifest["effects"]]
+        planner = Planner(learner.actions, learner.state, declared, **limits)
         self = cls.__new__(cls)
-        known = found.disk.manifest["effects"]
-        declared = [effect for effect in effects if effect.name in known]
-        limits: Any = {"constraint": constraint, "cost": cost}
-        planner = Planner(found.actions, found.state, declared, **limits)
-        found.state.show_progress = show_progress
-        self._begin(found.state, found.actions, found.learner, planner)
-        self._storage = Storage(found.disk, found.state.options.bank, found.prior)
+        self._begin(learner, planner, storage, show_progress)
         return self
 
     @guarded

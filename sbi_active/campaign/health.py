@@ -243,15 +243,13 @@ def doubts(trials: Sequence[Trial], notable: float = 0.1) -> list[str]:
 def in_doubt(
     belief: Distribution, prior: Distribution, texts: Sequence[str]
 ) -> Distribution:
-    """Return the same belief, marked untrustworthy for reasons; itself without any.
+    """Return the same belief, marked untrustworthy for reasons.
 
     Args:
         belief: Belief from the trials that are explained; the prior before any.
         prior: The original prior.
         texts: Reasons from :func:`doubts`.
     """
-    if not texts:
-        return belief
     if hasattr(belief, "diagnostics"):
         marked: Any = copy.copy(belief)
     else:

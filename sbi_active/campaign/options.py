@@ -12,7 +12,7 @@ import torch
 from torch.distributions import Distribution
 
 from sbi_active.design.design import Design
-from sbi_active.expected import require, suggests
+from sbi_active.expected import require, require_least, require_one_of, suggests
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.renamed import grouped, takes_loose
@@ -47,18 +47,9 @@ class CampaignDetails:
     num_scored: int = 2_000
 
     def __post_init__(self) -> None:
-        require(
-            self.design_on in ("fresh", "training"),
-            "design_on 'fresh' or 'training'",
-            repr(self.design_on),
-            "choose one of these",
-        )
-        require(
-            self.num_scored >= 100,
-            "num_scored >= 100",
-            self.num_scored,
-            "use about 2000, since no tail probability is below 1 / (num_scored + 1)",
-        )
+        require_one_of(self, design_on=("fresh", "training"))
+        advice = "use about 2000: no tail probability is below 1 / (num_scored + 1)"
+        require_least(self, advice, num_scored=100)
 
 
 @suggests
@@ -267,21 +258,10 @@ class CampaignOptions:
             f"{self.refinement.workers} for them",
             "pass workers to CampaignOptions alone",
         )
-        require(
-            self.network in ("each round", "on demand"),
-            "network 'each round' or 'on demand'",
-            repr(self.network),
-            "pass one of these",
-        )
-        for name, least, advice in (
-            ("num_simulations", 100, "use about 5000 a round"),
-            ("max_simulations", 100, "use some hundred a trial"),
-            ("planned_trials", 1, "pass the number of trials that you can run"),
-            ("check_every", 1, "use 2 or 3 where the simulator may lack something"),
-        ):
-            value = getattr(self, name)
-            expected = f"{name} >= {least}"
-            if getattr(type(self), name) is None:
-                expected += " or None"
-                value = least if value is None else value
-            require(value >= least, expected, value, advice)
+        require_one_of(self, network=("each round", "on demand"))
+        require_least(self, "use about 5000 a round", num_simulations=100)
+        require_least(self, "use some hundred a trial", max_simulations=100)
+        advice = "pass the number of trials that you can run"
+        require_least(self, advice, planned_trials=1)
+        advice = "use 2 or 3 where the simulator may lack something"
+        require_least(self, advice, check_every=1)

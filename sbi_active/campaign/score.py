@@ -26,34 +26,8 @@ SHARES = torch.logspace(-10, 0, 21, dtype=torch.float64)
 FLOOR = 1e-10  # of the largest variance, for numbers that never vary
 
 
-@dataclass(frozen=True)
-class Score:
-    """Scores of the prediction of an outcome.
-
-    Attributes:
-        surprise: Tail probability, in (0, 1].
-        log_score: Log density, nats.
-        num_simulations: Number of simulations spent.
-        num_missing: Number of those simulations lost to faults of the simulator.
-    """
-
-    surprise: float
-    log_score: float
-    num_simulations: int
-    num_missing: int
-
-
-def score_outcome(
-    x: Tensor,
-    action: Tensor,
-    simulator: Callable[..., Any],
-    belief: Distribution,
-    *,
-    num_samples: int,
-    seed: int,
-    workers: Workers = IN_PROCESS,
-) -> Score:
-    r"""Compare an outcome with simulations from the belief before it.
+def score_outcome(x: Tensor, rows: Simulations) -> tuple[float, float]:
+    r"""Return tail probability and log score of an outcome among simulations.
 
     .. math::
         p = \frac{\#\{i \le n + 1 : D(x_i) \ge D(x_{n + 1})\}}{n + 1}, \qquad
@@ -78,37 +52,18 @@ def score_outcome(
 
     Args:
         x: The outcome, shape x_shape; NaN where nothing was measured.
-        action: The executed one, shape (action_dim,).
-        simulator: ``simulator(theta, action)``.
-        belief: Belief before the trial.
-        num_samples: n, fewer of outcomes with more than 2,000 numbers: as many as have
-            4 million together, and at least 400.
-        seed: Seed of the simulations.
-        workers: Workers that run the simulations.
+        rows: Simulations of its action from the belief before it.
+
+    Returns:
+        p in (0, 1], and the log score in nats.
 
     References:
         Dawid, J. R. Stat. Soc. A 1984 (prequential assessment); Vovk, Gammerman &
         Shafer, Algorithmic Learning in a Random World, 2005 (conformal p-values).
     """
-    # Their products cost more than their simulation.
-    num_samples = min(num_samples, max(400, 4_000_000 // max(x.numel(), 1)))
-    rows = simulate_from(
-        belief,
-        simulator,
-        action,
-        num_samples=num_samples,
-        seed=seed,
-        workers=workers,
-    )
     drawn = rows.without_missing().x.double().flatten(1)
     drawn = torch.where(drawn.isfinite(), drawn, torch.nan)
-    surprise, log_score = compared(drawn, x.double().flatten())
-    return Score(
-        surprise=surprise,
-        log_score=log_score,
-        num_simulations=num_samples,
-        num_missing=num_samples - len(drawn),
-    )
+    return compared(drawn, x.double().flatten())
 
 
 def simulate_from(

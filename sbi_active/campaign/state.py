@@ -21,7 +21,7 @@ from sbi_active.display.table import number
 from sbi_active.inference.emulation.pool import Batch
 from sbi_active.progress import News, is_asked_for
 from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation.workers.meter import Meter
+from sbi_active.simulation.workers.store import Meter
 
 #: Ranges of the simulations from the prior beyond all of them at which an outcome is no
 #: longer used: no simulator that is worth refining is that far off.

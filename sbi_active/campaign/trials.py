@@ -16,13 +16,19 @@ from sbi_active.arrays import measured
 from sbi_active.callers import stack_level
 from sbi_active.campaign.display.figures import plot_campaign
 from sbi_active.campaign.display.page import campaign_html, to_dataframe
-from sbi_active.campaign.health import Health, assess, calibration_lost
+from sbi_active.campaign.health import (
+    Health,
+    assess,
+    calibration_lost,
+    doubts,
+    in_doubt,
+)
 from sbi_active.campaign.isolation import guarded, isolated
 from sbi_active.campaign.state import CampaignState, Trial, tensor_of
-from sbi_active.campaign.storage.simulations import Storage
+from sbi_active.campaign.storage.directory import Storage
 from sbi_active.campaign.telling import Facts, Telling, listed
 from sbi_active.display.figures import legible
-from sbi_active.inference.beliefs.belief import names_of, parameter_dim
+from sbi_active.inference.beliefs.belief import named, names_of, parameter_dim
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed
@@ -53,6 +59,7 @@ class CampaignTrials(Telling[Trial]):
     _learner: Any
     _planner: Any
     _storage: Storage
+    _stated: tuple[Distribution, list[str], Distribution] | None = None
     on_trial: Callable[[Trial], None] | None = None
     on_update: Callable[[Trial], None] | None = None
 
@@ -87,7 +94,18 @@ class CampaignTrials(Telling[Trial]):
         trial, until it is told again or withdrawn. Trials that are beyond all
         simulations but nearer stay in the belief and are named as well.
         """
-        return self._learner.stated_belief
+        state, learner = self.state, self._learner
+        belief, texts = learner.belief, doubts(state.measured)
+        if state.is_stale:
+            texts.append(
+                "SA601 trials were told or corrected since: update() computes it again"
+            )
+        if not texts:
+            return belief
+        if self._stated is None or self._stated[:2] != (belief, texts):
+            marked = named(in_doubt(belief, learner.prior, texts), learner.simulator)
+            self._stated = belief, texts, marked
+        return self._stated[2]
 
     @property
     def simulator(self) -> Callable[..., Any]:
@@ -127,8 +145,7 @@ class CampaignTrials(Telling[Trial]):
     @property
     def events(self) -> Sequence[Mapping[str, Any]]:
         """The lines of the log on the disk so far, without one in memory alone."""
-        disk = self._storage.disk
-        return () if disk is None else disk.events
+        return self._storage.events
 
     def contains(self, trial: Trial) -> bool:
         """Return whether the belief takes account of a trial as it is recorded now."""
@@ -166,9 +183,8 @@ class CampaignTrials(Telling[Trial]):
 
     def _declared(self, what: str) -> Sequence[str] | None:
         """Return names that the simulator has, or had where it is not given."""
-        disk = self._storage.disk
-        if self.simulator is None and disk is not None:
-            return disk.manifest[what]
+        if self.simulator is None:
+            return self._storage.manifest.get(what)
         return getattr(self.simulator, what, None)
 
     @property
@@ -215,12 +231,7 @@ class CampaignTrials(Telling[Trial]):
         trial had been used, missing where it was not; "seconds" and "cpu_seconds" over
         all stages. The index is the trial's. Units stand in ``attrs["units"]``.
         """
-        return to_dataframe(
-            self.state,
-            self.actions,
-            parameter_names=self.parameter_names,
-            channel_names=self.channel_names,
-        )
+        return to_dataframe(self)
 
     def plot(
         self, *, theta_true: Tensor | None = None, num_predicted: int = 64
@@ -240,15 +251,9 @@ class CampaignTrials(Telling[Trial]):
         Raises:
             ValueError: If ``theta_true`` has more numbers than there are parameters.
         """
-        figure = plot_campaign(
-            self.state,
-            None if self.simulator is None else self._learner.at,
-            self.prior,
-            parameter_names=self.parameter_names,
-            theta_true=theta_true,
-            num_predicted=0 if self.state.meter.limit else num_predicted,
-        )
-        return legible(figure)
+        num_predicted = 0 if self.state.meter.limit else num_predicted
+        how = {"theta_true": theta_true, "num_predicted": num_predicted}
+        return legible(plot_campaign(self, **how))
 
     tell = guarded(isolated(Telling.tell))
     attach = guarded(Telling.attach)

@@ -44,7 +44,7 @@ def init(folder: Path, set: list[str], **given: Any) -> None:  # noqa: A002
     from sbi_active.cli.problem import campaign_options, problem_of
 
     how = {name: given.pop(name) for name in ("method", "seed")}
-    simulator, prior, actions, effects = problem_of(**given)
+    simulator, prior, actions, effects = problem_of(given)
     how |= {"options": campaign_options(set), "directory": folder, "effects": effects}
     with Campaign(simulator, prior, actions, **how) as campaign:
         write_declared(folder, **given)

@@ -146,7 +146,7 @@ def _compared(path: Path, given: dict[str, Any], settings: dict[str, Any]) -> An
 
     columns = {k: v.split(",") for k, v in cli.pairs_of(given["columns"]).items()}
     units, options = cli.pairs_of(given["units"]), {k: given[k] for k in PROBLEM}
-    model, prior, actions, own = problem_of(**options, needs=["prior"])
+    model, prior, actions, own = problem_of(options, needs=["prior"])
     how = {"order": given["order"], "inputs": given["inputs"]}
     trials = Trials.from_csv(path, columns=columns or None, units=units, **how)
     labels = trials.action_labels or ()

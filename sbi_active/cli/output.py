@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import json
-import math
 import os
 import re
 import sys
@@ -14,6 +13,8 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import click
+
+from sbi_active.plain import plain
 
 FAILED, MISUSED, INTERRUPTED = 1, 2, 130
 #: What a worker says of an error: of its frames the last counts.
@@ -68,16 +69,7 @@ def place_of(error: BaseException) -> str:
 
 def as_line(value: Any) -> str:
     """Return an answer as one line of JSON, null for a number that is not finite."""
-    return json.dumps(_finite(value), allow_nan=False)
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(part) for part in value]
-    is_number = not isinstance(value, float) or math.isfinite(value)
-    return value if is_number else None
+    return json.dumps(plain(value), allow_nan=False)
 
 
 @contextlib.contextmanager

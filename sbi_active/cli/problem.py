@@ -7,7 +7,7 @@ import importlib
 import inspect
 import math
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from sbi_active.cli.trusted import (
     require_trust,
 )
 from sbi_active.criticism import Effect, generic_effects
+from sbi_active.expected import require
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.tasks import TASKS, Task, get_task  # pyright: ignore
 
@@ -140,58 +141,38 @@ def task_of(name: str, texts: Sequence[str]) -> Task:
 
 
 def problem_of(
-    simulator: str | None,
-    *,
-    task: str | None = None,
-    option: Sequence[str] = (),
-    prior: str | None = None,
-    theta_low: Sequence[float] | None = None,
-    theta_high: Sequence[float] | None = None,
-    actions: Sequence[str] = (),
-    noise: Sequence[float] | None = None,
-    names: str | None = None,
-    units: str | None = None,
-    effects: Sequence[str] = (),
-    folder: str | None = None,
-    needs: Sequence[str] = ("prior", "actions"),
+    given: Mapping[str, Any], needs: Sequence[str] = ("prior", "actions")
 ) -> tuple[Any, Any, Any, list[Effect]]:
-    """Return simulator, prior, actions and effects that options of these names give.
+    """Return simulator, prior, actions and effects that options give.
 
     A prior or actions that are not declared are None.
 
     Args:
-        simulator: Simulator as MODULE:NAME; None for a task's.
-        task: Name of a task, which has all but other actions and noise.
-        option: Options of the task, each NAME=VALUE.
-        prior: Prior as MODULE:NAME.
-        theta_low: Lower bounds of a uniform prior in its place.
-        theta_high: Upper bounds of a uniform prior in its place.
-        actions: Actions, as :func:`actions_of` takes them.
-        noise: Standard deviations of a Gaussian noise.
-        names: Names of the action's entries.
-        units: Units of the action's entries.
-        effects: Effects, each name that of a list or of a function that returns one.
-        folder: Folder where names begin, see :func:`load_object`.
+        given: Values of the options ``PROBLEM``, ``EFFECTS``, "names" and "units" by
+            their names, as far as there are any; and as "folder" where the names of
+            programs begin, see :func:`load_object`.
         needs: Parts without which nothing can be done.
 
     Raises:
         ValueError: If too much or too little is given, or it is not what it has to be.
     """
+    simulator, task, folder = map(given.get, ("simulator", "task", "folder"))
     if (task is None) == (simulator is None):
         raise ValueError(
             "expected --simulator or --task; got both or neither; name one, as in "
             "--simulator my_robot.py:fn"
         )
     model: Any
-    bounded, found, own = prior_of(prior, theta_low, theta_high, folder), None, []
+    bounded, found, own = prior_of(given), None, []
     if task is None:
         model = load_object(str(simulator), folder)
     else:
-        whole: Any = task_of(task, option)
+        whole: Any = task_of(task, given.get("option", ()))
         if bounded is not None:
             raise ValueError("expected no prior beside --task; got both; drop one")
         model, bounded, found = whole.simulator, whole.prior, whole.actions
         own = getattr(whole, "effects", list)()
+    actions, names, units = map(given.get, ("actions", "names", "units"))
     space: Any = actions_of(actions, folder) if actions else found
     if bounded is None and "prior" in needs:
         raise ValueError(
@@ -203,8 +184,8 @@ def problem_of(
     if space is not None and (names or units):
         labels = names.split(",") if names else space.names
         space._label(labels, units.split(",") if units else space.units)
-    own += effects_of(effects, folder)
-    return with_noise(model, noise), bounded, space, own
+    own += effects_of(given.get("effects", ()), folder)
+    return with_noise(model, given.get("noise")), bounded, space, own
 
 
 def with_noise(simulator: Any, sd: Sequence[float] | None) -> Any:
@@ -220,11 +201,7 @@ def with_noise(simulator: Any, sd: Sequence[float] | None) -> Any:
         )
     if sd is None:
         return simulator
-    if min(sd) <= 0:
-        raise ValueError(
-            f"expected --noise > 0; got {sd}; give the standard deviation of a "
-            "measurement"
-        )
+    require(min(sd) > 0, "--noise > 0", sd, "give the standard deviation of x")
     noise = GaussianNoise(torch.tensor(sd) if len(sd) > 1 else sd[0])
     if not isinstance(simulator, SimulatorModel):
         return SimulatorModel(simulator, noise=noise)
@@ -233,15 +210,11 @@ def with_noise(simulator: Any, sd: Sequence[float] | None) -> Any:
     return noisy
 
 
-def prior_of(
-    prior: str | None,
-    low: Sequence[float] | None,
-    high: Sequence[float] | None,
-    folder: str | None = None,
-) -> Distribution | None:
+def prior_of(given: Mapping[str, Any]) -> Distribution | None:
     """Return the prior that --prior, or --theta-low and --theta-high, name."""
+    prior, low, high = map(given.get, ("prior", "theta_low", "theta_high"))
     if prior is not None:
-        return load_object(prior, folder, kind=Distribution)
+        return load_object(prior, given.get("folder"), kind=Distribution)
     if low is None and high is None:
         return None
     if low is None or high is None or len(low) != len(high):
@@ -259,22 +232,21 @@ def actions_of(specs: Sequence[str], folder: str | None = None) -> ActionSpace:
     if names_object(specs):
         return load_object(specs[0], folder, kind=ActionSpace)
     entries = [_entry(spec) for spec in specs]
-    limits = [entry for entry in entries if isinstance(entry, tuple)]
     values = [entry for entry in entries if isinstance(entry, list)]
+    if len(values) == len(entries):
+        _require_few(math.prod(map(len, values)))
+        return DiscreteActions(torch.cartesian_prod(*map(torch.tensor, values)))
     if not values:
-        low, high = zip(*limits, strict=True)
+        low, high = zip(*entries, strict=True)
         return BoxActions([*low], [*high])
-    if limits:
-        return MixedActions(
-            *[
-                DiscreteActions(entry, names=[f"action_{k}"])
-                if isinstance(entry, list)
-                else BoxActions([entry[0]], [entry[1]], names=[f"action_{k}"])
-                for k, entry in enumerate(entries)
-            ]
-        )
-    _require_few(math.prod(map(len, values)))
-    return DiscreteActions(torch.cartesian_prod(*map(torch.tensor, values)))
+    parts: list[ActionSpace] = []
+    for k, entry in enumerate(entries):
+        names = [f"action_{k}"]
+        if isinstance(entry, list):
+            parts.append(DiscreteActions(entry, names=names))
+        else:
+            parts.append(BoxActions([entry[0]], [entry[1]], names=names))
+    return MixedActions(*parts)
 
 
 def _entry(spec: str) -> tuple[float, float] | list[float]:
@@ -293,11 +265,8 @@ def _entry(spec: str) -> tuple[float, float] | list[float]:
 
 
 def _require_few(count: int) -> None:
-    if count > MOST_ACTIONS:
-        raise ValueError(
-            f"expected at most {MOST_ACTIONS} actions; got {count}; write LOW:HIGH for "
-            "any number between, or a smaller COUNT"
-        )
+    advice = "write LOW:HIGH for any number between, or a smaller COUNT"
+    require(count <= MOST_ACTIONS, f"at most {MOST_ACTIONS} actions", count, advice)
 
 
 def effects_of(names: Sequence[str], folder: str | None = None) -> list[Effect]:
@@ -379,7 +348,7 @@ def open_campaign(
     if simulator is not None:  # whose place begins here
         declared |= {"simulator": absolute(simulator), "task": None}
     require_trust(folder, declared, own=simulator, trusts=trust)
-    model, prior, actions, own = problem_of(**declared, needs=())
+    model, prior, actions, own = problem_of(declared, needs=())
     if reader.state.version.effects:
         own = with_generic(own, model, reader.actions, reader.first_prior)
     return Campaign.load(

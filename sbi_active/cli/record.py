@@ -175,7 +175,7 @@ def sum_up_campaign(campaign: Any) -> None:
             "limits": [*zip(*limits, strict=True)],
             "processed": [*campaign.state.processed],
         }
-        campaign._storage.disk.sum_up(known)
+        campaign._storage.sum_up(known)
 
 
 def summary_of(campaign: Any) -> dict[str, Any]:

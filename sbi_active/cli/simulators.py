@@ -90,7 +90,7 @@ def check(rows: int, rounds: int, workers: int, seed: int, **problem: Any) -> in
     from sbi_active.cli.problem import problem_of
     from sbi_active.simulation import Workers, check_simulator
 
-    what = problem_of(**problem)[:3]
+    what = problem_of(problem)[:3]
     # The most that the default options allow: a round trains, designs over all actions,
     # and refines on the trials so far.
     options, trials = CampaignOptions(workers=Workers(workers)), range(1, rounds + 1)
@@ -144,7 +144,7 @@ def build(folder: Path, rows: int, seed: int, workers: int, **problem: Any) -> N
     from sbi_active.cli.problem import problem_of
     from sbi_active.seeding import derive_seed, forked_generators
 
-    model, prior, actions, _ = problem_of(**problem)
+    model, prior, actions, _ = problem_of(problem)
     missing = 0
     with Bank(folder, simulator=model, created=date.today().isoformat()) as made:
         store = made.drawn_from(prior, label="prior")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sbi_active.renamed import former_names, lazy_names
+from sbi_active.renamed import lazy_names
 
 if TYPE_CHECKING:
     from sbi_active.simulation.bank.bank import Bank
@@ -66,16 +66,12 @@ __getattr__ = lazy_names(
         "workers.engine": "simulate",
         "workers.settings": "Workers",
     },
-    former_names(
-        __name__,
-        {
-            "ReusedRows": "sbi_active.simulation.bank:ReusedRows",
-            "RowStore": "sbi_active.simulation.workers:RowStore",
-            "Simulator": "sbi_active.simulation.simulator:Simulator",
-            "SimulatorReport": "sbi_active.simulation.report:SimulatorReport",
-            "require_noise": "sbi_active.simulation.simulator:require_noise",
-            "unknown_noise": "sbi_active:AutocorrelatedNoise.unknown",
-        },
-        stacklevel=3,
-    ),
+    {
+        "ReusedRows": "sbi_active.simulation.bank:ReusedRows",
+        "RowStore": "sbi_active.simulation.workers.store:RowStore",
+        "Simulator": "sbi_active.simulation.simulator:Simulator",
+        "SimulatorReport": "sbi_active.simulation.report:SimulatorReport",
+        "require_noise": "sbi_active.simulation.simulator:require_noise",
+        "unknown_noise": "sbi_active:AutocorrelatedNoise.unknown",
+    },
 )

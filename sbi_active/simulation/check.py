@@ -6,7 +6,6 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -75,35 +74,36 @@ def check_simulator(
         >>> report.is_ready, report.is_deterministic, report.idle_parameters
         (False, True, ('theta_2',))
     """
-    run = _Runs(simulator, prior, action_space(actions), seed)
-    theta, action = run.draw(MIN_ROWS)
-    report = SimulatorReport(
-        takes_seeds=takes_seeds(simulator),
-        num_simulations=num_simulations,
-        num_workers=Workers.of(workers).num_workers,
-    )
+    check = _Check(simulator, prior, action_space(actions), seed)
+    check.found["num_simulations"] = num_simulations
+    check.found["num_workers"] = Workers.of(workers).num_workers
+    theta, action = check.draw(MIN_ROWS)
     try:
-        report = _look(run, theta, action, report)
+        check.look(theta, action)
     except Exception as error:  # whatever the user's code raises is the finding
         try:
-            report = _look_by_rows(run, theta, action, report)
+            check.look_by_rows(theta, action)
         except (SimulationError, ValueError):
-            return replace(report, defects=(_told(error),))
-    if report.defects:
-        return report
-    assert report.seconds_batch is not None
-    num_runs = RUNS + 3 * theta.shape[1] + action.shape[1] + RUNS
-    affordable = max_seconds / num_runs / (report.seconds_batch / MIN_ROWS + 1e-9)
-    report = replace(report, num_rows=max(MIN_ROWS, min(num_rows, int(affordable))))
-    theta, action = run.draw(report.num_rows)
-    try:
-        return _compare(run, theta, action, report)
-    except SimulationError as error:
-        return replace(report, defects=(_told(error),))
+            check.defects.append(_told(error))
+    if not check.defects:
+        num_runs = RUNS + 3 * theta.shape[1] + action.shape[1] + RUNS
+        seconds_row = check.found["seconds_batch"] / MIN_ROWS + 1e-9
+        affordable = int(max_seconds / num_runs / seconds_row)
+        try:
+            check.compare(max(MIN_ROWS, min(num_rows, affordable)))
+        except SimulationError as error:
+            check.defects.append(_told(error))
+    return check.report()
 
 
-class _Runs:
-    """Draws and runs that share their seeds."""
+class _Check:
+    """A look at a simulator, whose draws and runs share their seeds.
+
+    Attributes:
+        found: Findings so far, by their names in the report.
+        defects: Defects so far.
+        warnings: Warnings so far.
+    """
 
     def __init__(
         self,
@@ -114,6 +114,14 @@ class _Runs:
     ) -> None:
         self.simulator, self.prior = simulator, prior
         self.actions, self.seed = actions, seed
+        self.found: dict[str, Any] = {"takes_seeds": takes_seeds(simulator)}
+        self.defects: list[str] = []
+        self.warnings: list[str] = []
+
+    def report(self) -> SimulatorReport:
+        """Return what was found."""
+        told: Any = {"defects": (*self.defects,), "warnings": (*self.warnings,)}
+        return SimulatorReport(**self.found, **told)
 
     def draw(self, num: int, key: str = "draw") -> tuple[Tensor, Tensor]:
         """Return parameters and actions; those of a discrete space equally often."""
@@ -142,208 +150,179 @@ class _Runs:
             seed = derive_seed(self.seed, key)
             return simulate(self.simulator, theta, action, seed=seed)
 
+    def look(self, theta: Tensor, action: Tensor) -> None:
+        """Call it with several rows and with one; raises what it raises."""
+        seeds = row_seeds(self.seed, len(theta))
+        outcome_tensor(self.call(theta, action, seeds), len(theta))  # it may load
+        start = time.perf_counter()
+        raw = self.call(theta, action, seeds)
+        middle = time.perf_counter()
+        single = outcome_tensor(self.call(theta[:1], action[:1], seeds[:1]), 1)
+        end = time.perf_counter()
+        x = outcome_tensor(raw, len(theta))
+        if single.shape[1:] != x.shape[1:]:
+            self.defects.append(
+                f"expected x of one shape; got {tuple(x.shape[1:])} a row from "
+                f"{len(theta)} rows and {tuple(single.shape[1:])} from one; keep the "
+                "rows' axis for a single row"
+            )
+            return
+        dtype = str(getattr(raw, "dtype", type(raw).__name__))
+        output = dtype if isinstance(raw, Tensor) else f"{type(raw).__module__}.{dtype}"
+        self.found |= {"num_rows": len(theta), "x_shape": (*x.shape[1:],)}
+        self.found |= {"output": output, "seconds_batch": middle - start}
+        self.found["seconds_row"] = end - middle
 
-def _look(
-    run: _Runs, theta: Tensor, action: Tensor, report: SimulatorReport
-) -> SimulatorReport:
-    """Call it with several rows and with one; raises what it raises."""
-    seeds = row_seeds(run.seed, len(theta))
-    outcome_tensor(run.call(theta, action, seeds), len(theta))  # the first may load
-    start = time.perf_counter()
-    raw = run.call(theta, action, seeds)
-    middle = time.perf_counter()
-    single = outcome_tensor(run.call(theta[:1], action[:1], seeds[:1]), 1)
-    end = time.perf_counter()
-    x = outcome_tensor(raw, len(theta))
-    if single.shape[1:] != x.shape[1:]:
-        text = (
-            f"expected x of one shape; got {tuple(x.shape[1:])} a row from "
-            f"{len(theta)} rows and {tuple(single.shape[1:])} from one; keep the "
-            "rows' axis for a single row"
-        )
-        return replace(report, defects=(text,))
-    dtype = str(getattr(raw, "dtype", type(raw).__name__))
-    output = dtype if isinstance(raw, Tensor) else f"{type(raw).__module__}.{dtype}"
-    return replace(
-        report,
-        num_rows=len(theta),
-        x_shape=tuple(x.shape[1:]),
-        output=output,
-        seconds_batch=middle - start,
-        seconds_row=end - middle,
-    )
+    def look_by_rows(self, theta: Tensor, action: Tensor) -> None:
+        """Simulate so that only the rows are lost that raise; raises where all do."""
+        start = time.perf_counter()
+        x = self.simulate(theta, action).x
+        seconds = time.perf_counter() - start
+        self.found |= {"num_rows": len(theta), "x_shape": (*x.shape[1:],)}
+        self.found |= {"output": f"{x.dtype} after conversion"}
+        self.found |= {"seconds_batch": seconds, "seconds_row": seconds / len(theta)}
 
+    def compare(self, num_rows: int) -> None:
+        """Run so many rows under the same and other seeds, parameters and actions."""
+        self.found["num_rows"] = num_rows
+        theta, action = self.draw(num_rows)
+        seeds = row_seeds(derive_seed(self.seed, "x"), num_rows)
+        start = time.perf_counter()
+        rows = self.simulate(theta, action)
+        seconds = time.perf_counter() - start
+        again, other = (self.simulate(theta, action, key) for key in ("x", "other"))
+        independent = None
+        if self.found["takes_seeds"] and rows.counts["missing"] == 0:
+            order = torch.arange(num_rows).flip(0)
+            x = outcome_tensor(self.call(theta, action, seeds), num_rows)
+            permuted = self.call(theta[order], action[order], seeds[order])
+            independent = _close(outcome_tensor(permuted, num_rows), x[order])
+        self.found |= {
+            "seconds_batch": seconds,
+            "counts": rows.counts,
+            "lost_by_action": _lost(action, rows.status != Outcome.OK),
+            "is_reproducible": _same(rows.x, again.x),
+            "is_deterministic": _identical(rows.x, other.x),
+            "noiseless": _noiseless(rows.x, other.x),
+            "rows_are_independent": independent,
+        }
+        if self.found["is_reproducible"]:
+            fresh, drawn = self.draw(num_rows, "fresh"), (theta, action)
+            names = getattr(self.simulator, "parameter_names", None)
+            names = names or [f"theta_{i + 1}" for i in range(theta.shape[1])]
+            idle = self._idle(names, rows.x, drawn, (fresh[0], None))
+            self.found["idle_parameters"] = idle
+            self.found["idle_actions"] = self._idle(
+                self.actions.names, rows.x, drawn, (None, fresh[1])
+            )
+            self.found["undetermined"] = self._undetermined(names, idle, num_rows)
+        self._judge(theta, action, rows)
 
-def _look_by_rows(
-    run: _Runs, theta: Tensor, action: Tensor, report: SimulatorReport
-) -> SimulatorReport:
-    """Simulate so that only the rows are lost that raise; raises where all do."""
-    start = time.perf_counter()
-    x = run.simulate(theta, action).x
-    seconds = time.perf_counter() - start
-    return replace(
-        report,
-        num_rows=len(theta),
-        x_shape=tuple(x.shape[1:]),
-        output=f"{x.dtype} after conversion",
-        seconds_batch=seconds,
-        seconds_row=seconds / len(theta),
-    )
+    def _idle(
+        self,
+        names: Sequence[str],
+        x: Tensor,
+        drawn: tuple[Tensor, Tensor],
+        fresh: tuple[Tensor | None, Tensor | None],
+    ) -> tuple[str, ...]:
+        """Return names of columns of theta or action that change nothing."""
+        idle = []
+        for column, name in enumerate(names):
+            changed = [part.clone() for part in drawn]
+            for part, other in zip(changed, fresh, strict=True):
+                if other is not None:
+                    part[:, column] = other[:, column]
+            if all(map(torch.equal, changed, drawn)):  # a single action
+                continue
+            if _same(self.simulate(changed[0], changed[1]).x, x):
+                idle.append(name)
+        return tuple(idle)
+
+    def _undetermined(
+        self, names: Sequence[str], idle: Sequence[str], num_rows: int
+    ) -> tuple[Undetermined, ...]:
+        """Return parameters that no action tells apart, beside those that are idle."""
+        actions, num = self.actions.listed(), None
+        if actions is None:
+            seed = derive_seed(self.seed, "undetermined")
+            actions = self.actions.sample((ProbeSettings().most_actions,), seed=seed)
+        else:
+            num = len(actions)
+            with forked_generators(self.seed, "undetermined"):
+                actions = actions[torch.randperm(num)]
+        fewest = max(num_rows // 4, 1)  # as many sets of parameters as actions
+        try:
+            return find_undetermined(
+                lambda theta, action, key: self.simulate(theta, action, key).x,
+                self.prior,
+                actions[:fewest],
+                names,
+                skip=[i for i, name in enumerate(names) if name in idle],
+                num_rows=num_rows,
+                num_numbers=math.prod(self.found["x_shape"] or (1,)),
+                num_permitted=num,
+                seed=self.seed,
+            )
+        except SimulationError:  # at parameters next to others that it could simulate
+            return ()
+
+    def _judge(self, theta: Tensor, action: Tensor, rows: Any) -> None:
+        """Add defects and warnings."""
+        defects, notes, found = self.defects, self.warnings, self.report()
+        lost = len(theta) - found.counts["ok"]
+        if lost == len(theta):
+            defects.append("SA401 no row has a measurement")
+        elif lost > MANY * len(theta):
+            notes.append(
+                f"SA401 {lost / len(theta):.0%} of the rows have no measurement"
+            )
+        if found.counts["missing"]:
+            text = next(iter(rows.tracebacks.values()), "").strip().splitlines()
+            notes.append(
+                f"SA301 {found.counts['missing']} rows raise, the first "
+                f"{text[-1] if text else 'without a word'}; their outcome is missing; "
+                "return NaN where the system gave no measurement"
+            )
+        if found.is_deterministic:
+            try:
+                require_noise(rows.x, rows.x)
+            except ValueError as error:
+                defects.append(str(error))
+        model = self.simulator
+        declared = isinstance(model, SimulatorModel) and model.noise is not None
+        sound = found.counts["missing"] == 0
+        if declared and sound and not model.is_deterministic(theta, action):
+            notes.append(
+                "SA402 fn is random beside declared noise, which so counts twice; "
+                "declare noise=None, or remove the random numbers from fn"
+            )
+        if found.noiseless:
+            notes.append(
+                f"SA403 numbers {', '.join(map(str, found.noiseless))} of x have no "
+                "noise, and so no density; declare the noise of every channel"
+            )
+        if found.rows_are_independent is False:
+            defects.append(
+                "SA404 rows permuted with their seeds do not give permuted x; let row "
+                "i depend on theta[i], action[i] and seeds[i] alone"
+            )
+        if not found.is_reproducible:
+            notes.append(
+                "SA405 one seed gives two different x, so that no run can be repeated; "
+                "take seeds, or draw from torch's or NumPy's global generator"
+            )
+        if len(found.idle_parameters) == theta.shape[1]:
+            defects.append("SA303 no parameter changes x")
+        elif idle := ", ".join(found.idle_parameters):
+            notes.append(f"SA303 changing {idle} leaves x as it is")
+        if idle := ", ".join(found.idle_actions):
+            notes.append(f"SA303 changing {idle} leaves x as it is")
+        notes += [f"SA406 {group}" for group in found.undetermined]
 
 
 def _told(error: Exception) -> str:
     text = str(error)
     return text if text.startswith("expected ") else f"{type(error).__name__}: {text}"
-
-
-def _compare(
-    run: _Runs, theta: Tensor, action: Tensor, report: SimulatorReport
-) -> SimulatorReport:
-    """Run all rows under the same and other seeds, parameters and actions."""
-    seeds = row_seeds(derive_seed(run.seed, "x"), len(theta))
-    start = time.perf_counter()
-    rows = run.simulate(theta, action)
-    seconds = time.perf_counter() - start
-    again, other = run.simulate(theta, action), run.simulate(theta, action, "other")
-    reproducible = _same(rows.x, again.x)
-    independent = None
-    if report.takes_seeds and rows.counts["missing"] == 0:
-        order = torch.arange(len(theta)).flip(0)
-        x = outcome_tensor(run.call(theta, action, seeds), len(theta))
-        permuted = run.call(theta[order], action[order], seeds[order])
-        permuted = outcome_tensor(permuted, len(theta))
-        independent = _close(permuted, x[order])
-    report = replace(
-        report,
-        seconds_batch=seconds,
-        counts=rows.counts,
-        lost_by_action=_lost(action, rows.status != Outcome.OK),
-        is_reproducible=reproducible,
-        is_deterministic=_identical(rows.x, other.x),
-        noiseless=_noiseless(rows.x, other.x),
-        rows_are_independent=independent,
-    )
-    if reproducible:
-        fresh = run.draw(len(theta), "fresh")
-        report = replace(
-            report,
-            idle_parameters=_idle(run, rows.x, (theta, action), 0, fresh[0]),
-            idle_actions=_idle(run, rows.x, (theta, action), 1, fresh[1]),
-        )
-        report = replace(
-            report, undetermined=_undetermined(run, theta.shape[1], report)
-        )
-    return _judge(run, report, theta, action, rows)
-
-
-def _idle(
-    run: _Runs, x: Tensor, drawn: tuple[Tensor, Tensor], which: int, fresh: Tensor
-) -> tuple[str, ...]:
-    """Return names of columns of theta (0) or action (1) that change nothing."""
-    names = _names(run, which, fresh.shape[1])
-    idle = []
-    for column, name in enumerate(names):
-        changed = list(drawn)
-        changed[which] = drawn[which].clone()
-        changed[which][:, column] = fresh[:, column]
-        if torch.equal(changed[which], drawn[which]):  # a single action
-            continue
-        if _same(run.simulate(changed[0], changed[1]).x, x):
-            idle.append(name)
-    return tuple(idle)
-
-
-def _undetermined(
-    run: _Runs, num_parameters: int, report: SimulatorReport
-) -> tuple[Undetermined, ...]:
-    """Return parameters that no action tells apart, beside those that do nothing."""
-    actions, num = run.actions.listed(), None
-    if actions is None:
-        seed = derive_seed(run.seed, "undetermined")
-        actions = run.actions.sample((ProbeSettings().most_actions,), seed=seed)
-    else:
-        num = len(actions)
-        with forked_generators(run.seed, "undetermined"):
-            actions = actions[torch.randperm(num)]
-    fewest = max(report.num_rows // 4, 1)  # as many sets of parameters as actions
-    names = _names(run, 0, num_parameters)
-    try:
-        return find_undetermined(
-            lambda theta, action, key: run.simulate(theta, action, key).x,
-            run.prior,
-            actions[:fewest],
-            names,
-            skip=[i for i, name in enumerate(names) if name in report.idle_parameters],
-            num_rows=report.num_rows,
-            num_numbers=math.prod(report.x_shape or (1,)),
-            num_permitted=num,
-            seed=run.seed,
-        )
-    except SimulationError:  # at parameters next to others that it could simulate
-        return ()
-
-
-def _names(run: _Runs, which: int, num: int) -> Sequence[str]:
-    if which == 1:
-        return run.actions.names
-    names = getattr(run.simulator, "parameter_names", None)
-    return [f"theta_{i + 1}" for i in range(num)] if names is None else names
-
-
-def _judge(
-    run: _Runs, report: SimulatorReport, theta: Tensor, action: Tensor, rows: Any
-) -> SimulatorReport:
-    """Add defects and warnings."""
-    defects: list[str] = []
-    notes: list[str] = []
-    lost = len(theta) - report.counts["ok"]
-    if lost == len(theta):
-        defects.append("SA401 no row has a measurement")
-    elif lost > MANY * len(theta):
-        notes.append(f"SA401 {lost / len(theta):.0%} of the rows have no measurement")
-    if report.counts["missing"]:
-        text = next(iter(rows.tracebacks.values()), "").strip().splitlines()
-        notes.append(
-            f"SA301 {report.counts['missing']} rows raise, the first "
-            f"{text[-1] if text else 'without a word'}; their outcome is missing; "
-            "return NaN where the system gave no measurement"
-        )
-    if report.is_deterministic:
-        try:
-            require_noise(rows.x, rows.x)
-        except ValueError as error:
-            defects.append(str(error))
-    model = run.simulator
-    declared = isinstance(model, SimulatorModel) and model.noise is not None
-    sound = report.counts["missing"] == 0
-    if declared and sound and not model.is_deterministic(theta, action):
-        notes.append(
-            "SA402 fn is random beside declared noise, which so counts twice; declare "
-            "noise=None, or remove the random numbers from fn"
-        )
-    if report.noiseless:
-        notes.append(
-            f"SA403 numbers {', '.join(map(str, report.noiseless))} of x have no "
-            "noise, and so no density; declare the noise of every channel"
-        )
-    if report.rows_are_independent is False:
-        defects.append(
-            "SA404 rows permuted with their seeds do not give permuted x; let row i "
-            "depend on theta[i], action[i] and seeds[i] alone"
-        )
-    if not report.is_reproducible:
-        notes.append(
-            "SA405 one seed gives two different x, so that no run can be repeated; "
-            "take seeds, or draw from torch's or NumPy's global generator"
-        )
-    if len(report.idle_parameters) == theta.shape[1]:
-        defects.append("SA303 no parameter changes x")
-    elif idle := ", ".join(report.idle_parameters):
-        notes.append(f"SA303 changing {idle} leaves x as it is")
-    if idle := ", ".join(report.idle_actions):
-        notes.append(f"SA303 changing {idle} leaves x as it is")
-    notes += [f"SA406 {group}" for group in report.undetermined]
-    return replace(report, defects=(*defects,), warnings=(*notes,))
 
 
 def _lost(action: Tensor, lost: Tensor) -> tuple[tuple[tuple[float, ...], float], ...]:

@@ -1,4 +1,4 @@
-"""Conditions of a trial beyond its action: keyword arguments of a simulator.
+"""Arguments of a simulator's function, and conditions of a trial beyond its action.
 
 A function ``fn(theta, action)`` may take any of ``times``, shape (n, k), at which x is
 measured; ``inputs``, {name: (n, m)}, over time; ``input_times``, (m,), their uniform
@@ -27,6 +27,36 @@ SOURCES = {
     "input_times": "Trials(inputs=..., input_times=...)",
     "start": "Trials(start=...)",
 }
+
+
+def parameters_of(fn: Callable[..., Any]) -> list[inspect.Parameter]:
+    """Return the arguments of a function, none where it has no signature."""
+    try:
+        return [*inspect.signature(fn).parameters.values()]
+    except (TypeError, ValueError):  # builtins and C functions have no signature
+        return []
+
+
+def keywords_of(fn: Callable[..., Any], num_rows: int) -> tuple[list[str], bool]:
+    """Return names of keyword arguments behind the positional ones, and if any go."""
+    parameters = parameters_of(fn)
+    kinds = inspect.Parameter
+    named = kinds.POSITIONAL_OR_KEYWORD, kinds.KEYWORD_ONLY
+    positional = [p for p in parameters if p.kind != kinds.KEYWORD_ONLY][:num_rows]
+    names = [p.name for p in parameters if p.kind in named and p not in positional]
+    return names, any(p.kind == kinds.VAR_KEYWORD for p in parameters)
+
+
+def takes_rng(fn: Callable[..., Any]) -> bool:
+    """Return whether a function of one row takes a third argument, its generator."""
+    parameters = parameters_of(fn)
+    kinds = inspect.Parameter
+    if any(p.kind == kinds.VAR_POSITIONAL for p in parameters) or not parameters:
+        return True
+    behind = [p for p in parameters if p.kind < kinds.VAR_POSITIONAL][2:3]
+    return any(
+        p.name != "context" and not isinstance(p.default, int | float) for p in behind
+    )
 
 
 def conditions_of(
@@ -101,32 +131,47 @@ def require_rows_each(name: str, value: Any, num: int) -> None:
         )
 
 
+def changed(value: Any, change: Callable[[Any], Any]) -> Any:
+    """Return a value with a change, which is that of each part of a dict.
+
+    Args:
+        value: Value of a keyword argument.
+        change: Function of what is no dict.
+    """
+    if isinstance(value, Mapping):
+        return {name: changed(part, change) for name, part in value.items()}
+    return change(value)
+
+
 def at_rows(keywords: Mapping[str, Any], at: Any) -> dict[str, Any]:
     """Return keyword arguments of some rows; numbers belong to all."""
     return {
-        name: value if name == "input_times" else _part(value, at)
+        name: value
+        if name == "input_times"
+        else changed(value, lambda v: v[at] if np.ndim(v) else v)
         for name, value in keywords.items()
     }
 
 
-def _part(value: Any, at: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _part(part, at) for key, part in value.items()}
-    return value[at] if np.ndim(value) else value
-
-
 def typed(value: Any, dtype: torch.dtype) -> Any:
     """Return tensors in a type, those of a dict too; None stays None."""
-    if isinstance(value, Mapping):
-        return {name: typed(part, dtype) for name, part in value.items()}
-    return None if value is None else value.to(dtype)
+    return changed(value, lambda v: None if v is None else v.to(dtype))
+
+
+def copied(value: Any) -> Any:
+    """Return arrays that a function may change; a number is what it is."""
+
+    def own(part: Any) -> Any:
+        if isinstance(part, Tensor):
+            return part.clone()
+        return part.copy() if isinstance(part, np.ndarray) else part
+
+    return changed(value, own)
 
 
 def as_arrays(value: Any) -> Any:
     """Return keyword arguments with float64 arrays in place of tensors and numbers."""
-    if isinstance(value, Mapping):
-        return {name: as_arrays(part) for name, part in value.items()}
-    return np.asarray(value, dtype=np.float64)
+    return changed(value, lambda v: np.asarray(v, dtype=np.float64))
 
 
 def one_row(arrays: Mapping[str, Any], i: int) -> dict[str, Any]:
@@ -136,13 +181,9 @@ def one_row(arrays: Mapping[str, Any], i: int) -> dict[str, Any]:
         arrays: Arrays from :func:`as_arrays`.
         i: Index of the row.
     """
-    return {
-        name: value.copy() if name == "input_times" else _row(value, i)
-        for name, value in arrays.items()
-    }
 
+    def own(value: Any) -> Any:
+        is_number = isinstance(value, np.ndarray) and not value.ndim
+        return float(value) if is_number else value
 
-def _row(value: Any, i: int) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _row(part, i) for key, part in value.items()}
-    return value[i].copy() if value.ndim else float(value)
+    return changed(copied(at_rows(arrays, i)), own)

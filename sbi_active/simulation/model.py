@@ -21,15 +21,18 @@ from sbi_active.simulation.conditions import (
     as_arrays,
     at_rows,
     conditions_of,
+    copied,
+    keywords_of,
     one_row,
+    parameters_of,
     played,
     require_conditions,
     require_rows_each,
     require_taken,
+    takes_rng,
 )
 from sbi_active.simulation.noise.base import NoiseModel
 from sbi_active.simulation.noise.gaussian import GaussianNoise
-from sbi_active.simulation.signatures import keywords_of, parameters_of, takes_rng
 from sbi_active.simulation.simulator import (
     outcome_array,
     outcome_tensor,
@@ -300,8 +303,8 @@ class SimulatorModel(Shown):
             x = self._run_rows(theta, action, seeds, effects, keywords)
         else:
             if self.fn_takes_seeds:
-                keywords["seeds"] = _copied(seeds)
-            x = self.fn(theta.clone(), action.clone(), **_copied(effects), **keywords)
+                keywords["seeds"] = copied(seeds)
+            x = self.fn(theta.clone(), action.clone(), **copied(effects), **keywords)
         x = outcome_tensor(x, len(theta))
         self._square, names = square_of(x, self._square), self.channel_names
         # A trajectory of one channel has no axis of its own for it.
@@ -379,15 +382,6 @@ class SimulatorModel(Shown):
                     f"{name!r}; add it to fn, with its null value as the default"
                 )
             require_rows_each(name, value, len(theta))
-
-
-def _copied(value: Any) -> Any:
-    """Return arrays that ``fn`` may change; a number is what it is."""
-    if isinstance(value, Mapping):
-        return {name: _copied(part) for name, part in value.items()}
-    if isinstance(value, Tensor):
-        return value.clone()
-    return value.copy() if isinstance(value, np.ndarray) else value
 
 
 def takes_seeds(simulator: Callable[..., Any]) -> bool:

@@ -12,7 +12,7 @@ from torch.distributions import MultivariateNormal, Normal
 from sbi_active import StopRules
 from sbi_active.campaign import CampaignOptions, Trial, health
 from sbi_active.campaign.health import assess, log_e_value
-from sbi_active.campaign.score import score_outcome
+from sbi_active.campaign.score import score_outcome, simulate_from
 from sbi_active.campaign.state import CampaignState, ModelVersion
 from sbi_active.seeding import derive_seed
 from tests.campaign.problem import campaign
@@ -26,8 +26,15 @@ def simulator(theta, action):
 
 
 def score(x, simulator=simulator, seed=0, num_samples=2_000):
-    return score_outcome(
-        torch.as_tensor(x), ACTION, simulator, PRIOR, num_samples=num_samples, seed=seed
+    rows = simulate_from(PRIOR, simulator, ACTION, num_samples=num_samples, seed=seed)
+    return SimpleNamespace(
+        **dict(
+            zip(
+                ("surprise", "log_score"),
+                score_outcome(torch.as_tensor(x), rows),
+                strict=True,
+            )
+        )
     )
 
 

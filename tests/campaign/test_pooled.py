@@ -14,7 +14,7 @@ from sbi_active import (
     SimulatorModel,
 )
 from sbi_active.actions import SummaryAction
-from sbi_active.simulation.workers.meter import SimulationBudgetError
+from sbi_active.simulation.workers.store import SimulationBudgetError
 
 PRIOR = BoxUniform(torch.zeros(2), torch.ones(2))
 SIZE = 8  # pixels a side

@@ -5,7 +5,7 @@ import torch
 from scipy.stats import binom
 from torch.distributions import MultivariateNormal
 
-from sbi_active.campaign.score import score_outcome
+from sbi_active.campaign.score import score_outcome, simulate_from
 
 PRIOR = MultivariateNormal(torch.zeros(1), torch.eye(1))
 ACTION = torch.ones(1)
@@ -39,8 +39,11 @@ def surprises(simulator, num=60, change=None, num_samples=200):
         x = x if change is None else change(x)
         found.append(
             score_outcome(
-                x, ACTION, simulator, PRIOR, num_samples=num_samples, seed=seed
-            ).surprise
+                x,
+                simulate_from(
+                    PRIOR, simulator, ACTION, num_samples=num_samples, seed=seed
+                ),
+            )[0]
         )
     return torch.tensor(found)
 

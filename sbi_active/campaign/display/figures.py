@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,11 +31,8 @@ BARS = {"ok": "C0", "watch": "#b8860b", "alarm": TRUTH, None: FAINT}
 
 
 def plot_campaign(
-    state: CampaignState,
-    simulator: Callable[[int], Any] | None,
-    prior: Distribution,
+    campaign: Any,
     *,
-    parameter_names: Sequence[str],
     theta_true: Tensor | None,
     num_predicted: int,
     most_parameters: int = 24,
@@ -43,10 +40,7 @@ def plot_campaign(
     """Return the figure of :meth:`.Campaign.plot`.
 
     Args:
-        state: State of the campaign.
-        simulator: Simulator of a trial, by its index; None if there is none.
-        prior: Prior of the current parameters.
-        parameter_names: Names of the parameters.
+        campaign: The campaign.
         theta_true: True parameters, shape (theta_dim,), where known.
         num_predicted: Simulations of each trial.
         most_parameters: Parameters that have a panel.
@@ -56,6 +50,7 @@ def plot_campaign(
     """
     import matplotlib.pyplot as plt
 
+    state, parameter_names = campaign.state, campaign.parameter_names
     truth = None if theta_true is None else torch.as_tensor(theta_true).flatten()
     # Without the parameters of effects that were adopted, too.
     if truth is not None and len(truth) > len(parameter_names):
@@ -70,7 +65,7 @@ def plot_campaign(
     figure: Any = plt.figure(figsize=(12, high + 3.6), layout="constrained")
     upper, lower = figure.subfigures(2, 1, height_ratios=[high, 3.6])
     panels = upper.subplots(rows, columns, squeeze=False)
-    beliefs = _quantiles(state, prior, len(parameter_names))
+    beliefs = _quantiles(state, campaign.prior, len(parameter_names))
     for k, ax in enumerate(panels.flat):
         if k < len(shown):
             value = None if truth is None or k >= len(truth) else float(truth[k])
@@ -88,7 +83,7 @@ def plot_campaign(
     )
     axes = lower.subplots(1, 3)
     _gain_by_action(axes[0], state)
-    _against_prediction(axes[1], predict(state, simulator, prior, num_predicted), state)
+    _against_prediction(axes[1], predict(campaign, num_predicted), state)
     _information(axes[2], state)
     for ax in axes:
         if ax.get_xlabel() == "trial":
@@ -97,24 +92,18 @@ def plot_campaign(
     return figure
 
 
-def predict(
-    state: CampaignState,
-    simulator: Callable[[int], Any] | None,
-    prior: Distribution,
-    num_simulations: int,
-) -> dict[int, Array]:
+def predict(campaign: Any, num_simulations: int) -> dict[int, Array]:
     """Return simulations of each executed action, by the index of its trial, (n, q).
 
     They use the kept draws of the belief before the trial. Where these draws are of
     other parameters, those of an earlier model, there is no prediction.
 
     Args:
-        state: State of the campaign.
-        simulator: Simulator of a trial, by its index; None for no predictions.
-        prior: Prior of the current parameters.
+        campaign: Campaign; there are no predictions without its simulator.
         num_simulations: Simulations of each trial; 0 for no predictions.
     """
-    if simulator is None or num_simulations == 0:
+    state, prior = campaign.state, campaign.prior
+    if campaign.simulator is None or num_simulations == 0:
         return {}
     with forked_generators(derive_seed(state.seed, "shown")):
         before = prior.sample(torch.Size([num_simulations]))
@@ -125,7 +114,7 @@ def predict(
         if trial.status == "ok" and trial.x is not None and before.shape[1] == dim:
             theta = before[torch.arange(num_simulations) % len(before)]
             rows = simulate(
-                simulator(index),
+                campaign._learner.at(index),
                 theta,
                 trial.action.expand(num_simulations, -1),
                 seed=derive_seed(state.seed, "shown", index),

@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sbi_active.actions import ActionSpace
 from sbi_active.campaign.health import health_by_trial
-from sbi_active.campaign.state import CampaignState
 from sbi_active.design.design import action_labels
 from sbi_active.display.notebook import badge, card, table
 from sbi_active.display.page import Page, Picture, Section
@@ -38,25 +36,13 @@ DETAILS = ("expected_information_error", "misfit", "outlyingness", "num_simulati
 COLORS = {"ok": "good", "watch": "fair", "alarm": "bad"}
 
 
-def to_dataframe(
-    state: CampaignState,
-    actions: ActionSpace,
-    *,
-    parameter_names: Sequence[str],
-    channel_names: Sequence[str] | None,
-) -> DataFrame:
-    """Return the trials as a table, see :meth:`.Campaign.to_dataframe`.
-
-    Args:
-        state: State of the campaign.
-        actions: Action space of the campaign.
-        parameter_names: Names of the parameters.
-        channel_names: Names of the entries of x's last axis, where known.
-    """
+def to_dataframe(campaign: Any) -> DataFrame:
+    """Return the trials as a table, see :meth:`.Campaign.to_dataframe`."""
     import pandas as pd
 
+    state, actions = campaign.state, campaign.actions
     shape = next((t.x.shape for t in state.trials if t.x is not None), ())
-    numbers = outcome_labels(shape, channel_names)
+    numbers = outcome_labels(shape, campaign.channel_names)
     own = (*FIRST, *LAST)
     labels = [_apart(n, "action", own) for n in action_labels(actions)]
     told = [_apart(n, "outcome", (*own, *labels)) for n in numbers or ["x"]]
@@ -84,7 +70,7 @@ def to_dataframe(
     frame.attrs = {
         "method": state.method,
         "seed": state.seed,
-        "parameter_names": [*parameter_names],
+        "parameter_names": [*campaign.parameter_names],
         "action_names": [*actions.names],
         "action_units": [*actions.units],
         "units": dict.fromkeys((*NUMBERS[:3], "log_score"), "nats")

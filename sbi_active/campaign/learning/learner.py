@@ -16,7 +16,6 @@ from sbi_active.actions import ActionSpace
 from sbi_active.campaign.health import (
     doubts,
     error_nats,
-    in_doubt,
     is_suspect,
     misfit,
     outlyingness,
@@ -28,7 +27,7 @@ from sbi_active.campaign.learning.indexed import (
 )
 from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.learning.rounds import Round
-from sbi_active.campaign.score import Score, score_outcome, simulate_from
+from sbi_active.campaign.score import score_outcome, simulate_from
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.identifiability.known import note_combinations
 from sbi_active.inference.beliefs.belief import information_gained, named
@@ -39,9 +38,9 @@ from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeErro
 from sbi_active.inference.trainers.base import ActiveInference
 from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation import simulate
+from sbi_active.simulation import Simulations, simulate
 from sbi_active.simulation.simulator import square_of
-from sbi_active.simulation.workers.meter import SimulationBudgetError
+from sbi_active.simulation.workers.store import SimulationBudgetError
 
 
 class Learner:
@@ -67,6 +66,7 @@ class Learner:
     """
 
     has_networks = True
+    num_looked_at = 16  # simulations that show what the simulator is
 
     def __init__(
         self,
@@ -77,14 +77,17 @@ class Learner:
         *,
         x_shape: torch.Size | None = None,
     ) -> None:
+        self.simulator, self.actions, self.state = simulator, actions, state
+        self._require_options()
         enumerates = find_method(state.method).enumerates(state.options)
-        self.simulator = simulator
         self.prior = require_support(prior, enumerates=enumerates)
-        self.actions, self.state = actions, state
         self._names = getattr(simulator, "parameter_names", None)
         require_width(prior, self._names, seed=derive_seed(state.seed, "width"))
         self.restart()
         self.x_shape = self._probe() if x_shape is None else x_shape
+
+    def _require_options(self) -> None:
+        """Raise if this is no way to learn for the campaign's options."""
 
     def restart(self) -> None:
         """Forget all trials: the belief is the prior again."""
@@ -95,7 +98,6 @@ class Learner:
         self._trainer.starts_at_network = self.trains_each_round
         self._saved: Callable[[], Distribution] | None = None
         self.round = Round(self)
-        self.stated: tuple[Distribution, list[str], Distribution] | None = None
 
     @property
     def trains_each_round(self) -> bool:
@@ -108,10 +110,6 @@ class Learner:
         """Whether the simulator is another one at each trial."""
         seed = derive_seed(self.state.seed, "index")
         return depends_on_index(self.simulator, self.prior, self.actions, seed=seed)
-
-    def forget(self) -> None:
-        """Have the next update compute everything again."""
-        self.state.is_stale = bool(self.state.processed)
 
     def resume(self, belief: Callable[[], Distribution]) -> None:
         """Go on where ``state.processed`` ends.
@@ -144,19 +142,6 @@ class Learner:
         assert belief is not None
         return named(belief, self.simulator)
 
-    @property
-    def stated_belief(self) -> Distribution:
-        """The belief, marked untrustworthy where trials are beyond all simulations."""
-        belief, texts = self.belief, doubts(self.state.measured)
-        if self.state.is_stale:
-            texts.append(
-                "SA601 a trial was corrected since: update() computes it again"
-            )
-        if self.stated is None or self.stated[:2] != (belief, texts):
-            marked = named(in_doubt(belief, self.prior, texts), self.simulator)
-            self.stated = belief, texts, marked
-        return self.stated[2]
-
     def at(self, index: int) -> Callable[..., Any]:
         """Return the simulator of the trial of an index."""
         return at_index(self.simulator, index) if self.has_index else self.simulator
@@ -166,35 +151,41 @@ class Learner:
         state, index = self.state, trial.index
         diagnostics = getattr(self.belief, "diagnostics", Diagnostics())
         with state.stage(index, "scoring"):
-            score = self._score(trial)
-        state.account(
-            index,
-            score.num_simulations,
-            score.num_missing,
-            surprise=score.surprise,
-            belief_error=error_nats(diagnostics),
-            log_score=score.log_score,
-            version=state.version.number,
-        )
+            surprise, log_score = self._score(trial)
+        found: Any = {"surprise": surprise, "log_score": log_score}
+        found["belief_error"] = error_nats(diagnostics)
+        state.change(index, **found, version=state.version.number)
         self._examine(state.trials[index])
 
-    def _score(self, trial: Trial) -> Score:
+    def _score(self, trial: Trial, size: int = 4_000_000) -> tuple[float, float]:
+        """Return the surprise and the log score of a trial.
+
+        Args:
+            trial: The trial.
+            size: Numbers that are compared at most, in 400 simulations or more:
+                their products cost more than their simulation.
+        """
         assert trial.x is not None
+        affordable = max(400, size // max(trial.x.numel(), 1))
         return score_outcome(
-            trial.x,
-            trial.action,
-            self.at(trial.index),
-            self.belief,
-            **self._sizes("score", trial),
+            trial.x, self._simulated(self.belief, trial, "score", affordable)
         )
 
-    def _sizes(self, purpose: str, trial: Trial) -> dict[str, Any]:
+    def _simulated(
+        self, source: Distribution, trial: Trial, purpose: str, most: float = math.inf
+    ) -> Simulations:
+        """Return simulations of a trial with parameters from a distribution."""
         options = self.state.options
-        return {
-            "num_samples": options.details.num_scored,
-            "seed": derive_seed(self.state.seed, purpose, trial.index),
-            "workers": options.workers,
-        }
+        rows = simulate_from(
+            source,
+            self.at(trial.index),
+            trial.action,
+            num_samples=int(min(options.details.num_scored, most)),
+            seed=derive_seed(self.state.seed, purpose, trial.index),
+            workers=options.workers,
+        )
+        self.state.account(trial.index, len(rows), rows.counts["missing"])
+        return rows
 
     def _examine(self, trial: Trial) -> Trial:
         """Compare a trial that the belief did not lead to with all of the prior."""
@@ -202,15 +193,9 @@ class Learner:
             return trial
         assert trial.x is not None
         with self.state.stage(trial.index, "scoring"):
-            rows = simulate_from(
-                self.prior,
-                self.at(trial.index),
-                trial.action,
-                **self._sizes("prior", trial),
-            )
+            rows = self._simulated(self.prior, trial, "prior")
         far = outlyingness(trial.x, rows.without_missing().x)
-        lost = rows.counts["missing"]
-        self.state.account(trial.index, len(rows), lost, outlyingness=far)
+        self.state.change(trial.index, outlyingness=far)
         return self._warned(trial.index)
 
     def _warned(self, index: int) -> Trial:
@@ -326,16 +311,21 @@ class Learner:
         note_combinations(belief, self._names, seed=state.seed)
         return belief
 
-    def _few(self, num: int) -> tuple[Tensor, Tensor]:
+    def simulated(self, action: Tensor) -> Tensor:
+        """Return actions (..., action_dim) as the simulator gets them."""
+        return action
+
+    def _few(self) -> tuple[Tensor, Tensor]:
         """Return parameters and actions at which to look at the simulator."""
-        seed = self.state.seed
+        seed, num = self.state.seed, self.num_looked_at
         with forked_generators(seed, "probe"):
             theta: Tensor = self.prior.sample(torch.Size([num]))
-        return theta, self.actions.sample((num,), seed=derive_seed(seed, "probe"))
+        action = self.actions.sample((num,), seed=derive_seed(seed, "probe"))
+        return theta, self.simulated(action)
 
     def _probe(self) -> torch.Size:
         """Return x_shape from a few simulations, which must differ by seed."""
-        theta, action = self._few(16)
+        theta, action = self._few()
         options: dict[str, Any] = {"seed": derive_seed(self.state.seed, "probe", 1)}
         options["workers"] = self.state.options.workers
         x = simulate(self.simulator, theta, action, check_noise=True, **options).x

@@ -51,24 +51,18 @@ def _asbi(prior: Distribution, options: CampaignOptions) -> ActiveInference:
     return ASBI(prior, options.density_estimator, show_progress_bars=False)
 
 
-def _alhi(prior: Distribution, options: CampaignOptions) -> ActiveInference:
-    return ALHI(
-        prior,
-        options.density_estimator,
-        show_progress_bars=False,
-        posterior=options.details.posterior,
-    )
+def _sampled(
+    prior: Distribution, options: CampaignOptions, kind: Any = ALHI
+) -> ActiveInference:
+    """Return a trainer whose beliefs are sampled from its network."""
+    how = {"show_progress_bars": False, "posterior": options.details.posterior}
+    return kind(prior, options.density_estimator, **how)
 
 
 def _seqbed(prior: Distribution, options: CampaignOptions) -> ActiveInference:
     if isinstance(options.density_estimator, LFIRE):
         return SeqBED_LFIRE(prior, options.density_estimator)
-    return SeqBED(
-        prior,
-        options.density_estimator,
-        show_progress_bars=False,
-        posterior=options.details.posterior,
-    )
+    return _sampled(prior, options, SeqBED)
 
 
 _ALHI = {
@@ -87,8 +81,8 @@ _SEQBED = {
 METHODS = {
     "asbi": Method(True, _asbi, {}, refines=True),
     "nsbi": Method(False, _asbi, {}, refines=True),
-    "alhi": Method(True, _alhi, _ALHI),
-    "nlhi": Method(False, _alhi, _ALHI),
+    "alhi": Method(True, _sampled, _ALHI),
+    "nlhi": Method(False, _sampled, _ALHI),
     "seqbed": Method(True, _seqbed, _SEQBED),
 }
 

@@ -75,17 +75,15 @@ class Planner:
         listed = actions.listed()
         self._limits.cost(actions.sample((8,), seed=0) if listed is None else listed)
         self._designs = find_method(state.method).designs
-        self._designer = (
-            InformationGainDesigner(
+        self._designer: Any = RandomDesigner(actions, workers=options.workers)
+        if self._designs:
+            self._designer = InformationGainDesigner(
                 actions,
                 num_samples=options.num_samples,
                 estimator=options.estimator,
                 eliminate=options.details.eliminate,
                 workers=options.workers,
             )
-            if self._designs
-            else RandomDesigner(actions, workers=options.workers)
-        )
 
     def require(self, target: Target) -> None:
         """Raise a ValueError if a trial cannot be designed for a target."""
@@ -150,14 +148,23 @@ class Planner:
         limits = self._limits
         if told and not details.repeat:
             limits = replace(limits, exclude=torch.stack(told))
+        allowed = {
+            "constraint": limits.constraint,
+            "exclude": limits.exclude,
+            "min_probability_valid": limits.least,
+        }
         if not self._designs:
-            options = _keywords(limits)
-            return self._select(index, learner, self._designer, **options), "random"
+            return self._select(index, learner, self._designer, **allowed), "random"
         if target == "auto" and self._checks(index):
             places = most_unlike(permitted(limits), told)
             designer = RandomDesigner(places, workers=self._state.options.workers)
             return self._select(index, learner, designer), "check"
-        about_model = self._about_model(index, target, learner, limits)
+        # What nothing explains would draw the next trial after it; reports have it.
+        trials, about_model = self._state.explained, None
+        can_compare = self.effects and len(trials) >= FEWEST_TRIALS
+        if target == "model" or target == "auto" and can_compare:
+            with self._state.stage(index, "criticism"):
+                about_model = _model_design(self.compare(learner, trials), limits)
         if about_model is not None and (target == "model" or alarmed):
             return about_model, "model"
         own = "theta" if target in ("auto", "model") else target
@@ -170,49 +177,18 @@ class Planner:
                 )
             design, own = learner.design(index, limits), "theta"
         else:
-            design = self._about_parameters(index, own, learner, limits)
-        if about_model is not None and _utility(about_model) > _utility(design):
-            return about_model, "model"
+            model, rows = learner.round.model(index), learner.round.simulations
+            about: Any = {"target": own, "cost": limits.price, "simulations": rows}
+            chosen = index, learner, self._designer, model
+            design = self._select(*chosen, **about, **allowed)
+            if model.was_asked:
+                user = "design" if _rests_on_model(design) else "notes"
+                learner.round.note(index, user)
+        if about_model is not None:  # nats a unit of cost
+            gains = [float(d.utility[d.index]) for d in (about_model, design)]
+            if gains[0] > gains[1]:
+                return about_model, "model"
         return design, name_of(own)
-
-    def _about_model(
-        self,
-        index: int,
-        target: Target,
-        learner: Learner,
-        limits: DesignLimits,
-    ) -> Design | None:
-        """Return the design for the right model, where it is asked for or may be."""
-        # What nothing explains would draw the next trial after it; reports have it.
-        trials = self._state.explained
-        can_compare = self.effects and len(trials) >= FEWEST_TRIALS
-        if target != "model" and not (target == "auto" and can_compare):
-            return None
-        with self._state.stage(index, "criticism"):
-            return _model_design(self.compare(learner, trials), limits)
-
-    def _about_parameters(
-        self,
-        index: int,
-        target: Target,
-        learner: Learner,
-        limits: DesignLimits,
-    ) -> Design:
-        """Return the design for parameters, with the model of the round."""
-        model = learner.round.model(index)
-        design = self._select(
-            index,
-            learner,
-            self._designer,
-            model,
-            target=target,
-            cost=limits.price,
-            simulations=learner.round.simulations,
-            **_keywords(limits),
-        )
-        if model.was_asked:
-            learner.round.note(index, "design" if _rests_on_model(design) else "notes")
-        return design
 
     def _select(
         self,
@@ -290,15 +266,6 @@ def most_unlike(
     return DiscreteActions(values[best], names=actions.names, units=actions.units)
 
 
-def _keywords(limits: DesignLimits) -> dict[str, Any]:
-    """Return limits as a designer takes them, without the cost."""
-    return {
-        "constraint": limits.constraint,
-        "exclude": limits.exclude,
-        "min_probability_valid": limits.least,
-    }
-
-
 def _model_design(criticism: Criticism, limits: DesignLimits) -> Design | None:
     """Return the design that tells most about which rival is right.
 
@@ -343,8 +310,3 @@ def _rests_on_model(design: Design) -> bool:
     """Return whether an estimator uses something learned; unknown ones do."""
     needs = {kind.__name__: kind.needs_model for kind in ESTIMATORS.values()}
     return needs.get(design.estimator, True)
-
-
-def _utility(design: Design) -> float:
-    """Return the chosen action's information by cost, nats a unit of cost."""
-    return float(design.utility[design.index])

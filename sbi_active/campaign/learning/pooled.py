@@ -16,7 +16,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.actions.summaries import find_summaries
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.learning.methods import find_method
-from sbi_active.campaign.score import Score, compared
+from sbi_active.campaign.score import compared
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.design.design import Design
 from sbi_active.design.elimination import choose
@@ -29,12 +29,11 @@ from sbi_active.inference.emulation.summaries import fitted_summaries
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import SimulatorModel, simulate
 from sbi_active.simulation.noise.base import NoiseModel
-from sbi_active.simulation.workers.meter import SimulationBudgetError
+from sbi_active.simulation.workers.store import SimulationBudgetError
 
 DESIGN_SHARE = 0.4  # of a round's simulations
 MOST_CANDIDATES = 48  # of a space without end
 NUM_LEADERS = 6  # that the second half of a design's simulations goes to
-FEW = 8  # rows to look at a simulator
 BESIDE = 8  # rows at an executed action, beyond one a parameter, before it is used
 
 
@@ -49,25 +48,18 @@ class PooledLearner(Learner):
     """
 
     has_networks = False
+    num_looked_at = 8
 
-    def __init__(
-        self,
-        simulator: Callable[..., Any],
-        prior: Distribution,
-        actions: ActionSpace,
-        state: CampaignState,
-        *,
-        x_shape: torch.Size | None = None,
-    ) -> None:
-        if state.method not in ("asbi", "nsbi") or not state.options.refine:
+    def _require_options(self) -> None:
+        found = find_summaries(self.actions)
+        self._choice, self._entry = (None, 0) if found is None else found
+        method, refine = self.state.method, self.state.options.refine
+        if method not in ("asbi", "nsbi") or not refine:
             raise ValueError(
                 "expected the method 'asbi' or 'nsbi' with refine=True for "
-                f"max_simulations or a SummaryAction; got {state.method!r} with refine="
-                f"{state.options.refine}; leave them out, or pass one of these"
+                f"max_simulations or a SummaryAction; got {method!r} with refine="
+                f"{refine}; leave them out, or pass one of these"
             )
-        found = find_summaries(actions)
-        self._choice, self._entry = (None, 0) if found is None else found
-        super().__init__(simulator, prior, actions, state, x_shape=x_shape)
 
     def simulated(self, action: Tensor) -> Tensor:
         """Return actions (..., action_dim) as the simulator gets them."""
@@ -75,18 +67,6 @@ class PooledLearner(Learner):
         if self._choice is not None:
             action[..., self._entry] = 0.0
         return action
-
-    def _probe(self) -> torch.Size:
-        theta, action = self._few(FEW)
-        rows = simulate(
-            self.simulator,
-            theta,
-            self.simulated(action),
-            seed=derive_seed(self.state.seed, "probe", 1),
-            check_noise=True,
-            workers=self.state.options.workers,
-        )
-        return rows.x.shape[1:]
 
     @cached_property
     def noise(self) -> NoiseModel | None:
@@ -96,7 +76,7 @@ class PooledLearner(Learner):
             return None
         if model.noise is None or not bool((model.noise.parameters > 0).all()):
             return None
-        theta, action = self._few(FEW)
+        theta, action = self._few()
         bare, workers = model.without_noise(), self.state.options.workers
         first, second = (
             simulate(bare, theta, action, seed=k, workers=workers).x for k in (1, 2)
@@ -275,8 +255,8 @@ class PooledLearner(Learner):
             action = torch.cat([a.expand(num, -1) for a, num in lacking])
             self._add(self._drawn(total), action, self.belief)
 
-    def _score(self, trial: Trial, num_predicted: int = 2_000) -> Score:
-        """Compare a trial with what the belief and the pool predict, by draws."""
+    def _score(self, trial: Trial, size: int = 2_000) -> tuple[float, float]:
+        """Compare a trial with ``size`` predictions of the belief and the pool."""
         state, start = self.state, self.state.meter.spent
         own = self._trial(trial)
         self._require_rows([own], self._rows_left("belief", trial.index))
@@ -284,16 +264,15 @@ class PooledLearner(Learner):
         near, label = processes.near, processes.best_summary(own)
         fitted = processes.fit_trial(own, label, near)
         rng = np.random.default_rng(derive_seed(state.seed, "score", trial.index))
-        z = near[rng.integers(len(near), size=num_predicted)]
+        state.account(trial.index, state.meter.spent - start, 0)
+        z = near[rng.integers(len(near), size=size)]
         if fitted.processes:
             drawn = torch.from_numpy(fitted.draw(z, rng))
-            surprise, log_score = compared(drawn, torch.from_numpy(fitted.observed))
-        else:
-            share = 1.0
-            if fitted.outcome is not None:
-                share = float(np.exp(fitted.outcome.log_prob(z)).mean())
-            surprise, log_score = (share if share < 0.5 else 1.0), math.log(share)
-        return Score(surprise, log_score, state.meter.spent - start, 0)
+            return compared(drawn, torch.from_numpy(fitted.observed))
+        share = 1.0
+        if fitted.outcome is not None:
+            share = float(np.exp(fitted.outcome.log_prob(z)).mean())
+        return (share if share < 0.5 else 1.0), math.log(share)
 
     def _prepare(self, index: int) -> None:
         pass  # there is no network

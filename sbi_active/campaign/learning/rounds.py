@@ -9,10 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from torch import Tensor
-from torch.distributions import Distribution
 
-from sbi_active.actions import ActionSpace
 from sbi_active.campaign.isolation import isolated
 from sbi_active.inference.beliefs.enumerated import Enumeration
 from sbi_active.inference.models.posterior import ActionPosterior
@@ -21,101 +18,10 @@ from sbi_active.simulation.bank.bank import Bank
 from sbi_active.simulation.bank.reweighting import FEW, reuse
 from sbi_active.simulation.outcomes import Simulations
 from sbi_active.simulation.workers.engine import simulate
-from sbi_active.simulation.workers.meter import find_store
-from sbi_active.simulation.workers.settings import Workers
+from sbi_active.simulation.workers.store import find_store
 
 LOGGER = logging.getLogger("sbi_active")
 DENSITIES = ("log_posterior", "log_likelihood", "log_ratio")
-
-
-def simulate_round(
-    simulator: Callable[..., Any],
-    theta: Tensor,
-    action: Tensor,
-    *,
-    prior: Distribution | None,
-    actions: ActionSpace,
-    num_earlier: int,
-    seed: int,
-    workers: Workers,
-) -> tuple[Simulations, int, int]:
-    """Return simulations of a round; of a first one those that a bank has among them.
-
-    The new ones of a first round are stored with their density under the prior, so that
-    the next campaign can weight them.
-
-    Args:
-        simulator: The current one.
-        theta: Parameters of the round, shape (n, theta_dim).
-        action: Actions of the round, shape (n, action_dim).
-        prior: Prior that theta was drawn from, for a first round; else None.
-        actions: Rows of other actions are not taken.
-        num_earlier: Rows of the bank that were there before this campaign; what it
-            stored itself must not count when it begins again.
-        seed: Seed of the new simulations, and of the choice of earlier ones.
-        workers: Workers that run the simulations.
-
-    Returns:
-        At most n rows without the missing, how many were simulated, and how many of
-        these are missing.
-    """
-    store = None if prior is None else find_store(simulator)
-    if prior is None or not isinstance(store, Bank):
-        rows = simulate(simulator, theta, action, seed=seed, workers=workers)
-        return rows.without_missing(), len(rows), rows.counts["missing"]
-    earlier = _earlier(store, prior, actions, num_earlier, len(theta), seed)
-    first = 0 if earlier is None else len(earlier)
-    if earlier is not None and first == len(theta):
-        return earlier, 0, 0
-    rows = simulate(
-        simulator,
-        theta[first:],
-        action[first:],
-        seed=seed,
-        workers=workers,
-        store=store.drawn_from(prior, label="prior"),
-    )
-    known = rows.without_missing()
-    if earlier is not None:
-        parts = [(getattr(earlier, n), getattr(known, n)) for n in ("theta", "action")]
-        x = torch.cat([earlier.x, known.x])
-        known = Simulations(*map(torch.cat, parts), x=x)
-    return known, len(rows), rows.counts["missing"]
-
-
-def _earlier(
-    bank: Bank,
-    prior: Distribution,
-    actions: ActionSpace,
-    num_earlier: int,
-    num_rows: int,
-    seed: int,
-) -> Simulations | None:
-    """Return as many earlier rows as they are worth; None if that is too few."""
-    if not num_earlier:
-        return None
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # their number is said below
-            found = reuse(bank, prior)
-    except ValueError:  # none whose proposal is known
-        return None
-    permitted = actions.contains(bank.read(found.rows).action)
-    weights = found.weights * (permitted & (found.rows < num_earlier))
-    if not weights.sum() > 0:
-        return None
-    found = replace(found, weights=weights / weights.sum())
-    worth = found.effective_sample_size
-    used = min(num_rows, int(worth))
-    LOGGER.info(
-        "first round: %d of %d rows are read from %s, whose %d earlier rows are worth "
-        "%.0f draws from the prior",
-        *(used if used >= FEW else 0, num_rows, bank.path, int((weights > 0).sum())),
-        worth,
-    )
-    if used < FEW:
-        return None
-    return found.resample(used, seed=derive_seed(seed, "reused"))
 
 
 class Round:
@@ -209,7 +115,16 @@ class Round:
         return learner.inference.build_posterior()
 
     def _rows(self, index: int) -> tuple[Simulations, int, int]:
-        """Simulate the round: parameters from the belief, actions from the space."""
+        """Simulate the round: parameters from the belief, actions from the space.
+
+        A first round begins with what earlier campaigns left in a bank, and stores the
+        others with their density under the prior, by which the next campaign weights
+        them.
+
+        Returns:
+            Rows without the missing, how many were simulated, and how many of these
+            are missing.
+        """
         learner, state = self._learner, self._learner.state
         # Not the index: a trial that was missing, or taken out, trains nothing.
         seed, num, key = state.seed, state.options.num_simulations, len(state.explained)
@@ -217,17 +132,62 @@ class Round:
             drawn = learner.belief.sample(torch.Size([num]))
         action = learner.actions.sample((num,), seed=derive_seed(seed, "action", key))
         theta, action = learner.inference.arrange(drawn, action)
-        is_first = key == 0 and theta is drawn and not learner.has_index
-        return simulate_round(
-            learner.at(index),
-            theta,
-            action,
-            prior=learner.belief if is_first else None,
-            actions=learner.actions,
-            num_earlier=state.num_earlier,
-            seed=derive_seed(seed, "x", key),
+        simulator, own = learner.at(index), derive_seed(seed, "x", key)
+        store = earlier = None
+        if key == 0 and theta is drawn and not learner.has_index:
+            store = find_store(simulator)
+            earlier = self._earlier(store, len(theta), own)
+            if isinstance(store, Bank):
+                store = store.drawn_from(learner.belief, label="prior")
+        first = 0 if earlier is None else len(earlier)
+        if earlier is not None and first == len(theta):
+            return earlier, 0, 0
+        rows = simulate(
+            simulator,
+            theta[first:],
+            action[first:],
+            seed=own,
             workers=state.options.workers,
+            store=store,
         )
+        known = rows.without_missing()
+        if earlier is not None:
+            pairs = [(earlier.theta, known.theta), (earlier.action, known.action)]
+            x = torch.cat([earlier.x, known.x])
+            known = Simulations(*map(torch.cat, pairs), x=x)
+        return known, len(rows), rows.counts["missing"]
+
+    def _earlier(self, bank: Any, num_rows: int, seed: int) -> Simulations | None:
+        """Return as many rows of earlier campaigns as they are worth; None if few.
+
+        Rows that this campaign stored itself must not count when it begins again, nor
+        do those of other actions.
+        """
+        learner, state = self._learner, self._learner.state
+        if not (isinstance(bank, Bank) and state.num_earlier):
+            return None
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # their number is said below
+                found = reuse(bank, learner.belief)
+        except ValueError:  # none whose proposal is known
+            return None
+        permitted = learner.actions.contains(bank.read(found.rows).action)
+        weights = found.weights * (permitted & (found.rows < state.num_earlier))
+        if not weights.sum() > 0:
+            return None
+        found = replace(found, weights=weights / weights.sum())
+        worth = found.effective_sample_size
+        used = min(num_rows, int(worth))
+        LOGGER.info(
+            "first round: %d of %d rows are read from %s, whose %d earlier rows are "
+            "worth %.0f draws from the prior",
+            *(used if used >= FEW else 0, num_rows, bank.path),
+            *(int((weights > 0).sum()), worth),
+        )
+        if used < FEW:
+            return None
+        return found.resample(used, seed=derive_seed(seed, "reused"))
 
 
 class RoundModel:

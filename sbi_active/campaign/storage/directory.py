@@ -9,17 +9,18 @@ simulator's. ``campaign.toml`` says what the campaign is, for people alone.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from sbi_active.campaign.options import CampaignOptions
-from sbi_active.campaign.state import LOST, CampaignState, ModelVersion
+from sbi_active.campaign.state import CampaignState, ModelVersion
 from sbi_active.campaign.storage.codec import NotStorableError, decode, encode
 from sbi_active.campaign.storage.manifest import read_manifest
+from sbi_active.campaign.storage.simulations import form_of
 from sbi_active.campaign.telling import LOG, STATE, SUMMARY, event_of, facts_in
 from sbi_active.messages import Explained
+from sbi_active.simulation.bank.bank import Bank
 from sbi_active.simulation.bank.sqlite import CorruptSegmentError, require, sensible
 from sbi_active.simulation.bank.store import Store
 
@@ -46,46 +47,94 @@ class LogChangedError(Explained, ValueError):
         )
 
 
-class CampaignDirectory:
-    """Keeps a campaign on the disk.
+class Storage:
+    """Keeps a campaign in a folder, its simulations in banks, or neither.
 
     Any number of processes may read. The first thing that is written takes the right to
-    write, which ends with :meth:`close` or the process.
+    write, which ends with :meth:`close` or the process. A row is never simulated twice:
+    what is asked for again, by the same seed, theta and action, is read. Rows of
+    rivals, simulators with effects that are compared and not used, are not stored.
 
     Args:
-        path: Folder with a campaign.
+        path: Folder with a campaign; None keeps it in memory alone.
         repair: Whether to give up what is damaged.
+        prior: Prior that the campaign began with; it may be set later.
 
     Attributes:
         path: The folder.
         store: Store of the campaign's records.
         manifest: Description of the campaign.
         notes: Notes on what was given up, a sentence each.
+        bank: Folder of the simulations, to be set; None keeps them in the campaign's
+            file.
+        prior: Prior that the campaign began with.
 
     Raises:
         ValueError: If the folder holds no campaign, or one of another schema.
         CorruptSegmentError: If the file does not hold what was written.
     """
 
-    def __init__(self, path: Path, *, repair: bool = False) -> None:
-        self.path, self.notes = path, []
-        self.store = Store(path, "campaign")
-        if repair and self.store.problems():
-            self._give_up_lines()
-            self.store.salvage()
-            with self.store.writing():
-                self.store.delete(SUMMARY)
-            self.store.close()
-        self.manifest = read_manifest(self.store)
-        numbers = range(1, self.store.length(LOG) + 1)
-        self._entries = [self._line(number) for number in numbers]
-        self._saved = self._saved_state()
-        if self._saved is not None:
-            with sensible(self.store.path):
-                self._require_whole(self._saved, repair=repair)
+    def __init__(
+        self, path: Path | None = None, *, repair: bool = False, prior: Any = None
+    ) -> None:
+        self.path, self.notes, self.manifest = path, [], {}
+        self.prior = prior
+        self.bank: str | None = None
+        self._entries: list[dict[str, Any]] = []
+        self._saved: dict[str, Any] | None = None
         self._written: Any = None  # the belief that is on the disk
+        self._banks: dict[str, Bank] = {}
+        self._shared: Store | None = None  # the file of ``bank``
+        self._store = None if path is None else Store(path, "campaign")
+        if self._store is not None:
+            self._read(repair=repair)
+
+    def _read(self, *, repair: bool) -> None:
+        store = self.store
+        if repair and store.problems():
+            self._give_up_lines()
+            store.salvage()
+            with store.writing():
+                store.delete(SUMMARY)
+            store.close()
+        self.manifest = read_manifest(store)
+        self._entries = [self._line(k + 1) for k in range(store.length(LOG))]
+        self._saved = self._kept(STATE, lambda content: decode(content, known={}))
+        if self._saved is not None:
+            with sensible(store.path):
+                self._require_whole(self._saved, repair=repair)
         for entry in self._changes:
             self.manifest["simulator"] = entry["simulator"]
+
+    @property
+    def store(self) -> Store:
+        """Store of the campaign's records, where it has a folder."""
+        assert self._store is not None
+        return self._store
+
+    def find_bank(
+        self, simulator: Callable[..., Any], current: Any, version: int
+    ) -> Bank | None:
+        """Return the bank of a form of the current simulator, open for writing.
+
+        Args:
+            simulator: Simulator whose rows are to be kept.
+            current: The current simulator of the campaign.
+            version: Number of its version.
+        """
+        is_kept = self._store is not None or self.bank is not None
+        form = form_of(simulator, current) if is_kept and current is not None else None
+        if form is None:
+            return None
+        changes = len(self._changes) if self.bank is None else 0
+        name = form + f"-model-{version}" * (version > 0)
+        name += f"-changed-{changes}" * (changes > 0)
+        if name not in self._banks:
+            if self.bank is not None and self._shared is None:
+                self._shared = Store(Path(self.bank), make=True)
+            place = self._shared or self.store
+            self._banks[name] = Bank(place, simulator=simulator, name=name)
+        return self._banks[name]
 
     def write(self, event: str, trial: Any = None, **entries: Any) -> None:
         """Add to the log; it is on the disk when this returns.
@@ -95,22 +144,17 @@ class CampaignDirectory:
             trial: The trial as it is afterwards, or its facts.
             **entries: JSON data.
         """
+        if self._store is None:
+            return
         line = {"line": len(self._entries) + 1, **event_of(event, trial, **entries)}
-        self.acquire()
-        with self.store.writing():
-            if self.store.append(LOG, line) != line["line"]:
-                raise LogChangedError(self.store.path)
+        with self._writing():
+            self.store.append(LOG, line)
         self._entries.append(line)
 
     @property
     def events(self) -> Sequence[Mapping[str, Any]]:
         """The lines of the log so far."""
         return (*self._entries,)
-
-    @property
-    def num_changes(self) -> int:
-        """Number of times that another simulator took the place of the one before."""
-        return len(self._changes)
 
     def given(self, what: str, *, reads: bool) -> Any:
         """Return the prior, the actions or the options; None if they are not stored.
@@ -128,16 +172,19 @@ class CampaignDirectory:
                 return None
             return decode(content, known={})
 
-    def save(self, state: CampaignState, belief: Any, known: Mapping[str, Any]) -> None:
+    def save(self, state: CampaignState, learner: Any) -> None:
         """Write what follows from the log so far.
 
         A belief that cannot be stored is computed again after :meth:`restore`.
 
         Args:
             state: State of the campaign.
-            belief: Belief after ``state.processed``; None if that is the prior.
-            known: Objects that the reader has too, see :func:`.encode`.
+            learner: Learner of the campaign, whose belief is after ``state.processed``.
         """
+        if self._store is None:
+            return
+        belief = None if learner.belief is learner.prior else learner.belief
+        known = {"simulator": learner.simulator, "prior": self.prior}
         content = None
         if belief is not None and belief is not self._written:
             content = b""  # it has to be computed again, unless it can be stored
@@ -189,18 +236,18 @@ class CampaignDirectory:
             state.is_stale |= len(state.versions) > 1
         if saved is None or saved["belief"] in (None, False):
             return None
-        belief = None
-        try:
-            belief = self.store.get(BELIEF) if saved["belief"] else None
-        except CorruptSegmentError as error:
-            self.notes.append(f"SA601 the belief is computed again: {error}")
+        belief = self._kept(BELIEF, bytes)
         if not belief and state.processed:
             state.is_stale = True
         return belief or None
 
     def close(self) -> None:
         """Let others write."""
-        self.store.close()
+        for bank in self._banks.values():
+            bank.close()
+        self._banks.clear()
+        if self._store is not None:
+            self._store.close()
 
     def acquire(self) -> None:
         """Take the right to write.
@@ -209,7 +256,7 @@ class CampaignDirectory:
             LockedError: If another process has it.
             LogChangedError: If another process wrote since the campaign was loaded.
         """
-        if self.store.held:
+        if self._store is None or self._store.held:
             return
         self.store.acquire()
         try:
@@ -249,12 +296,13 @@ class CampaignDirectory:
                     left = self.store.remains(LOG, number) or error.reason
                     self.notes.append(f"SA603 given up, tell it again: {left}")
 
-    def _saved_state(self) -> dict[str, Any] | None:
+    def _kept(self, what: str, read: Callable[[bytes], Any]) -> Any:
+        """Return what was computed; None where it has to be computed again."""
         try:
-            content = self.store.get(STATE)
-            return None if content is None else decode(content, known={})
+            content = self.store.get(what)
+            return None if content is None else read(content)
         except (CorruptSegmentError, ValueError) as error:
-            self.notes.append(f"SA601 {STATE} is computed again: {error}")
+            self.notes.append(f"SA601 the {what} is computed again: {error}")
             return None
 
     def _require_whole(self, saved: Mapping[str, Any], *, repair: bool) -> None:
@@ -269,12 +317,9 @@ class CampaignDirectory:
         reason = f"{len(self._entries)} lines of the log; the state counts"
         reason = f"{reason} {saved['lines']} with {len(told)} trials that were told"
         require(self.store.path, repair, reason)
-        state = CampaignState("asbi", 0, CampaignOptions())
-        for entry in self._entries:
-            if (facts := facts_in(entry)) is not None:
-                state.record(facts)
-        known = [t.index for t in state.trials if t.status != "pending"]
-        known = [k for k in known if state.trials[k].reason != LOST]
+        facts = [f for e in self._entries if (f := facts_in(e)) is not None]
+        last = {f.index: f.status for f in facts}
+        known = [index for index, status in last.items() if status != "pending"]
         self._saved = None
         with self.store.writing():
             self.store.delete(STATE)

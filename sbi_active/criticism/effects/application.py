@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sbi_active.criticism.effects.effect import Context, Effect
 from sbi_active.seeding import forked_generators
+from sbi_active.simulation.conditions import copied
 
 
 def applied(
@@ -34,8 +35,8 @@ def applied(
         ValueError: If ``apply`` gives back another type, shape or kind of number, or a
             standard deviation that is not positive.
     """
-    own = Context(**{name: _copied(part) for name, part in vars(context).items()})
-    changed = effect.apply(_copied(value), phi.clone(), action.clone(), own)
+    own = Context(**{name: copied(part) for name, part in vars(context).items()})
+    changed = effect.apply(copied(value), phi.clone(), action.clone(), own)
     if effect.hook == "dynamics":
         if isinstance(changed, Mapping):
             return {**changed}
@@ -113,9 +114,3 @@ def _numbers(effect: Effect, value: Tensor, changed: Any, what: str) -> Tensor:
             f"{result.dtype}; return the changed {what}"
         )
     return result.to(value.dtype, copy=True)
-
-
-def _copied(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {name: _copied(part) for name, part in value.items()}
-    return value.clone() if torch.is_tensor(value) else value

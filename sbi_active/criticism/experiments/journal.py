@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import operator
 import os
 from dataclasses import fields
 from pathlib import Path
@@ -38,7 +39,9 @@ class Journal:
         if self.path is None:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        line = json.dumps({"event": event, **parts}, default=_plain)
+        line = json.dumps(
+            {"event": event, **parts}, default=operator.methodcaller("tolist")
+        )
         with self.path.open("a", encoding="utf-8") as file:
             file.write(f"{line}\n")
             file.flush()
@@ -94,7 +97,3 @@ def _read(path: Path) -> list[dict[str, Any]]:
     if cut:
         path.write_text(f"{whole}\n" if whole else "", encoding="utf-8")
     return [json.loads(line) for line in whole.splitlines()]
-
-
-def _plain(value: Any) -> Any:
-    return value.tolist()  # of an array or a tensor

@@ -35,7 +35,7 @@ from sbi_active.criticism.rivals.validity import surprising_outcomes
 from sbi_active.criticism.steps.detection import REFUTED, TOO_SMALL
 from sbi_active.messages import Message
 from sbi_active.seeding import forked_generators
-from sbi_active.simulation.signatures import parameters_of
+from sbi_active.simulation.conditions import parameters_of
 
 #: Families of effects that blame an instrument, beside those on what is observed.
 INSTRUMENTS = ["sensor", "geometry"]

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
 import cloudpickle
-import numpy as np
 
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.trials import Trials
@@ -28,6 +26,7 @@ from sbi_active.display.figures import legible
 from sbi_active.display.notebook import card, items, table
 from sbi_active.display.table import Table
 from sbi_active.messages import Message
+from sbi_active.plain import plain
 
 #: Parts of the reasons of a verdict where every model misses, in :meth:`to_dict`.
 MISFIT = ("helps", "named", "open_forms", "instead", "left_out")
@@ -80,7 +79,7 @@ class Report(Contents):
             "parameters": self.parameters,
             "residuals_by_trial": self.residuals_by_trial,
         }
-        return _plain(
+        return plain(
             {
                 "verdict": self.verdict,
                 "line": made.title,
@@ -180,17 +179,3 @@ def build_report(
 
 def _restored(parts: bytes) -> Report:
     return Report(**cloudpickle.loads(parts))
-
-
-def _plain(value: Any) -> Any:
-    """Return lists, numbers and texts in place of arrays, tuples and sets."""
-    if isinstance(value, dict):
-        return {str(key): _plain(part) for key, part in value.items()}
-    if isinstance(value, frozenset):
-        return sorted(value)
-    if isinstance(value, list | tuple):
-        return [_plain(part) for part in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
-    is_lost = isinstance(value, float) and not math.isfinite(value)
-    return None if is_lost else value

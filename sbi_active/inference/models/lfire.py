@@ -13,7 +13,7 @@ from sklearn.linear_model import LogisticRegressionCV
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.expected import require
+from sbi_active.expected import require_least
 from sbi_active.inference.beliefs.belief import ParticleDraws
 from sbi_active.inference.rounds.rows import RoundRows
 
@@ -67,9 +67,7 @@ class LFIRE:
     num_folds: int = 3
 
     def __post_init__(self) -> None:
-        for name, low in (("num_marginal", 10), ("num_penalties", 1), ("num_folds", 2)):
-            value = getattr(self, name)
-            require(value >= low, f"{name} >= {low}", value, "raise it")
+        require_least(self, "raise it", num_marginal=10, num_penalties=1, num_folds=2)
 
     def summaries(self, x: Tensor, center: Tensor, scale: Tensor) -> Tensor:
         """Return summaries, and whether there was a measurement, shape (n, q + 1).

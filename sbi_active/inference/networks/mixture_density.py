@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 from torch.optim import Optimizer
 
-from sbi_active.expected import require, suggests
+from sbi_active.expected import require, require_least, require_one_of, suggests
 from sbi_active.inference.networks.mixture_network import (
     ACTIVATIONS,
     MixtureDensityNetwork,
@@ -74,25 +74,12 @@ class MixtureDensity:
     embedding_net: nn.Module | None = field(default=None)
 
     def __post_init__(self) -> None:
-        counts = {
-            "num_components": self.num_components,
-            "num_iterations": self.num_iterations,
-            "batch_size": self.batch_size,
-            "hidden_features": min(self.hidden_features, default=1),
-        }
-        for name, value in counts.items():
-            require(value >= 1, f"{name} >= 1", value, "raise it")
+        names = ("num_components", "num_iterations", "batch_size", "hidden_features")
+        require_least(self, "raise it", **dict.fromkeys(names, 1))
         rate = self.learning_rate
         require(rate > 0, "learning_rate > 0", rate, "use 1e-3")
-        choices = {
-            "activation": (*ACTIVATIONS,),
-            "scaling": ("action", "global"),
-            "baseline": ("best", "none", "linear", "curved"),
-        }
-        for name, valid in choices.items():
-            among = f"{name} among {', '.join(map(repr, valid))}"
-            value = getattr(self, name)
-            require(value in valid, among, repr(value), "choose one of these")
+        require_one_of(self, activation=ACTIVATIONS, scaling=("action", "global"))
+        require_one_of(self, baseline=("best", "none", "linear", "curved"))
 
     @classmethod
     def faithful(cls) -> MixtureDensity:

@@ -8,7 +8,7 @@ import torch
 from sbi.neural_nets.ratio_estimators import RatioEstimator
 from torch import Tensor, nn
 
-from sbi_active.expected import require
+from sbi_active.expected import require, require_least
 from sbi_active.inference.networks.action_scaling import ActionScaling
 from sbi_active.inference.networks.conditioning import (
     can_regress,
@@ -41,11 +41,8 @@ class RatioClassifier:
     stop_after_epochs: int = 20
 
     def __post_init__(self) -> None:
-        values = {"hidden_features": min(self.hidden_features, default=1)}
-        for name in ("batch_size", "num_iterations", "stop_after_epochs"):
-            values[name] = getattr(self, name)
-        for name, value in values.items():
-            require(value >= 1, f"{name} >= 1", value, "raise it")
+        names = ("hidden_features", "batch_size", "num_iterations", "stop_after_epochs")
+        require_least(self, "raise it", **dict.fromkeys(names, 1))
         rate = self.learning_rate
         require(rate > 0, "learning_rate > 0", rate, "use 1e-3")
 

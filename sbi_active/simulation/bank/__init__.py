@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sbi_active.renamed import former_names, lazy_names
+from sbi_active.renamed import lazy_names
 
 if TYPE_CHECKING:
     from sbi_active.simulation.bank.bank import Bank
@@ -30,5 +30,4 @@ __getattr__ = lazy_names(
         "reweighting": "ReusedRows reuse",
         "sqlite": "CorruptSegmentError LockedError",
     },
-    former_names(__name__, {}, stacklevel=3),
 )

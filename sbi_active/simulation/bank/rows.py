@@ -117,7 +117,6 @@ class Rows:
         self._of_run: defaultdict[str, list[Segment]] = defaultdict(list)
         self._x_shape: Sequence[int] = ()
         self._last = 0, np.zeros(0)  # the segment whose x was read last
-        self._stored = "", 0, np.zeros(0, bool)  # rows of the run that was written last
 
     def _segment(self, number: int, kind: np.dtype) -> Segment:
         head = self.store.get(self._name, number) or b""
@@ -155,9 +154,13 @@ class Rows:
                 f"expected rows of shapes {known}, as in the bank {self.store.folder}; "
                 f"got {shapes}; make a bank of its own for them"
             )
-        mask = _grown(self._mask(run["run"]), index)
+        before = [segment.rows["index"] for segment in self.of_run(run["run"])]
+        largest = max(int(part.max(initial=-1)) for part in (*before, index))
+        is_stored = np.zeros(largest + 1, bool)
+        for part in before:
+            is_stored[part] = True
         first = np.unique(index, return_index=True)[1]  # of those that are given twice
-        fresh = np.sort(first[~mask[index[first]]])
+        fresh = np.sort(first[~is_stored[index[first]]])
         rows = np.empty(len(index), row_type(shapes))
         for name, array in arrays.items():
             rows[name] = array
@@ -171,18 +174,6 @@ class Rows:
                 body = np.ascontiguousarray(x[part], "<f4").reshape(-1).view(np.uint8)
                 self.store.append(self._name, head, body.data)
 
-    def _mask(self, run: str) -> np.ndarray:
-        """Return a mask over the rows of a run that are stored."""
-        segments = self.of_run(run)
-        name, seen, mask = self._stored
-        if name != run:
-            seen, mask = 0, np.zeros(0, bool)
-        for segment in segments[seen:]:
-            mask = _grown(mask, segment.rows["index"])
-            mask[segment.rows["index"]] = True
-        self._stored = run, len(segments), mask
-        return mask
-
     def gather(self, names: Sequence[str], rows: np.ndarray) -> list[Tensor]:
         """Return columns at positions."""
         segments = self.segments()
@@ -190,26 +181,30 @@ class Rows:
             raise ValueError(
                 f"expected rows in {self.store.folder}; got none; simulate into it"
             )
-        ends = np.cumsum([0, *(len(segment.rows) for segment in segments)])
-        order = np.argsort(rows, kind="stable")
-        bounds = np.searchsorted(rows[order], ends)
+        starts = np.cumsum([0, *(len(segment.rows) for segment in segments[:-1])])
+        which = np.searchsorted(starts, rows, side="right") - 1
+        order = np.argsort(which, kind="stable")
+        groups = np.split(order, np.flatnonzero(np.diff(which[order])) + 1)
         labels = [*dict.fromkeys(segment.label for segment in segments)]
-        result: dict[str, np.ndarray] = {}
-        for k, segment in enumerate(segments):
-            here = order[bounds[k] : bounds[k + 1]]
-            if not len(here) and (result or k < len(segments) - 1):
-                continue
-            own = {"seed": segment.seed, "label": labels.index(segment.label)}
-            for name in names:
-                if name in own:
-                    value: Any = _whole_number(own[name])
-                else:
-                    column = self.x(segment) if name == "x" else segment.rows[name]
-                    value = column[rows[here] - ends[k]]
-                if name not in result:
-                    result[name] = np.empty((len(rows), *value.shape[1:]), value.dtype)
-                result[name][here] = value
-        return [torch.from_numpy(result[name]) for name in names]
+        of_run = {
+            "seed": [segment.seed for segment in segments],
+            "label": [labels.index(segment.label) for segment in segments],
+        }
+        columns = []
+        for name in names:
+            if name in of_run:
+                column = _whole_numbers(of_run[name])[which]
+            else:
+                of_x = np.dtype(("<f4", (*self._x_shape,)))
+                of_row = of_x if name == "x" else segments[0].rows.dtype[name]
+                column = np.empty(len(rows), of_row)
+                for group in groups if len(rows) else ():
+                    k = which[group[0]]
+                    is_x = name == "x"
+                    values = self.x(segments[k]) if is_x else segments[k].rows[name]
+                    column[group] = values[rows[group] - starts[k]]
+            columns.append(torch.from_numpy(column))
+        return columns
 
 
 def row_type(shapes: Mapping[str, Sequence[int]]) -> np.dtype:
@@ -281,16 +276,11 @@ def positions(rows: Any, total: int) -> np.ndarray:
     return found
 
 
-def _whole_number(value: int) -> np.int64:
+def _whole_numbers(values: Sequence[int]) -> np.ndarray:
     try:
-        return np.int64(value)
+        return np.array(values, np.int64)
     except OverflowError as error:
         raise ValueError(
             "expected seeds below 2**63 for a column of them; got one of "
-            f"{value.bit_length()} bits; read the other columns"
+            f"{max(values, key=abs).bit_length()} bits; read the other columns"
         ) from error
-
-
-def _grown(mask: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """Return a mask over the rows of a run with room for more of them."""
-    return np.pad(mask, (0, max(0, int(index.max(initial=-1)) + 1 - len(mask))))

@@ -17,7 +17,7 @@ import shutil
 import sqlite3
 import stat
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -177,37 +177,33 @@ def opened(path: Path, what: str) -> tuple[sqlite3.Connection, bool]:
         found = path.stat()  # a pipe or a device would be waited for
         is_file = stat.S_ISREG(found.st_mode) and found.st_size > 0
         require(path, is_file, "no file, or an empty one")
+    with suppress(sqlite3.OperationalError):
+        return _checked(path, what, "rw"), False
     log = path.with_name(f"{NAME}-wal")
-    has_log = log.exists() and log.stat().st_size
-    last = ("rw", "locking_mode = EXCLUSIVE") if has_log else ("ro&immutable=1", "")
-    for mode, setting in (("rw", ""), last):
-        connection = connected(path, mode, timeout=PATIENCE)
-        try:
-            _check(connection, path, what, (setting, *SETTINGS))
-        except Exception as error:
-            connection.close()
-            is_last = (mode, setting) == last
-            if is_last or not isinstance(error, sqlite3.OperationalError):
-                raise
-        else:
-            return connection, (mode, setting) == last
-    raise AssertionError
+    if log.exists() and log.stat().st_size:
+        return _checked(path, what, "rw", "locking_mode = EXCLUSIVE"), True
+    return _checked(path, what, "ro&immutable=1"), True
 
 
-def _check(
-    connection: sqlite3.Connection, path: Path, what: str, settings: Iterable[str]
-) -> None:
-    for setting in filter(None, settings):
-        connection.execute(f"PRAGMA {setting}")
-    form = connection.execute("PRAGMA user_version").fetchone()[0]
-    if form != FORMAT:
-        raise ValueError(
-            f"expected a {what} of format {FORMAT}; got {form} in {path}; use the "
-            "release of sbi-active that wrote it"
-        )
-    found = connection.execute("SELECT sql FROM sqlite_master").fetchall()
-    own = found == [(SCHEMA,), (None,)]  # the table, and the index of its key
-    require(path, own, "tables that are not those of a store")
+def _checked(path: Path, what: str, mode: str, *first: str) -> sqlite3.Connection:
+    """Return a connection to a file whose table is that of a store."""
+    connection = connected(path, mode, timeout=PATIENCE)
+    try:
+        for setting in (*first, *SETTINGS):
+            connection.execute(f"PRAGMA {setting}")
+        form = connection.execute("PRAGMA user_version").fetchone()[0]
+        if form != FORMAT:
+            raise ValueError(
+                f"expected a {what} of format {FORMAT}; got {form} in {path}; use the "
+                "release of sbi-active that wrote it"
+            )
+        found = connection.execute("SELECT sql FROM sqlite_master").fetchall()
+        own = found == [(SCHEMA,), (None,)]  # the table, and the index of its key
+        require(path, own, "tables that are not those of a store")
+    except BaseException:
+        connection.close()
+        raise
+    return connection
 
 
 def make_store(folder: Path, what: str) -> None:

@@ -193,23 +193,17 @@ class Store:
             head: Bytes, or JSON data.
             body: Bytes.
         """
-        self._put(self.catalog, kind, number, head, body)
-
-    def append(self, series: str, head: Any, body: Any = b"") -> int:
-        """Write the next record of a series, in :meth:`writing`; return its number."""
-        catalog = self.catalog
-        number = catalog.get(series, 0) + 1
-        self._put(catalog, series, number, head, body)
-        return number
-
-    def _put(
-        self, catalog: dict[str, int], kind: str, number: int, *parts: Any
-    ) -> None:
         assert self._connection is not None
-        records = [sealed(self._id, kind, number, *parts)]
+        catalog, records = self.catalog, [sealed(self._id, kind, number, head, body)]
         if kind != CATALOG and number > catalog.get(kind, -1):
             records.append(sealed(self._id, CATALOG, 0, {**catalog, kind: number}))
         self._connection.executemany(INSERT.format("REPLACE"), records)
+
+    def append(self, series: str, head: Any, body: Any = b"") -> int:
+        """Write the next record of a series, in :meth:`writing`; return its number."""
+        number = self.length(series) + 1
+        self.put(series, number, head, body)
+        return number
 
     def delete(self, *kinds: str) -> None:
         """Remove records; for use in :meth:`writing`."""

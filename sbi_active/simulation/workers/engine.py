@@ -24,9 +24,7 @@ from sbi_active.simulation.outcomes import (
     Simulations,
 )
 from sbi_active.simulation.simulator import require_noise, require_rows
-from sbi_active.simulation.workers.meter import find_store, spend
 from sbi_active.simulation.workers.pace import pace_of
-from sbi_active.simulation.workers.pickling import pickled
 from sbi_active.simulation.workers.pools import (
     DaskPool,
     InProcess,
@@ -34,9 +32,10 @@ from sbi_active.simulation.workers.pools import (
     WorkerPool,
     configured_client,
 )
+from sbi_active.simulation.workers.processes import pickled
 from sbi_active.simulation.workers.schedule import Schedule
 from sbi_active.simulation.workers.settings import Workers
-from sbi_active.simulation.workers.store import Recorder, RowStore
+from sbi_active.simulation.workers.store import Recorder, RowStore, find_store, spend
 
 
 @takes_loose(workers=Workers)

@@ -8,8 +8,7 @@ import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor
-from concurrent.futures import wait as wait_for
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import lru_cache
 from multiprocessing import current_process
 from typing import Any
@@ -27,42 +26,27 @@ from sbi_active.simulation.workers.processes import Worker
 class Pool(ABC):
     """Runs calls, some at a time, and hands back what came of them in any order.
 
-    Args:
+    Attributes:
         num_slots: Number of calls at a time.
     """
 
     #: Seconds between two looks at who is there, where no call ends; None for none.
     LOOK: float | None = None
+    #: Exceptions of a reply that say that whoever had the call was lost.
+    LOSSES: tuple[type[Exception], ...] = ()
+    num_slots = 1
 
-    def __init__(self, num_slots: int) -> None:
-        self.num_slots = num_slots
-        self._calls: dict[Future[Reply], Call] = {}
-
-    def submit(self, call: Call, time_limit: float | None) -> None:
-        """Take a call.
+    @abstractmethod
+    def submit(self, call: Call, time_limit: float | None) -> Future[Reply]:
+        """Return the reply to come of a call.
 
         Args:
             call: The rows.
             time_limit: Seconds after which it is given up; None waits for ever.
         """
-        self._calls[self._begun(call, time_limit)] = call
 
-    @abstractmethod
-    def _begun(self, call: Call, time_limit: float | None) -> Future[Reply]:
-        """Return the reply to come of a call."""
-
-    def collect(self) -> tuple[Call, Reply]:
-        """Wait until a call has ended, and return it with its reply."""
-        while not (done := wait_for(self._calls, self.LOOK, FIRST_COMPLETED).done):
-            self._look()
-        future = done.pop()
-        return self._calls.pop(future), self._reply(future)
-
-    def _look(self) -> None:  # noqa: B027
-        """See who is there."""
-
-    def _reply(self, future: Future[Reply]) -> Reply:
-        return future.result()
+    def look(self, num_waiting: int) -> None:  # noqa: B027
+        """See who is there, while so many calls wait."""
 
     def close(self) -> None:  # noqa: B027  # one has nothing to close
         """Give up what still runs."""
@@ -76,11 +60,10 @@ class InProcess(Pool):
     """
 
     def __init__(self, simulator: Callable[..., Any]) -> None:
-        super().__init__(1)
         self._simulator = simulator
 
     @override
-    def _begun(self, call: Call, time_limit: float | None) -> Future[Reply]:
+    def submit(self, call: Call, time_limit: float | None) -> Future[Reply]:
         future: Future[Reply] = Future()
         future.set_result(answer(self._simulator, call))
         return future
@@ -99,7 +82,7 @@ class WorkerPool(Pool):
     """
 
     def __init__(self, simulator: bytes, num_workers: int) -> None:
-        super().__init__(num_workers)
+        self.num_slots = num_workers
         self._threads = ThreadPoolExecutor(num_workers)
         self._simulator = simulator
         environment = tuple(sorted(os.environ.items()))
@@ -110,7 +93,7 @@ class WorkerPool(Pool):
         self._is_closed = False
 
     @override
-    def _begun(self, call: Call, time_limit: float | None) -> Future[Reply]:
+    def submit(self, call: Call, time_limit: float | None) -> Future[Reply]:
         return self._threads.submit(self.ask, call, time_limit)
 
     def ask(self, call: Call, time_limit: float | None) -> Reply:
@@ -178,15 +161,15 @@ class DaskPool(Pool):
         client: A ``distributed.Client``.
     """
 
-    #: Seconds between two looks at who is there, where no call ends.
     LOOK = 0.5
+    LOSSES = (Exception,)
 
     #: Seconds without any worker until that is said.
     PATIENCE = 5.0
 
     def __init__(self, simulator: bytes, num_workers: int, client: Any) -> None:
         num_workers = effective_n_jobs(-1) if num_workers == -1 else num_workers
-        super().__init__(num_workers)
+        self.num_slots = num_workers
         self._executor = client.get_executor(pure=False)
         self._client = client
         key = f"simulator-{hashlib.sha256(simulator).hexdigest()}"
@@ -195,7 +178,7 @@ class DaskPool(Pool):
         self._last_seen: float | None = time.monotonic()  # None once it was said
 
     @override
-    def _begun(self, call: Call, time_limit: float | None) -> Future[Reply]:
+    def submit(self, call: Call, time_limit: float | None) -> Future[Reply]:
         return self._executor.submit(_ask_child, self._simulator, call, time_limit)
 
     @override
@@ -203,15 +186,7 @@ class DaskPool(Pool):
         self._executor.shutdown(wait=False)
 
     @override
-    def _reply(self, future: Future[Reply]) -> Reply:
-        try:
-            return future.result()
-        except Exception as error:  # all Dask workers that had it were lost
-            text = f"worker died: {error!r}"
-            return Reply(fault="worker died", traceback=text)
-
-    @override
-    def _look(self) -> None:
+    def look(self, num_waiting: int) -> None:
         """Say that no worker is there, and ask for those that were given up."""
         from distributed import LocalCluster
 
@@ -222,7 +197,7 @@ class DaskPool(Pool):
             self._last_seen = None
             warn(
                 f"SA306 no workers at {self._client.scheduler.address} for "
-                f"{self.PATIENCE:g} s: {len(self._calls)} calls of the simulator "
+                f"{self.PATIENCE:g} s: {num_waiting} calls of the simulator "
                 "wait for one; start workers there, or interrupt, which keeps what is "
                 "finished",
                 stacklevel=2,

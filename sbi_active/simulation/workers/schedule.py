@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 
 import numpy as np
 import torch
@@ -123,18 +124,23 @@ class Schedule:
             of_block = np.arange(len(to_come)) // BLOCK
             to_come = np.isin(of_block, of_block[to_come])
         self._to_come, self._next = np.flatnonzero(to_come), 0
-        num_running = 0
+        running: dict[Future[Reply], Call] = {}
         while True:
-            while num_running < pool.num_slots:
+            while len(running) < pool.num_slots:
                 call = self._next_call(pool.num_slots)
                 if call is None:
                     break
-                pool.submit(call, self._limit(call))
-                num_running += 1
-            if not num_running:
+                running[pool.submit(call, self._limit(call))] = call
+            if not running:
                 return
-            call, reply = pool.collect()
-            num_running -= 1
+            while not (done := wait(running, pool.LOOK, FIRST_COMPLETED).done):
+                pool.look(len(running))
+            future = done.pop()
+            call = running.pop(future)
+            try:
+                reply = future.result()
+            except pool.LOSSES as error:
+                reply = Reply(fault="worker died", traceback=f"worker died: {error!r}")
             rows = self._receive(call, reply)
             if rows is not None:
                 yield rows

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sbi_active.expected import require, suggests
+from sbi_active.expected import require, require_least, suggests
 
 
 @suggests
@@ -42,12 +42,7 @@ class Workers:
             self.time_limit,
             "use None to wait for ever",
         )
-        require(
-            self.num_retries >= 0,
-            "num_retries >= 0",
-            self.num_retries,
-            "use 0 to try once",
-        )
+        require_least(self, "use 0 to try once", num_retries=0)
 
     @classmethod
     def of(cls, workers: Workers | int | None) -> Workers:

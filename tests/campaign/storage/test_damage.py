@@ -58,7 +58,7 @@ def flip_line(folder, number, share=0.5):
 
 def test_what_was_not_committed_is_not_there(made, folder):
     with Campaign.load(folder, simulator=drawn) as campaign:
-        campaign._storage.disk.acquire()
+        campaign._storage.acquire()
         campaign.tell([0.1, 0.2, 0.3, 0.4])
         log = (folder / "store.db-wal").read_bytes()
         before = (folder / FILE).read_bytes()
@@ -143,7 +143,7 @@ def test_a_manifest_has_a_copy(made, folder):
 
 
 def test_another_schema_names_the_release(folder):
-    manifest = {**Campaign.load(folder)._storage.disk.manifest, "schema": 9}
+    manifest = {**Campaign.load(folder)._storage.manifest, "schema": 9}
     manifest["packages"]["sbi-active"] = "9.9"
     crafted(folder, "campaign", 0, manifest)
     with pytest.raises(ValueError, match=r"schema 3; got 9 in .*9\.9"):
@@ -216,7 +216,7 @@ def test_a_full_disk_refuses_and_loses_nothing(made, folder):
 
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         campaign = Campaign.load(folder, simulator=drawn)
-        campaign._storage.disk.acquire()
+        campaign._storage.acquire()
         log = (folder / "store.db-wal").stat().st_size
         resource.setrlimit(resource.RLIMIT_FSIZE, (log + 50, log + 50))
         try:

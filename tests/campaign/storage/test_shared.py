@@ -227,7 +227,7 @@ def test_crafted_files_are_one_error_that_names_the_file(tmp_path):
     whole = go_on(new(folder, MODEL), 2)
     whole.close()
     content = (folder / FILE).read_bytes()
-    manifest = whole._storage.disk.manifest
+    manifest = whole._storage.manifest
     rng = np.random.default_rng(0)
     changes = []
     for key in manifest:

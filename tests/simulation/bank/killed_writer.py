@@ -16,7 +16,7 @@ import torch
 
 from sbi_active import Bank, simulate
 from sbi_active.seeding import row_normals
-from sbi_active.simulation.workers import Recorder
+from sbi_active.simulation.workers.store import Recorder
 
 #: An outcome of 80 kB, so that writing takes most of the time.
 ROWS, BATCH, NUMBERS = 480, 16, 20_000

@@ -14,7 +14,7 @@ import torch
 from sbi_active import GaussianNoise, SimulatorModel, simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import Outcome, SimulationInterrupted, Workers
-from sbi_active.simulation.workers import run_digest
+from sbi_active.simulation.workers.store import run_digest
 
 # A worker cannot import a test module.
 cloudpickle.register_pickle_by_value(sys.modules[__name__])

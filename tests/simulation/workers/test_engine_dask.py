@@ -17,8 +17,9 @@ import torch
 from sbi_active import simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning
-from sbi_active.simulation.workers import DaskPool, Schedule, pickled
-from sbi_active.simulation.workers.pools import _ask_child
+from sbi_active.simulation.workers.pools import DaskPool, _ask_child
+from sbi_active.simulation.workers.processes import pickled
+from sbi_active.simulation.workers.schedule import Schedule
 from sbi_active.simulation.workers.settings import Workers
 
 dask = pytest.importorskip("dask")

@@ -13,7 +13,7 @@ import torch
 from sbi_active import SimulatorModel, simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import Outcome
-from sbi_active.simulation.workers import Pace, pace_of
+from sbi_active.simulation.workers.pace import Pace, pace_of
 
 SCRIPT = """
 import pickle, sys, time, torch
