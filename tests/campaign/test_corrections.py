@@ -204,3 +204,14 @@ def test_what_is_told_is_a_copy(make):
     array[0] = 9.0
     assert again.x.tolist() == [7.0]
     assert (trial.x.tolist(), trial.x.dtype) == ([1.0], torch.float32)
+
+
+def test_a_robot_that_changes_its_action_changes_no_record():
+    c = campaign()
+
+    def real_system(action):
+        action *= 2.0
+        return 0.3 * action
+
+    c.run(real_system, num_rounds=1)
+    assert bool(ACTIONS.contains(c.history[0].action))

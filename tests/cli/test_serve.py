@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from sbi_active.cli import main
-from tests.cli.sled import INIT, SIMULATOR, read, run
+from tests.cli.sled import BOX, SIMULATOR, SMALL, read, run
 
 LOUD = """
 
@@ -30,7 +30,8 @@ def camp(tmp_path, monkeypatch):
     (tmp_path / "sled.py").write_text(SIMULATOR + LOUD)
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.delitem(sys.modules, "sled", raising=False)
-    assert main([*INIT, "sled.py:loud"]) == 0
+    words = [*BOX, *SMALL, "--actions", "1,2", "--simulator", "sled.py:loud"]
+    assert main(["init", "camp", *words]) == 0
 
 
 class Server:

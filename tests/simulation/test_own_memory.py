@@ -9,10 +9,13 @@ import pytest
 import torch
 
 from sbi_active import (
+    BoxActions,
+    DiscreteActions,
     GaussianNoise,
     SimulatorModel,
     simulate,
 )
+from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning
 
@@ -196,3 +199,40 @@ def test_effects_of_rows_may_be_changed():
         assert torch.equal(
             model.mean(THETA[:4], ACTION[:4], gain=effect) - 1, THETA[:4]
         )
+
+
+def test_simulations_keep_the_theta_that_was_simulated():
+    theta, action = THETA.clone(), ACTION.clone()
+    rows = simulate(changing, theta, action, seed=0)
+    theta.zero_()
+    action.zero_()
+    assert torch.equal(rows.theta, THETA)
+    assert torch.equal(rows.action, ACTION)
+
+
+def test_noise_keeps_the_values_that_were_declared():
+    sd, times = torch.ones(2, dtype=torch.float64), np.arange(3.0)
+    noise = GaussianNoise(sd).at(times)
+    model = SimulatorModel(changing, noise=GaussianNoise(1.0), sample_times=times)
+    sd.fill_(9.0)
+    times += 7
+    assert noise.sd.tolist() == [1.0, 1.0]
+    for kept in (noise.times, model.sample_times, model.noise.times):
+        assert kept.tolist() == [0.0, 1.0, 2.0]
+
+
+def test_actions_keep_the_values_that_were_given():
+    values, low, high = np.arange(3, dtype=np.float32), torch.zeros(1), torch.ones(1)
+    listed, box = DiscreteActions(values), BoxActions(low, high)
+    for given in (values, low, high):
+        given += 5
+    assert listed.values.flatten().tolist() == [0.0, 1.0, 2.0]
+    assert (box.low.item(), box.high.item()) == (0.0, 1.0)
+
+
+def test_conditions_are_rows_of_their_own():
+    x, action = torch.ones(3, 2), torch.ones(3, 1)
+    rows = outcome_rows(x, (2,)), action_rows(action, 1)
+    x.zero_()
+    action.zero_()
+    assert all(r.unique().tolist() == [1.0] for r in rows)

@@ -215,3 +215,27 @@ def test_a_malformed_row_of_a_table_is_named(row, tmp_path):
         ValueError, match=r"expected cells of, .* in line 5 of table.md"
     ):
         rows_of(tmp_path / "table.md")
+
+
+def test_phi_along_the_wrong_axis_shows_where_x_has_as_many_entries_as_rows():
+    wide = SimulatorModel(
+        lambda theta, xi: theta * xi * torch.ones(16), noise=GaussianNoise(0.1)
+    )
+    trials = Trials(SPEED, STOP[:, None] * torch.ones(16))
+    wrong = effect(apply=lambda x, phi, action, context: x + phi[:, 0])
+    with pytest.raises(RuntimeError, match="must match"):
+        Criticism(wide, PRIOR, trials, effects=[wrong])
+
+
+def test_apply_may_return_a_view_of_what_it_keeps():
+    kept = torch.zeros(100, 1)
+
+    def apply(x, phi, action, context):
+        kept[: len(x)] = x + phi
+        return kept[: len(x)]
+
+    model = AugmentedSimulator(MODEL, [effect(apply=apply)])
+    theta, action = torch.tensor([[0.5, 1.0]]), torch.ones(1, 1)
+    first = model.mean(theta, action)
+    model.mean(2 * theta, action)
+    assert float(first) == pytest.approx(1.5)

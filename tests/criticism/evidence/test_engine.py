@@ -22,3 +22,12 @@ def test_the_standard_error_claims_what_repeated_runs_show():
     gap = np.array([f.log_evidence for f in found]) - closed.log_evidence
     claimed = np.mean([f.standard_error for f in found])
     assert 0.5 * claimed < np.sqrt((gap**2).mean()) < 1.7 * claimed
+
+
+def test_a_likelihood_of_zero_has_no_evidence():
+    rival, rng = linear_rival(), np.random.default_rng(0)
+    found = search(rival, rng, settings=THOROUGH)
+    rival.log_likelihood = lambda u, floor=0.0: np.full(len(u), -np.inf)  # type: ignore[method-assign]
+    none = infer(rival, rng, found=found, settings=FEW)
+    assert none.log_evidence == -np.inf
+    assert none.effective_sample_size == 0

@@ -227,3 +227,10 @@ def test_seeds_beyond_int64_are_stored(folder):
     assert len(Bank(folder).read()) == 23
     with pytest.raises(ValueError, match=r"seeds below 2\*\*63 .* got one of 71 bits"):
         Bank(folder).columns("seed")
+
+
+def test_control_characters_do_not_reach_the_terminal(folder, capsys):
+    header = {**Bank(folder).header, "created": "\x1b[2J\ud800"}
+    crafted(folder, "bank rows", 0, header)
+    assert main(["bank", "inspect", str(folder)]) == 0
+    assert r"created: '\x1b[2J\ud800'" in capsys.readouterr().out
