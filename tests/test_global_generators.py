@@ -67,14 +67,13 @@ def kept():
 
 def test_a_campaign(kept):
     c = kept("Campaign", lambda: campaign("asbi", by_numpy, network="each round"))
-    for _ in range(2):
-        trial = kept("ask", c.ask)
-        kept("tell", lambda trial=trial: c.tell(0.6 * trial.action))
-        belief = kept("update", c.update)
-        kept("health", lambda: c.health)
-        kept("stop_reason", lambda: c.stop_reason)
-        kept("mean", lambda belief=belief: (belief.mean, belief.variance, repr(belief)))
-        kept("log_prob", lambda belief=belief: belief.log_prob(THETA))
+    trial = kept("ask", c.ask)
+    kept("tell", lambda: c.tell(0.6 * trial.action))
+    belief = kept("update", c.update)
+    kept("health", lambda: c.health)
+    kept("stop_reason", lambda: c.stop_reason)
+    kept("mean", lambda: (belief.mean, belief.variance, repr(belief)))
+    kept("log_prob", lambda: belief.log_prob(THETA))
     kept("criticize", lambda: c.criticize([], evaluate=False))
     kept("to_inference_data", lambda: to_inference_data(c, num_samples=20))
     kept("withdraw", lambda: c.withdraw(0))
@@ -92,8 +91,8 @@ def test_a_trainer_after_training(kept, make):
     trainer = trained(make(PRIOR, network, show_progress_bars=False))
     trainer.train()
     model = kept("build_posterior", trainer.build_posterior)
-    for designer in (InformationGainDesigner(ACTIONS, num_samples=100),):
-        kept("select", lambda d=designer: d.select(model, MODEL, belief=PRIOR, seed=1))
+    designer = InformationGainDesigner(ACTIONS, num_samples=100)
+    kept("select", lambda: designer.select(model, MODEL, belief=PRIOR, seed=1))
     settings = OPTIONS.refinement
     told = {"simulator": MODEL, "refinement": settings, "seed": 3}
     belief = kept(

@@ -34,7 +34,7 @@ PRINTED = {
     "docs/howto/recordings.md": "Verdict: rail friction loss (P = 0.99",
 }
 NEEDED = {"docs/pouring.md": "pybullet", "docs/howto/recordings.md": "mcap"}
-DEAR = ("docs/methods.md", "docs/robots.md")
+DEAR = ("docs/methods.md", "docs/robots.md", "docs/howto/recordings.md")
 OWN = ("README.md", "docs/closing_the_loop.md", "docs/howto/thrown_ball.md")
 PAGES = sorted(
     str(page.relative_to(ROOT))
@@ -99,6 +99,7 @@ def test_readme(run, capsys):
     assert not campaign.belief.diagnostics.combinations
 
 
+@pytest.mark.slow
 def test_closing_the_loop(run, capsys):
     pages = run("docs/closing_the_loop.md")
     _, bare, _, forces, drag, decides, starts, campaign, *motor = pages

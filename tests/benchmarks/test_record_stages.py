@@ -8,6 +8,7 @@ from torch.distributions import HalfNormal, Independent, Normal
 from benchmarks.measured.record_stages import Bench, aliases, run_stages, table
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials
+from tests.effects import on_outcomes
 
 PLACES = torch.linspace(-1, 1, 12, dtype=torch.float64)[:, None]
 
@@ -37,13 +38,7 @@ def line_bench():
         prior=Independent(Normal(torch.zeros(1), 3 * torch.ones(1)), 1),
         effects=[
             Effect.keyword("bend", prior=kind),
-            Effect(
-                "bias",
-                hook="observation",
-                prior=Normal(0.0, 0.1),
-                null=0.0,
-                apply=lambda x, phi, action, context: x + phi,
-            ),
+            on_outcomes("bias", lambda x, phi, action, context: x + phi, sd=0.1),
         ],
         trials=Trials(PLACES, PLACES + 0.5 * PLACES**2),
         removals=[("bend",)],

@@ -69,10 +69,9 @@ def run(mode, method):
     return trial.action.tolist(), scores, c.belief.sample((20,)).tolist()
 
 
-@pytest.mark.parametrize("method", ["asbi", "alhi"])
-def test_numbers_are_the_same_without_gradients(method):
+def test_numbers_are_the_same_without_gradients():
     modes = (contextlib.nullcontext, torch.inference_mode)
-    plain, other = (run(mode, method) for mode in modes)
+    plain, other = (run(mode, "asbi") for mode in modes)
     assert other == plain
 
 

@@ -17,8 +17,6 @@ import matplotlib.pyplot as plt
 
 from .storage.campaigns import MODEL, OPTIONS, PRIOR, go_on, new
 
-TRUTH = torch.tensor([0.3, 0.6])
-
 
 @pytest.fixture(autouse=True)
 def _closed():
@@ -93,32 +91,6 @@ def test_table_draws_and_names_are_the_same_without_the_simulator(folder):
 def panels(figure):
     """Return the axes of the beliefs, and the three below."""
     return [ax for ax in figure.axes if ax.axison][:-3], figure.axes[-3:]
-
-
-def test_the_figure_has_beliefs_gain_prediction_and_information(campaign):
-    figure = campaign.plot(theta_true=TRUTH, num_predicted=16)
-    beliefs, (gain, told, information) = panels(figure)
-    assert len(beliefs) == 2
-    for k, ax in enumerate(beliefs):
-        median = ax.lines[0].get_xydata()
-        assert median[:, 0].tolist() == [0, 1, 2]
-        draws = [campaign.state.draws[i][:, k].quantile(0.5) for i in range(2)]
-        np.testing.assert_allclose(median[1:, 1], draws, rtol=1e-5)
-        assert median[0, 1] == pytest.approx(0.5, abs=0.05)  # of the prior
-        assert ax.lines[1].get_ydata()[0] == pytest.approx(float(TRUTH[k]))
-        assert ax.get_title().startswith("ab"[k] + "\n")
-    assert gain.get_xlabel() == "speed [m/s]"
-    dots = [ln.get_xydata()[0] for ln in gain.lines if len(ln.get_xydata()) == 1]
-    for trial, dot in zip(campaign.state.trials, dots, strict=True):
-        best = trial.expected_gain[0]
-        np.testing.assert_allclose(dot, [float(trial.action), best], rtol=1e-5)
-    assert [len(ln.get_xdata()) for ln in told.lines] == [4, 4]
-    heights = [bar.get_height() for bar in information.patches]
-    gained = [t.information_gained for t in campaign.history[:2]]
-    np.testing.assert_allclose(heights, gained)
-    assert f"{sum(gained):.3g} nats" in information.get_title()
-    with pytest.raises(ValueError, match="at most 2 numbers; got 3"):
-        campaign.plot(theta_true=torch.zeros(3))
 
 
 def test_empty_random_and_failed_campaigns_have_a_figure():

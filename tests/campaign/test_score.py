@@ -55,7 +55,7 @@ def assert_valid(found):
         assert int((found <= level).sum()) <= most, (level, found.sort().values)
 
 
-@pytest.mark.parametrize("num_numbers", [1, 90, 260])
+@pytest.mark.parametrize("num_numbers", [1, 90])
 def test_surprises_are_uniform_for_any_number_of_numbers(num_numbers):
     found = surprises(noisy(num_numbers))
     assert_valid(found)

@@ -85,7 +85,6 @@ def test_names_are_those_of_the_library():
     ("line", "offered"),
     [
         ("sbi-active st", "status"),
-        ("sbi-active tell camp --mis", "--missing"),
         ("sbi-active init camp --method nl", "nlhi"),
     ],
 )

@@ -64,17 +64,14 @@ def test_neither_torch_nor_numpy_is_imported(camp, words):
 SERIES = [
     ["tell camp 0.4 nan"],
     ["tell camp --missing", "tell camp 0.5 1.0 --action 2.5"],
-    ["tell camp --invalid --action 0.7"],
     [
         "withdraw camp 1 --reason pushed",
         "tell camp 1 2 --action 3",
         "correct camp 2 1 3",
     ],
     ["correct camp 0 0.31 0.61 --reason typo", "correct camp 0 --action 1.5"],
-    ["correct camp 0 --invalid", "withdraw camp 0", "tell camp 0.1 0.2"],
     ["tell camp 0.4 0.8", "tell camp 0.4 0.8", "correct camp 1 0.4 0.8 --reason same"],
     ["tell camp 0.4 0.8 --trial 0 --action 1", "tell camp 1e-20 -1e3"],
-    ["tell camp 0.4 0.8 --action 9", "tell camp --missing --action 2"],
 ]
 
 

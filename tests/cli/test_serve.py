@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from sbi_active.cli import main
-from tests.cli.sled import INIT, SIMULATOR, read, run
+from tests.cli.sled import BOX, SIMULATOR, SMALL, read, run
 
 LOUD = """
 
@@ -30,7 +30,8 @@ def camp(tmp_path, monkeypatch):
     (tmp_path / "sled.py").write_text(SIMULATOR + LOUD)
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.delitem(sys.modules, "sled", raising=False)
-    assert main([*INIT, "sled.py:loud"]) == 0
+    words = [*BOX, *SMALL, "--actions", "1,2", "--simulator", "sled.py:loud"]
+    assert main(["init", "camp", *words]) == 0
 
 
 class Server:
@@ -63,6 +64,12 @@ def server(camp):
 
 
 def test_a_robot_s_loop(server):
+    # Another process may write between two requests.
+    assert server.says({"command": "tell", "x": 0.7, "action": 1})["answer"]
+    assert main(["tell", "camp", "0.9", "--action", "2"]) == 0
+    assert len(server.says({"command": "status"})["answer"]["trials"]) == 2
+    assert server.says({"command": "tell", "x": 0.8, "action": 1.5})["answer"]
+    assert main(["status", "camp"]) == 0
     asked = server.says({"command": "ask", "id": 7})
     assert asked["id"] == 7
     assert asked["answer"]["names"] == ["action"]
@@ -118,11 +125,3 @@ def test_errors_are_json_and_the_session_goes_on(camp):
     status, error = server.ends()
     assert status == 130
     assert error.splitlines()[-1].startswith("sbi-active: interrupted")
-
-
-def test_another_process_may_write_between_two_requests(server):
-    assert server.says({"command": "tell", "x": 0.5, "action": 1})["answer"]
-    assert main(["tell", "camp", "0.9", "--action", "2"]) == 0
-    assert len(server.says({"command": "status"})["answer"]["trials"]) == 2
-    assert server.says({"command": "tell", "x": 0.6, "action": 1.5})["answer"]
-    assert main(["status", "camp"]) == 0

@@ -77,9 +77,7 @@ def test_reading_imports_nothing(mine, words):
     ("how", "command"),
     [
         ("changed", "ask"),
-        ("changed", "update"),
         ("changed", "criticize"),
-        ("changed", "adopt"),
         ("of another account", "ask"),
         ("within", "ask"),
     ],

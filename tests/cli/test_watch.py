@@ -1,11 +1,11 @@
 """``watch``: a page of a campaign that another process runs, for this machine alone."""
 
 import http.client
+import os
 import re
 import signal
 import socket
 import subprocess
-import sys
 import threading
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,55 +13,43 @@ from types import SimpleNamespace
 import pytest
 
 from sbi_active.cli import main, watch
+from tests.campaign.storage.campaigns import MODEL, go_on, new
 from tests.cli.sled import run
 from tests.display.browser import CHROMIUM, FLAGS, assert_reads_well
 
-ROOT = Path(__file__).parents[2]
-#: A campaign that goes on one step with each line that it reads.
-RUN = """
-from pathlib import Path
-from tests.campaign.storage.campaigns import MODEL, go_on, new
-
-campaign = new(Path("camp"), simulator=MODEL)
-for step in (campaign.ask, lambda: go_on(campaign, 1), lambda: go_on(campaign, 2)):
-    print("ready", flush=True)
-    input()
-    step()
-print("ready", flush=True)
-input()
-"""
-
 
 class Campaigner:
-    """A campaign in a process of its own."""
+    """A campaign in a process of its own, which goes on one step when it is told to."""
 
     def __init__(self, folder):
-        self.process = subprocess.Popen(
-            [
-                sys.executable,
-                "-c",
-                f"import sys; sys.path.insert(0, {str(ROOT)!r})\n{RUN}",
-            ],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            cwd=folder,
-        )
-        self.reads()
-
-    def reads(self):
-        assert self.process.stdout is not None
-        assert self.process.stdout.readline() == "ready\n"
+        (theirs, self.told), (self.heard, ours) = os.pipe(), os.pipe()
+        self.pid = os.fork()
+        if self.pid == 0:
+            status = 1
+            try:
+                campaign = new(folder / "camp", simulator=MODEL)
+                steps = (
+                    campaign.ask,
+                    lambda: go_on(campaign, 1),
+                    lambda: go_on(campaign, 2),
+                )
+                for step in (*steps, campaign.close):
+                    os.write(ours, b".")
+                    os.read(theirs, 1)
+                    step()
+                status = 0
+            finally:
+                os._exit(status)
+        os.close(ours)
+        assert os.read(self.heard, 1) == b"."
 
     def goes_on(self):
-        assert self.process.stdin is not None
-        self.process.stdin.write("\n")
-        self.process.stdin.flush()
-        self.reads()
+        os.write(self.told, b".")
+        assert os.read(self.heard, 1) == b"."
 
     def ends(self):
-        self.process.communicate("\n", timeout=60)
-        assert self.process.returncode == 0
+        os.write(self.told, b".")
+        assert os.waitpid(self.pid, 0)[1] == 0
 
 
 @pytest.fixture(scope="module")
@@ -135,19 +123,12 @@ def test_it_listens_on_this_machine_alone(server):
     assert asked(server, Host=f"localhost:{server.server_port}")[0] == 200
 
 
-@pytest.mark.parametrize("method", ["POST", "HEAD"])
-def test_it_is_only_read(server, method):
-    assert asked(server, method=method)[0] == 403
-
-
-@pytest.mark.parametrize(
-    "path",
-    ["/store.db", "/../store.db", "/%2e%2e/store.db", "/version/.."],
-)
-def test_no_file_is_given(server, path):
-    status, text, _ = asked(server, path)
-    assert status == 404
-    assert "SQLite" not in text
+def test_it_is_only_read_and_gives_no_file(server):
+    assert [asked(server, method=m)[0] for m in ("POST", "HEAD")] == [403, 403]
+    for path in ("/store.db", "/../store.db", "/%2e%2e/store.db", "/version/.."):
+        status, text, _ = asked(server, path)
+        assert status == 404
+        assert "SQLite" not in text
 
 
 def test_a_reader_that_leaves_is_no_error(server, capfd):

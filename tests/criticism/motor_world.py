@@ -6,6 +6,7 @@ from torch.distributions import HalfNormal, Independent, Normal
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import AugmentedSimulator, Context, Effect, Trials
+from tests.effects import on_outcomes
 
 NOISE = 0.05  # rad/s
 STEP = 0.02  # s
@@ -61,13 +62,7 @@ OFFSET = Effect(
     apply=_voltage(lambda u, phi: u + phi),
     units="V",
 )
-BIAS = Effect(
-    "bias",
-    hook="observation",
-    prior=Independent(Normal(torch.zeros(1), torch.tensor([0.3])), 1),
-    null=0.0,
-    apply=lambda x, phi, action, context: x + phi,
-)
+BIAS = on_outcomes("bias", lambda x, phi, action, context: x + phi, sd=0.3)
 COULOMB = Effect.keyword("coulomb", prior=HalfNormal(0.5))
 LIBRARY = [DEAD_ZONE, OFFSET, BIAS, COULOMB]
 

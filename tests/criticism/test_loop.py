@@ -17,6 +17,7 @@ from sbi_active.criticism import (
     close_loop,
     generic_effects,
 )
+from tests.effects import BIAS, on_outcomes
 
 PRIOR = BoxUniform(-3 * torch.ones(2), 3 * torch.ones(2))
 ACTIONS = DiscreteActions(torch.linspace(-2, 2, 17))
@@ -35,35 +36,14 @@ def normal(sd):
     return Independent(Normal(torch.zeros(1), torch.full((1,), sd)), 1)
 
 
-BIAS = Effect(
-    "bias",
-    hook="observation",
-    prior=normal(1.0),
-    null=0.0,
-    apply=lambda x, phi, action, context: x + phi,
-)
 CUBIC = Effect.keyword("cubic", prior=normal(0.5))
-DRIFT = Effect(
-    "drift",
-    hook="observation",
-    prior=normal(0.2),
-    null=0.0,
-    apply=lambda x, phi, action, context: x + phi * context.index[:, None],
+DRIFT = on_outcomes(
+    "drift", lambda x, phi, action, context: x + phi * context.index[:, None], sd=0.2
 )
-GAIN = Effect(
-    "gain",
-    hook="observation",
-    prior=normal(0.3),
-    null=0.0,
-    apply=lambda x, phi, action, context: x * (1 + phi),
-)
+GAIN = on_outcomes("gain", lambda x, phi, action, context: x * (1 + phi), sd=0.3)
 LIBRARY = [BIAS, CUBIC, DRIFT, GAIN]
-OUTSIDE = Effect(
-    "ripple",
-    hook="observation",
-    prior=normal(1.0),
-    null=0.0,
-    apply=lambda x, phi, action, context: x + phi * torch.sin(4 * action),
+OUTSIDE = on_outcomes(
+    "ripple", lambda x, phi, action, context: x + phi * torch.sin(4 * action)
 )
 
 
@@ -186,7 +166,7 @@ def test_nothing_is_added_to_a_right_model():
 def test_the_augmented_simulator_and_its_prior_go_on():
     trials = measured(1, {"bias": 0.8})
     report = close_loop(
-        MODEL, PRIOR, trials, effects=LIBRARY, actions=ACTIONS, evaluate=False
+        MODEL, PRIOR, trials, effects=LIBRARY, evaluate=False, plan=False
     )
     z = report.prior.sample((7,))
     assert report.verdict == "bias"
@@ -337,18 +317,6 @@ def test_noise_counted_twice():
     )
     with pytest.raises(ValueError, match="noise would count twice"):
         Criticism(noisy, PRIOR, measured(1, {}))
-
-
-def test_an_effect_that_does_not_vanish():
-    wrong = Effect(
-        "wrong",
-        hook="observation",
-        prior=normal(1.0),
-        null=1.0,
-        apply=lambda x, phi, action, context: x + phi,
-    )
-    with pytest.raises(ValueError, match="effect 'wrong' to vanish at its null 1.0"):
-        Criticism(MODEL, PRIOR, measured(1, {}), effects=[wrong])
 
 
 def test_the_name_of_a_catch_all():

@@ -119,7 +119,12 @@ def test_flags_that_nothing_explains_are_unexplained_and_named():
     model = SimulatorModel(line, noise=GaussianNoise(NOISE))
     action, x = ACTION.repeat(2, 1), torch.cat([x, x + 0.1])
     report = close_loop(
-        model, PRIOR, Trials(action, x), effects=[effect("bias")], evaluate=False
+        model,
+        PRIOR,
+        Trials(action, x),
+        effects=[effect("bias")],
+        evaluate=False,
+        plan=False,
     )
     assert report.verdict == "unexplained"
     assert report.residuals.probability_valid is not None

@@ -4,23 +4,17 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import Normal
 
 from sbi_active import AutocorrelatedNoise, DiscreteActions, SimulatorModel
-from sbi_active.criticism import Criticism, Effect, Trials
+from sbi_active.criticism import Criticism, Trials
 from tests.criticism.report.reports import flat
+from tests.effects import on_outcomes
 
 SENSOR = 0.002
 TIMES = torch.arange(1, 241) * 0.02
 PRIOR = BoxUniform(0.2 * torch.ones(1), 2 * torch.ones(1))
 ACTIONS = DiscreteActions(torch.linspace(0.5, 2.0, 6))
-BIAS = Effect(
-    "bias",
-    hook="observation",
-    prior=Normal(0.0, 0.1),
-    null=0.0,
-    apply=lambda x, phi, action, context: x + phi,
-)
+BIAS = on_outcomes("bias", lambda x, phi, action, context: x + phi, sd=0.1)
 CALLS = []
 
 

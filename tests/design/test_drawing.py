@@ -88,7 +88,7 @@ def test_each_category_has_a_panel(own):
     assert seen == len(made.candidates)
 
 
-@pytest.mark.parametrize("dim", [3, 7])
+@pytest.mark.parametrize("dim", [7])
 def test_more_entries_are_bars_in_order_with_the_chosen_one(dim):
     actions = BoxActions([0.0] * dim, [1.0] * dim)
     worst = int(design(actions).expected_information_gain.argmin())

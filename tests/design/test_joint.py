@@ -34,10 +34,10 @@ def simulated(action, theta, seed, noise=None, missing=None):
 
 def test_what_an_action_tells_beyond_others_has_a_closed_form():
     generator = torch.Generator().manual_seed(0)
-    theta = torch.randn(6_000, 1, generator=generator)
+    theta = torch.randn(4_000, 1, generator=generator)
     action, others = torch.tensor([[0.5], [2.0]]), torch.tensor([[1.0], [1.5]])
     joint = join_outcomes(simulated(action, theta, 1), simulated(others, theta, 2))
-    estimator = LikelihoodGain(num_contrastive=2_000)
+    estimator = LikelihoodGain(num_contrastive=1_000)
     gain = conditional_gain(estimator, Slope(), joint, PRIOR, action_dim=1)
     known = 1 + float(others.square().sum())
     exact = [0.5 * math.log1p(a**2 / known) for a in (0.5, 2.0)]

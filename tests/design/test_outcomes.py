@@ -44,11 +44,11 @@ def lose_rows(simulations, share, seed=0):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("world", [CERTAIN, LUCKY, LUCKIER], ids=["certain", "a", "b"])
+@pytest.mark.parametrize("world", [CERTAIN, LUCKIER], ids=["certain", "lucky"])
 @pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda e: type(e).__name__)
 def test_every_estimator_counts_all_outcomes(world, estimator):
     exact = world.exact()["counted"]
-    gain, error = estimate(world, estimator, world.simulations(900, 0))
+    gain, error = estimate(world, estimator, world.simulations(700, 0))
     assert ((gain - exact).abs() < 3 * error).all()
     assert int(gain.argmax()) == int(exact.argmax())
 

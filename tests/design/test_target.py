@@ -33,8 +33,9 @@ def select(target, *, actions=SIDES, model=MODEL, belief=PRIOR, **options):
     return designer.select(None, model, belief=belief, target=target, seed=0)
 
 
-@pytest.mark.parametrize("estimator", ["auto", "linear"])
-@pytest.mark.parametrize(("name", "place"), [("mass", 0), ("friction", 1)])
+@pytest.mark.parametrize(
+    ("estimator", "name", "place"), [("auto", "mass", 0), ("linear", "friction", 1)]
+)
 def test_a_linear_function_of_a_parameter_is_the_parameter(estimator, name, place):
     by_name = select(name, estimator=estimator)
     by_value = select(lambda theta: 1 - 3 * theta[:, place], estimator=estimator)
@@ -96,8 +97,6 @@ def test_a_failure_or_none():
     ("function", "text"),
     [
         (lambda theta: theta.mean(), r"of shape \(2000,\) or \(2000, k\)"),
-        (lambda theta: theta[:5], r"got \(5, 2\); return one row"),
-        (lambda theta: theta[:, None], r"got \(2000, 1, 2\)"),
         (lambda theta: theta[:, 0].log(), r"got NaN or inf in \d+ of 2000 rows"),
         (lambda theta: theta * torch.tensor([1.0, 0.0]), "in column 1 of 2"),
     ],

@@ -1,5 +1,7 @@
 """Names that a user chose: money, control marks and halves of pairs."""
 
+from dataclasses import replace
+
 import matplotlib
 import torch
 from sbi.utils import BoxUniform
@@ -7,6 +9,7 @@ from sbi.utils import BoxUniform
 from sbi_active import Campaign, DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.campaign.display.page import write_page
 from sbi_active.display import Page
+from tests.campaign.storage.campaigns import OPTIONS
 
 matplotlib.use("Agg")
 NAMES = ["cost [$] \x07", "half \ud800", "a$b$c\\frac{"]
@@ -21,10 +24,8 @@ def test_any_name_can_be_drawn_and_read(tmp_path):
     )
     prior = BoxUniform(torch.zeros(3), torch.ones(3))
     actions = DiscreteActions(torch.eye(3) + 1, names=NAMES, units=["$"] * 3)
-    sizes = {"num_simulations": 200, "num_samples": 50, "num_scored": 100}
-    c = Campaign(
-        model, prior, actions, seed=0, options={**sizes, "network": "on demand"}
-    )
+    options = replace(OPTIONS, network="on demand")
+    c = Campaign(model, prior, actions, seed=0, options=options)
     c.tell([0.5] * 3, trial=c.ask())
     c.update()
     page = write_page(c, tmp_path / "page.html").read_text(encoding="utf-8")

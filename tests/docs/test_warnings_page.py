@@ -25,8 +25,6 @@ from sbi_active.messages import (
 
 ROOT = Path(__file__).parents[2]
 LIBRARY = ROOT / "sbi_active"
-#: Errors that another one of the library says in its own words.
-CAUGHT = 9
 #: What takes messages.
 GATHERED = re.compile(r"warn|.*\.warned|(texts|warnings|defects|self\.notes)\.append")
 #: What is yielded there is one sentence of a report each.

@@ -59,8 +59,7 @@ def gaussian(num, num_trials, seed, sd=0.05):
     return moments, covariance
 
 
-@pytest.mark.parametrize("num", [2, 5, 12, 20])
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+@pytest.mark.parametrize(("num", "share"), [(2, 0.5), (5, 0.9), (12, 0.5), (20, 0.1)])
 def test_what_is_found_is_known_and_new(num, share):
     for seed in range(3):
         num_trials = max(int(share * num), 1)

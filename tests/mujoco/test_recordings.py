@@ -136,8 +136,6 @@ def test_angles_that_wrap_or_are_degrees_are_said():
     ("changes", "message"),
     [
         ({"time": encoder_log()["time"] + 1.7e9}, "subtract the time at which"),
-        ({"time": encoder_log()["time"] - 1}, "subtract the time at which"),
-        ({"angle": encoder_log()["angle"] + 1j}, "real numbers in column angle"),
         ({"angle": ["0.1 rad"] * 50}, "numbers in column 'angle'.*'0.1 rad' in row 0"),
     ],
 )

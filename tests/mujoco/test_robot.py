@@ -178,12 +178,9 @@ def test_a_state_that_diverges_is_invalid_and_counted():
     ("change", "message"),
     [
         ({"parameters": {"hinge.dampin": (0, 1)}}, "did you mean 'hinge.damping'"),
-        ({"parameters": {"hinge.damping": (1, 0)}}, "low < high"),
-        ({"parameters": {"bob.mass": (0, 1)}}, "inertia; got none of 'hinge'"),
         ({"parameters": {"bob.mass": (-1, 1)}}, "'bob.mass' from 0 on; got -1 to 1"),
         ({"times": [0.1, np.nan]}, "times that increase from 0 s on"),
         ({"times": [1.7e9, 1.7e9 + 1]}, "subtract the time at which the trial starts"),
-        ({"sensors": ["hinges"]}, "did you mean 'hinge'"),
         ({"start": {"hinge_": 1.0}}, "did you mean 'hinge'"),
     ],
 )

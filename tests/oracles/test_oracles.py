@@ -27,19 +27,20 @@ from tests.oracles.ways import WAYS, trials_of
 #: What takes less than two seconds a run.
 QUICK = {
     "refine": (
-        *("linear_1_1", "linear_3_10", "linear_20_4", "linear_20_200", "numerical"),
-        *("compartments_3", "compartments_6", "decay", "eight_modes", "banana", "jump"),
+        *("linear_1_1", "linear_20_4", "linear_20_200", "numerical"),
+        *("compartments_6", "decay", "eight_modes", "banana", "jump"),
         *("edge", "student", "missing", "invalid"),
     ),
     "refine, noise drawn": ("linear_3_10", "banana", "edge", "hard_edged"),
-    "close_loop, bare model": tuple(
-        name for name in PROBLEMS if name not in ("hard_edged", "payload")
+    "close_loop, bare model": (
+        *("linear_3_10", "linear_10_4", "numerical", "oscillator", "compartments_6"),
+        *("eight_modes", "banana", "jump", "edge", "student", "missing", "invalid"),
     ),
     "identify": ("decay", "missing"),
 }
 #: Posteriors of several modes or with a curved ridge, whose normal fits vary by the
 #: seed by a tenth of a nat: the median of so many seeds is judged.
-VARIED, NUM_SEEDS = ("eight_modes", "banana"), 5
+VARIED, NUM_SEEDS = ("eight_modes", "banana"), 3
 #: What is wrong today, each with the reason; strict, so that a cure shows.
 KNOWN: dict[tuple[str, str], str] = {}
 
@@ -69,7 +70,7 @@ def test_the_answer_holds_with_fresh_draws(name):
 
 @pytest.mark.parametrize(
     "name",  # of more parameters the search for a proposal takes longer
-    ["linear_1_1", "linear_3_10", "linear_6_40", "linear_7_40"],
+    ["linear_1_1", "linear_3_10", "linear_6_40"],
 )
 def test_long_importance_sampling_gives_a_closed_form(name):
     """The sampler behind the other answers, where the answer is known without it."""

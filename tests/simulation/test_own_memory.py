@@ -15,7 +15,6 @@ from sbi_active import (
     SimulatorModel,
     simulate,
 )
-from sbi_active.criticism import Trials
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import MissingRowsWarning
@@ -229,16 +228,6 @@ def test_actions_keep_the_values_that_were_given():
         given += 5
     assert listed.values.flatten().tolist() == [0.0, 1.0, 2.0]
     assert (box.low.item(), box.high.item()) == (0.0, 1.0)
-
-
-def test_trials_keep_the_numbers_that_were_measured():
-    action, x = np.arange(4.0)[:, None], torch.ones(4, 2, dtype=torch.float64)
-    trials = Trials(action, x, sample_times=(times := np.arange(2.0)))
-    for given in (action, x, times):
-        given += 5
-    assert trials.action.flatten().tolist() == [0.0, 1.0, 2.0, 3.0]
-    assert trials.x.unique().tolist() == [1.0]
-    assert trials.sample_times.tolist() == [0.0, 1.0]
 
 
 def test_conditions_are_rows_of_their_own():

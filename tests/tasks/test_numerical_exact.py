@@ -24,7 +24,9 @@ HISTORIES = {
     "twelve": [-4.5, 0.0, 3.3] * 4,
 }
 each_variant = pytest.mark.parametrize("variant", VARIANTS)
-each_history = pytest.mark.parametrize("history", HISTORIES)
+#: Every history of the linear response, and two of the others.
+CASES = [("linear", history) for history in HISTORIES]
+CASES += [(v, h) for v in VARIANTS[1:] for h in ("off grid", "repeated")]
 
 
 def posterior_of(history: str, variant: str = "linear") -> ExactPosterior:
@@ -82,7 +84,7 @@ def cell_masses(posterior: ExactPosterior) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 @each_variant
-@pytest.mark.parametrize("action", [[3.0], [2.0, 5.0], [4.0, 2.5, 3.5]])
+@pytest.mark.parametrize("action", [[2.0, 5.0], [4.0, 2.5, 3.5]])
 def test_evidence_against_prior_samples(action: list[float], variant: str) -> None:
     x = [0.4, -1.0, 2.0][: len(action)]
     theta = np.random.default_rng(4).uniform(-5, 5, (400_000, 2))
@@ -94,8 +96,7 @@ def test_evidence_against_prior_samples(action: list[float], variant: str) -> No
     assert standard_error < 0.03 * evidence  # or the check would be blunt
 
 
-@each_variant
-@each_history
+@pytest.mark.parametrize(("variant", "history"), CASES)
 def test_samples_follow_the_density(history: str, variant: str) -> None:
     posterior = posterior_of(history, variant)
     edges_1, edges_2, mass = cell_masses(posterior)
@@ -125,10 +126,10 @@ def test_samples_follow_the_density(history: str, variant: str) -> None:
 
 
 @each_variant
-@pytest.mark.parametrize("history", ["prior", "theta_2 unidentified", "twelve"])
+@pytest.mark.parametrize("history", ["prior", "twelve"])
 def test_gain_against_monte_carlo(history: str, variant: str) -> None:
     posterior = posterior_of(history, variant)
-    for action in (-5.0, 0.0, 3.7):
+    for action in (-5.0, 3.7):
         assert abs(gain_error(posterior, action)) < 4, action
 
 
@@ -148,18 +149,19 @@ def test_gain_of_the_prior_at_the_reference_values() -> None:
 
 
 def test_greedy_campaigns_at_the_reference_values() -> None:
-    campaigns = [greedy_design(THETA_TRUE, ACTIONS, seed=seed) for seed in range(16)]
+    num = 8
+    campaigns = [greedy_design(THETA_TRUE, ACTIONS, seed=seed) for seed in range(num)]
     action = torch.stack([c.action[:, 0] for c in campaigns])
     assert (action[:, 0] == -5).all()
     assert (action[:, 1] == 5).all()
     log_prob = torch.stack([c.log_prob for c in campaigns]).numpy()
     quartiles = np.percentile(log_prob, [25, 50, 75], axis=0)
-    standard_error = 1.253 * (quartiles[2] - quartiles[0]) / 1.349 / 16**0.5
+    standard_error = 1.253 * (quartiles[2] - quartiles[0]) / 1.349 / num**0.5
     reference = np.array([4.57, 7.14, 7.41, 7.74])
     assert (abs(quartiles[1] - reference) < 4 * standard_error).all()
     error = torch.stack([c.reproduction_error[-1] for c in campaigns]).numpy()
     reference = np.array([0.39, 0.0076, 0.485])
-    assert (abs(error.mean(0) - reference) < 4 * error.std(0) / 16**0.5).all()
+    assert (abs(error.mean(0) - reference) < 4 * error.std(0) / num**0.5).all()
 
 
 # Errors

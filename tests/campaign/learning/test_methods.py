@@ -9,15 +9,15 @@ import torch
 from sbi_active import CampaignOptions, MixtureDensity
 from sbi_active.campaign.learning.methods import METHODS, faithful_options
 from sbi_active.inference import LFIRE
-from sbi_active.inference.networks.ratio_network import RatioClassifier
-from tests.campaign.problem import campaign, noisy
+from tests.campaign.problem import OPTIONS, RATIOS, campaign, noisy
 from tests.campaign.sizes import REFINEMENT
 
 DENSITY = MixtureDensity(hidden_features=(16,), num_components=2, num_iterations=150)
 TRAINED = {
     **dict.fromkeys(("asbi", "nsbi", "alhi", "nlhi"), DENSITY),
-    "seqbed": RatioClassifier(hidden_features=(16,), num_iterations=50),
+    "seqbed": RATIOS,
 }
+QUICK = {**dict.fromkeys(TRAINED, OPTIONS.density_estimator), "seqbed": RATIOS}
 GAINS = {"asbi": "posterior", "alhi": "likelihood", "seqbed": "ratio"}
 
 
@@ -32,7 +32,8 @@ def small(method, **changes):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_round_its_cost_and_a_copy_that_goes_on(method):
-    c = small(method)
+    sizes = {"num_simulations": 300, "density_estimator": QUICK[method]}
+    c = small(method, **sizes)
     trial = c.ask()
     assert METHODS[method].designs == (trial.target == "theta")
     assert trial.design.bound in ("lower", "none")
@@ -40,7 +41,7 @@ def test_a_round_its_cost_and_a_copy_that_goes_on(method):
     belief = c.update()
     assert float((belief.sample((2_000,)) - 0.7).abs().median()) < 0.3
     spent = c.history[0].num_simulations - 200 - trial.design.num_simulations
-    trained = 600 if "training" in c.history[0].cpu_seconds else 0
+    trained = 300 if "training" in c.history[0].cpu_seconds else 0
     assert spent - trained == belief.diagnostics.num_simulations
     if method in ("asbi", "nsbi"):  # stops by itself
         assert 0 < spent - trained <= 17 * REFINEMENT.num_histories

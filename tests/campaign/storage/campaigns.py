@@ -44,7 +44,7 @@ def outcome(action, index):
     return mean(TRUTH, action[None])[0] + noise
 
 
-def new(directory=None, simulator=drawn, method="nsbi", **more):
+def new(directory=None, simulator=MODEL, method="nsbi", **more):
     """Return a campaign; what is given besides takes the place of what is usual."""
     usual = {"prior": PRIOR, "actions": ACTIONS, "options": OPTIONS}
     given = {**usual, "method": method, "directory": directory, **more}

@@ -17,7 +17,7 @@ from sbi_active.campaign import storage
 from sbi_active.messages import RenamedWarning
 from sbi_active.simulation.bank import CorruptSegmentError
 from sbi_active.simulation.bank.store import Store
-from tests.campaign.storage.campaigns import drawn, draws, facts, go_on, new
+from tests.campaign.storage.campaigns import MODEL, draws, facts, go_on, new
 from tests.simulation.bank.filled import crafted, execute, flip
 
 if sys.version_info >= (3, 11):
@@ -45,6 +45,7 @@ def folder(made, tmp_path):
 
 def line(folder, number):
     """Return the place of a line of the log in the file, and its bytes."""
+    execute(folder, "VACUUM")  # no page of before holds the line as well
     ((text,),) = execute(
         folder, "SELECT head FROM records WHERE kind = 'log' AND number = ?", number
     )
@@ -57,7 +58,7 @@ def flip_line(folder, number, share=0.5):
 
 
 def test_what_was_not_committed_is_not_there(made, folder):
-    with Campaign.load(folder, simulator=drawn) as campaign:
+    with Campaign.load(folder, simulator=MODEL) as campaign:
         campaign._storage.acquire()
         campaign.tell([0.1, 0.2, 0.3, 0.4])
         log = (folder / "store.db-wal").read_bytes()
@@ -66,14 +67,14 @@ def test_what_was_not_committed_is_not_there(made, folder):
         (folder / FILE).write_bytes(before)
         (folder / "store.db-wal").write_bytes(log[:num_bytes])
         (folder / "store.db-shm").unlink(missing_ok=True)
-        campaign = Campaign.load(folder, simulator=drawn)
+        campaign = Campaign.load(folder, simulator=MODEL)
         assert facts(campaign) == facts(made[1])
     campaign.tell([0.1, 0.2, 0.3, 0.4])
     campaign.close()
     assert len(Campaign.load(folder).history) == 3
 
 
-@pytest.mark.parametrize("number", [1, 3, 5])
+@pytest.mark.parametrize("number", [1, 3])
 def test_every_byte_of_the_log_is_looked_at(folder, number):
     start, text = line(folder, number)
     content = (folder / FILE).read_bytes()
@@ -90,7 +91,7 @@ def test_a_damaged_line_is_given_up_by_name(made, folder):
     with pytest.raises(CorruptSegmentError, match="'log' 2 with .*repair=True"):
         Campaign.load(folder)
     with pytest.warns(UserWarning, match="given up, tell it again: .*told"):
-        campaign = Campaign.load(folder, simulator=drawn, repair=True)
+        campaign = Campaign.load(folder, simulator=MODEL, repair=True)
     assert (folder / "store.db.damaged").exists()
     assert campaign.history[-1].x is not None
     campaign.tell(made[1].history[0].x, trial=0)
@@ -105,7 +106,7 @@ def test_a_trial_without_any_line_leaves_a_gap(tmp_path):
     campaign.close()
     flip_line(tmp_path / "c", 1)
     with pytest.warns(UserWarning, match="given up, tell it again: .*attached"):
-        again = Campaign.load(tmp_path / "c", simulator=drawn, repair=True)
+        again = Campaign.load(tmp_path / "c", simulator=MODEL, repair=True)
     assert [t.status for t in again.history] == ["withdrawn", "ok", "ok"]
     assert again.history[0].reason == "its record was lost"
     again.correct(0, [0.3] * 4, action=[0.8])
@@ -127,7 +128,7 @@ def test_what_can_be_computed_again_is(made, folder, name):
         "DELETE FROM records WHERE kind = ?",
     ):
         execute(folder, change, name)
-        campaign = Campaign.load(folder, simulator=drawn)
+        campaign = Campaign.load(folder, simulator=MODEL)
         campaign.update()
         assert torch.equal(draws(campaign), draws(made[1]))
         campaign.close()
@@ -137,7 +138,7 @@ def test_a_manifest_has_a_copy(made, folder):
     execute(folder, "UPDATE records SET head = x'00' WHERE kind = 'campaign'")
     with pytest.raises(CorruptSegmentError, match="'campaign' 0 with another checksum"):
         Campaign.load(folder)
-    campaign = Campaign.load(folder, simulator=drawn, repair=True)
+    campaign = Campaign.load(folder, simulator=MODEL, repair=True)
     assert facts(campaign) == facts(made[1])
     Campaign.load(folder)
 
@@ -179,8 +180,7 @@ def short(tmp_path_factory):
 @pytest.mark.parametrize(
     ("kind", "number"),
     [
-        *(("state", 0), ("belief", 0), ("campaign", 0), ("log", 1)),
-        *(("prior", 0), ("actions", 0), ("options", 0)),
+        *(("state", 0), ("belief", 0), ("campaign", 0), ("log", 1), ("prior", 0)),
     ],
 )
 def test_nothing_is_executed(short, tmp_path, kind, number):
@@ -192,7 +192,7 @@ def test_nothing_is_executed(short, tmp_path, kind, number):
     ):
         crafted(folder, kind, number, content)
         with contextlib.suppress(ValueError, OSError):
-            Campaign.load(folder, simulator=drawn).update()
+            Campaign.load(folder, simulator=MODEL).update()
         assert not (tmp_path / "exploded").exists()
     (folder / FILE).write_bytes(pickle.dumps(Bomb()))
     with pytest.raises(CorruptSegmentError):
@@ -215,7 +215,7 @@ def test_a_full_disk_refuses_and_loses_nothing(made, folder):
         import signal
 
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        campaign = Campaign.load(folder, simulator=drawn)
+        campaign = Campaign.load(folder, simulator=MODEL)
         campaign._storage.acquire()
         log = (folder / "store.db-wal").stat().st_size
         resource.setrlimit(resource.RLIMIT_FSIZE, (log + 50, log + 50))
@@ -227,13 +227,13 @@ def test_a_full_disk_refuses_and_loses_nothing(made, folder):
         os._exit(1)
     assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
     assert (folder / FILE).stat().st_size == size
-    campaign = Campaign.load(folder, simulator=drawn)
+    campaign = Campaign.load(folder, simulator=MODEL)
     assert facts(campaign) == facts(made[1])
     campaign.tell([0.1, 0.2, 0.3, 0.4])
 
 
 def test_a_directory_that_cannot_be_written(made, folder, monkeypatch):
-    campaign = Campaign.load(folder, simulator=drawn)
+    campaign = Campaign.load(folder, simulator=MODEL)
     if os.geteuid() == 0:  # whom no permission stops
 
         def refuse(self):

@@ -11,16 +11,16 @@ import torch
 
 from sbi_active import Campaign
 from sbi_active.campaign.storage.manifest import has_manifest
-from tests.campaign.storage.campaigns import drawn, draws, facts, go_on, new
+from tests.campaign.storage.campaigns import MODEL, draws, facts, go_on, new
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-NUM_TRIALS = 6
+NUM_TRIALS, NUM_KILLED = 4, 5
 
 
 def run(folder, num_trials):
     """Begin the campaign or go on with it, as a robot's program would."""
     if has_manifest(folder):
-        campaign = Campaign.load(folder, simulator=drawn)
+        campaign = Campaign.load(folder, simulator=MODEL)
     else:
         campaign = new(folder)
     return go_on(campaign, num_trials)
@@ -86,12 +86,12 @@ def whole():
 
 
 @pytest.mark.parametrize("how", ["by the clock", "at the disk"])
-def test_killed_ten_times_and_resumed(tmp_path, how, whole):
+def test_killed_again_and_again_and_resumed(tmp_path, how, whole):
     rng = random.Random(0)
     num_killed = num_campaigns = 0
-    while num_killed < 10:
+    while num_killed < NUM_KILLED:
         folder, told, ended = tmp_path / f"c{num_campaigns}", [], False
-        while num_killed < 10 and not ended:
+        while num_killed < NUM_KILLED and not ended:
             if how == "by the clock":
                 moment = {"after": rng.uniform(0.02, 0.4)}
             else:
@@ -113,7 +113,7 @@ def two_rounds():
     return go_on(new(), 2)
 
 
-@pytest.mark.parametrize("at_call", range(1, 60, 4))
+@pytest.mark.parametrize("at_call", range(1, 60, 7))
 def test_killed_at_each_write_of_a_round(tmp_path, at_call, two_rounds):
     """A first round, from the manifest on, dies at each of its writes in turn."""
     folder = tmp_path / "c"
@@ -140,12 +140,12 @@ def apart():
     return learn(attached())
 
 
-@pytest.mark.parametrize("at_call", range(1, 60, 4))
+@pytest.mark.parametrize("at_call", range(3, 60, 7))
 def test_killed_while_several_trials_are_learned(tmp_path, at_call, apart):
     folder = tmp_path / "c"
     attached(folder).close()
-    killed(lambda: learn(Campaign.load(folder, simulator=drawn)), at_call=at_call)
-    campaign = learn(Campaign.load(folder, simulator=drawn))
+    killed(lambda: learn(Campaign.load(folder, simulator=MODEL)), at_call=at_call)
+    campaign = learn(Campaign.load(folder, simulator=MODEL))
     assert torch.equal(draws(campaign), draws(apart))
     assert facts(campaign) == facts(apart)
 
@@ -161,7 +161,7 @@ def test_a_measurement_whose_tell_returned_is_there(tmp_path):
     campaign.close()
 
     def tell():
-        loaded = Campaign.load(folder, simulator=drawn)
+        loaded = Campaign.load(folder, simulator=MODEL)
         loaded.tell([1.0, 2.0, 3.0, 4.0])
         os.kill(os.getpid(), signal.SIGKILL)
 

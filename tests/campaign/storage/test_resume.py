@@ -35,12 +35,13 @@ def counted(theta, action):
 
 @pytest.mark.parametrize(
     ("method", "simulator"),
-    [("asbi", drawn), ("asbi", MODEL), ("nsbi", drawn), ("nlhi", drawn)],
+    [("asbi", MODEL), ("nsbi", drawn), ("nlhi", drawn)],
 )
 def test_left_after_every_step(tmp_path, method, simulator):
-    whole = go_on(new(method=method, simulator=simulator), 3)
+    given = {"method": method, "simulator": simulator, "actions": [0.5, 1.0, 2.0]}
+    whole = go_on(new(**given), 3)
 
-    campaign = new(tmp_path / "c", method=method, simulator=simulator)
+    campaign = new(tmp_path / "c", **given)
     for index in range(3):
         action = campaign.ask().action
         campaign.close()
@@ -93,7 +94,7 @@ def test_without_a_simulator_it_is_read_told_and_corrected(tmp_path):
     for trial in reader.history[1:]:
         whole.attach(trial.action, trial.x)
     whole.update()
-    again = Campaign.load(tmp_path / "c", simulator=drawn)
+    again = Campaign.load(tmp_path / "c", simulator=MODEL)
     again.update()
     assert torch.equal(draws(again), draws(whole))
     assert again.history[0].reason == "gain of 2"
@@ -127,7 +128,7 @@ def test_attached_before_and_while_a_trial_is_pending(tmp_path):
     assert campaign.pending.index == asked.index == 1
     campaign.close()
 
-    again = Campaign.load(tmp_path / "c", simulator=drawn)
+    again = Campaign.load(tmp_path / "c", simulator=MODEL)
     assert [t.status for t in again.state.trials] == ["ok", "pending", "invalid"]
     assert again.state.trials[2].x.isnan().all()
 
@@ -145,7 +146,7 @@ def test_what_is_refused_is_written_down(tmp_path):
 
 def test_one_writer_any_number_of_readers(tmp_path):
     campaign = go_on(new(tmp_path / "c"), 1)
-    other = Campaign.load(tmp_path / "c", simulator=drawn)
+    other = Campaign.load(tmp_path / "c", simulator=MODEL)
     assert torch.equal(draws(other), draws(campaign))
     with pytest.raises(LockedError, match="expected no other writer"):
         other.tell([0.0] * 4, action=[1.0])
@@ -153,7 +154,7 @@ def test_one_writer_any_number_of_readers(tmp_path):
     campaign.close()
     with pytest.raises(ValueError, match="load it again"):
         other.tell([0.0] * 4, action=[1.0])
-    with Campaign.load(tmp_path / "c", simulator=drawn) as third:
+    with Campaign.load(tmp_path / "c", simulator=MODEL) as third:
         assert len(third.history) == 2
 
 
@@ -171,7 +172,7 @@ def test_a_new_campaign_wants_an_empty_directory(tmp_path):
 
 @pytest.mark.parametrize("told_since", [False, True])
 def test_another_simulator_is_refused_or_not_forgotten_by_a_kill(tmp_path, told_since):
-    go_on(new(tmp_path / "c"), 2).close()
+    go_on(new(tmp_path / "c", simulator=drawn), 1).close()
 
     def mended(theta, action):
         return drawn(theta, action) + 0.1
@@ -201,15 +202,15 @@ def test_options_and_actions_are_taken_as_by_the_constructor(tmp_path):
     whole.close()
     fields = {f.name: getattr(OPTIONS, f.name) for f in dataclasses.fields(OPTIONS)}
     again = Campaign.load(
-        tmp_path / "c", simulator=drawn, options=fields, actions=listed
+        tmp_path / "c", simulator=MODEL, options=fields, actions=listed
     )
     assert again.state.options == whole.state.options
     assert again.actions.listed()[:, 0].tolist() == listed
     assert torch.equal(draws(again), draws(whole))
     with pytest.raises(TypeError, match="expected keywords of CampaignOptions among"):
-        Campaign.load(tmp_path / "c", simulator=drawn, options={"rows": 3})
+        Campaign.load(tmp_path / "c", simulator=MODEL, options={"rows": 3})
     with pytest.raises(TypeError, match="expected an action space or a list"):
-        Campaign.load(tmp_path / "c", simulator=drawn, actions="fast")
+        Campaign.load(tmp_path / "c", simulator=MODEL, actions="fast")
 
 
 def test_options_of_a_load_are_said_to_hold_for_one_process(tmp_path):
@@ -217,10 +218,10 @@ def test_options_of_a_load_are_said_to_hold_for_one_process(tmp_path):
     own = Campaign.load(tmp_path / "c").state.options
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        Campaign.load(tmp_path / "c", simulator=drawn, options=own)
+        Campaign.load(tmp_path / "c", simulator=MODEL, options=own)
     other = replace(own, num_samples=own.num_samples + 1)
     with pytest.warns(UserWarning, match="hold for this process"):
-        Campaign.load(tmp_path / "c", simulator=drawn, options=other)
+        Campaign.load(tmp_path / "c", simulator=MODEL, options=other)
     assert Campaign.load(tmp_path / "c").state.options == own
 
 
@@ -237,7 +238,7 @@ def test_what_only_its_author_can_make_is_asked_for(tmp_path):
     campaign = go_on(new(tmp_path / "c", prior=prior, cost=price), 1)
     campaign.close()
     with pytest.raises(ValueError, match="expected prior=, which only its author"):
-        Campaign.load(tmp_path / "c", simulator=drawn, cost=price)
+        Campaign.load(tmp_path / "c", simulator=MODEL, cost=price)
     reader = Campaign.load(tmp_path / "c")  # by the draws that are kept
     scale = campaign.belief.variance.sqrt()
     assert ((reader.belief.mean - campaign.belief.mean).abs() < 0.2 * scale).all()
@@ -246,8 +247,8 @@ def test_what_only_its_author_can_make_is_asked_for(tmp_path):
     with pytest.raises(ValueError, match="load the campaign with prior="):
         reader.belief.log_prob(torch.zeros(2))
     with pytest.raises(ValueError, match="expected cost= as declared; got none"):
-        Campaign.load(tmp_path / "c", simulator=drawn, prior=prior)
-    again = Campaign.load(tmp_path / "c", simulator=drawn, prior=prior, cost=price)
+        Campaign.load(tmp_path / "c", simulator=MODEL, prior=prior)
+    again = Campaign.load(tmp_path / "c", simulator=MODEL, prior=prior, cost=price)
     assert torch.equal(draws(again), draws(campaign))
 
 

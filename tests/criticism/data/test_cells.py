@@ -59,11 +59,6 @@ def test_nanoseconds_are_a_unit(name):
     assert trials.sample_times.flatten()[:2].tolist() == pytest.approx([0.0, 0.02])
 
 
-def test_complex_numbers_are_refused():
-    with pytest.raises(ValueError, match="real numbers in column x_h; got complex"):
-        Trials.from_dataframe(long(x_h=[1 + 1j, 2, 3, 4]))
-
-
 def test_files_of_attributes_are_no_recordings(tmp_path):
     for name in ("run_1", "run_2"):
         (tmp_path / f"{name}.csv").write_text(

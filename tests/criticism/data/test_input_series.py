@@ -16,16 +16,6 @@ def trials(inputs, input_times=FINE, **keywords):
     return Trials(None, X, inputs=inputs, input_times=input_times, **keywords)
 
 
-def test_what_is_on_a_uniform_grid_stays():
-    voltage = torch.randn(2, 11).double()
-    found = trials({"voltage": voltage, "load": torch.arange(11.0)})
-    assert found.inputs is not None
-    assert found.input_times is not None
-    assert torch.equal(found.inputs["voltage"], voltage)
-    assert torch.equal(found.inputs["load"], torch.arange(11.0).double().expand(2, -1))
-    assert torch.equal(found.input_times, FINE.double())
-
-
 def test_without_actions_the_action_is_a_label():
     found = trials({"voltage": torch.zeros(2, 11)})
     assert found.action_is_label
@@ -36,16 +26,6 @@ def test_without_actions_the_action_is_a_label():
     assert some.action.tolist() == [[1.0]]
     own = Trials(torch.ones(2), X, inputs=torch.zeros(2, 11), input_times=FINE)
     assert not own.action_is_label
-
-
-def test_arrays_without_a_name():
-    one = trials(torch.zeros(2, 11)).inputs
-    assert one is not None
-    assert [*one] == ["input"]
-    two = trials(torch.zeros(2, 11, 2)).inputs
-    assert two is not None
-    assert [*two] == ["input 1", "input 2"]
-    assert two["input 2"].shape == (2, 11)
 
 
 def test_values_are_held_on_the_finest_grid():
@@ -118,12 +98,6 @@ def test_a_selection_is_not_resampled_again():
     assert found.held_out.start.tolist() == [[3.0, 4.0]]
 
 
-def test_times_of_x_are_those_of_as_many_inputs():
-    found = trials(torch.zeros(2, 3), None)
-    assert found.input_times is not None
-    assert found.input_times.tolist() == TIMES.tolist()
-
-
 def test_equal_inputs_make_repeats():
     same = trials(torch.zeros(2, 11))
     assert same.repeat_of.tolist() == [-1, 0]
@@ -149,20 +123,10 @@ BACK = FINE.clone().index_put((torch.tensor(3),), torch.tensor(0.1))
     ("arguments", "message"),
     [
         ({"inputs": NAN}, "NaN for input 'input' of trial 1, value 4; fill it in"),
-        ({"inputs": {"u": torch.zeros(3, 11)}}, "input 'u' of shape .2, m."),
         (
             {"inputs": torch.zeros(2, 11), "input_times": BACK},
             "increase; got 0.1 after 0.2 for input 'input' of trial 0",
         ),
-        (
-            {
-                "inputs": torch.zeros(2, 4),
-                "input_times": [[0, 0.1, 0.2, 1.0], [0.0, 0.1, 0.2, 0.3]],
-            },
-            "without gaps; got no value from 0.2 to 1 for input 'input' of trial 0",
-        ),
-        ({"inputs": torch.zeros(2, 11), "input_times": None}, "expected input_times"),
-        ({"inputs": None, "input_times": FINE, "action": [1.0, 2.0]}, "got none; pass"),
         ({"inputs": None}, "expected actions, or inputs"),
         (
             {"inputs": torch.zeros(2, 11), "input_times": FINE / 1000},
@@ -176,13 +140,11 @@ BACK = FINE.clone().index_put((torch.tensor(3),), torch.tensor(0.1))
             },
             "begin at similar times; got trial 1 of 1 .* 5000 after .* its own begin",
         ),
-        ({"inputs": torch.zeros(2, 11), "input_hold": "cubic"}, "'previous' or"),
         ({"inputs": torch.zeros(2, 11), "start": [1.0]}, "start states of shape"),
         (
             {"inputs": torch.zeros(2, 11), "start": {"w": [1.0, torch.nan]}},
             "'w' without a number in trials .1.",
         ),
-        ({"inputs": torch.zeros(2, 11), "input_labels": ["a", "b"]}, "input_labels"),
     ],
 )
 def test_bad_inputs(arguments, message):

@@ -87,29 +87,6 @@ def test_inputs_come_from_another_file_on_their_own_grid():
     assert lines.inputs["u"][0].tolist() == [1, 1.5, 2]
 
 
-def test_trials_may_share_the_series_of_another_file():
-    trials = beside(["0,1", "10,2", "20,3"], "time_ms,input_u")
-    assert trials.inputs is not None
-    assert trials.inputs["u"].tolist() == [[1, 2, 3]] * 2
-
-
-def test_columns_of_another_file_may_have_names_of_their_own():
-    write("inputs.csv", OTHER, "run,t_ms,volt")
-    write("trials.csv", X, "run,t,speed")
-    told = {"trial": "run", "time": "t", "x": "speed", "input": "volt"}
-    with pytest.raises(ValueError, match="expected a column time for time"):
-        Trials.from_csv("trials.csv", columns=told, inputs="inputs.csv")
-    write("inputs.csv", OTHER, "run,t,volt")
-    write("trials.csv", [r.replace("0.0", "") for r in X], "run,t,speed")
-    units = {"t": "ms", "volt": "V"}
-    trials = Trials.from_csv(
-        "trials.csv", columns=told, inputs="inputs.csv", units=units
-    )
-    assert trials.input_labels == ("volt [V]",)
-    assert trials.input_times is not None
-    assert trials.input_times.tolist() == [0, 0.01, 0.02]
-
-
 @pytest.mark.parametrize(
     ("rows", "header", "message"),
     [
@@ -118,16 +95,10 @@ def test_columns_of_another_file_may_have_names_of_their_own():
             "trial,time,action_u,x_y",
             "got 1.0 in row 1 and 2.0 in row 2 .* call it input_u if it is commanded",
         ),
-        (["1,2"], "input_u,x_y", "columns trial and time with inputs over time"),
         (
             ["a,0,1,5", "a,1,1,5", "a,2,1,5", "a,9,1,5", "a,10,1,5"],
             "trial,time,input_u,x_y",
             "no value from 2 to 9 for input 'u' of trial a.* fill in",
-        ),
-        (
-            ["a,0,1,5", "b,0,1,5", "b,1,1,5"],
-            "trial,time,input_u,x_y",
-            "two or more values; got 1 of input 'u' of trial a; .* action_",
         ),
         (
             ["a,0,1,5,0", "a,1,1,5,1"],
@@ -138,11 +109,6 @@ def test_columns_of_another_file_may_have_names_of_their_own():
             ["a,0,1,5", "a,1,2,5", "b,2,1,6", "b,3,1,7"],
             "trial,time,input_u,x_y",
             "similar times; got trial b of 1 that begins 2 after .* from its own begin",
-        ),
-        (
-            ["a,0,1 V,5", "a,1,1,5"],
-            "trial,time,input_u,x_y",
-            "a number in column input_u, row 1 .trial a.; got '1 V'",
         ),
     ],
 )
@@ -167,11 +133,6 @@ def test_a_table_with_inputs_that_is_not_understood(rows, header, message):
             "x of trial a measured within the time of its input 'u', 0 to 0.001; got "
             "x at 0.02",
         ),
-        (
-            {"header": "trial,time,input_u,x_z", "inputs": ["a,0,1,1"]},
-            "got x_z in inputs",
-        ),
-        ({"header": "trial,time,u"}, "in a table of inputs; got trial, time, u"),
         ({"inputs": ["a,0,1", "a,0,2"]}, "each sample once; .* rows 1 and 2 of inputs"),
     ],
 )
@@ -181,9 +142,3 @@ def test_another_table_that_is_not_understood(arguments, message):
         return
     with pytest.raises(ValueError, match=message):
         beside(**arguments)
-
-
-def test_inputs_stand_in_one_table():
-    write("inputs.csv", OTHER, "trial,time_ms,input_u")
-    with pytest.raises(ValueError, match="inputs in one table; got input_voltage"):
-        read(SAMPLES, inputs="inputs.csv")

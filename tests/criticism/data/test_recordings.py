@@ -26,15 +26,6 @@ def test_a_file_a_trial():
     assert trials.order == "unknown"
 
 
-def test_columns_of_other_names():
-    write("a.csv", "0,1,5", "1,1,6", header="t,u,h")
-    write("b.csv", "0,2,5", "1,2,7", header="t,u,h")
-    told = {"time": "t", "action": "u", "x": "h"}
-    trials = Trials.from_csv("runs", columns=told, units={"h": "m"})
-    assert trials.names == ("a", "b")
-    assert trials.channel_labels == ("h [m]",)
-
-
 def test_files_of_several_trials_have_the_file_in_the_name():
     header = f"trial,{HEADER}"
     write("monday.csv", "1,0,1,5", "1,100,1,4", "2,0,2,5", header=header)
@@ -49,12 +40,6 @@ def test_files_where_a_row_is_a_trial_go_on_from_each_other():
     trials = Trials.from_csv("runs")
     assert trials.action[:, 0].tolist() == [1, 2, 4]
     assert trials.names == ("0", "1", "2")
-
-
-def test_one_table_goes_before_others():
-    write("trials.csv", "1,2", "2,3", header="action_v,x_y")
-    write("notes.csv", "whatever", header="text")
-    assert len(Trials.from_csv("runs")) == 2
 
 
 def test_recordings_whose_trials_stand_in_a_column_of_another_name():

@@ -96,10 +96,8 @@ def test_measurements_order_channels_before_times():
     ("arguments", "keywords", "message"),
     [
         (([1.0, 2.0], [1.0]), {}, "expected actions .* with as many rows"),
-        (([1.0, np.nan], [1.0, 2.0]), {}, "expected finite actions"),
         (([1.0], [np.nan]), {}, "expected at least one valid trial"),
         (([1.0, 2.0], [1.0, 2.0]), {"index": [0]}, r"expected index of shape \(2,\)"),
-        (([1.0, 2.0], [1.0, 2.0]), {"role": ["fit"]}, "expected a role"),
         (
             ([1.0, 2.0], [1.0, np.nan]),
             {"role": ["fit", "held out"]},
@@ -111,11 +109,6 @@ def test_measurements_order_channels_before_times():
             r"expected sample_times of shape \(3,\)",
         ),
         (([1.0, 2.0], [[1.0], [[1.0, 2.0]]]), {}, "differ in their first axis alone"),
-        (
-            ([1.0, 2.0], [1.0, 2.0]),
-            {"mask": [[True, True], [True, True]]},
-            "expected a mask of shape",
-        ),
     ],
 )
 def test_bad_trials(arguments, keywords, message):

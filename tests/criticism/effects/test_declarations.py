@@ -5,7 +5,6 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 from torch.distributions import (
-    Gamma,
     HalfNormal,
     LogNormal,
     Normal,
@@ -52,20 +51,10 @@ def loop(*effects, model=MODEL):
     ("changes", "message"),
     [
         ({"null": NAN}, "expected a null of effect 'bias'; got NaN"),
-        ({"null": torch.tensor([NAN])}, "expected a null of effect 'bias'; got NaN"),
         ({"null": "0"}, "expected a null of effect 'bias' in numbers; got '0'"),
-        ({"null": None}, "expected a null of effect 'bias' in numbers; got None"),
         ({"null": [0.0, 0.0]}, r"expected a null of shape \(1,\)"),
-        (
-            {"prior": Normal(torch.zeros(2), torch.ones(2)), "null": torch.zeros(3)},
-            r"expected a null of shape \(2,\).*got \(3,\)",
-        ),
         ({"name": 3}, "expected name of an effect as text; got 3"),
-        ({"name": ""}, "expected a name of an effect"),
         ({"units": 3}, "expected units of an effect as text; got 3"),
-        ({"units": None}, "expected units of an effect as text; got None"),
-        ({"family": 3}, "expected family of an effect as text; got 3"),
-        ({"describe": b"drag"}, "expected describe of an effect as text"),
         ({"apply": None}, "expected apply of effect 'bias' as a function"),
         ({"prior": 1.0}, "expected a torch distribution as prior of effect 'bias'"),
         (
@@ -103,11 +92,8 @@ def test_a_prior_that_excludes_its_null_is_refused_where_it_is_declared(prior, n
     "prior",
     [
         Normal(0.0, 1.0),
-        HalfNormal(1.0),
-        Uniform(0.0, 1.0),
         Uniform(-1.0, 0.0),
-        LogNormal(0.0, 1.0),  # zero is where its support ends
-        Gamma(2.0, 1.0),
+        LogNormal(0.0, 1.0),
         BoxUniform(torch.zeros(1), torch.ones(1)),
     ],
 )
@@ -152,11 +138,8 @@ def no_change(value, phi, action, context):
     [
         ("observation", no_change, r"observation of shape \(16, 1\); got NoneType"),
         ("observation", lambda v, phi, a, c: v + phi[:, 0], r"got \(16, 16\)"),
-        ("observation", lambda v, phi, a, c: 0.0, r"got \(\)"),
         ("observation", lambda v, phi, a, c: v + phi > 0, "got torch.bool"),
-        ("observation", lambda v, phi, a, c: v + phi + 0j, "got torch.complex64"),
         ("action", lambda v, phi, a, c: (v + phi)[:, 0], r"got \(16,\)"),
-        ("parameter", lambda v, phi, a, c: torch.cat([v, v], 1), r"got \(16, 2\)"),
         ("noise", lambda v, phi, a, c: phi, "vanish at its null"),
         (
             "noise",
@@ -169,16 +152,6 @@ def no_change(value, phi, action, context):
 def test_apply_that_returns_something_else_is_named(hook, apply, message):
     with pytest.raises(ValueError, match=f"(?s)effect 'bias'.*{message}"):
         loop(effect(hook=hook, apply=apply))
-
-
-def test_phi_along_the_wrong_axis_shows_where_x_has_as_many_entries_as_rows():
-    wide = SimulatorModel(
-        lambda theta, xi: theta * xi * torch.ones(16), noise=GaussianNoise(0.1)
-    )
-    trials = Trials(SPEED, STOP[:, None] * torch.ones(16))
-    wrong = effect(apply=lambda x, phi, action, context: x + phi[:, 0])
-    with pytest.raises(RuntimeError, match="must match"):
-        Criticism(wide, PRIOR, trials, effects=[wrong])
 
 
 def test_a_standard_deviation_that_is_not_positive_is_refused():
@@ -227,6 +200,33 @@ def test_a_wrong_null_shows_where_noise_is_changed_in_place():
         loop(effect(hook="noise", prior=HalfNormal(1.0), apply=apply))
 
 
+@pytest.mark.parametrize(
+    "row",
+    [
+        "| joint | {} drag | damping | half force |",
+        "| joint | {} drag | damping | whole force | N | drag in {} |",
+        "| joint | {} drag | damping | half | N | drag in {} |",
+    ],
+)
+def test_a_malformed_row_of_a_table_is_named(row, tmp_path):
+    heading = "| of | effect | changes | prior | unit | sentence |\n|---|\n"
+    (tmp_path / "table.md").write_text(f"Effects.\n\n{heading}{row}\n")
+    with pytest.raises(
+        ValueError, match=r"expected cells of, .* in line 5 of table.md"
+    ):
+        rows_of(tmp_path / "table.md")
+
+
+def test_phi_along_the_wrong_axis_shows_where_x_has_as_many_entries_as_rows():
+    wide = SimulatorModel(
+        lambda theta, xi: theta * xi * torch.ones(16), noise=GaussianNoise(0.1)
+    )
+    trials = Trials(SPEED, STOP[:, None] * torch.ones(16))
+    wrong = effect(apply=lambda x, phi, action, context: x + phi[:, 0])
+    with pytest.raises(RuntimeError, match="must match"):
+        Criticism(wide, PRIOR, trials, effects=[wrong])
+
+
 def test_apply_may_return_a_view_of_what_it_keeps():
     kept = torch.zeros(100, 1)
 
@@ -239,32 +239,3 @@ def test_apply_may_return_a_view_of_what_it_keeps():
     first = model.mean(theta, action)
     model.mean(2 * theta, action)
     assert float(first) == pytest.approx(1.5)
-
-
-def test_apply_may_return_numpy():
-    made = effect(apply=lambda x, phi, a, c: x.numpy() + phi.numpy().astype(float))
-    x = AugmentedSimulator(MODEL, [made]).mean(
-        torch.tensor([[0.5, 1.0]]), torch.ones(1, 1)
-    )
-    assert x.dtype == torch.float32
-    assert float(x) == pytest.approx(1.5)
-
-
-@pytest.mark.parametrize(
-    "row",
-    [
-        "| joint | {} drag | damping | half force |",
-        "| joint | {} drag | damping | half force | N | drag | more |",
-        "| joint | {} drag | damping | whole force | N | drag in {} |",
-        "| joint | {} drag | damping | half force ** 2 | N | drag in {} |",
-        "| joint | {} drag | damping | half | N | drag in {} |",
-        "| joint | {} drag | damping | limit force | N | drag in {} |",
-    ],
-)
-def test_a_malformed_row_of_a_table_is_named(row, tmp_path):
-    heading = "| of | effect | changes | prior | unit | sentence |\n|---|\n"
-    (tmp_path / "table.md").write_text(f"Effects.\n\n{heading}{row}\n")
-    with pytest.raises(
-        ValueError, match=r"expected cells of, .* in line 5 of table.md"
-    ):
-        rows_of(tmp_path / "table.md")

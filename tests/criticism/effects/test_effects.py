@@ -200,19 +200,6 @@ def test_a_clock_offset_reads_the_trajectory_elsewhere():
     torch.testing.assert_close(x[0], 3 * (times + 0.05))
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"hook": "sensor"}, "expected a hook of action, input, parameter"),
-        ({"scope": "row"}, "expected scope 'campaign' or 'trial'"),
-        ({"null": torch.zeros(3)}, r"expected a null of shape \(1,\)"),
-    ],
-)
-def test_bad_effects(changes, message):
-    with pytest.raises(ValueError, match=message):
-        effect(**changes)
-
-
 def test_distinct_names():
     with pytest.raises(ValueError, match="got bias more than once"):
         AugmentedSimulator(MODEL, [effect(), effect()])

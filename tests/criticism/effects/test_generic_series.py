@@ -8,14 +8,12 @@ from sbi.utils import BoxUniform
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import (
-    AugmentedSimulator,
     Context,
     Criticism,
     Trials,
     generic_effects,
 )
 from sbi_active.criticism.effects.series import delayed_input, played
-from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from tests.criticism.motor_world import GRID, MODEL, NOISE, PRIOR, measured, speed
 
 ACTUATOR = {
@@ -92,7 +90,7 @@ def test_several_inputs_give_their_names():
 
 def distorted(change):
     """Trials of a motor whose voltage is changed before it acts."""
-    trials = measured(0, {}, held_out=0)
+    trials = measured(0, {}, num=5, held_out=0)
     assert trials.inputs is not None
     real = {"voltage": change(trials.inputs["voltage"])}
     rows = len(trials)
@@ -125,7 +123,6 @@ def distorted(change):
             lambda u: delayed_input(u, torch.full((len(u), 1), 0.07), 0.02),
         ),
         ("backlash", lambda u: played(u, torch.full((len(u), 1), 0.5).double())),
-        ("input offset", lambda u: u + 0.15),
     ],
 )
 def test_what_an_actuator_does_is_found(name, change):
@@ -141,37 +138,6 @@ def test_what_an_actuator_does_is_found(name, change):
     assert loop.trace().verdict == name or loop.trace().verdict in named
     assert not any({"none", "input lag"} <= group for group in loop.trace().equivalent)
     assert not any({"none", name} <= group for group in loop.trace().equivalent)
-
-
-def test_a_required_time_of_the_trials_is_enough():
-    model = SimulatorModel(
-        lambda theta, action, *, times: theta * times, noise=GaussianNoise(0.1)
-    )
-    times, prior = torch.linspace(0, 1, 5), BoxUniform(torch.zeros(1), torch.ones(1))
-    trials = Trials(torch.ones(3), torch.zeros(3, 5), sample_times=times)
-    names = {e.name for e in generic_effects(model, trials, prior=prior)}
-    assert {"action gain", "sensor lag", "drift in time"} <= names
-
-
-def test_a_small_effect_changes_x_in_proportion():
-    """By 1e-4 and 2e-4 of its prior's deviation; a limit at infinity has no such."""
-    trials = measured(0, {}, held_out=0)
-    effects = generic_effects(MODEL, trials, prior=PRIOR)
-    simulator = TrialSimulator(AugmentedSimulator(MODEL, effects), trials)
-    theta = torch.tensor([[3.0, 0.3]]).double()
-    bare, _, _ = simulator.predict(theta, {})
-    for effect in effects:
-        if not bool(effect.null_phi(1).isfinite().all()):
-            continue
-        scale = effect.declared_draws().square().mean(0).sqrt()[None]
-        one, two = (
-            (simulator.predict(theta, {effect.name: k * 1e-4 * scale})[0] - bare) / k
-            for k in (1, 2)
-        )
-        size = abs(one).max() / 1e-4
-        assert size > 1e-3, effect.name
-        if effect.name != "sensor quantum":  # which rounds up or down
-            assert abs(one - two).max() / 1e-4 < 0.02 * size, effect.name
 
 
 def two_sensors(theta, action, *, inputs, times):
@@ -204,5 +170,6 @@ def test_sensors_have_effects_each_for_itself():
     assert "bias" not in effects
     sd = [effects[f"{n} bias"].declared_draws().std() for n in ("angle", "rate")]
     assert 3 < float(sd[1] / sd[0]) < 5
-    loop = Criticism(model, prior, trials, effects=[*effects.values()])
+    some = [e for n, e in effects.items() if n.endswith(("bias", "sensor lag"))]
+    loop = Criticism(model, prior, trials, effects=some)
     assert loop.trace().verdict == "rate bias"

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from sbi_active.criticism.evidence.settings import NESTED, THOROUGH, settings_of
+from sbi_active.criticism.evidence.settings import THOROUGH, settings_of
 from sbi_active.inference.engine import infer, search
 from tests.criticism.evidence.linear import exact, linear_rival
 
@@ -18,21 +17,8 @@ def fit(seed=0, settings=FEW, **given):
     return rival, infer(rival, rng, found=found, settings=settings, **given)
 
 
-@pytest.mark.parametrize("how", [THOROUGH, NESTED])
-def test_the_mode_and_its_width_are_the_posterior_s(how):
-    rival, closed = linear_rival(), exact()
-    found = search(rival, np.random.default_rng(0), settings=how)
-    assert len(found.modes) == 1
-    z = rival.coordinates.to_z(found.modes)[0]
-    deviation = np.sqrt(np.diag(closed.covariance))
-    # The prior's moments in the search are those of 1,000 draws.
-    assert (abs(z - closed.mean) < 0.1 * deviation).all()
-    factor = rival.coordinates.scale[:, None] * found.guess.factors[0] / found.wider
-    assert factor @ factor.T == pytest.approx(closed.covariance, rel=0.05)
-
-
 def test_the_standard_error_claims_what_repeated_runs_show():
-    closed, found = exact(), [fit(seed)[1] for seed in range(30)]
+    closed, found = exact(), [fit(seed)[1] for seed in range(20)]
     gap = np.array([f.log_evidence for f in found]) - closed.log_evidence
     claimed = np.mean([f.standard_error for f in found])
     assert 0.5 * claimed < np.sqrt((gap**2).mean()) < 1.7 * claimed

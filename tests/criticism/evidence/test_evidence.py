@@ -8,19 +8,16 @@ from scipy.stats import multivariate_normal
 from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
-from sbi_active.criticism import Effect, Trials
+from sbi_active.criticism import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import ModelKey
+from tests.effects import on_outcomes
 
 PRIOR = Independent(Normal(torch.zeros(2), torch.tensor([2.0, 1.0])), 1)
 ACTION = torch.linspace(-2, 2, 8)[:, None]
 X = torch.tensor([0.3, 1.4, -0.2, 0.8, 2.2, 1.1, 3.5, 2.9])[:, None]
-CURVE = Effect(
-    "curve",
-    hook="observation",
-    prior=Normal(0.0, 0.7),
-    null=0.0,
-    apply=lambda x, phi, action, context: x + phi * action**2,
+CURVE = on_outcomes(
+    "curve", lambda x, phi, action, context: x + phi * action**2, sd=0.7
 )
 
 
@@ -87,13 +84,7 @@ def test_scatter_sums_out_the_inflation():
 
 def test_a_curved_ridge_has_the_right_evidence():
     # theta (1 + phi) is all that the data see: the ridge is a hyperbola.
-    gain = Effect(
-        "gain",
-        hook="observation",
-        prior=Normal(0.0, 0.2),
-        null=0.0,
-        apply=lambda x, phi, action, context: x * (1 + phi),
-    )
+    gain = on_outcomes("gain", lambda x, phi, action, context: x * (1 + phi), sd=0.2)
     sd = 1e-3
     x = 2.0 * ACTION + sd * torch.linspace(-1, 1, 8)[:, None]
     sets = RivalSet(

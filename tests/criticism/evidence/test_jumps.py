@@ -9,41 +9,9 @@ from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Trials
 from sbi_active.criticism.evidence.jumps import (
     _beside_quadratic,
-    look_for_jumps,
-    probe_step,
     quadratic,
 )
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.results import ModelKey
-from tests.criticism.evidence.linear import linear_rival
-
-
-def stairs(height):
-    """Return a line whose value is rounded to steps of a height."""
-    model = SimulatorModel(
-        lambda theta, action: torch.round(theta * action / height) * height,
-        noise=GaussianNoise(0.3),
-    )
-    prior = Independent(Normal(torch.zeros(1), torch.ones(1)), 1)
-    action = torch.linspace(1, 2, 8)[:, None]
-    return RivalSet(model, prior, Trials(action, 0.7 * action), []).rival(ModelKey())
-
-
-def test_a_line_has_the_finest_step_and_no_roughness():
-    rival = linear_rival()
-    assert probe_step(rival, rival.coordinates.sample(4, seed=0)) == (1e-4, True)
-    step, is_smooth, rough = look_for_jumps(linear_rival(), seed=0)
-    assert (step, is_smooth) == (1e-4, True)
-    assert not rough.any()
-
-
-def test_stairs_have_the_roughness_of_their_rounding():
-    # Below the height slopes are 0 or wild. Rounding errs uniformly, and the median
-    # of |uniform| over +-h/2 is h / 4.
-    height = 0.1
-    _, is_smooth, rough = look_for_jumps(stairs(height), seed=0)
-    assert not is_smooth
-    assert np.median(rough) == pytest.approx(height / 4 / 0.6745, rel=0.4)
 
 
 def test_jumps_far_from_the_fit_are_none_there():

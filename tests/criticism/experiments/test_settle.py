@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
-from sbi_active.criticism import Criticism, Effect, Trials, close_loop
+from sbi_active.criticism import Criticism, Trials, close_loop
 from sbi_active.criticism.experiments.choice import limit_of
 from sbi_active.criticism.experiments.journal import NAME
 from sbi_active.criticism.experiments.settle import VerdictError, settle
+from tests.effects import on_outcomes
 
 NOISE = 0.1
 PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
@@ -25,12 +25,8 @@ BOTH = DiscreteActions(torch.tensor([-3.0, -2.0, -1.0, 1.0, 1.5, 2.0, 2.5, 3.0])
 
 
 def effect(name, form):
-    return Effect(
-        name,
-        hook="observation",
-        prior=Independent(Normal(torch.zeros(1), torch.ones(1)), 1),
-        null=0.0,
-        apply=lambda x, phi, action, context: x + phi * form(action.to(x)),
+    return on_outcomes(
+        name, lambda x, phi, action, context: x + phi * form(action.to(x))
     )
 
 
@@ -65,13 +61,12 @@ def loop(robot, trials, **options):
     return close_loop(MODEL, PRIOR, trials, real_system=robot, **options)
 
 
-@pytest.mark.parametrize("name", ["lift", "drag"])
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(("name", "seed"), [("lift", 1), ("drag", 2)])
 def test_a_chosen_trial_tells_a_cause_from_its_exact_alias(name, seed):
     robot = Robot(FORMS[name], seed=seed)
     trials = robot.trials()
-    passive = close_loop(MODEL, PRIOR, trials, effects=LIBRARY, evaluate=False)
-    assert passive.probabilities[name] < 0.6
+    passive = Criticism(MODEL, PRIOR, trials, effects=LIBRARY)
+    assert passive.trace().probabilities[name] < 0.6
     report = loop(robot, trials)
     assert report.verdict == name
     assert report.probabilities[name] > 0.95
@@ -86,7 +81,8 @@ def test_the_alias_is_withdrawn_by_the_rule_that_named_it():
     """A library without the cause names its alias, until a trial backward."""
     robot = Robot(FORMS["drag"], seed=3)
     trials = robot.trials()
-    assert close_loop(MODEL, PRIOR, trials, effects=[EVEN]).verdict == "lift"
+    passive = Criticism(MODEL, PRIOR, trials, effects=[EVEN])
+    assert passive.trace().verdict == "lift"
     report = loop(robot, trials, effects=[EVEN])
     assert report.verdict != "lift"
     first = report.tested[0]
@@ -105,7 +101,7 @@ def test_what_nothing_explains_is_looked_at_where_no_trial_was():
     assert robot.asked[0] == -3.0  # farthest from all forward ones
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_clean_simulator_loses_at_most_one_trial(seed):
     robot = Robot(seed=seed)
     report = loop(robot, robot.trials())
@@ -154,7 +150,7 @@ def wandering(num, seed):
 
 def test_predictions_where_every_model_misses_are_as_wide_as_left_out_errors():
     held, sizes = [], []
-    for seed in range(8):
+    for seed in range(5):
         action, x = wandering(9, seed)
         prior = BoxUniform(torch.tensor([0.5]), torch.tensor([2.5]))
         report = close_loop(
@@ -169,15 +165,15 @@ def test_predictions_where_every_model_misses_are_as_wide_as_left_out_errors():
         held.append(trial.held)
         sizes.append(trial.registered.limit * trial.registered.sd.mean())
     # The process has a root mean square of .07; t of 8 trials widens its 90 % limit.
-    assert sum(held) >= 5  # fewer of 8 at .9 have a probability of .005
+    assert sum(held) >= 3  # fewer of 5 at .9 have a probability of .009
     assert 0.07 < sum(sizes) / len(sizes) < 0.2
 
 
-@pytest.mark.parametrize(("most", "worth"), [(1, 1), (30, 1), (30, 4), (30, 30)])
+@pytest.mark.parametrize(("most", "worth"), [(1, 1), (30, 1), (30, 30)])
 def test_nine_of_ten_further_errors_stay_below_the_limit(most, worth):
     """Whatever the numbers of a trial are worth, and whatever their size."""
     rng = np.random.default_rng(0)
-    draws = 7 * rng.chisquare(worth, (2000, 8)) / worth
+    draws = 7 * rng.chisquare(worth, (600, 8)) / worth
     below = [new <= limit_of(before, most) ** 2 for *before, new in draws]
     # A prior of what a trial is worth has a share in it where few trials tell of that.
     assert 0.86 < np.mean(below) < 0.96

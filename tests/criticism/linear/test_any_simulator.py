@@ -7,11 +7,12 @@ from scipy.stats import multivariate_normal
 from torch.distributions import Independent, Normal, Uniform
 
 from sbi_active import GaussianNoise, SimulatorModel, StudentTNoise
-from sbi_active.criticism import Criticism, Effect, Trials
+from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit.verdict import judge
 from sbi_active.criticism.results import ModelKey
+from tests.effects import on_outcomes
 
 SD = 0.3
 ACTION = torch.linspace(-2, 2, 12, dtype=torch.float64)[:, None]
@@ -21,13 +22,7 @@ BARE, BIAS = ModelKey(), ModelKey(("bias",))
 
 
 def shifted(name, shape):
-    return Effect(
-        name,
-        hook="observation",
-        prior=Independent(Normal(torch.zeros(1), torch.ones(1)), 1),
-        null=0.0,
-        apply=lambda x, phi, action, context: x + phi * shape(action),
-    )
+    return on_outcomes(name, lambda x, phi, action, context: x + phi * shape(action))
 
 
 EFFECTS = [shifted("bias", torch.ones_like), shifted("wave", lambda xi: (3 * xi).sin())]

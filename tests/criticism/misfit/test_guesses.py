@@ -50,7 +50,7 @@ def test_what_the_sensor_does_is_guessed(change, hidden, formula):
     name, gain = tracing.guesses[0]
     assert name == formula
     assert gain > 5
-    report = found.report(evaluate=False)
+    report = found.report(evaluate=False, plan=False)
     assert report.guess == formula
     text = " ".join(str(report).split())
     assert f"no declared effect helps, a guess, not declared: {formula}" in text

@@ -1,14 +1,13 @@
 """Effects that the noise hides from each other."""
 
 import torch
-from torch.distributions import Normal
 
 from sbi_active import DiscreteActions
-from sbi_active.criticism import Effect
 from sbi_active.criticism.misfit import near_aliases as room
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.detection import THRESHOLD
 from tests.criticism.steps.linear_world import NOISE, judged, measured, rivals
+from tests.effects import on_outcomes
 
 SIZE = 0.5
 X = measured(curve=SIZE)
@@ -25,12 +24,9 @@ def near_aliases(some, actions, known=()):
 def twin(distance):
     """Return the curve with a wave of a root mean square, in noise deviations."""
     size = distance * NOISE / SIZE * 2**0.5
-    return Effect(
+    return on_outcomes(
         "twin",
-        hook="observation",
-        prior=Normal(0.0, 1.0),
-        null=0.0,
-        apply=lambda x, phi, action, context: (
+        lambda x, phi, action, context: (
             x + phi * (action**2 - 1 + size * torch.sin(5 * action))
         ),
     )
@@ -47,12 +43,9 @@ def test_what_is_listed_already_is_left_out():
 
 def test_effects_apart_by_more_over_the_permitted_actions_are_not():
     # Between the trials at hand they hardly differ; beyond them they do.
-    other = Effect(
+    other = on_outcomes(
         "twin",
-        hook="observation",
-        prior=Normal(0.0, 1.0),
-        null=0.0,
-        apply=lambda x, phi, action, context: (
+        lambda x, phi, action, context: (
             x + phi * (action**2 - 1 + torch.relu(action.abs() - 2) ** 3)
         ),
     )

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
@@ -10,7 +9,7 @@ from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
-from sbi_active.criticism.next_trial.candidates import outside_candidates, simulated
+from sbi_active.criticism.next_trial.candidates import simulated
 from sbi_active.criticism.next_trial.next_action import PredictedRival, choose_action
 from sbi_active.criticism.results import ModelKey
 from sbi_active.design.estimators.model_index import ModelIndexGain, RivalSampler
@@ -159,22 +158,3 @@ def test_there_is_nothing_beyond_labels():
     )
     c = Criticism(model, PRIOR, own, effects=[BIAS])
     assert len(simulated(c.rivals, torch.tensor([[3.5]]))) == 0
-
-
-def test_the_same_seed_gives_the_same_choice():
-    action = [1.0, 2.0, 3.0]
-    gains = [
-        criticism(action, [0.7, 1.4, 2.1], [BIAS, TILT], BOTH)
-        .next_action()
-        .information_gain
-        for _ in range(2)
-    ]
-    assert np.array_equal(*gains)
-
-
-def test_actions_outside_are_not_permitted_and_near_ones_come_first():
-    actions = DiscreteActions([[1.0, 0.0], [2.0, 0.0], [1.0, 1.0]])
-    found = outside_candidates(actions, actions.values, limit=6)
-    assert found.shape == (6, 2)
-    assert not bool(actions.contains(found).any())
-    assert len(found.unique(dim=0)) == 6

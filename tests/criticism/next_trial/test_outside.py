@@ -1,7 +1,6 @@
 """Actions beyond the permitted ones."""
 
 import pytest
-import torch
 
 from sbi_active import DiscreteActions
 from sbi_active.criticism.next_trial.candidates import extrapolated
@@ -24,15 +23,6 @@ def test_extrapolated_actions_keep_their_sign_where_there_is_one(values, farthes
         assert float(found.min()) >= 0
     if max(values) <= 0:
         assert float(found.max()) <= 0
-
-
-def test_extrapolated_actions_lie_beyond_and_are_few():
-    grid = torch.cartesian_prod(torch.arange(5.0), torch.arange(-2.0, 3.0))
-    actions = DiscreteActions(grid)
-    found = extrapolated(actions, grid, limit=7)
-    assert found.shape == (7, 2)
-    beyond = (found > grid.max(0).values) | (found < grid.min(0).values)
-    assert bool(beyond.any(-1).all())
 
 
 def test_a_single_action_has_nothing_beyond():

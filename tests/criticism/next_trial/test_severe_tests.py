@@ -8,10 +8,11 @@ from torch.distributions import Independent, Normal
 
 from sbi_active import BoxActions, DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.actions import ActionSpace
-from sbi_active.criticism import Criticism, Effect, Trials, generic_effects
+from sbi_active.criticism import Criticism, Trials, generic_effects
 from sbi_active.criticism.next_trial.candidates import extrapolated
 from sbi_active.criticism.next_trial.severe_tests import severe_tests
 from sbi_active.criticism.steps.predictive import predict
+from tests.effects import BIAS
 
 NOISE = 0.01
 ANGLES = DiscreteActions(
@@ -119,13 +120,6 @@ def normal(sd):
     return Independent(Normal(torch.zeros(1), torch.full((1,), sd)), 1)
 
 
-BIAS = Effect(
-    "bias",
-    hook="observation",
-    prior=normal(1.0),
-    null=0.0,
-    apply=lambda x, phi, action, context: x + phi,
-)
 SPEEDS = DiscreteActions([1.0, 1.5, 2.0, 2.5, 3.0])
 
 

@@ -6,10 +6,9 @@ import numpy as np
 import pandas as pd
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
-from sbi_active.criticism import Effect, Trials
+from sbi_active.criticism import Trials
 from sbi_active.criticism.report.report import build_report
 from sbi_active.criticism.results import (
     Detection,
@@ -21,14 +20,9 @@ from sbi_active.criticism.results import (
     Residuals,
     Tracing,
 )
+from tests.effects import on_outcomes
 
-DRAG = Effect(
-    "drag",
-    hook="observation",
-    prior=Normal(0.0, 1.0),
-    null=0.0,
-    apply=lambda x, phi, action, context: x - phi,
-)
+DRAG = on_outcomes("drag", lambda x, phi, action, context: x - phi)
 NAMES = ["drag", "tilt", "bias"]
 SHUFFLED = [2.0, -1.0, 3.0, 1.0, -2.0, -3.0, 1.5, -1.5, 2.5]
 
@@ -171,7 +165,3 @@ def report(**changes):
         "digest": "0123456789abcdef",
     }
     return build_report(**(parts | changes))
-
-
-def first_paragraph(made):
-    return " ".join(str(made).split("\n\n")[0].split())

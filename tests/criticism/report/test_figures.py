@@ -1,7 +1,5 @@
 """What the figures of a report draw, number by number."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from matplotlib.colors import to_hex
@@ -71,25 +69,6 @@ def test_the_band_is_two_deviations_and_all_points_are_in_view(size, scale):
         assert largest < high < 2 * max(largest, 3.5)
 
 
-def test_trials_have_their_names_at_the_axis():
-    names = tuple(f"drop {letter}" for letter in "abcdefgh")
-    _, trial, _ = plot_residuals(replace(residuals(), names=names)).axes
-    assert tuple(t.get_text() for t in trial.get_xticklabels()) == names
-    numbers = replace(residuals(), names=tuple("01234567"))
-    _, trial, _ = plot_residuals(numbers).axes
-    assert len(trial.get_xticks()) != len(names)
-
-
-def test_labels_are_those_of_actions_and_channels():
-    figure = plot_residuals(
-        residuals(), action_labels=["speed [m/s]"], channel_names=list("abcdef")
-    )
-    first, trial, channel = figure.axes
-    assert first.get_xlabel() == "speed [m/s]"
-    assert trial.get_xlabel() == "trial"
-    assert [t.get_text() for t in channel.get_xticklabels()] == list("abcdef")
-
-
 def test_bars_are_as_long_as_probabilities_the_most_probable_on_top():
     shares = {"drag": 0.6, "tilt": 0.33, "drag + tilt": 0.015, "none": 0.001}
     shares |= {"drag + bias": 0.004, "scatter": 0.05}
@@ -126,12 +105,3 @@ def test_every_score_is_drawn_before_and_after_with_its_total():
         ]
         ticks = [label.get_text() for label in ax.get_xticklabels()]
         assert ticks == ["before", "after"]
-
-
-def test_scores_that_span_decades_have_a_logarithmic_axis():
-    made = evaluation()
-    assert plot_before_after(made).axes[0].get_yscale() == "linear"
-    made.after["rmse"][:] /= 10
-    ax = plot_before_after(made).axes[0]
-    assert ax.get_yscale() == "log"
-    assert ax.get_ylim()[0] < made.after["rmse"].min()

@@ -40,29 +40,6 @@ def test_the_family_is_named_where_no_form_has_nine_tenths():
     assert first_line(certain).startswith("Verdict: sin 2q of hinge (P = 0.95)")
 
 
-def test_two_families_are_named_together():
-    pair = "sin 2q of hinge + v of hinge"
-    both = replace(
-        forces(),
-        verdict=pair,
-        evidences={n: evidence("none", -3.0) for n in ["none", pair, *FORMS]},
-        chosen=("sin 2q of hinge", "v of hinge"),
-        probabilities={
-            pair: 0.6,
-            "q^3 of hinge + v of hinge": 0.3,
-            "none": 0.1,
-            **dict.fromkeys(FORMS, 0.0),
-        },
-    )
-    line = first_line(both)
-    assert line.startswith(f"Verdict: {IN_Q} and force in v of hinge (P = 0.90)")
-
-
-def test_a_stand_in_is_called_one_and_why():
-    line = first_line(forces(stand_in=("its form is free", "p = 0.001")))
-    assert "a stand-in for something undeclared: its form is free; p = 0.001" in line
-
-
 def test_two_lines_say_what_separates_the_forms():
     action = NextAction(
         action=np.array([0.4]),

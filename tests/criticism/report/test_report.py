@@ -9,9 +9,8 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import AutocorrelatedNoise, SimulatorModel
 from sbi_active.criticism import Trials, joint_prior
-from sbi_active.criticism.contradictions import MissedTrial, SevereTest
+from sbi_active.criticism.contradictions import SevereTest
 from sbi_active.criticism.report.summary import sentences
 from sbi_active.criticism.report.words import with_error
 from sbi_active.criticism.under_misfit import Misfit, ModelError, Support
@@ -22,7 +21,6 @@ from tests.criticism.report.reports import (
     report,
     residuals,
     tracing,
-    trials,
 )
 
 NONE = {"tracing": tracing("none"), "residuals_after": None}
@@ -51,55 +49,12 @@ def test_the_verdict_line_says_what_limits_it():
     assert first_line(tracing=sure, residuals_after=None) == "Verdict: none (P = 0.90)"
 
 
-def test_many_held_out_trials_are_counted_in_the_line_and_named_below():
-    missed = tuple(
-        MissedTrial(position=i, name=f"{i}", size=60.0 - i, p_value=0.0, by_both=True)
-        for i in range(4)
-    )
-    made = report(evaluation=replace(evaluation(), missed=missed))
-    assert str(made).splitlines()[0].endswith("; 4 held-out trials are far outside it")
-    for i in range(4):
-        assert any(f"held-out trial {i} is far" in w for w in made.warnings)
-
-
 def test_a_dictionary_has_no_probabilities_where_they_contradict_the_verdict():
     plain = report().to_dict()
     assert plain["probabilities"] == pytest.approx(report().probabilities)
     assert plain["misfit"] is None
     withdrawn = report(tracing=tracing("unexplained", instead_of="drag")).to_dict()
     assert withdrawn["probabilities"] is withdrawn["credible_set"] is None
-
-
-@pytest.mark.parametrize(
-    ("engines", "said"),
-    [
-        (("linear", "linear"), ["linearized models"]),
-        (("linear", "importance"), ["linearized models", "importance sampling"]),
-        (("importance", "importance"), ["importance sampling"]),
-    ],
-)
-def test_the_record_says_how_evidence_was_found(engines, said):
-    own = tracing()
-    every = dict.fromkeys(own.evidences, engines[1]) | {"none": engines[0]}
-    made = {n: replace(e, engine=every[n]) for n, e in own.evidences.items()}
-    record = flat(report(tracing=replace(own, evidences=made))).split(" Record ")[1]
-    for words in ("linearized models", "importance sampling"):
-        assert (words in record) == (words in said)
-
-
-def test_residuals_stand_beside_the_sensor_s_error_in_the_units_of_x():
-    noise = AutocorrelatedNoise(0.1, 1.0, measurement_sd=[0.1, 20.0])
-    model = SimulatorModel(lambda theta, action: theta, noise=noise)
-    made = residuals((10, 2), times=np.linspace(0, 1, 10))
-    scaled = replace(made, x=made.x * [1, 100], mean=made.mean * [1, 100])
-    rms = np.sqrt(((scaled.x - scaled.mean) ** 2).mean((0, 1)))
-    labels = ["angle [rad]", "force [N]"]
-    named = Trials(trials().action, torch.randn(8, 10, 2), channel_labels=labels)
-    parts = {"trials": named, "simulator": model, "residuals": scaled, **NONE}
-    assert (
-        f"of angle {rms[0]:.3g} rad, force {rms[1]:.3g} N, {rms[0] / 0.1:.2g}, "
-        f"{rms[1] / 20:.2g} times the sensor's error"
-    ) in sentences(report(**parts))[2]
 
 
 def under_misfit(**changes):
@@ -155,18 +110,6 @@ def test_a_guess_is_called_a_guess():
     assert "a guess, not declared: c xi^2" in str(sure).splitlines()[0]
 
 
-def test_pairs_with_names_in_common_are_one_line():
-    names = ["drag", "tilt", "bias", "lag", "gain", "delay"]
-    pairs = [frozenset({a, b}) for a in names for b in names if a < b]
-    items = [
-        line
-        for line in str(report(tracing=tracing(aliases=(*pairs,)))).splitlines()
-        if "nearly the same here" in line
-    ]
-    assert len(items) == 1
-    assert items[0].startswith("- bias = delay = drag = gain = lag = tilt: nearly")
-
-
 def test_scores_stand_before_and_after():
     table = report().before_after
     assert [*table.columns] == ["metric", "before", "after", "ratio", "interval"]
@@ -184,17 +127,6 @@ def test_scores_stand_before_and_after():
         evaluation(), scheme="leave one out", selected=("drag",) * 7 + ("x",)
     )
     assert "7 of 8 such verdicts are drag" in flat(report(evaluation=folds))
-
-
-def test_tables_stand_in_columns():
-    lines = str(report()).splitlines()
-    start = next(i for i, line in enumerate(lines) if line.startswith("model  "))
-    rows = [lines[start], *lines[start + 2 : start + 8]]
-    assert " ".join(rows[0].split()) == "model P phi log BF ESS 90 % set"
-    assert "0.123 +- 0.011 1/m" in rows[1]
-    ends = {row.index("312") + 3 for row in rows if "312" in row}
-    assert ends == {rows[0].index("ESS") + 3}
-    assert max(map(len, lines)) <= 88
 
 
 GROUP = frozenset({"tilt", "none"})
@@ -231,24 +163,6 @@ def test_only_a_bare_model_that_holds_is_a_stop():
     alone = replace(plan, separates=("drag",))
     assert "Of the declared models only drag is left." in flat(
         report(next_action=alone)
-    )
-
-
-def test_a_named_verdict_is_followed_by_its_tests():
-    plan = replace(report().next_action, action=None)
-    made = report(severe_tests=TESTS, next_action=plan)
-    assert sentences(made)[3] == (
-        "Measure next at speed = 3 m/s, or beyond the permitted range at speed = 4.5 "
-        "m/s: this tests the verdict."
-    )
-    assert "differ by 1.23 of its standard deviations" in flat(made)
-    assert "No other action was tried than these 8: speed from -3 to 3 m/s." in flat(
-        made
-    )
-    assert "P holds among the declared effects alone" in flat(made)
-    once = replace(residuals(size=6.0), action=np.full((8, 1), 2.0))
-    assert "No other action was tried than speed = 2 m/s." in flat(
-        report(residuals=once)
     )
 
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 
-from sbi_active.criticism.contradictions import Bounds
 from sbi_active.criticism.report.summary import sentences
 from tests.criticism.report.reports import flat, report, tracing
 
@@ -46,33 +45,3 @@ def test_the_sentences_of_what_names_no_effect(verdict, missing, advice):
     assert advice in following
     assert "P holds among" not in flat(made)
     assert "stop" not in flat(made).lower() or verdict == "none"
-
-
-def test_without_a_plan_nothing_is_said_of_further_trials():
-    made = report(tracing=tracing("none"), evaluation=None, next_action=None)
-    assert sentences(made)[3] == "No trial was planned."
-
-
-@pytest.mark.parametrize(
-    ("verdict", "changes", "said"),
-    [
-        (
-            "outlier",
-            {"instead_of": "drag", "outliers": {3.0: 0.95}, "needed": (3.0,)},
-            "trial 3 does not agree with the others; drag is not named",
-        ),
-        (
-            "drag",
-            {"stand_in": ("its form is free",)},
-            "drag (a force against the speed) stands in for something undeclared",
-        ),
-        (
-            "drag",
-            {"bounds": Bounds(p_value=0.5)},
-            "it lacks drag (a force against the speed); but no permitted action tells",
-        ),
-    ],
-)
-def test_the_first_sentence_says_what_limits_the_verdict(verdict, changes, said):
-    made = report(tracing=tracing(verdict, **changes))
-    assert said in sentences(made)[0]

@@ -25,7 +25,6 @@ from tests.criticism.report.reports import (
     trials,
 )
 
-PRIOR = BoxUniform(-3 * torch.ones(2), 3 * torch.ones(2))
 SURE = report().detection
 HELD = evaluation()
 RIGHT = tracing()
@@ -118,7 +117,6 @@ ASIDE = OutlyingTrial(position=3, name="3", times=9.0, size=50.0)
 BOUND = BoundParameter(name="mu_1", model="none", side="lower", bound=0.5, beyond=0.4)
 WEAK = {"log_bayes_factor": 1.0, "p_value": 1e-9}
 SORTED = trials(sorted(trials().action[:, 0].tolist()))
-UNORDERED = Trials(SORTED.action, SORTED.x, order="unknown")
 NEARLY = [2.0, -1.0, 3.0, 1.0, -2.0]
 
 #: By code, and words where it has two kinds: a report that deserves it, and one that
@@ -220,7 +218,7 @@ def measured(missing, **options):
     model = SimulatorModel(curve, noise=options.pop("noise", GaussianNoise(0.1)))
     trials = Trials(action, x, **known)
     prior = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
-    return close_loop(model, prior, trials, evaluate=False, **options)
+    return close_loop(model, prior, trials, evaluate=False, plan=False, **options)
 
 
 BIAS = on_x("bias", lambda phi, action, context: phi, 0.5)

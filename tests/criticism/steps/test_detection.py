@@ -5,22 +5,16 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 from scipy.stats import kstest
-from torch.distributions import Normal
 
 from sbi_active import GaussianNoise, SimulatorModel, StudentTNoise
-from sbi_active.criticism import Criticism, Effect, Trials
+from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.steps.detection import LEVEL
 from sbi_active.simulation import estimate_noise
+from tests.effects import on_outcomes
 
 NOISE = 0.1
 PRIOR = BoxUniform(-3 * torch.ones(2), 3 * torch.ones(2))
-CUBIC = Effect(
-    "cubic",
-    hook="observation",
-    prior=Normal(torch.zeros(1), torch.ones(1)),
-    null=0.0,
-    apply=lambda x, phi, action, context: x + phi * action**3,
-)
+CUBIC = on_outcomes("cubic", lambda x, phi, action, context: x + phi * action**3)
 
 
 def line(theta, action):
@@ -53,7 +47,7 @@ def test_the_chi_square_alone_raises_the_alarm_where_the_noise_is_known():
 
 def test_what_an_effect_leaves_over_is_undeclared_beside_it():
     x, action = zigzag(2.2)
-    made = criticism(x + 3.0 * action**3, action).report(evaluate=False)
+    made = criticism(x + 3.0 * action**3, action).report(evaluate=False, plan=False)
     assert made.verdict == "cubic"
     assert made.tracing.misfit.size > 2  # the error beside it, in sensor deviations
     assert not made.tracing.misfit.passes

@@ -34,14 +34,6 @@ def under_misfit(left_out, held_out=None, *, sensor=(0.005,)):
     return tracing("unexplained", chosen=("drag",), beside=("drag",), misfit=misfit)
 
 
-def test_what_lowers_the_errors_that_are_printed_predicts_better():
-    made = unless_refuted(under_misfit((1.45, 1.2), (0.31, 0.2)), None)
-    assert made.chosen == ("drag",)
-    text = flat(report(tracing=made, evaluation=None))
-    assert text.startswith("Verdict: unexplained: drag predicts better, and is not")
-    assert "goes from 1.45 to 1.2, on held-out trials from 0.31 to 0.2." in text
-
-
 @pytest.mark.parametrize(
     ("left_out", "held_out", "where"),
     [

@@ -101,7 +101,7 @@ def test_correlated_errors_are_no_contradiction():
         sample_times=times,
     )
     rho, named = float(np.exp(-0.05)), 0
-    for seed in range(5):
+    for seed in range(3):
         gen = torch.Generator().manual_seed(seed)
         e = torch.randn(10, 40, generator=gen)
         for k in range(1, 40):
@@ -149,9 +149,7 @@ def test_what_no_model_predicts_refutes_none(fitted):
 
 
 def test_trials_that_agree_are_not_named():
-    told = [
-        report_of(slid(drag=d, seed=s)).evaluation for d in (0, 0.3) for s in (1, 2)
-    ]
+    told = [report_of(slid(drag=d, seed=s)).evaluation for d, s in ((0, 1), (0.3, 2))]
     assert not any(evaluation.missed for evaluation in told)
 
 

@@ -7,7 +7,7 @@ import torch
 from sbi.utils import BoxUniform, MultipleIndependent
 from torch.distributions import Bernoulli, Categorical, Normal
 
-from sbi_active import BoxActions, Campaign, GaussianNoise, SimulatorModel
+from sbi_active import Campaign, GaussianNoise, SimulatorModel
 from sbi_active.inference import refine
 from sbi_active.inference.beliefs.enumerated import EnumeratedBelief
 
@@ -103,7 +103,7 @@ def test_a_campaign_designs_and_comes_back(tmp_path):
     campaign = Campaign(
         model,
         PRIOR,
-        BoxActions([0.5], [2.0]),
+        [0.5, 1.0, 2.0],
         seed=0,
         directory=tmp_path / "campaign",
         options={"num_samples": 100, "num_scored": 100},

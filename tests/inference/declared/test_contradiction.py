@@ -53,10 +53,13 @@ def least_squares(trials):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("simulator", [DECLARED, drawn], ids=["declared", "drawn"])
 @pytest.mark.parametrize(
-    "trials",
-    [[(1.0, -1.0), (1.0, 2.0)], [(1.0, 0.5), (1.0, 0.6), (3.0, -6.0), (0.5, 2.0)]],
+    ("simulator", "trials"),
+    [
+        (drawn, [(1.0, -1.0), (1.0, 2.0)]),
+        (DECLARED, [(1.0, 0.5), (1.0, 0.6), (3.0, -6.0), (0.5, 2.0)]),
+    ],
+    ids=["drawn", "declared"],
 )
 def test_the_belief_is_as_wide_as_the_trials_scatter(trials, simulator):
     c = after(trials, simulator)

@@ -69,13 +69,12 @@ def test_hard_edged_noise_is_flagged(noise: str):
     action = torch.tensor([[-5.0], [5.0], [-5.0], [5.0]])
     settings = RefinementOptions(num_histories=500)
     simulator = numerical(noise=noise)
-    for seed in range(2):
-        x = observe(simulator, torch.tensor([[1.0, 2.0]]), action, seed)
-        belief = refine(simulator, BOX, action, x, settings=settings, seed=seed)
-        holds = belief.diagnostics.assumptions["gaussian_noise"].holds
-        assert holds == (noise == "gaussian")
-        if noise == "uniform":
-            assert not belief.diagnostics.trustworthy
+    x = observe(simulator, torch.tensor([[1.0, 2.0]]), action, 0)
+    belief = refine(simulator, BOX, action, x, settings=settings, seed=0)
+    holds = belief.diagnostics.assumptions["gaussian_noise"].holds
+    assert holds == (noise == "gaussian")
+    if noise == "uniform":
+        assert not belief.diagnostics.trustworthy
 
 
 def test_four_sharp_modes_are_flagged():
@@ -96,12 +95,14 @@ def test_impossible_observation_is_flagged(linear):
     assert 0.01 < linear[0].diagnostics.tail_probability <= 1
     action = torch.tensor([[0.0], [0.0], [5.0]])
     x = torch.tensor([[50.0], [-50.0], [200.0]])  # the same action, 100 sigma apart
-    diagnostics = refine(numerical(), BOX, action, x, seed=0).diagnostics
+    settings = RefinementOptions(num_histories=500)
+    belief = refine(numerical(), BOX, action, x, settings=settings, seed=0)
+    diagnostics = belief.diagnostics
     assert diagnostics.tail_probability < 1e-3
     assert "unlike anything simulated" in " ".join(diagnostics.warnings)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_draws_on_a_curved_ridge_are_not_a_few_heavy_ones(seed: int):
     """Those of one fit, weighted, had a divergence of .13 beyond an end of it."""
     own, known = PROBLEMS["banana"](), answers()["banana"]

@@ -37,9 +37,8 @@ def refined(dim: int, num: int, seed: int, num_histories: int):
     return float(log_ratio.mean()), belief
 
 
-@pytest.mark.parametrize(("dim", "num_histories"), [(10, 600), (20, 200)])
-def test_ten_and_twenty_parameters(dim: int, num_histories: int):
-    divergence, _ = refined(dim, 2, seed=0, num_histories=num_histories)
+def test_twenty_parameters():
+    divergence, _ = refined(20, 2, seed=0, num_histories=200)
     assert -0.02 < divergence < 0.3
 
 

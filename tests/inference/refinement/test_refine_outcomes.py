@@ -11,7 +11,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch import Tensor
 
-from sbi_active.inference import refine
+from sbi_active.inference import RefinementOptions, refine
 from sbi_active.seeding import forked_generators
 
 PRIOR = BoxUniform(-torch.ones(2), torch.ones(2))
@@ -153,8 +153,9 @@ def test_lost_rows_cost_their_histories_and_nothing_else():
         return world(theta, action)
 
     action, x = trials(world, 2, 0, all_invalid=False)
+    settings = RefinementOptions(num_histories=500)
     with pytest.warns(UserWarning, match="simulations of the refinement are missing"):
-        belief = refine(faulty, PRIOR, action, x, seed=0)
+        belief = refine(faulty, PRIOR, action, x, settings=settings, seed=0)
     diagnostics = belief.diagnostics
     assert 0 < diagnostics.num_missing < 0.3 * diagnostics.num_simulations
     log_b = belief.log_prob(GRID.float()).double() + LOG_CELL

@@ -13,6 +13,7 @@ from sbi_active.inference import ActionEmbedding, ActionPosterior
 from tests.linear_gaussian import DIM, PRIOR, moments, simulator
 
 SMALL = MixtureDensity(hidden_features=(32, 32), num_components=2, num_iterations=600)
+QUICK = MixtureDensity(hidden_features=(8,), num_iterations=20)
 BOX = BoxUniform(-2 * torch.ones(DIM), 2 * torch.ones(DIM))
 
 
@@ -29,8 +30,8 @@ def trained(density_estimator=SMALL, prior=PRIOR, n=1_000, data=None, **train):
 
 
 def test_the_posterior_meets_the_closed_form_at_every_action():
-    settings = MixtureDensity(hidden_features=(64, 64), num_iterations=1_500)
-    posterior = trained(settings, n=8_000).build_posterior()
+    settings = MixtureDensity(hidden_features=(32, 32), num_iterations=600)
+    posterior = trained(settings, n=4_000).build_posterior()
     theta, x, action = rows(4_000)
     mean, variance = moments(x, action)
     exact = torch.distributions.Normal(mean, variance.sqrt()).log_prob(theta).sum(1)
@@ -45,11 +46,11 @@ def test_the_posterior_meets_the_closed_form_at_every_action():
 
 
 def test_two_rounds_chain_to_the_exact_posterior():
-    settings = MixtureDensity(hidden_features=(64, 64), num_iterations=1_500)
+    settings = MixtureDensity(hidden_features=(32, 32), num_iterations=600)
     inference, belief = ASBI(PRIOR, settings, show_progress_bars=False), PRIOR
     trials = [(2.0, torch.tensor([1.0, -1.5])), (1.0, torch.tensor([0.2, 0.1]))]
     for action, x_o in trials:
-        theta = belief.sample((6_000,))
+        theta = belief.sample((3_000,))
         xi = 3 * torch.rand(len(theta), 1)
         inference.append_simulations(
             theta, simulator(theta, xi), action=xi, belief=belief
@@ -112,7 +113,8 @@ def test_the_posterior_takes_outcomes_without_a_measurement():
     best = posterior.map(num_iter=5, num_to_optimize=5, **at[2])
     assert float(best.reshape(-1)[0]) > 0.5
     # the same network, had it seen complete rows alone, says so
-    other = trained(SMALL, data=(theta, complete, action)).build_posterior()
+    data = tuple(rows[:300] for rows in (theta, complete, action))
+    other = trained(QUICK, data=data).build_posterior()
     with pytest.warns(UserWarning, match="has never seen an outcome like this"):
         other.sample((2,), **at[2])
 
@@ -141,7 +143,7 @@ def test_images_pass_through_an_embedding():
 
 
 def test_belief_is_a_distribution():
-    inference = trained(prior=BOX)
+    inference = trained(QUICK, prior=BOX)
     belief = inference.update(torch.tensor([1.5, -1.5]), action=torch.tensor([1.0]))
     assert isinstance(belief, Distribution)
     assert isinstance(belief, Belief)
@@ -164,7 +166,7 @@ def test_belief_is_a_distribution():
 
 @pytest.mark.filterwarnings("ignore")
 def test_action_posterior_offers_what_sbi_s_do():
-    posterior = trained(prior=BOX).build_posterior()
+    posterior = trained(QUICK, prior=BOX).build_posterior()
     assert isinstance(posterior, ActionPosterior)
     x, action = torch.tensor([0.5, 0.5]), torch.tensor([2.0])
     theta = posterior.sample((100,), x=x, action=action)
@@ -182,7 +184,7 @@ def test_action_posterior_offers_what_sbi_s_do():
 
 def test_truncated_proposals_of_the_belief_pass_and_others_do_not():
     theta, x, action = rows(200, BOX)
-    inference = trained(prior=BOX)
+    inference = trained(QUICK, prior=BOX)
     packed = inference.build_posterior().packed()
     packed.set_default_x(torch.tensor([[0.0, 0.0, 1.0]]))
     restricted = RestrictedPrior(BOX, get_density_thresholder(packed))

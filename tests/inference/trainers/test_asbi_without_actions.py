@@ -28,10 +28,10 @@ def two_rounds(trainer_class, density_estimator, **train):
     )
     proposal = PRIOR
     for _ in range(2):
-        theta = proposal.sample((300,))
+        theta = proposal.sample((100,))
         x = simulate(theta)
         trainer.append_simulations(theta, x, proposal=proposal)
-        trainer.train(max_num_epochs=3, training_batch_size=50, **train)
+        trainer.train(max_num_epochs=2, training_batch_size=50, **train)
         posterior = trainer.build_posterior().set_default_x(X_O)
         proposal = posterior
     return posterior, trainer

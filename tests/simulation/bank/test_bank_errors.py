@@ -105,11 +105,6 @@ def test_other_formats_and_folders(bank, tmp_path):
         Bank(tmp_path / "full", simulator=simulator)
 
 
-def test_a_bank_that_reads_does_not_write(bank):
-    with pytest.raises(ValueError, match="opened with its simulator, to write to"):
-        Bank(bank.path).append(rows(), seed=5)
-
-
 def full_disk(folder):
     """Return whether a small file system could be mounted."""
     command = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)]
@@ -171,3 +166,8 @@ def test_a_folder_that_cannot_be_written(small_disk):
         OSError, match="a folder that can be made for a bank; got 'Read"
     ):
         Bank(small_disk / "new", simulator=simulator)
+
+
+def test_a_bank_that_reads_does_not_write(bank):
+    with pytest.raises(ValueError, match="opened with its simulator, to write to"):
+        Bank(bank.path).append(rows(), seed=5)

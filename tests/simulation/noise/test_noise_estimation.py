@@ -13,7 +13,7 @@ from sbi_active import (
 )
 from sbi_active.seeding import row_seeds
 
-SETS = 400
+SETS = 150
 
 
 def binomial_error(level, num):
@@ -72,7 +72,7 @@ def test_marginal_of_gaussian_noise_is_a_student_t():
 
 @pytest.mark.parametrize("rho", [0.95])
 def test_autocorrelated_noise_recovers_rho(rho):
-    tau, step, sets = -0.02 / math.log(rho), 0.02, 100
+    tau, step, sets = -0.02 / math.log(rho), 0.02, 40
     times = step * torch.arange(50).double()
     truth = AutocorrelatedNoise(2.0, tau).at(times)
     level = torch.tensor([[0.05, 0.05], [0.5, 0.5], [0.95, 0.95]]).double()

@@ -94,12 +94,6 @@ def test_faults_cost_their_rows_alone():
     check_faults(200, num_workers=2, time_limit=1.0, killer=40)
 
 
-@pytest.mark.slow
-def test_faults_cost_their_rows_alone_at_scale():
-    for num_workers in (1, 4):
-        check_faults(5_000, num_workers=num_workers, time_limit=0.5, killer=1_234)
-
-
 def test_a_batch_that_raises_is_divided_here_too():
     def simulator(theta, action, seeds):
         if (theta == 5).any() or (theta == 70).any():
@@ -243,16 +237,15 @@ class Stop(BaseException):
     """What except Exception does not see."""
 
 
-@pytest.mark.parametrize("kind", [Stop, KeyboardInterrupt])
-def test_whatever_is_raised_in_a_worker_has_its_traceback(kind):
+def test_whatever_is_raised_in_a_worker_has_its_traceback():
     def simulator(theta, action, seeds):
         if (theta == 1).any():
-            raise kind("the reason")
+            raise Stop("the reason")
         return seeded(theta, action, seeds)
 
     rows = quietly(simulator, *index_rows(8), seed=0, workers=2)
     assert rows.tracebacks.keys() == {1}
-    assert 'raise kind("the reason")' in rows.tracebacks[1]
+    assert 'raise Stop("the reason")' in rows.tracebacks[1]
     assert rows.tracebacks[1].strip().endswith("the reason")
     expected = simulate(seeded, *index_rows(8), seed=0).x
     assert torch.equal(rows.x[rows.valid], expected[rows.valid])
@@ -268,15 +261,3 @@ def test_whatever_ends_the_loading_has_its_traceback():
     model = SimulatorModel(fn, setup=setup)
     with pytest.raises(SimulationError, match=r"(?s)can load; got.*no licence"):
         simulate(model, *index_rows(3), seed=0, workers=2)
-
-
-def test_a_simulator_that_cannot_be_loaded():
-    class Unloadable:
-        def __call__(self, theta, action, seeds):
-            return theta
-
-        def __reduce__(self):
-            return int, ("no number",)
-
-    with pytest.raises(SimulationError, match="(?s)can load; got.*invalid literal"):
-        simulate(Unloadable(), *index_rows(3), seed=0, workers=2)
