@@ -157,7 +157,6 @@ def score_case(number: int, hidden: int) -> dict[str, object]:
     seconds = time.process_time() - begin
     alone = np.array([e.effective_sample_size for e in tracing.estimates])
     own = {NONE, tracing.model} & {*tracing.evidences}
-    dearest = max(tracing.evidences.values(), key=lambda e: e.num_simulations)
     inside, intervals = _coverage(loop, case)
     return {
         "size": case.size,
@@ -173,7 +172,6 @@ def score_case(number: int, hidden: int) -> dict[str, object]:
         "not_printed": int((alone < TOLD.draws).sum()),
         "inside": inside,
         "intervals": intervals,
-        "dearest": f"{dearest.name}: {dearest.num_simulations}",
     }
 
 

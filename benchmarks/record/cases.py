@@ -148,13 +148,13 @@ def closed_loop(draw: Callable[[], Any], seed: int) -> Result:
     )
     found = Result(words={"verdict": report.verdict})
     found.figures["log Bayes factor"] = report.detection.log_bayes_factor, None
+    found.rows = report.num_simulations
     if report.tracing is not None:
         for name, value in report.tracing.inclusion.items():
             found.figures[f"P({name})"] = float(value), None
         for name, fit in report.tracing.evidences.items():
             error = fit.standard_error
             found.figures[f"log Z({name})"] = float(fit.log_evidence), float(error)
-            found.rows = max(found.rows, int(fit.num_simulations))
         bare = report.tracing.evidences.get("none")
         if bare is not None and len(bare.draws):
             effective = min(max(bare.effective_sample_size, 10.0), len(bare.draws))

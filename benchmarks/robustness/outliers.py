@@ -55,7 +55,7 @@ def measure(name: str, size: int, number: int) -> dict[str, object]:
     alone = loop.trace()
     report = loop.report(plan=False)
     rmse = report.before_after.set_index("metric").to_dict("index")["rmse"]
-    spent = sum(e.num_simulations for e in report.tracing.evidences.values())
+    spent = loop.rivals.simulator.num_simulations
     return {
         "trial": trial,
         "action": float(trials.action[trial, 0]),

@@ -72,8 +72,8 @@ class Simulations:
 
     def at(self, mask: Tensor) -> Simulations:
         """Return some rows, by a mask of shape (n,), without tracebacks."""
-        parts = self.theta, self.action, self.x, self.status
-        return Simulations(*(part[mask] for part in parts))
+        each = self.action[mask], self.x[mask], self.status[mask]
+        return Simulations(self.theta[mask], *each)
 
     def without_missing(self) -> Simulations:
         """Return the rows that tell something: those not missing."""
