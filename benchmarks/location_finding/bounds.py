@@ -85,7 +85,7 @@ class KernelMixture(StudentMixture):
         center = (inverse @ self.means[..., None])[..., 0]
         step = np.tensordot(z, inverse, (1, 2)) - center  # (n, k, d)
         log_volume = np.log(np.diagonal(self.factors, axis1=1, axis2=2)).sum(1)
-        each = log_student((step**2).sum(-1), log_volume, z.shape[1])
+        each = log_student((step**2).sum(-1), log_volume, z.shape[1], self.freedom)
         return np.asarray(logsumexp(each, axis=1)) - np.log(len(self.means))
 
 
