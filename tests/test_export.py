@@ -134,7 +134,7 @@ def report():
         parameter_names=["gain"],
     )
     prior = BoxUniform(torch.zeros(1), 2 * torch.ones(1))
-    action = torch.linspace(0.5, 2.0, 20)[:, None]
+    action = torch.linspace(0.5, 2.0, 40)[:, None]
     x = 0.8 * action + 0.2
     actions = BoxActions([0.5], [2.0], names=["push"], units=["N"])
     effects = generic_effects(model, actions)

@@ -69,6 +69,7 @@ def test_a_campaign(kept):
     c = kept("Campaign", lambda: campaign("asbi", by_numpy, network="each round"))
     trial = kept("ask", c.ask)
     kept("tell", lambda: c.tell(0.6 * trial.action))
+    kept("attach", lambda: c.attach([1.0], [0.6]))
     belief = kept("update", c.update)
     kept("health", lambda: c.health)
     kept("stop_reason", lambda: c.stop_reason)

@@ -30,8 +30,9 @@ def camp(tmp_path, monkeypatch):
     (tmp_path / "sled.py").write_text(SIMULATOR + LOUD)
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.delitem(sys.modules, "sled", raising=False)
-    words = [*BOX, *SMALL, "--actions", "1,2", "--simulator", "sled.py:loud"]
-    assert main(["init", "camp", *words]) == 0
+    words = ["--actions", "0.5:3", "--simulator", "sled.py:loud"]
+    sizes = [*SMALL, "num_samples=200"]
+    assert main(["init", "camp", *BOX, *sizes, *words]) == 0
 
 
 class Server:
@@ -68,7 +69,7 @@ def test_a_robot_s_loop(server):
     assert server.says({"command": "tell", "x": 0.7, "action": 1})["answer"]
     assert main(["tell", "camp", "0.9", "--action", "2"]) == 0
     assert len(server.says({"command": "status"})["answer"]["trials"]) == 2
-    assert server.says({"command": "tell", "x": 0.8, "action": 1.5})["answer"]
+    assert server.says({"command": "tell", "x": 0.8, "action": 1})["answer"]
     assert main(["status", "camp"]) == 0
     asked = server.says({"command": "ask", "id": 7})
     assert asked["id"] == 7
@@ -80,8 +81,8 @@ def test_a_robot_s_loop(server):
     assert server.says(again)["answer"]["reason"] == "read off"
     updated = server.says({"command": "update"})["answer"]
     assert updated["not_in_belief"] == []
-    missed = server.says({"command": "tell", "missing": True, "action": [1.5]})
-    assert missed["answer"]["action"] == [1.5]
+    missed = server.says({"command": "tell", "missing": True, "action": [2.0]})
+    assert missed["answer"]["action"] == [2.0]
     assert missed["answer"]["status"] == "missing"
     assert [t["status"] for t in server.says({"command": "status"})["answer"]["trials"]]
     saved = server.says({"command": "report", "out": "page.html"})
