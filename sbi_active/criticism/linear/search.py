@@ -262,8 +262,6 @@ class Search:
         r = self._rival(key).residual(u[None])[0] / self._units
         return float(np.sqrt(np.mean(r[:, : len(self.unit)] ** 2)))
 
-    # Which sets are worth a fit.
-
     def _best(self, size: int) -> list[ModelKey]:
         """Return the sets to add to: the likeliest by either error, the best fits.
 
@@ -318,8 +316,6 @@ class Search:
             given = {"reference": self._reference, "df": self.sensor.df}
             self._rivals[key] = self.rivals.rival(key, **given)
         return self._rivals[key]
-
-    # The fits.
 
     def _fit_bare(self) -> LinearModel:
         rival = self._rival(ModelKey())
