@@ -65,12 +65,14 @@ class Session:
         self.folder = folder
         self._campaign: Any = None
         self._opened: tuple[object, ...] = ()
+        self._is_used = False
 
     def __enter__(self) -> Session:
+        self._is_used = False
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
-        if self._campaign is not None:
+        if self._campaign is not None and self._is_used:
             self._campaign.close()  # let others write
             self._opened = (*self._opened[:-1], digest(self.folder))
         if kind is not None:  # what went wrong may be that another process wrote
@@ -117,6 +119,7 @@ class Session:
                 simulator_changed=simulator_changed,
                 repair=need == "repair",
             )
+        self._is_used = True
         answer = function(self._campaign, **options)
         if need == "simulator":
             sum_up_campaign(self._campaign)
