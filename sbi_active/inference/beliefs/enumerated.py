@@ -248,7 +248,9 @@ def enumerated(
         assert fault is not None
         raise fault
     mass = torch.tensor(log_mass, dtype=torch.float64)
-    is_inflated = torch.tensor([_is_inflated(part) for part in parts])
+    # Trials contradict each other where the noise was inflated.
+    known = [part.diagnostics.figures for part in parts]
+    is_inflated = torch.tensor(["noise_inflation" in figures for figures in known])
     if not bool(is_inflated.all()):
         # Evidence under wider noise is not comparable: trials rule these values out.
         mass[is_inflated] = -torch.inf
@@ -260,11 +262,6 @@ def enumerated(
     belief = EnumeratedBelief(prior, some, parts, mass.softmax(0))
     belief.diagnostics = _diagnosed(belief, float(mass.logsumexp(0)))
     return belief
-
-
-def _is_inflated(belief: Belief) -> bool:
-    """Return whether trials contradict each other, so that the noise was inflated."""
-    return "noise_inflation" in belief.diagnostics.figures
 
 
 def _diagnosed(

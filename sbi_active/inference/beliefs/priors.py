@@ -54,7 +54,8 @@ def require_support(
             "sbi's MultipleIndependent and the method asbi or nsbi, or declare the "
             "choice as an Effect"
         )
-    if _is_constrained(support):
+    tied = tuple(map(type, (constraints.simplex, constraints.corr_cholesky)))
+    if any(isinstance(part, tied) for part in parts_of(support)):
         raise ValueError(
             "expected a prior whose parameters may vary one by one; got "
             f"{_shown_prior(prior)}, which ties them to one another; use parameters "
@@ -98,12 +99,6 @@ def is_discrete(part: Any) -> bool:
     """Return whether a constraint without parts is one of discrete numbers."""
     one_hot = type(constraints.one_hot)
     return bool(getattr(part, "is_discrete", False)) or isinstance(part, one_hot)
-
-
-def _is_constrained(support: Any) -> bool:
-    """Return whether some part of a support has less dimensions than numbers."""
-    tied = (constraints.simplex, constraints.corr_cholesky)
-    return any(isinstance(part, tuple(map(type, tied))) for part in parts_of(support))
 
 
 def _nested(prior: Any) -> Iterator[Any]:

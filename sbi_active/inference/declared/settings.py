@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from sbi_active.expected import require, suggests
+from sbi_active.expected import require, require_least, suggests
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 
@@ -59,14 +57,7 @@ class RefinementOptions:
         return self.num_effective * max(1.0, dim / many)
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("num_histories", 200, np.inf),
-            ("num_effective", 20, np.inf),
-            ("num_draws", 50, np.inf),
-            ("defensive", 1e-6, 0.5),
-        ):
-            value = getattr(self, name)
-            if name == "num_draws" and value is None:
-                continue
-            where = f"{name} in [{low:g}, {high:g}]"
-            require(low <= value <= high, where, value, "choose a value in this range")
+        numbers = {"num_histories": 200, "num_effective": 20, "num_draws": 50}
+        require_least(self, "raise it", **numbers, defensive=1e-6, max_inflations=0)
+        share = self.defensive
+        require(share <= 0.5, "defensive <= 0.5", share, "use a small share")

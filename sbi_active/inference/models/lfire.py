@@ -15,7 +15,7 @@ from torch.distributions import Distribution
 
 from sbi_active.expected import require_least
 from sbi_active.inference.beliefs.belief import ParticleDraws
-from sbi_active.inference.rounds.rows import RoundRows
+from sbi_active.simulation.outcomes import Simulations
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ class LFIREModel:
 
 
 def fit_log_ratios(
-    settings: LFIRE, parts: Sequence[RoundRows], seed: int
+    settings: LFIRE, parts: Sequence[Simulations], seed: int
 ) -> LFIREModel:
     """Fit the log ratio of every particle at every action.
 

@@ -44,15 +44,6 @@ class Observation:
     x: Tensor
 
 
-@dataclass(frozen=True)
-class RoundRows:
-    """Simulations of a round, one a row, in float32."""
-
-    theta: Tensor
-    x: Tensor
-    action: Tensor
-
-
 def round_rows(
     theta: Tensor,
     x: Tensor,
@@ -63,8 +54,8 @@ def round_rows(
     action_dim: int | None,
     exclude_invalid: bool,
     may_be_invalid: bool = False,
-) -> RoundRows:
-    """Return the rows of a round, or say what is wrong with them.
+) -> Simulations:
+    """Return the rows of a round in float32, or say what is wrong with them.
 
     Args:
         theta: Parameters, shape (n, theta_dim), within the prior's support.
@@ -99,7 +90,7 @@ def round_rows(
         )
     x = outcome_rows(x, x.shape[1:] if x_shape is None else x_shape)
     action = action_rows(action, action_dim, num_rows=len(theta))
-    rows = RoundRows(theta, x, action)
+    rows = Simulations(theta, action, x)
     present = x.flatten(1).isfinite()
     invalid = ~(present.all(-1) if exclude_invalid else present.any(-1))
     if bool(invalid.all()) and (exclude_invalid or not may_be_invalid):
@@ -116,7 +107,7 @@ def round_rows(
         "default MixtureDensity network keeps them.",
         stacklevel=4,
     )
-    return RoundRows(theta[~invalid], x[~invalid], action[~invalid])
+    return rows.at(~invalid)
 
 
 def require_whole(x: Tensor) -> None:

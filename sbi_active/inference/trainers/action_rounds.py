@@ -18,8 +18,9 @@ from typing_extensions import Self
 
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.rounds.condition import pack
-from sbi_active.inference.rounds.rows import RoundRows, check_proposal, round_rows
+from sbi_active.inference.rounds.rows import check_proposal, round_rows
 from sbi_active.inference.trainers.base import ActiveInference
+from sbi_active.simulation.outcomes import Simulations
 from sbi_active.threads import single_thread
 
 P = ParamSpec("P")
@@ -178,7 +179,7 @@ class ActionRounds(ActiveInference):
     def _training_defaults(self, given: dict[str, Any]) -> dict[str, Any]:
         """Return arguments of sbi's ``train`` by the settings, before those given."""
 
-    def _stored(self, rows: RoundRows) -> tuple[Tensor, Tensor]:
+    def _stored(self, rows: Simulations) -> tuple[Tensor, Tensor]:
         """Return the parameters and outcomes that sbi's trainer sees."""
         return rows.theta, pack(rows.x, rows.action)
 

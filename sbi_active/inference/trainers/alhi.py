@@ -13,10 +13,10 @@ from torch import Tensor
 from sbi_active.inference.models.factors import ActionLikelihood
 from sbi_active.inference.networks.likelihood_network import LikelihoodNetwork
 from sbi_active.inference.networks.mixture_density import TrainingRecord
-from sbi_active.inference.rounds.rows import RoundRows
 from sbi_active.inference.trainers.action_rounds import extends, takes
 from sbi_active.inference.trainers.mixture_rounds import MixtureRounds
 from sbi_active.inference.trainers.product_rounds import ProductRounds
+from sbi_active.simulation.outcomes import Simulations
 
 
 class ALHI(ProductRounds, MixtureRounds, NLE_A):
@@ -78,7 +78,7 @@ class ALHI(ProductRounds, MixtureRounds, NLE_A):
     ) -> None:
         super().__init__(*args, posterior=posterior, **kwargs)
 
-    def _stored(self, rows: RoundRows) -> tuple[Tensor, Tensor]:
+    def _stored(self, rows: Simulations) -> tuple[Tensor, Tensor]:
         return torch.cat([rows.theta, rows.action], 1), rows.x.flatten(1)
 
     @takes(NLE_A.train)

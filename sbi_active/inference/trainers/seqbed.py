@@ -19,7 +19,6 @@ from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.models.lfire import LFIRE, LFIREModel, fit_log_ratios
 from sbi_active.inference.rounds.rows import (
     Observation,
-    RoundRows,
     require_whole,
     round_rows,
     rows_of,
@@ -27,6 +26,7 @@ from sbi_active.inference.rounds.rows import (
 from sbi_active.inference.trainers.base import ActiveInference, Told
 from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.simulation.outcomes import Simulations
 from sbi_active.threads import single_thread
 
 
@@ -95,7 +95,7 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
                 f"expected num_particles >= 2; got {num_particles}; use about 50"
             )
         self._num_particles = num_particles
-        self._rows: list[RoundRows] = []
+        self._rows: list[Simulations] = []
         self._model: LFIREModel | None = None
         self.trials = []
 
@@ -237,13 +237,9 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         workers = settings.workers
         rows = rows_of(simulator, theta, action, derive_seed(seed, "x"), workers)
         assert rows is not None
-        known = rows.without_missing()
+        folds = derive_seed(seed, "folds")
         with single_thread():
-            model = fit_log_ratios(
-                self._settings,
-                [RoundRows(known.theta, known.x, known.action)],
-                derive_seed(seed, "folds"),
-            )
+            model = fit_log_ratios(self._settings, [rows.without_missing()], folds)
         spent = {"num_simulations": len(rows), "num_missing": rows.counts["missing"]}
         return self._weighted(model, trial, spent)
 
