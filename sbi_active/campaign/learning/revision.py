@@ -14,6 +14,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.learning.pooled import make_learner
 from sbi_active.campaign.state import CampaignState, ModelVersion, Trial
+from sbi_active.expected import require
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import SimulatorModel
 
@@ -118,6 +119,20 @@ def revise(state: CampaignState, actions: ActionSpace, report: Report) -> Learne
     return revised
 
 
+def require_effects(what: str, names: Sequence[str], effects: Sequence[Effect]) -> None:
+    """Raise a ValueError if effects of a campaign are not among those that are given.
+
+    Args:
+        what: Words for the effects of these names.
+        names: Names of effects.
+        effects: Effects that are given.
+    """
+    lacking = {*names} - {effect.name for effect in effects}
+    got = f"none named {', '.join(sorted(map(str, lacking)))}"
+    advice = "pass effects= as they were declared"
+    require(not lacking, f"{what}, {', '.join(map(str, names))}", got, advice)
+
+
 def rebuilt(
     state: CampaignState,
     simulator: Callable[..., Any],
@@ -139,13 +154,7 @@ def rebuilt(
     """
     for before, version in itertools.pairwise(state.versions):
         added = [name for name in version.effects if name not in before.effects]
-        lacking = {*added} - {effect.name for effect in effects}
-        if lacking:
-            raise ValueError(
-                f"expected the effects that the campaign adopted, {', '.join(added)}; "
-                f"got none named {', '.join(sorted(lacking))}; pass effects= as they "
-                "were declared"
-            )
+        require_effects("the effects that the campaign adopted", added, effects)
         then = replace(state, versions=[before], trials=state.trials)
         trials = [t for i in version.trials if (t := state.trials[i]).is_measured]
         criticism = compare(

@@ -11,7 +11,7 @@ from torch.distributions import Distribution
 from sbi_active.actions import ActionSpace
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.learning.pooled import make_learner
-from sbi_active.campaign.learning.revision import rebuilt
+from sbi_active.campaign.learning.revision import rebuilt, require_effects
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.state import CampaignState
 from sbi_active.campaign.storage.codec import Absent, decode
@@ -147,12 +147,7 @@ def load(
                 f"got {'none' if limit is None else 'one'}; pass what the campaign was "
                 "made with"
             )
-    lacking = {*manifest["effects"]} - {effect.name for effect in effects}
-    if lacking:
-        raise ValueError(
-            f"expected the effects {manifest['effects']}; got none named "
-            f"{', '.join(sorted(lacking))}; pass effects= as they were declared"
-        )
+    require_effects("the effects of the campaign", manifest["effects"], effects)
     if simulator_changed:
         storage.write("simulator changed", simulator=fingerprint(simulator))
         apply(state, storage.events[-1])

@@ -264,7 +264,7 @@ def test_adopted_effects_come_back(tmp_path):
     reader = Campaign.load(tmp_path / "c")
     assert torch.equal(draws(reader), draws(campaign))
     assert reader.parameter_names == ["a", "b", "bias"]
-    with pytest.raises(ValueError, match=r"expected the effects \['bias'\]; got"):
+    with pytest.raises(ValueError, match="expected the effects of .*, bias; got"):
         Campaign.load(tmp_path / "c", simulator=MODEL)
     again = Campaign.load(tmp_path / "c", simulator=MODEL, effects=[BIAS])
     assert again.state.version.effects == ("bias",)
