@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import pandas as pd
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.contradictions import Bounds, MissedTrial, OutlyingTrial
 from sbi_active.criticism.under_misfit import Misfit
-
-Array = NDArray[Any]
 
 #: What is no effect: the bare model, the residual process, noise inflation, and a gross
 #: error of one trial.

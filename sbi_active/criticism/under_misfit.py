@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from sbi_active.arrays import Array
 
 #: What is neither named nor declared.
 UNDECLARED = "something undeclared"

@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from sbi_active.arrays import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-Array = NDArray[Any]
 
 CHOSEN = "#c1432e"
 NOTES = {"lower": " (lower bound)", "upper": " (upper bound)", "none": ""}

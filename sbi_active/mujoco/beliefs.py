@@ -8,11 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.seeding import forked_generators
-
-Array = NDArray[Any]
 
 NUM_DRAWS = 10_000
 

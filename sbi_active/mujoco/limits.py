@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.arrays import Array
 from sbi_active.mujoco.models.machine import Machine
 from sbi_active.mujoco.models.names import names_of, require_name, scalar_joints
 from sbi_active.mujoco.robot import Robot
@@ -23,8 +23,6 @@ from sbi_active.mujoco.sensors import (
 from sbi_active.mujoco.simulator import MujocoFunction
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
-
-Array = NDArray[Any]
 
 #: Readings of all rows that are in memory at once.
 NUMBERS = 20_000_000

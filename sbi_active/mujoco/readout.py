@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from sbi_active.arrays import Array
 
 #: Share of a step by which a time may be off and count as that of a step.
 ON_TIME = 1e-3

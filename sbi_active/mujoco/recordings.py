@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.callers import stack_level
 from sbi_active.criticism.data.recordings import find_recordings
 from sbi_active.criticism.data.table_rows import (
@@ -24,8 +24,6 @@ from sbi_active.expected import did_you_mean
 from sbi_active.messages import warn
 from sbi_active.mujoco.models.names import held_places, names_of, start_places
 from sbi_active.mujoco.simulator import Channel
-
-Array = NDArray[Any]
 
 START = "start "
 #: Relative excess over a range that is rounding.

@@ -6,16 +6,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sbi_active.actions import DiscreteActions
+from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.mujoco.models.parameters import Bounded
 from sbi_active.mujoco.robot import Robot, named_box
 from sbi_active.simulation import SimulatorModel
-
-Array = NDArray[Any]
 
 
 def free_parameters(params: Any) -> tuple[Bounded, ...]:

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sbi_active.arrays import Array
 from sbi_active.mujoco.models.changes import StateChange, require_changes
 from sbi_active.mujoco.models.machine import Machine, Model, Rows
 from sbi_active.mujoco.models.names import (
@@ -23,8 +24,6 @@ from sbi_active.mujoco.models.names import (
 from sbi_active.mujoco.models.running import held_states, readings
 from sbi_active.mujoco.models.spec import mujoco_of
 from sbi_active.mujoco.readout import held, num_steps, sampled
-
-Array = NDArray[Any]
 
 Watch = Callable[[Model, list[Any], Rows], Any]
 

@@ -15,12 +15,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, DiscreteActions
 from sbi_active.actions.signals import SignalActions
 from sbi_active.actions.waveforms import Recorded
+from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.expected import suggests
 from sbi_active.mujoco.idle import warn_of_idle
@@ -35,8 +35,6 @@ from sbi_active.mujoco.simulator import MODEL, RECORDING, Channel, MujocoFunctio
 from sbi_active.mujoco.transforms import Signal, SignalReadout
 from sbi_active.simulation import AutocorrelatedNoise, SimulatorModel
 from sbi_active.simulation.noise.base import NoiseModel
-
-Array = NDArray[Any]
 
 #: Unknown errors, from this share of a signal's deviation up to all of it, lasting from
 #: this share of a sample's distance up to this share of a trial.

@@ -8,9 +8,8 @@ from fnmatch import fnmatch
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[Any]
+from sbi_active.arrays import Array
 
 
 @dataclass(frozen=True)

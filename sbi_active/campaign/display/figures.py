@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.arrays import Array
 from sbi_active.campaign.health import health_by_trial
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.design.drawing import draw, labels_of
@@ -21,8 +21,6 @@ from sbi_active.simulation import simulate
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-Array = NDArray[Any]
 
 #: Quantiles that are drawn: the median, half and nine tenths of the belief.
 LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)

@@ -7,14 +7,13 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from sbi_active.arrays import Array
 from sbi_active.callers import stack_level
 from sbi_active.criticism.data.arrays import padded
 from sbi_active.messages import warn
 
-Array = NDArray[Any]
 Hold = Literal["previous", "linear"]
 
 #: Median steps from which a step is a gap.

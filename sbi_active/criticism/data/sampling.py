@@ -19,11 +19,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True, kw_only=True)

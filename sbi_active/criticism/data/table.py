@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.callers import stack_level
 from sbi_active.criticism.data.table_columns import (
     Columns,
@@ -26,8 +26,6 @@ from sbi_active.criticism.data.table_columns import (
 )
 from sbi_active.criticism.data.table_rows import Rows, read_frame
 from sbi_active.messages import ChangedWarning, warn
-
-Array = NDArray[Any]
 
 SHOWN = 5  # places that a message lists
 

@@ -11,11 +11,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.data.table_columns import PREFIXES, Columns
-
-Array = NDArray[Any]
 
 EMPTY = ("", "nan", "none", "na", "<na>")
 

@@ -22,18 +22,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.stats import chi2
 from torch import Tensor
 from torch.distributions import Independent, Normal
 
+from sbi_active.arrays import Array
 from sbi_active.callers import stack_level
 from sbi_active.criticism.data.arrays import repeated
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Context, Effect, Hook
 from sbi_active.messages import warn
-
-Array = NDArray[Any]
 
 #: Standard errors in a deviation of the nuisance.
 WIDTH = 3.0

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
@@ -26,8 +25,6 @@ from sbi_active.criticism.effects.effect import Context, Effect
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.simulation.noise.base import declared_sds
-
-Array = NDArray[Any]
 
 #: Numbers a trial beyond which summaries are taken unless they are refused.
 MANY = 500

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.results import Evidence
 from sbi_active.criticism.rivals.error_models import ErrorModel, NoiseGrid
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.engine import Fit as Sampled
 from sbi_active.inference.engine import WeightedDraws
 from sbi_active.inference.sampling.weights import effective_sample_size, normalized
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.evidence.settings import THOROUGH
 from sbi_active.criticism.rivals.error_models import NoiseGrid
 from sbi_active.criticism.rivals.rival import Rival
@@ -17,8 +15,6 @@ from sbi_active.inference.sampling.mixtures import (
     lower_factors,
 )
 from sbi_active.seeding import derive_seed
-
-Array = NDArray[Any]
 
 #: Finite-difference steps in prior deviations, and where two of them count as one; a
 #: coarse one, whose slope is of the same kind where nothing jumps.

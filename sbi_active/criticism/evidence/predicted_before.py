@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
-
-Array = NDArray[Any]
 
 #: A choice: of the prior, which gives deviations to 5 % at a simulation of all trials.
 NUM_DRAWS = 200

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
+from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
@@ -39,8 +40,6 @@ from sbi_active.inference.engine import Found, WeightedDraws, infer, search
 from sbi_active.inference.engine.search import SearchSettings
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import AutocorrelatedNoise, GaussianNoise, SimulatorModel
-
-Array = NDArray[Any]
 
 NUM_DRAWS = 400  # kept of a model; a mean is then known to a 20th of a deviation
 #: Trials from which their order may be what residuals follow.

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect
@@ -18,8 +18,6 @@ from sbi_active.criticism.forces.dictionary import SIZES
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from torch.distributions import Distribution
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
@@ -38,8 +38,6 @@ from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.inference.sampling.least_squares import basis_of
 from sbi_active.simulation import SimulatorModel
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

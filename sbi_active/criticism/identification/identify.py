@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.stats import norm, rankdata
 from torch.distributions import Distribution
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.checks import require_fitting
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
@@ -30,8 +29,6 @@ from sbi_active.inference.sampling.weights import (
 )
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel
-
-Array = NDArray[Any]
 
 
 class IdentifiedBelief(KernelBelief):

@@ -24,12 +24,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.identification.settings import SamplerSettings
 from sbi_active.criticism.linear.processes import Grams, Processes
 from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.truncated import log_inside, truncated_normal
 
-Array = NDArray[Any]
 Flags = NDArray[np.bool_]
 
 TINY = 1e-300  # keeps logarithms finite

@@ -12,16 +12,13 @@ References:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.identification.fitting import Fitted
 from sbi_active.criticism.linear.processes import parts_of
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

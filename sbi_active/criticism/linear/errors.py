@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.linear.mixture import WIDTHS, summed
 from sbi_active.criticism.linear.model import LinearModel
@@ -39,8 +40,6 @@ from sbi_active.criticism.linear.processes import (
 from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseGrid
 from sbi_active.criticism.steps.nuisances import is_first_part
 from sbi_active.inference.sampling.weights import log_sum_exp
-
-Array = NDArray[Any]
 
 #: Sizes of the process in sensor deviations, a factor apart.
 SMALLEST, LARGEST, FACTOR = 0.3, 40.0, 1.63

@@ -7,11 +7,10 @@ fit, which whatever is linear rests on.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.linear.model import (
     LinearModel,
     centered,
@@ -20,8 +19,6 @@ from sbi_active.criticism.linear.model import (
 )
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.sampling.least_squares import descend
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True, kw_only=True)

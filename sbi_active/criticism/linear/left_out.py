@@ -8,17 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.linear.errors import Errors, Grams, Posterior
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.results import ModelKey
 from sbi_active.inference.sampling.least_squares import within
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.linear.errors import Errors, Grams, Posterior
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.tracing import log_prior
-
-Array = NDArray[Any]
 
 
 class Library:

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.inference.sampling.truncated import log_inside
 from sbi_active.inference.sampling.weights import log_sum_exp
-
-Array = NDArray[Any]
 
 #: Factors on the scale of an effect's prior, equally likely.
 WIDTHS = (1 / 3, 1.0, 3.0)

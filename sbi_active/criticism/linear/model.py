@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import LOG_2PI, student
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.least_squares import within
-
-Array = NDArray[Any]
 
 #: Share of the squares that is added to them, so that a flat direction is solved for.
 RIDGE = 1e-9

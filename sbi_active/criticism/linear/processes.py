@@ -18,14 +18,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True, kw_only=True)

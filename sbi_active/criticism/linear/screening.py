@@ -10,11 +10,10 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.linear.fits import JUMPING, FitSettings
@@ -24,8 +23,6 @@ from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.channel_noise import ChannelNoise
 from sbi_active.criticism.steps.equivalence import MANY
 from sbi_active.criticism.steps.tracing import log_priors
-
-Array = NDArray[Any]
 
 #: Effects that are kept: the best alone, members of the best pairs, and those whose
 #: linear optimum leaves the smallest residual of the simulator itself.

@@ -12,11 +12,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.evidence.predicted_before import NUM_DRAWS
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
@@ -43,8 +43,6 @@ from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.steps.tracing import log_prior
 from sbi_active.seeding import derive_seed
-
-Array = NDArray[Any]
 
 
 @dataclass

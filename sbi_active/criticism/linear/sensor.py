@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.evidence.predicted_before import NUM_DRAWS
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.fits import FitSettings, best_fit
@@ -18,8 +17,6 @@ from sbi_active.criticism.rivals.channel_noise import ChannelNoise, SettledNoise
 from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import measurement_sds
 from sbi_active.seeding import derive_seed
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

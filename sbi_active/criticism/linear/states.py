@@ -14,13 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.linear.left_out import Candidate
 from sbi_active.criticism.linear.mixture import WIDTHS, Mixture, summed
@@ -34,8 +34,6 @@ from sbi_active.criticism.rivals.validity import (
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.support import support_bounds, support_of
-
-Array = NDArray[Any]
 
 
 @dataclass

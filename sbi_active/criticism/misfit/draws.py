@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.rival_set import NUM_DRAWS, RivalSet
 from sbi_active.criticism.linear.model import LinearModel
@@ -15,8 +14,6 @@ from sbi_active.criticism.results import Evidence, ModelKey
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.engine import WeightedDraws
 from sbi_active.seeding import derive_seed
-
-Array = NDArray[Any]
 
 
 def bends(search: Search, key: ModelKey, *, num: int = 16, most: float = 0.5) -> bool:

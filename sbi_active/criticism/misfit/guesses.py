@@ -15,13 +15,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.linear.left_out import leave_out
 from sbi_active.criticism.linear.mixture import summed
 from sbi_active.criticism.linear.model import LinearModel
@@ -29,8 +29,6 @@ from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.scored import predicts_better
 from sbi_active.criticism.results import ModelKey
 from sbi_active.inference.sampling.weights import log_sum_exp
-
-Array = NDArray[Any]
 
 #: Nats by which a formula must beat what it stands for to be printed, and a simpler one
 #: to be taken in its place.

@@ -24,19 +24,16 @@ center is that of least squares, which predicts new trials better.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.linear.errors import Errors
 from sbi_active.criticism.linear.left_out import Candidate
 from sbi_active.criticism.linear.mixture import WIDTHS, summed
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.processes import Filter, Processes, alike
 from sbi_active.inference.sampling.eigen import eigh
-
-Array = NDArray[Any]
 
 
 def covariance(own: Candidate, errors: Errors, action: Array) -> Array:

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sbi_active.actions import ActionSpace
+from sbi_active.arrays import Array
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.criticism.steps.equivalence import every_action, noise_unit
 from sbi_active.seeding import derive_seed
-
-Array = NDArray[Any]
 
 
 def near_aliases(

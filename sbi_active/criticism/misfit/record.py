@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.actions import ActionSpace
+from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.fit import Fit
@@ -39,8 +39,6 @@ from sbi_active.criticism.steps.tracing import (
 )
 from sbi_active.criticism.under_misfit import Misfit as Found
 from sbi_active.criticism.under_misfit import ModelError
-
-Array = NDArray[Any]
 
 #: Probability from which an admitted model is recorded with its errors and draws, and
 #: how many are at most.

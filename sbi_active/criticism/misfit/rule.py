@@ -42,18 +42,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sbi_active.criticism.misfit.scored import Scored, predicts_better
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.under_misfit import Support
 from sbi_active.expected import suggests
 from sbi_active.inference.sampling.weights import log_sum_exp
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.results import OUTLIER, UNEXPLAINED
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.contradictions import OutlyingTrial
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.linear.errors import Posterior
@@ -40,8 +40,6 @@ from sbi_active.criticism.steps.missed_trials import outlying_trials
 from sbi_active.criticism.steps.tracing import RESCALED, kind_of, log_bayes_factor
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed
-
-Array = NDArray[Any]
 
 
 def judge(

@@ -19,15 +19,12 @@ References:
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.results import ModelKey
 from sbi_active.inference.sampling.weights import log_sum_exp
-
-Array = NDArray[Any]
 
 
 def weights_by_error(

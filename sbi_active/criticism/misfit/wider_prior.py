@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.contradictions import BoundParameter, Bounds
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import NONE, UNEXPLAINED, ModelKey, Tracing
@@ -18,8 +18,6 @@ from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.criticism.steps.influence import withdrawn
 from sbi_active.inference.sampling.least_squares import descend
 from sbi_active.seeding import derive_seed
-
-Array = NDArray[Any]
 
 #: Draws of a posterior that say whether it lies at a bound, and steps of a refit.
 NUM_DRAWS, STEPS = 400, 30

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, DiscreteActions
+from sbi_active.arrays import Array
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.next_trial.candidates import (
@@ -26,8 +25,6 @@ from sbi_active.criticism.steps.predictive import predict
 from sbi_active.design.design import Design
 from sbi_active.design.designer import InformationGainDesigner
 from sbi_active.seeding import derive_seed
-
-Array = NDArray[Any]
 
 
 class PredictedRival:

@@ -19,14 +19,12 @@ References:
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace
+from sbi_active.arrays import Array
 from sbi_active.criticism.contradictions import SevereTest
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.next_trial.candidates import (
@@ -38,8 +36,6 @@ from sbi_active.criticism.next_trial.candidates import (
 )
 from sbi_active.criticism.results import UNEXPLAINED, ModelKey, Tracing
 from sbi_active.criticism.steps.predictive import Prediction, predict
-
-Array = NDArray[Any]
 
 
 def severe_tests(

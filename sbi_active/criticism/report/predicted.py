@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.display.page import Section
 from sbi_active.display.table import Table
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True, kw_only=True)

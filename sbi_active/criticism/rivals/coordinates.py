@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -11,13 +10,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.joint_prior import JointPrior
 from sbi_active.criticism.rivals.energy import dissipative_bounds
 from sbi_active.seeding import forked_generators
 from sbi_active.support import support_bounds, support_of
-
-Array = NDArray[Any]
 
 #: A positive number whose prior spans this ratio (5 % to 95 %) is searched in logs.
 WIDE = 100.0

@@ -7,15 +7,11 @@ any damping, fits what was tried a little better, and diverges beyond.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.effects.effect import Context, Effect
-
-Array = NDArray[Any]
 
 
 def dissipative_bounds(effect: Effect) -> tuple[Array, Array]:

@@ -10,17 +10,16 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 from typing_extensions import override
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.inference.sampling.weights import log_sum_exp
 
-Array = NDArray[Any]
 Whitener = Callable[[Array], Array]
 
 LOG_2PI = float(np.log(2 * np.pi))

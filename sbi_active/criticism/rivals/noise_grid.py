@@ -9,14 +9,13 @@ import torch
 from numpy.typing import NDArray
 from torch.distributions import Distribution
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.rivals.channel_noise import ChannelNoise
 from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.noise.base import NoiseModel, declared_sds
 from sbi_active.simulation.noise.posterior import NoisePosterior, SdGrid
-
-Array = NDArray[Any]
 
 #: Cells of the correlation time, from half a sample step to twice the recording, and
 #: the prior probability of no correlation at all.

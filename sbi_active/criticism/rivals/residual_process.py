@@ -21,12 +21,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.rivals.error_models import (
     LOG_2PI,
@@ -37,8 +37,6 @@ from sbi_active.criticism.rivals.error_models import (
 )
 from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.weights import log_sum_exp
-
-Array = NDArray[Any]
 
 #: Length scales, in ranges of the action space: a local and a global misfit.
 LENGTHS = (0.1, 0.3)

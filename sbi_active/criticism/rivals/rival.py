@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from torch.distributions import Distribution
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
 from sbi_active.criticism.rivals.error_models import ErrorModel, NoiseGrid, Whitener
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.criticism.rivals.validity import log_outcomes
-
-Array = NDArray[Any]
 
 STEP = 1e-3  # of finite differences, in deviations of the prior
 #: Square that stands for the reference of a random simulator's deviations: a thirtieth

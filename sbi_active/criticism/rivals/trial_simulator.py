@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
@@ -20,7 +18,6 @@ from sbi_active.criticism.effects.trial_conditions import (
 from sbi_active.inference.sampling.row_cache import RowCache
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 
-Array = NDArray[Any]
 Prediction = tuple[Array, "Array | None", Array]
 
 #: Draws a row from which a stochastic simulator's mean and deviation are taken.

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from sbi_active.actions import ActionSpace
+from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.rival_set import RivalSet
@@ -21,8 +22,6 @@ from sbi_active.criticism.rivals.noise_grid import declared_noise
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.inference.sampling.least_squares import basis_of
 from sbi_active.seeding import derive_seed, forked_generators
-
-Array = NDArray[Any]
 
 #: Effects of a library whose pairs are all compared, and that are all fitted.
 MANY = 24

@@ -7,17 +7,15 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import NONE, Evaluation, Tracing
 from sbi_active.criticism.steps.missed_trials import LEVEL, missed_trials
 from sbi_active.criticism.steps.predictive import NUM_DRAWS, Prediction, predict
 from sbi_active.simulation import GaussianNoise
-
-Array = NDArray[Any]
 
 #: Metrics whose "ratio" is a difference, after minus before.
 DIFFERENCES = ("log predictive density", "coverage")

@@ -9,11 +9,11 @@ from the weighted sample behind the evidence, which costs no simulation.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.results import (
     CATCH_ALLS,
     NONE,
@@ -25,8 +25,6 @@ from sbi_active.criticism.results import (
 )
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.criticism.under_misfit import Misfit
-
-Array = NDArray[Any]
 
 #: Score of trials that speaks against effects.
 DENSITY = "log predictive density"

@@ -18,13 +18,13 @@ References:
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 from scipy.stats import t as student
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.contradictions import MissedTrial
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
@@ -36,8 +36,6 @@ from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.criticism.steps.predictive import Prediction, correlated_errors
 from sbi_active.criticism.under_misfit import Misfit
 from sbi_active.seeding import derive_seed
-
-Array = NDArray[Any]
 
 #: Probability that a right verdict has any of its held-out trials called far outside,
 #: as that of the chi-squares that refute. What is in another unit, or of another

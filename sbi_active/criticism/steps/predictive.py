@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.rival_set import RivalSet
@@ -19,8 +18,6 @@ from sbi_active.criticism.rivals.validity import log_outcomes
 from sbi_active.criticism.steps.nuisances import conditioned, is_first_part
 from sbi_active.inference.sampling.weights import log_sum_exp
 from sbi_active.seeding import derive_seed, forked_generators
-
-Array = NDArray[Any]
 
 #: A choice: each draw costs a simulation of every trial.
 NUM_DRAWS = 200

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.results import Estimate, Evidence, ModelKey, Tracing
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.seeding import derive_seed
-
-Array = NDArray[Any]
 
 
 def widened(

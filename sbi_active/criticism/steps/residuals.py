@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import ModelKey, Residuals
 from sbi_active.criticism.steps.predictive import Prediction, predict
-
-Array = NDArray[Any]
 
 
 def find_residuals(

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from math import comb
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.rival_set import RivalSet
@@ -21,8 +19,6 @@ from sbi_active.criticism.results import (
 )
 from sbi_active.criticism.steps.detection import alternatives
 from sbi_active.inference.sampling.weights import log_sum_exp
-
-Array = NDArray[Any]
 
 #: All sets of one effect more are together this much less probable, nats.
 COST = float(np.log(3.0))

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import override
 
+from sbi_active.arrays import Array
 from sbi_active.mujoco.models.changes import ModelChange, StateChange
 from sbi_active.mujoco.models.names import element_id, names_of
 from sbi_active.mujoco.models.quantities import (
@@ -19,8 +19,6 @@ from sbi_active.mujoco.models.quantities import (
     field_of,
 )
 from sbi_active.mujoco.models.spec import mujoco_of
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

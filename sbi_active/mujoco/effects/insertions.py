@@ -20,14 +20,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import override
 
+from sbi_active.arrays import Array
 from sbi_active.mujoco.models.changes import Insertion
 from sbi_active.mujoco.models.names import element_id
 from sbi_active.mujoco.models.spec import mujoco_of
-
-Array = NDArray[Any]
 
 #: What an inserted joint is called after its joint.
 INSERTED = " (inserted)"

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.mujoco.models.machine import Rows
 from sbi_active.mujoco.models.names import element_id, start_places
@@ -17,8 +17,6 @@ from sbi_active.mujoco.models.running import begin, start_states
 from sbi_active.mujoco.models.spec import mujoco_of
 from sbi_active.mujoco.simulator import MujocoFunction
 from sbi_active.simulation import SimulatorModel
-
-Array = NDArray[Any]
 
 #: Rows that are looked at, and states in each.
 NUM_ROWS, NUM_STATES = 4, 200

@@ -11,10 +11,9 @@ from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import override
 
-Array = NDArray[Any]
+from sbi_active.arrays import Array
 
 
 class ModelChange(ABC):

@@ -9,15 +9,13 @@ from itertools import compress, product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.mujoco.models.changes import Insertion, ModelChange, StateChange
 from sbi_active.mujoco.models.names import names_of, start_places
 from sbi_active.mujoco.models.parameters import Bounded, Writer, renew, writer_of
 from sbi_active.mujoco.models.quantities import copied, restore
 from sbi_active.mujoco.models.spec import Source, mujoco_of, quiet
-
-Array = NDArray[Any]
 
 #: Models at a time: more gain nothing, and each has memory of its own.
 POOL = 32

@@ -20,8 +20,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.mujoco.models.quantities import (
     FRAMES,
     Entry,
@@ -32,8 +32,6 @@ from sbi_active.mujoco.models.quantities import (
     set_to,
 )
 from sbi_active.mujoco.models.spec import mujoco_of
-
-Array = NDArray[Any]
 
 #: What ``mj_setConst`` makes of the other fields.
 DERIVED = (

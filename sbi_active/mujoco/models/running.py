@@ -12,15 +12,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sbi_active.arrays import Array
 from sbi_active.mujoco.models.changes import StateChange
 from sbi_active.mujoco.models.machine import Model, Rows
 from sbi_active.mujoco.models.names import element_id, start_places
 from sbi_active.mujoco.models.quantities import field_of
 from sbi_active.mujoco.models.spec import mujoco_of
-
-Array = NDArray[Any]
 
 
 def readings(model: Model, models: list[Any], rows: Rows, *, threads: int = 1) -> Array:
