@@ -59,6 +59,7 @@ class Search:
         found: Fitted models, the bare one first.
         errors: Errors that all models share; known after the bare fit.
         names: Effects that change the prediction, of which sets are fitted.
+        units: Deviations of residuals in a search, (N,); (2 N,) if it is random.
     """
 
     rivals: RivalSet
@@ -72,10 +73,10 @@ class Search:
         self.names = [e.name for e in effects if e.hook != "noise"]
         self._rivals: dict[ModelKey, Rival] = {}
         self._reference: Array | None = None
-        self._units = self.sensor.unit
+        self.units = self.sensor.unit
         if self.rivals.simulator.is_stochastic:
             self._reference = self.sensor.unit
-            self._units = np.ones(2 * len(self._units))
+            self.units = np.ones(2 * len(self.units))
         self._library: Library | None = None
         self._processes: dict[bytes, ResidualProcess] = {}
         self._looked_again = False
@@ -107,7 +108,7 @@ class Search:
         self._looked_again = True
         key, settings = ModelKey(), self.settings
         found = self.rivals.found[key] = self.rivals.search(key)
-        own = self._rival(key)
+        own = self.rival(key)
         best = min(
             (self._polished(own, u) for u in found.modes[: settings.num_kept]),
             key=lambda fit: fit.cost,
@@ -158,10 +159,10 @@ class Search:
             self.fit_set(ModelKey((name,)))
         if not new:
             return
-        bare, rival = self.found[ModelKey()].model, self._rival(ModelKey())
+        bare, rival = self.found[ModelKey()].model, self.rival(ModelKey())
         best = {key: self.columns(key, ModelKey()) for key in self._best(1)}
         u = np.array([self.found[k].model.u[own] for k, own in best.items()])
-        square = ((rival.residual(u)[0] / self._units) ** 2)[:, : bare.num].mean(1)
+        square = ((rival.residual(u)[0] / self.units) ** 2)[:, : bare.num].mean(1)
         if square.min() < 2 * bare.rms**2:
             again = self._polished(rival, u[int(np.argmin(square))])
             if again.cost < bare.cost:
@@ -233,7 +234,7 @@ class Search:
 
     def columns(self, key: ModelKey, part: ModelKey) -> NDArray[np.bool_]:
         """Return the coordinates of a model that one with fewer effects has."""
-        rival = self._rival(key)
+        rival = self.rival(key)
         keep = np.ones(rival.dim, dtype=bool)
         for name in {*key.effects} - {*part.effects}:
             keep[rival.columns()[name]] = False
@@ -247,17 +248,17 @@ class Search:
         The column is a chord and no tangent: many effects are flat at their null.
         """
         key = self._joined(base, [name])
-        rival, model = self._rival(key), self.found[base].model
+        rival, model = self.rival(key), self.found[base].model
         null, step = self._at_null(name)
         start = np.empty(rival.dim)
         own = ~self.columns(key, base)
         start[~own], start[own] = model.u, null
-        slope = chords(rival, start, own, step, model, self._units)
+        slope = chords(rival, start, own, step, model, self.units)
         return enlarged(model, rival, own, null, slope), own
 
     def rms(self, key: ModelKey, u: Array) -> float:
         """Return the rms residual of a model anywhere, in sensor deviations."""
-        r = self._rival(key).residual(u[None])[0] / self._units
+        r = self.rival(key).residual(u[None])[0] / self.units
         return float(np.sqrt(np.mean(r[:, : len(self.unit)] ** 2)))
 
     def _best(self, size: int) -> list[ModelKey]:
@@ -306,25 +307,26 @@ class Search:
         return is_force(effect) and effect.phi_dim > 1
 
     def _at_null(self, name: str) -> tuple[Array, Array]:
-        alone = self._rival(ModelKey((name,)))
+        alone = self.rival(ModelKey((name,)))
         return at_null(alone, self.rivals.effects[name], self.settings.tried)
 
-    def _rival(self, key: ModelKey) -> Rival:
+    def rival(self, key: ModelKey) -> Rival:
+        """Return a model that may be fitted."""
         if key not in self._rivals:
             given = {"reference": self._reference, "df": self.sensor.df}
             self._rivals[key] = self.rivals.rival(key, **given)
         return self._rivals[key]
 
     def _fit_bare(self) -> LinearModel:
-        rival = self._rival(ModelKey())
+        rival = self.rival(ModelKey())
         # Draws of the prior predictive, which are simulated already.
         seed = derive_seed(self.rivals.seed, "spread")
         u = rival.coordinates.sample(NUM_DRAWS, seed=seed)
-        return best_fit(rival, u, self._units, self.settings)
+        return best_fit(rival, u, self.units, self.settings)
 
     def _fit(self, key: ModelKey, parents: Sequence[ModelKey]) -> LinearModel:
         """Fit a set of effects from the smaller one that leaves least."""
-        rival = self._rival(key)
+        rival = self.rival(key)
         parent = min(parents, key=lambda p: self.found[p].model.cost)
         base, model = parent, self.found[parent].model
         for name in key.effects:
@@ -334,7 +336,7 @@ class Search:
         r, jacobian = searched_from(rival, model)
         known = r[None] / scale, jacobian[None] / scale
         u = np.clip(model.u, model.low, model.high)[None]
-        secant, unit = self.settings.secant, self._units * scale
+        secant, unit = self.settings.secant, self.units * scale
         own = unit * model.scale if np.isfinite(rival.df) else unit
         u, _ = along_secants(rival, u, own, secant, known)
         fits = [self._polished(rival, u[0])]
@@ -361,12 +363,12 @@ class Search:
         key = self._joined(model.key, [name])
         new = ~self.columns(key, model.key)
         return enlarged(
-            *(model, self._rival(key), new, beside.u[own], beside.jacobian[:, own])
+            *(model, self.rival(key), new, beside.u[own], beside.jacobian[:, own])
         )
 
     def _starts(self, key: ModelKey, parent: ModelKey) -> Array:
         """Return starts of a set's fit beside its linear optimum, shape (n, d)."""
-        own, rival, model = self.settings, self._rival(key), self.found[parent].model
+        own, rival, model = self.settings, self.rival(key), self.found[parent].model
         c, shared = rival.coordinates, self.columns(key, parent)
         u = c.sample(own.num_drawn, seed=derive_seed(self._seed, str(key)))
         u[:, shared] = model.u
@@ -374,7 +376,7 @@ class Search:
         if not all(has_null(self.rivals.effects[n]) for n in key.effects):
             seed = derive_seed(self._seed, str(key), "screened")
             far = c.sample(own.num_far, seed=seed)
-            square = ((rival.residual(far)[0] / self._units) ** 2).sum(1)
+            square = ((rival.residual(far)[0] / self.units) ** 2).sum(1)
             starts.append(far[np.argsort(square)[: own.num_kept_far]])
         return np.clip(np.concatenate(starts), c.low, c.high)
 
@@ -384,7 +386,7 @@ class Search:
         A set fits no worse than its part. Where it seems to, its fit was lost where an
         effect as strong as its prior holds the machine still, or throws it about.
         """
-        rival, model = self._rival(key), self.found[parent].model
+        rival, model = self.rival(key), self.found[parent].model
         u, columns = np.empty(rival.dim), rival.columns()
         u[self.columns(key, parent)] = model.u
         for name in {*key.effects} - {*parent.effects}:
@@ -393,4 +395,4 @@ class Search:
         return u
 
     def _polished(self, rival: Rival, u: Array) -> LinearModel:
-        return polished(rival, u, self._units, self.settings)
+        return polished(rival, u, self.units, self.settings)

@@ -13,7 +13,7 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.linear.errors import Posterior
-from sbi_active.criticism.linear.left_out import leave_out
+from sbi_active.criticism.linear.fits import refitted
 from sbi_active.criticism.linear.model import LinearModel, reweighted_at
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.draws import bends, linear_fit
@@ -228,7 +228,8 @@ def _beside(
     own, errors = misfit.search.found[key], misfit.search.errors
     model, log_z, best = own.model, own.posterior.log_process, own.model.u
     if use is not None:
-        best = leave_out(model, errors, use).fit
+        search, kept = misfit.search, use[errors.fold]
+        best = refitted(search.rival(key), model, search.units, kept)
     return linear_fit(
         *(misfit.rivals, key, model, best, misfit.covariance(key), log_z),
         best=best,
