@@ -1,9 +1,7 @@
 r"""What a real table may have and the scene lacks.
 
 Each effect vanishes exactly at its null. ``describe`` quotes the shift that it makes of
-the cube's x at 3, 5 and 7 m/s, for theta = (.2, .2, .2) on a table without end;
-``python -m benchmarks box_collision.shifts`` measures it, there and at other
-parameters, into ``benchmarks/box_collision/shifts.csv``.
+the cube's x at 3, 5 and 7 m/s, for theta = (.2, .2, .2) on a table without end.
 
 A central push shows only x. A gain and an offset of the speed then differ by how they
 grow with the speed alone, and so do a tilt and a force; a shift of the pusher's aim or

@@ -21,8 +21,7 @@ from sbi_active.simulation.bank.store import Store
 from sbi_active.support import log_density
 
 #: Bytes of a segment: what reading one row may cost in memory. With 16 MiB, ten rows of
-#: 1 MB one by one take four times the CPU, and nothing else takes less
-#: (``python -m benchmarks cost.store``).
+#: 1 MB one by one take four times the CPU, and nothing else takes less.
 SEGMENT_BYTES = 4 * 2**20
 COLUMNS = ("theta", "action", "x", "status", "index", "log_proposal")
 #: Entries of a header, and what they may be.
