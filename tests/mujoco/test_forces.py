@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sbi_active.criticism import AugmentedSimulator, Trials
-from sbi_active.criticism.forces.trajectories import trajectories
+from sbi_active.criticism.forces.library import trajectories
 from sbi_active.mujoco import force_effects, from_mjcf
 
 CART = """<mujoco><option timestep=".002"/><worldbody>

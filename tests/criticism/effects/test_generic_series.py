@@ -13,7 +13,7 @@ from sbi_active.criticism import (
     Trials,
     generic_effects,
 )
-from sbi_active.criticism.effects.series import delayed_input, played
+from sbi_active.criticism.effects.changes import delayed_input, played
 from tests.criticism.motor_world import GRID, MODEL, NOISE, PRIOR, measured, speed
 
 ACTUATOR = {

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from sbi_active.criticism.effects.series import (
+from sbi_active.criticism.effects.changes import (
     delayed_input,
     delayed_samples,
     lagged_input,

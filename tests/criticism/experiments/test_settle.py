@@ -10,8 +10,7 @@ from sbi.utils import BoxUniform
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials, close_loop
 from sbi_active.criticism.experiments.choice import limit_of
-from sbi_active.criticism.experiments.journal import NAME
-from sbi_active.criticism.experiments.settle import VerdictError, settle
+from sbi_active.criticism.experiments.settle import NAME, VerdictError, settle
 from tests.effects import on_outcomes
 
 NOISE = 0.1

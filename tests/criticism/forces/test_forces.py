@@ -11,7 +11,7 @@ from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.forces import force_effects, total_force
 from sbi_active.criticism.forces.dictionary import FORMS, FREE
-from sbi_active.criticism.forces.trajectories import trajectories
+from sbi_active.criticism.forces.library import trajectories
 
 TIMES = torch.linspace(0.1, 2.0, 20, dtype=torch.float64)
 STEP, SD, MASS = 0.02, 0.003, 2.0

@@ -9,7 +9,7 @@ from torch.distributions import Independent, Normal
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.forces import force_effects, total_force
-from sbi_active.criticism.rivals.energy import dissipative_bounds
+from sbi_active.criticism.rivals.coordinates import dissipative_bounds
 
 STEP, NUM = 0.02, 100
 
