@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from torch.distributions import Distribution
 
@@ -312,9 +312,8 @@ class Criticism:
             return evaluate_held_out(self.rivals, tracing, held_out, **self._fewer)
         if int(self.trials.valid.sum()) < FEWEST_TRIALS:
             return None
-        what = "error before and after, a verdict without each trial"
-        with stage(what, show_progress=self.show_progress):
-            return evaluate_left_out(self._judge(), trials.fit, **self._fewer)
+        options: dict[str, Any] = {"show_progress": self.show_progress, **self._fewer}
+        return evaluate_left_out(self._judge(), trials.fit, **options)
 
     def judged(self, evaluation: Evaluation | None) -> Tracing:
         """Return the tracing, unless trials that had no part in it speak against it.

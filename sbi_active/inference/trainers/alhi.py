@@ -53,6 +53,7 @@ class ALHI(ProductRounds, MixtureRounds, NLE_A):
 
     Example:
         >>> from sbi.utils import BoxUniform
+        >>> from sbi_active import MixtureDensity
         >>> _ = torch.manual_seed(0)
         >>> prior = BoxUniform(-torch.ones(1), torch.ones(1))
         >>> theta, action = prior.sample((500,)), torch.rand(500, 1)
