@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from torch.distributions import Distribution
@@ -307,6 +308,10 @@ class Criticism:
         Otherwise each trial is predicted by models that were chosen and fitted without
         it; None with fewer than four trials.
         """
+        return self._evaluation
+
+    @cached_property
+    def _evaluation(self) -> Evaluation | None:
         tracing, trials = self.trace(), self._parts[1]
         if (held_out := trials.held_out) is not None:
             return evaluate_held_out(self.rivals, tracing, held_out, **self._fewer)

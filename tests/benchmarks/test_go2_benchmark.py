@@ -21,6 +21,7 @@ def leg():
     return read_leg(DATA, "FL")
 
 
+@pytest.mark.slow
 @needs_data
 def test_friction_by_position_follows_the_knee_where_a_constant_one_does_not(leg):
     parameters = usual_parameters(leg)

@@ -35,7 +35,7 @@ def counted(theta, action):
 
 @pytest.mark.parametrize(
     ("method", "simulator"),
-    [("asbi", MODEL), ("nsbi", drawn), ("nlhi", drawn)],
+    [("asbi", MODEL), ("nlhi", drawn)],
 )
 def test_left_after_every_step(tmp_path, method, simulator):
     given = {"method": method, "simulator": simulator, "actions": [0.5, 1.0, 2.0]}
