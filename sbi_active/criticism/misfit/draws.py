@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.rival_set import NUM_DRAWS, RivalSet
-from sbi_active.criticism.linear.model import LinearModel
+from sbi_active.criticism.linear.errors import Posterior
+from sbi_active.criticism.linear.model import LinearModel, reweighted_at
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.results import Evidence, ModelKey
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.engine import WeightedDraws
+from sbi_active.inference.sampling.weights import effective_sample_size, normalized
 from sbi_active.seeding import derive_seed
 
 
@@ -144,3 +148,52 @@ def drawn(rivals: RivalSet, model: LinearModel, center: Array, cov: Array) -> Ar
     """Return draws of a model's coordinates within their bounds, (NUM_DRAWS, d)."""
     rng = np.random.default_rng(derive_seed(rivals.seed, "linear", str(model.key)))
     return model.draws(center, cov, NUM_DRAWS, rng)
+
+
+def left_out_fit(whole: Fit, known: NDArray[np.bool_]) -> Fit:
+    """Return a sampled model with its posterior by some of the numbers.
+
+    What bends has no linear model that could be fitted again; its draws are weighed by
+    the density of the other numbers.
+
+    Args:
+        whole: Fit to all numbers, by draws of the simulator's own posterior.
+        known: Mask of the numbers that count, shape (N,).
+    """
+    own, fit = whole.sample, replace(whole, known=known)
+    residual, log_scale, _ = whole.rival.residual(own.u, penalized=False)
+    lost = np.broadcast_to(log_scale, residual.shape)[:, ~known].sum(1)
+    log_w = np.log(np.maximum(own.weight, 1e-300)) + lost
+    log_w += fit.error.log_likelihood(residual[:, known])
+    log_w -= whole.error.log_likelihood(residual)
+    log_w = np.where(np.isfinite(log_w), log_w, -np.inf)
+    sample = WeightedDraws(
+        u=own.u,
+        weight=normalized(log_w),
+        log_evidence=own.log_evidence,
+        standard_error=own.standard_error,
+        effective_sample_size=effective_sample_size(log_w),
+        method=own.method,
+    )
+    return replace(fit, sample=sample)
+
+
+def by_weights(
+    model: LinearModel, search: Search, use: NDArray[np.bool_], *, rounds: int = 5
+) -> tuple[LinearModel, Posterior]:
+    """Return a model of t errors with the weights of a fit to some parts, and the fit.
+
+    Args:
+        model: Model with the weights of the fit to all.
+        search: Search with the errors.
+        use: Parts of the trials that count, shape (f,).
+        rounds: Times that weights follow from residuals, and the fit from weights;
+            two agree to some percent of a deviation.
+    """
+    errors = search.errors
+    for _ in range(rounds):
+        grams = errors.grams(model.rows)
+        own = errors.posterior(model, grams, use, process=False)
+        u = np.clip(own.mean, model.low, model.high)
+        model = reweighted_at(model, u, search.sensor.df)
+    return model, own

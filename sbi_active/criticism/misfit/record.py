@@ -12,11 +12,13 @@ from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.fit import Fit
-from sbi_active.criticism.linear.errors import Posterior
 from sbi_active.criticism.linear.fits import refitted
-from sbi_active.criticism.linear.model import LinearModel, reweighted_at
-from sbi_active.criticism.linear.search import Search
-from sbi_active.criticism.misfit.draws import bends, linear_fit
+from sbi_active.criticism.misfit.draws import (
+    bends,
+    by_weights,
+    left_out_fit,
+    linear_fit,
+)
 from sbi_active.criticism.misfit.guesses import guess_residual
 from sbi_active.criticism.misfit.near_aliases import near_aliases
 from sbi_active.criticism.misfit.verdict import Verdict
@@ -168,7 +170,12 @@ def fitted(found: Verdict, key: ModelKey, use: NDArray[np.bool_]) -> Fit:
         use: Parts of the trials that count, shape (f,).
     """
     known = use[found.search.errors.fold]
-    return (_beside if found.is_missed else _alone)(found, key, use, known)
+    if found.is_missed:
+        return _beside(found, key, use, known)
+    whole = found.rivals.fits.get(key)
+    if whole is not None and whole.evidence.engine != "linear":
+        return left_out_fit(whole, known)
+    return _alone(found, key, use, known)
 
 
 def _alone(
@@ -184,34 +191,13 @@ def _alone(
         at = states.mixture(found.key, use)
     model = search.model(states.predicting(key))
     if use is not None and np.isfinite(search.sensor.df):
-        model, at = _by_weights(model, search, use)
+        model, at = by_weights(model, search, use)
     given = found.rivals, key, model, at.mean, at.cov, own.log_evidence
     options = {"known": known, "suspect": found.suspect}
     if not states.louder(key):
         return linear_fit(*given, unit=search.unit, **options)
     phi, square = states.louder_draws(key, use)[0], states.chi_square(key)[0]
     return linear_fit(*given, louder=phi, chi_square=square, **options)
-
-
-def _by_weights(
-    model: LinearModel, search: Search, use: NDArray[np.bool_], *, rounds: int = 5
-) -> tuple[LinearModel, Posterior]:
-    """Return a model of t errors with the weights of a fit to some parts, and the fit.
-
-    Args:
-        model: Model with the weights of the fit to all.
-        search: Search with the errors.
-        use: Parts of the trials that count, shape (f,).
-        rounds: Times that weights follow from residuals, and the fit from weights;
-            two agree to some percent of a deviation.
-    """
-    errors = search.errors
-    for _ in range(rounds):
-        grams = errors.grams(model.rows)
-        own = errors.posterior(model, grams, use, process=False)
-        u = np.clip(own.mean, model.low, model.high)
-        model = reweighted_at(model, u, search.sensor.df)
-    return model, own
 
 
 def _beside(

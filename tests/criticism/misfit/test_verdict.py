@@ -178,6 +178,12 @@ def test_likely_models_that_bend_have_samples_of_their_posterior():
     assert own.draws[:, 0] * own.draws[:, 1] == pytest.approx(4.0, abs=1.0)
     linear = loop._judge().states.log_evidence(ModelKey(("bias",)))
     assert own.log_evidence == linear  # asked by one, drawn by the other
+    # Left-out trials are predicted along the hyperbola, as by the line without them.
+    line = np.concatenate([action, torch.ones_like(action)], 1)
+    hat = line @ np.linalg.pinv(line)
+    error = (trials.x - hat @ trials.x.numpy()).numpy()[:, 0] / (1 - np.diag(hat))
+    rmse = loop.evaluate().table.set_index("metric").loc["rmse"]
+    assert rmse["after"] == pytest.approx(np.sqrt((error**2).mean()), rel=0.2)
 
 
 def scattered(size, *effects):
