@@ -146,6 +146,7 @@ def test_the_command_ends_by_an_interrupt(place):
     said = process.stdout.readline()
     port = re.fullmatch(r".* is shown at http://127.0.0.1:(\d+) until Ctrl-C\n", said)
     assert port is not None, said
+    socket.create_connection(("127.0.0.1", int(port[1])), timeout=10).close()
     process.send_signal(signal.SIGINT)
     _, error = process.communicate(timeout=60)
     assert process.returncode == 130

@@ -45,10 +45,13 @@ def evaluate_left_out(
             model = ModelKey(key.effects)
             if not key.effects and key.error not in (UNEXPLAINED, OUTLIER):
                 model = key
-            for kept, each in ((before, ModelKey()), (after, model)):
+            scored = {}
+            for each in dict.fromkeys((ModelKey(), model)):
                 fit = fitted(found, each, ~own)
                 prediction = predict(found.rivals, one, fit=fit, num_draws=num_draws)
-                kept.append(scores(prediction, one))
+                scored[each] = scores(prediction, one)
+            before.append(scored[ModelKey()])
+            after.append(scored[model])
             named = key.effects and key.error != UNEXPLAINED
             selected.append(
                 str(ModelKey(key.effects) if named else ModelKey(error=key.error))

@@ -72,6 +72,8 @@ class ResidualProcess(ErrorModel):
         lengths: Length scales, in ranges of the action space.
         spread: Deviation of the prior predictive, shape (N,); None has the noise as the
             only unit.
+        num_amplitudes: Number of amplitudes, a choice: neighbors are a factor of two
+            apart where the process may be 500 times the noise.
     """
 
     def __init__(

@@ -135,6 +135,7 @@ def summary(
     selected: tuple[str, ...],
     names: tuple[str, ...],
     *,
+    # Draws of the bootstrap, a choice: an end of an interval is known to some percent.
     num_bootstrap: int = 2_000,
     # Trials below which a bootstrap interval is not what it claims to be.
     enough_trials: int = 8,
