@@ -7,6 +7,7 @@ imported. Requests from other machines, or for anything else, are refused.
 from __future__ import annotations
 
 import contextlib
+import sys
 import threading
 from html import escape
 from pathlib import Path
@@ -150,14 +151,14 @@ def served(watched: Watched, port: int) -> WSGIServer:
 class _Server(ThreadingMixIn, WSGIServer):
     daemon_threads = True
 
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing of a reader that leaves, nor of what an interrupt cuts off."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handle_error(request, client_address)
+
 
 class _Quiet(WSGIRequestHandler):
-    """Says nothing of each request, nor of a reader that leaves."""
-
-    def handle(self) -> None:
-        """Answer a request."""
-        with contextlib.suppress(ConnectionError):
-            super().handle()
+    """Says nothing of each request."""
 
     def log_message(self, format: str, *_: object) -> None:
         """Say nothing."""
