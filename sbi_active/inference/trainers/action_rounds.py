@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
@@ -121,10 +122,8 @@ class ActionRounds(ActiveInference):
 
     #: This library's settings, the default where actions are given.
     _settings: ClassVar[type]
-    #: sbi's name of the estimator, its default, and what makes a builder of a name.
+    #: sbi's name of the estimator.
     _sbi_name: ClassVar[str]
-    _sbi_default: ClassVar[str]
-    _sbi_builder: ClassVar[Callable[..., Any]]
 
     # Attributes of sbi's trainers.
     _device: str
@@ -139,8 +138,8 @@ class ActionRounds(ActiveInference):
         given = given_arguments(self._sbi.__init__, args, kwargs)
         estimator = given.pop(self._sbi_name, None)
         ours = isinstance(estimator, self._settings)
-        sbi_takes = estimator is not None and (callable(estimator) or not ours)
-        given[self._sbi_name] = estimator if sbi_takes else self._sbi_default
+        if estimator is not None and (callable(estimator) or not ours):
+            given[self._sbi_name] = estimator
         self._sbi.__init__(**given)
         # A name stays one: the builder that sbi makes of it cannot be pickled.
         self._action_estimator = self._settings() if estimator is None else estimator
@@ -227,10 +226,12 @@ class ActionRounds(ActiveInference):
     def _build_action_network(self, theta: Tensor, x: Tensor) -> Any:
         if self._has_settings:
             return self._network(theta, x)
-        build: Any = self._action_estimator
-        if isinstance(build, str):
-            build = type(self)._sbi_builder(model=build)
-        return build(theta, x)
+        # sbi's constructor makes a builder of what it takes, which pickle loses.
+        made = type(self).__new__(type(self))
+        with warnings.catch_warnings():  # of names, said when this was made
+            warnings.simplefilter("ignore", FutureWarning)
+            made._sbi.__init__(**{self._sbi_name: self._action_estimator})
+        return made._build_neural_net(theta, x)
 
     def _resolve_estimator(self, estimator: Any) -> Any:
         """Return the estimator of a posterior and its device, sbi's hook."""

@@ -7,7 +7,6 @@ from typing import Any
 import torch
 from sbi.inference import NLE_A
 from sbi.inference.trainers._contracts import TrainConfig
-from sbi.neural_nets import likelihood_nn
 from torch import Tensor
 
 from sbi_active.inference.models.factors import ActionLikelihood
@@ -68,7 +67,6 @@ class ALHI(ProductRounds, MixtureRounds, NLE_A):
     """
 
     _factor = ActionLikelihood
-    _sbi_builder = staticmethod(likelihood_nn)
 
     @extends(NLE_A.__init__)
     def __init__(

@@ -12,7 +12,6 @@ import torch
 from sbi.inference import NPE_C
 from sbi.inference.trainers._contracts import TrainConfig
 from sbi.inference.trainers.npe.npe_base import PosteriorEstimatorTrainer
-from sbi.neural_nets import posterior_nn
 from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
 from torch import Tensor
 from torch.distributions import Distribution
@@ -94,7 +93,6 @@ class ASBI(MixtureRounds, NPE_C):
         torch.Size([3, 1])
     """
 
-    _sbi_builder = staticmethod(posterior_nn)
     _fused = True
     network_serves = ("start", "diagnostics")
 

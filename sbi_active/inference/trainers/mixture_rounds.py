@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from typing import Any
 
-import torch
 from sbi.inference.trainers._contracts import LossArgs, TrainConfig
 from torch import Tensor
 from torch.utils.data import DataLoader
@@ -17,6 +16,7 @@ from sbi_active.inference.networks.mixture_density import (
     train_mixture_density,
 )
 from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
+from sbi_active.inference.sampling.adam import Adam
 from sbi_active.inference.trainers.action_rounds import NEVER, ActionRounds
 
 
@@ -28,9 +28,9 @@ class MixtureRounds(ActionRounds):
     """
 
     _settings = MixtureDensity
-    _sbi_name, _sbi_default = "density_estimator", "maf"
+    _sbi_name = "density_estimator"
     _action_estimator: Any
-    _fused: bool | None = None  # whether Adam is one kernel
+    _fused = False  # whether Adam is one kernel
 
     @abstractmethod
     def _train_mixture(self, config: TrainConfig, loss_args: Any) -> TrainingRecord:
@@ -85,9 +85,8 @@ class MixtureRounds(ActionRounds):
         The optimizer is the one so far where training is resumed.
         """
         if not config.resume_training:
-            self.optimizer = torch.optim.Adam(
-                network.parameters(), lr=config.learning_rate, fused=self._fused
-            )
+            rate = config.learning_rate
+            self.optimizer = Adam(network.parameters(), rate=rate, fused=self._fused)
         settings, size = self._action_estimator, config.training_batch_size
         steps, patience = (
             max(len(rows["train_rows"]) // size, 1),

@@ -8,7 +8,6 @@ from typing import Any
 
 from sbi.inference import NRE_B, NRE_C
 from sbi.inference.trainers.nre.nre_base import RatioEstimatorTrainer
-from sbi.neural_nets import classifier_nn
 from sbi.neural_nets.ratio_estimators import RatioEstimator
 from torch import Tensor
 from typing_extensions import Self
@@ -52,8 +51,7 @@ class AmortizedRounds(ProductRounds, RatioEstimatorTrainer):
 
     _factor = ActionRatio
     _settings = RatioClassifier
-    _sbi_name, _sbi_default = "classifier", "resnet"
-    _sbi_builder = staticmethod(classifier_nn)
+    _sbi_name = "classifier"
     _action_estimator: Any
 
     @extends(RatioEstimatorTrainer.__init__)

@@ -8,6 +8,7 @@ import warnings
 
 import cloudpickle
 import pytest
+import sbi.neural_nets
 import torch
 from sbi.inference import NLE_A, NPE_C, NRE_B, NRE_C
 from sbi.inference.trainers._contracts import StartIndexContext, TrainConfig
@@ -82,6 +83,19 @@ def test_a_trainer_on_a_builder_of_sbi_is_loaded_by_another_process(tmp_path):
 
     loaded = simulate(elsewhere, theta, theta, seed=0, workers=2, batch_size=2).x
     assert torch.allclose(loaded, believed(whole), atol=1e-4)
+
+
+@pytest.mark.parametrize("trainer", [ASBI, ALHI])
+def test_settings_of_sbi_build_the_network(trainer, recwarn):
+    """From 0.28 on sbi has settings with a method ``build`` in place of names."""
+    config = getattr(sbi.neural_nets, "MAFConfig", None)
+    if config is None:
+        pytest.skip("this version of sbi has names and functions alone")
+    own = config(hidden_features=11)
+    trained = round_of(trainer(PRIOR, own, show_progress_bars=False))
+    assert 11 in {p.shape[0] for p in trained._neural_net.parameters()}
+    round_of(trainer(PRIOR, show_progress_bars=False))
+    assert not [w for w in recwarn if w.category is FutureWarning]
 
 
 PARENTS = {ASBI: NPE_C, ALHI: NLE_A, SeqBED_B: NRE_B, SeqBED: NRE_C}
