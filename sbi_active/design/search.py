@@ -13,6 +13,7 @@ from typing_extensions import override
 from sbi_active.actions import ActionSpace
 from sbi_active.design.coordinates import Coordinates
 from sbi_active.expected import Shown
+from sbi_active.inference.sampling.adam import Adam
 from sbi_active.inference.sampling.gaussian_process import GaussianProcess
 from sbi_active.seeding import derive_seed
 
@@ -349,9 +350,9 @@ def ascend(
     fixed = start[:, c:]
     other = (fixed[:, None] != fixed[None]).any(-1) | torch.eye(len(start)).bool()
     u = start[:, :c].clone().requires_grad_(True)
-    optimizer = torch.optim.Adam([u], lr=step)
+    optimizer = Adam([u], rate=step)
     for k in range(num_steps):
-        optimizer.zero_grad()
+        optimizer.forget_gradients()
         left = 1 - (k + 1) / num_steps
         square = (u[:, None] - u[None]).square().sum(-1) / (2 * reach**2)
         close = (-square).exp().masked_fill(other, 0.0).sum()
@@ -363,8 +364,7 @@ def ascend(
             u.clamp_(0, 1)
             inside = permitted(torch.cat([u, fixed], 1))
             u.copy_(torch.where(inside[:, None], u, before))
-        for group in optimizer.param_groups:
-            group["lr"] = step * (0.1 + 0.9 * left)
+        optimizer.rate = step * (0.1 + 0.9 * left)
     return torch.cat([u.detach(), fixed], 1)
 
 

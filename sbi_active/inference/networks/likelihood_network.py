@@ -22,6 +22,7 @@ from sbi_active.inference.networks.conditioning import (
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.inference.networks.mixture_network import log_prob_of_batch
 from sbi_active.inference.networks.response import Response, exceeds_chance
+from sbi_active.inference.sampling.adam import Adam
 
 
 class ValidityNetwork(nn.Module):
@@ -58,12 +59,10 @@ class ValidityNetwork(nn.Module):
             assert isinstance(last, nn.Linear)
             last.weight.mul_(0.1)
             last.bias.fill_(float(share.logit()))
-        optimizer = torch.optim.AdamW(
-            self.parameters(), lr=learning_rate, weight_decay=weight_decay
-        )
+        optimizer = Adam(self.parameters(), rate=learning_rate, decay=weight_decay)
         sign = valid.to(seen.dtype) * 2 - 1
         for _ in range(num_iterations):
-            optimizer.zero_grad(set_to_none=True)
+            optimizer.forget_gradients()
             loss = -logsigmoid(sign * self.net(seen)[:, 0]).mean()
             loss.backward()
             optimizer.step()

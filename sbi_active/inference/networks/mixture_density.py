@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from copy import deepcopy
@@ -11,7 +12,6 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
-from torch.optim import Optimizer
 
 from sbi_active.expected import require, require_least, require_one_of, suggests
 from sbi_active.inference.networks.mixture_network import (
@@ -19,6 +19,7 @@ from sbi_active.inference.networks.mixture_network import (
     MixtureDensityNetwork,
     PreparedLoss,
 )
+from sbi_active.inference.sampling.adam import Adam
 
 
 @suggests
@@ -163,7 +164,7 @@ class TrainingRecord:
 
 def train_mixture_density(
     network: MixtureDensityNetwork,
-    optimizer: Optimizer,
+    optimizer: Adam,
     theta: Tensor,
     condition: Tensor,
     *,
@@ -208,15 +209,12 @@ def train_mixture_density(
             loss = calibration_kernel(condition) * loss
         return loss.mean()
 
-    for group in optimizer.param_groups:  # resumed: an annealed rate starts again
-        group["lr"] = group.get("initial_lr", group["lr"])
-    # Listed once: a walk through all modules costs a sixth of a step.
-    weights = [*network.parameters()]
+    def height(step: int) -> float:
+        return 1 + math.cos(math.pi * step / budget.num_iterations)
+
+    optimizer.rate = optimizer.initial_rate  # resumed: an annealed one starts again
     size = min(budget.batch_size, len(train_rows))
     steps_an_epoch = len(train_rows) // size
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
-        optimizer, budget.num_iterations
-    )
     record, best, best_state, fruitless, done = TrainingRecord(), torch.inf, None, 0, 0
     while done < budget.num_iterations and fruitless != patience:
         start, total = time.time(), theta.new_zeros(())
@@ -228,17 +226,16 @@ def train_mixture_density(
             theta[order].split(size), condition[order].split(size), strict=True
         )
         for batch in batches:
-            for weight in weights:
-                weight.grad = None
+            optimizer.forget_gradients()
             loss = loss_of(*batch)
             loss.backward()
             if budget.clip_max_norm is not None:
-                clip_grad_norm_(weights, budget.clip_max_norm)
+                clip_grad_norm_(optimizer.parameters, budget.clip_max_norm)
             optimizer.step()
+            done += 1
             if budget.anneal:
-                schedule.step()
+                optimizer.rate *= height(done) / height(done - 1)
             total += loss.detach()
-        done += num_steps
 
         network.eval()
         training_loss = validation_loss = float(total) / num_steps

@@ -3,11 +3,11 @@ r"""Gaussian processes: of outcomes on few simulations, and of a utility on acti
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import torch
+from scipy.optimize import minimize
 from torch import Tensor
 
 from sbi_active.arrays import Array
@@ -306,33 +306,25 @@ def _hyperparameters(
     if isinstance(noise, Tensor):
         priors[-1] = (0.0, 2.0)  # logit of the factor
     center, deviation = torch.tensor(priors, dtype=torch.float64).T
-    free = center.clone().requires_grad_(True)
-    optimizer = torch.optim.LBFGS(
-        [free], max_iter=settings.num_steps, line_search_fn="strong_wolfe"
-    )
 
-    def negative_log_evidence() -> Tensor:
+    def negative_log_evidence(values: Array) -> tuple[float, Array]:
+        free = torch.tensor(values, requires_grad=True)
         kernel = _kernel(u, u, free, num_categories, settings)
         kernel = kernel + _variance(free, noise, len(u), settings).diag()
         white, log_volume = _whitened(kernel, y)
         loss = 0.5 * white.square().sum() + y.shape[1] * log_volume
-        return loss + 0.5 * ((free - center) / deviation).square().sum()
+        loss = loss + 0.5 * ((free - center) / deviation).square().sum()
+        return float(loss.detach()), torch.autograd.grad(loss, free)[0].numpy()
 
-    def closure() -> Tensor:
-        with torch.enable_grad():
-            optimizer.zero_grad()
-            loss = negative_log_evidence()
-            loss.backward()
-            return loss
-
-    step: Callable[..., Any] = optimizer.step
-    step(closure)
-    with torch.no_grad():
-        found = free.detach().clone()
-        if not bool(found.isfinite().all()):
-            found = center.clone()
-        free.data.copy_(found)
-        return found, -float(negative_log_evidence())
+    with torch.enable_grad():
+        found = minimize(
+            negative_log_evidence,
+            center.numpy(),
+            jac=True,
+            method="L-BFGS-B",
+            options={"maxiter": settings.num_steps},
+        )
+    return torch.from_numpy(found.x), -float(found.fun)
 
 
 def _whitened(
