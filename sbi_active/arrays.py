@@ -15,7 +15,11 @@ Array = NDArray[Any]
 
 
 def own_tensor(
-    value: Any, dtype: torch.dtype | None = None, *, name: str = "x"
+    value: Any,
+    dtype: torch.dtype | None = None,
+    *,
+    name: str = "x",
+    copy: bool = True,
 ) -> Tensor:
     """Return real numbers as floating ones, in a tensor that shares no memory.
 
@@ -24,6 +28,7 @@ def own_tensor(
             what a masked array masks, and for None among other numbers.
         dtype: Type of the result; None keeps a floating one.
         name: Name of the numbers, for errors.
+        copy: Whether a tensor of this type is copied as well.
 
     Raises:
         ValueError: If they are no real numbers, but complex, text, dates or None; if
@@ -38,7 +43,7 @@ def own_tensor(
     if dtype is None:
         keeps = tensor.is_floating_point() and not _is_of_python(value)
         dtype = tensor.dtype if keeps else torch.get_default_dtype()
-    own = tensor.to(dtype, copy=tensor is value)
+    own = tensor.to(dtype, copy=copy and tensor is value)
     if tensor.dtype == torch.float64 != dtype and not all_finite(own):
         beyond = tensor.isfinite() & ~own.isfinite()
         if bool(beyond.any()):
@@ -71,6 +76,16 @@ def all_finite(x: Tensor) -> bool:
     each number.
     """
     return math.isfinite(x.sum()) or bool(x.isfinite().all())
+
+
+def finite(x: Tensor) -> Tensor:
+    """Return which numbers are neither NaN nor infinite, bool, of the shape of x.
+
+    NumPy's test takes no copy of the numbers, as torch's does.
+    """
+    if x.device.type != "cpu" or x.requires_grad:
+        return x.isfinite()
+    return torch.from_numpy(np.asarray(np.isfinite(x.numpy())))
 
 
 def _converted(value: Any, name: str) -> Tensor:

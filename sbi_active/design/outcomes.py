@@ -219,35 +219,39 @@ class LinearSummaries:
         """The noise of the summaries."""
         return GaussianNoise(1.0)
 
-    def __call__(self, action: Tensor, mean: Tensor) -> Tensor:
+    def __call__(self, action: Tensor, mean: Tensor, *, block: int = 512) -> Tensor:
         """Return summaries, shape (n, k), NaN of an outcome that lacks any number.
 
         Args:
             action: Action, shape (action_dim,).
             mean: Noise-free outcomes at it, shape (n, *x_shape).
+            block: Number of rows in double precision at once.
         """
-        white = whitened(self._noise, mean).flatten(1)
-        whole = white.isfinite().all(1)
-        found = torch.full((len(white), self._num_kept), torch.nan).double()
-        key = action.numpy().tobytes()
-        if key not in self._known and bool(whole.any()):
-            self._known[key] = self._directions(white[whole][: self._num_rows])
-        if key not in self._known:
-            return found
-        own = self._known[key]
-        off = white[whole] - own.center
-        short = off @ own.rows.T
-        rest = off.square().sum(1) - short.square().sum(1)
-        self.left_out = max(self.left_out, 0.5 * float(rest.mean().clamp_min(0.0)))
-        found[whole] = torch.nn.functional.pad(
-            short, (0, self._num_kept - short.shape[1])
-        )
+        found = torch.full((len(mean), self._num_kept), torch.nan).double()
+        key, rest = action.numpy().tobytes(), []
+        for rows, summaries in zip(mean.split(block), found.split(block), strict=True):
+            white = whitened(self._noise, rows).flatten(1)
+            whole = white.isfinite().all(1)
+            if not bool(whole.any()):
+                continue
+            if key not in self._known:
+                self._known[key] = self._directions(white[whole][: self._num_rows])
+            own = self._known[key]
+            off = white[whole] - own.center
+            short = off @ own.rows.T
+            rest.append(off.square().sum(1) - short.square().sum(1))
+            padding = 0, self._num_kept - short.shape[1]
+            summaries[whole] = torch.nn.functional.pad(short, padding)
+        if rest:
+            lost = 0.5 * float(torch.cat(rest).mean().clamp_min(0.0))
+            self.left_out = max(self.left_out, lost)
         return found
 
     def _directions(self, white: Tensor) -> _Directions:
         center = white.mean(0)
         rows = torch.linalg.svd(white - center, full_matrices=False)[2]
-        return _Directions(center, rows[: self._num_kept])
+        # Without a copy all that are not kept would stay in memory.
+        return _Directions(center, rows[: self._num_kept].clone())
 
     def note(self, num_numbers: int) -> str:
         """Return a note on what is compared in place of how many numbers."""

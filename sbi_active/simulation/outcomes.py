@@ -8,6 +8,7 @@ from enum import IntEnum
 import torch
 from torch import Tensor
 
+from sbi_active.arrays import finite
 from sbi_active.messages import Explained, SimulationWarning
 
 
@@ -48,7 +49,7 @@ class Simulations:
 
     def __post_init__(self) -> None:
         if self.status is None:
-            lost = ~self.x.flatten(1).isfinite().any(-1)
+            lost = ~finite(self.x.flatten(1)).any(-1)
             object.__setattr__(self, "status", lost.to(torch.int8))
 
     @property

@@ -101,18 +101,24 @@ class Round:
         learner, state = self._learner, self._learner.state
         if not self._is_trained:
             with state.stage(index, "simulation"):
-                rows, num_simulations, num_missing = self._rows(index)
-                if state.options.details.design_on == "training":
-                    self.simulations = rows
-            with state.stage(index, "training"):
-                learner.inference.append_simulations(
-                    rows.theta, rows.x, action=rows.action, belief=learner.belief
-                )
-                with forked_generators(state.seed, "train", len(state.explained)):
-                    learner.inference.train()
+                num_simulations, num_missing = self._appended(index)
+            own = forked_generators(state.seed, "train", len(state.explained))
+            with state.stage(index, "training"), own:
+                learner.inference.train()
             state.account(index, num_simulations, num_missing)
             self._is_trained = True
         return learner.inference.build_posterior()
+
+    def _appended(self, index: int) -> tuple[int, int]:
+        """Simulate rows for the training; return their number, and of the missing."""
+        learner = self._learner
+        rows, num_simulations, num_missing = self._rows(index)
+        if learner.state.options.details.design_on == "training":
+            self.simulations = rows
+        learner.inference.append_simulations(
+            rows.theta, rows.x, action=rows.action, belief=learner.belief
+        )
+        return num_simulations, num_missing
 
     def _rows(self, index: int) -> tuple[Simulations, int, int]:
         """Simulate the round: parameters from the belief, actions from the space.

@@ -141,8 +141,18 @@ class SimulatedLikelihood:
     def __len__(self) -> int:
         return len(self.action)
 
-    def terms(self, theta: Tensor, trial: int) -> Array:
-        """Return the log likelihood of one trial, shape (n,)."""
+    def terms(self, theta: Tensor, trial: int, *, most: int = 4_000_000) -> Array:
+        """Return the log likelihood of one trial, shape (n,).
+
+        Args:
+            theta: Parameters, shape (n, d).
+            trial: Place of the trial.
+            most: Number of outcomes' numbers in double precision at once, 32 MB.
+        """
+        blocks = theta.split(max(most // self.x[trial].numel(), 64))
+        return np.concatenate([self._terms(block, trial) for block in blocks])
+
+    def _terms(self, theta: Tensor, trial: int) -> Array:
         mean, lost = self.table.mean(theta, self.action[trial])
         x = self.x[trial]
         seen = x.isfinite().numpy()

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from sbi_active.arrays import finite
 from sbi_active.inference.networks.action_scaling import ActionScaling, held_out
 from sbi_active.inference.networks.baseline import Baseline, Frames, local
 
@@ -54,7 +56,9 @@ class Directions(nn.Module):
         self, u: Tensor, x: Tensor, action: Tensor, *, num: int, block: int = 512
     ) -> None:
         super().__init__()
-        mean, scale = x.mean(0, dtype=torch.float64), x.std(0).double()
+        # NumPy sums in double precision without a copy in it.
+        mean = torch.from_numpy(x.cpu().numpy().mean(0, dtype=np.float64)).to(x.device)
+        scale = x.std(0).double()
         scale = torch.where(scale > 1e-12 * (1 + mean.abs()), scale, 1.0)
         self.register_buffer("mean", mean)
         self.register_buffer("scale", scale)
@@ -165,10 +169,11 @@ class Conditioning(nn.Module):
         self.register_buffer("theta_factor", covariance_factor(theta, whiten))
 
         x, action = condition.split([self.x_dim, action_dim], 1)
-        valid = x.isfinite().all(1)
+        valid = finite(x).all(1)
         self.directions: Directions | None = None
         if self.x_dim > most_numbers and can_regress(valid, num_directions):
-            own = self.whiten(theta[valid]), x[valid], action[valid]
+            some = slice(None) if bool(valid.all()) else valid  # without a copy
+            own = self.whiten(theta[some]), x[some], action[some]
             self.directions = Directions(*own, num=num_directions)
         x, action = self._summarized(x), action.double()
         few = not can_regress(valid, x.shape[1])
@@ -248,7 +253,7 @@ class Conditioning(nn.Module):
         Numbers of x that are missing are zero; a row with any has trivial frames.
         """
         x, action = condition.split([self.x_dim, condition.shape[1] - self.x_dim], 1)
-        lost = ~x.isfinite().all(1)[:, None]
+        lost = ~finite(x).all(1)[:, None]
         x, action = self._summarized(x), action.double()
         missing = ~x.isfinite()
         # Missing numbers are replaced before any arithmetic, lest gradients be NaN.

@@ -11,6 +11,7 @@ from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
 from torch import Tensor, nn
 from typing_extensions import override
 
+from sbi_active.arrays import finite
 from sbi_active.inference.networks.baseline import Frames, local
 from sbi_active.inference.networks.conditioning import BaselineKind, Conditioning
 
@@ -109,10 +110,11 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         few: int = 12,
     ) -> None:
         dim, num = theta.shape[1], num_components
-        missing = ~condition.isfinite()
-        ever_missing, largest_gap = missing.any(0), int(missing.sum(1).max())
+        missing = ~finite(condition)
+        ever_missing = missing.any(0)
         # Columns that go missing together need one mask between them.
         lost = ever_missing.nonzero()[:, 0]
+        largest_gap = int(missing[:, lost].sum(1).max())
         masks, columns = missing[:, lost].unique(dim=1, return_inverse=True)
         first = [int((columns == k).nonzero()[0]) for k in range(masks.shape[1])]
         masked = lost[first].tolist()

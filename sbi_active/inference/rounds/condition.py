@@ -55,12 +55,13 @@ def action_rows(
     return rows if num_rows is None else rows.expand(num_rows, -1)
 
 
-def outcome_rows(x: Tensor, x_shape: Sequence[int]) -> Tensor:
+def outcome_rows(x: Tensor, x_shape: Sequence[int], *, copy: bool = True) -> Tensor:
     """Return outcomes as float32 rows of their own, of the shape seen in training.
 
     Args:
         x: Shape x_shape or (n, *x_shape); a scalar where x is one number.
         x_shape: Shape of one outcome.
+        copy: Whether float32 rows are copied as well.
 
     Returns:
         Shape (n, *x_shape).
@@ -69,7 +70,7 @@ def outcome_rows(x: Tensor, x_shape: Sequence[int]) -> Tensor:
         ValueError: If the shape does not fit, or a number is complex or beyond float32.
     """
     shape = torch.Size(x_shape)
-    rows = own_tensor(x, torch.float32)
+    rows = own_tensor(x, torch.float32, copy=copy)
     if rows.shape == shape or (rows.ndim == 0 and shape.numel() == 1):
         return rows.reshape(1, *shape)
     if rows.shape[1:] == shape:

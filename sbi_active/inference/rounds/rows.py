@@ -12,6 +12,7 @@ from sbi.utils import RestrictedPrior
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.arrays import finite
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 from sbi_active.messages import Explained, warn
 from sbi_active.simulation.outcomes import (
@@ -57,6 +58,8 @@ def round_rows(
 ) -> Simulations:
     """Return the rows of a round in float32, or say what is wrong with them.
 
+    Outcomes may be gigabytes: who keeps them makes a copy.
+
     Args:
         theta: Parameters, shape (n, theta_dim), within the prior's support.
         x: Outcomes, shape (n, *x_shape), or (n,) where x is one number.
@@ -88,10 +91,10 @@ def round_rows(
             f"{len(theta)} rows outside, the first {theta[row].tolist()} in row {row}; "
             "sample theta from the belief"
         )
-    x = outcome_rows(x, x.shape[1:] if x_shape is None else x_shape)
+    x = outcome_rows(x, x.shape[1:] if x_shape is None else x_shape, copy=False)
     action = action_rows(action, action_dim, num_rows=len(theta))
     rows = Simulations(theta, action, x)
-    present = x.flatten(1).isfinite()
+    present = finite(x.flatten(1))
     invalid = ~(present.all(-1) if exclude_invalid else present.any(-1))
     if bool(invalid.all()) and (exclude_invalid or not may_be_invalid):
         raise UnexplainedOutcomeError(

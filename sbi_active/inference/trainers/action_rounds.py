@@ -10,6 +10,7 @@ from contextlib import nullcontext
 from typing import Any, ClassVar, ParamSpec, TypeVar
 
 import cloudpickle
+import torch
 from sbi.inference.trainers._contracts import StartIndexContext
 from sbi.sbi_types import Tracker
 from sbi.utils.sbiutils import mask_sims_from_prior
@@ -309,18 +310,34 @@ class ActionRounds(ActiveInference):
         self._action_dim = rows.action.shape[1]
         self._outcome_shape = rows.x.shape[1:]
         current = max(self._data_round_index, default=-1)
-        if belief is not self._round_belief:
+        device = self._device if data_device is None else data_device
+        if is_new := belief is not self._round_belief:
             self._round_belief = belief
             current += 1
+            # Nothing is trained on earlier rounds, which may be gigabytes.
+            self._theta_roundwise, self._x_roundwise = [], []
+        parameters, outcomes = (part.to(device) for part in self._stored(rows))
+        if not is_new:
+            earlier, seen, _ = self.get_simulations()
+            parameters = torch.cat([earlier, parameters])
+            outcomes = torch.cat([seen, outcomes])
         self._belief = belief
         self._trained_round = None
-        device = self._device if data_device is None else data_device
-        parameters, outcomes = self._stored(rows)
-        self._theta_roundwise.append(parameters.to(device))
-        self._x_roundwise.append(outcomes.to(device))
-        self._prior_masks.append(mask_sims_from_prior(current, len(rows.theta)))
-        self._data_round_index.append(current)
+        self._theta_roundwise, self._x_roundwise = [parameters], [outcomes]
+        self._prior_masks = [mask_sims_from_prior(current, len(parameters))]
+        self._data_round_index = [current]
         return self
+
+    def get_simulations(self, starting_round: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+        """Return parameters, outcomes and masks, with actions those of this round.
+
+        Args:
+            starting_round: Number of the first round; sbi's, of rounds without actions.
+        """
+        if not self.has_actions:
+            return self._sbi.get_simulations(starting_round)
+        # Of one tensor no copy is made.
+        return self._theta_roundwise[0], self._x_roundwise[0], self._prior_masks[0]
 
     def _get_start_index(self, context: StartIndexContext) -> int:
         if not self.has_actions:

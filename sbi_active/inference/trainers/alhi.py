@@ -78,7 +78,7 @@ class ALHI(ProductRounds, MixtureRounds, NLE_A):
         super().__init__(*args, posterior=posterior, **kwargs)
 
     def _stored(self, rows: Simulations) -> tuple[Tensor, Tensor]:
-        return torch.cat([rows.theta, rows.action], 1), rows.x.flatten(1)
+        return torch.cat([rows.theta, rows.action], 1), rows.x.flatten(1).clone()
 
     @takes(NLE_A.train)
     def train(self, *args: Any, **kwargs: Any) -> Any:

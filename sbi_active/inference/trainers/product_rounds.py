@@ -158,20 +158,13 @@ class ProductRounds(ActionRounds):
     @contextmanager
     def _aside(self) -> Iterator[None]:
         """Leave rounds and belief as they were, whatever was appended meanwhile."""
-        names = ("_belief", "_round_belief", "_trained_round", "_neural_net")
-        before = {name: getattr(self, name) for name in names}
-        num = len(self._data_round_index)
+        names = ["_belief", "_round_belief", "_trained_round", "_neural_net"]
+        names += ["_theta_roundwise", "_x_roundwise", "_prior_masks"]
+        before = {name: getattr(self, name) for name in [*names, "_data_round_index"]}
         try:
             yield
         finally:
             vars(self).update(before)
-            for rows in (
-                self._theta_roundwise,
-                self._x_roundwise,
-                self._prior_masks,
-                self._data_round_index,
-            ):
-                del rows[num:]
 
     def _refined(
         self,
@@ -282,16 +275,8 @@ class ProductRounds(ActionRounds):
 
     def _round_parameters(self) -> Tensor:
         """Return the parameters of this round's rows, shape (n, theta_dim)."""
-        current = max(self._data_round_index)
-        rows = [
-            theta
-            for theta, index in zip(
-                self._theta_roundwise, self._data_round_index, strict=True
-            )
-            if index == current
-        ]
-        prior = require_support(self._prior)
-        return torch.cat(rows)[:, : prior.event_shape[-1]].cpu()
+        theta, _, _ = self.get_simulations()
+        return theta[:, : require_support(self._prior).event_shape[-1]].cpu()
 
 
 def _says_something(

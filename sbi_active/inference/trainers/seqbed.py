@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -166,7 +167,7 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         self._outcome_shape, self._action_dim = rows.x.shape[1:], rows.action.shape[1]
         if belief is not self._round_belief:
             self._round_belief, self._rows = belief, []
-        self._rows.append(rows)
+        self._rows.append(replace(rows, x=rows.x.clone()))
         self._belief, self._model = belief, None
         return self
 

@@ -128,7 +128,7 @@ def _draw(simulator: Callable[..., Any], call: Call) -> Tensor:
         x = simulator(theta, action, seeds=seeds)
         return outcome_tensor(x, len(theta), dtype=torch.float32)
     kind = "block" if call.draws == "blocks" else "row"
-    x = []
+    x = torch.empty(0)
     for start in range(0, len(call), BLOCK):
         rows = slice(start, start + BLOCK)
         given = theta[rows], action[rows]
@@ -137,8 +137,17 @@ def _draw(simulator: Callable[..., Any], call: Call) -> Tensor:
         with _GENERATORS, forked_generators(call.seed, kind, int(call.rows[start])):
             part = simulator(*given)
             # Copied before the simulator fills its buffer again.
-            x.append(outcome_tensor(part, len(theta[rows]), dtype=torch.float32))
-    return x[0] if len(x) == 1 else torch.cat(x)
+            part = outcome_tensor(part, len(theta[rows]), dtype=torch.float32)
+        if not start:
+            x = part.new_empty((len(call), *part.shape[1:]))
+        if part.shape[1:] != x.shape[1:]:
+            raise ValueError(
+                "expected x of one shape a row; got "
+                f"{tuple(x.shape[1:])} and {tuple(part.shape[1:])}; pad trajectories "
+                "with NaN, which masks them"
+            )
+        x[rows] = part
+    return x
 
 
 def _is_of_the_interface(error: BaseException) -> bool:

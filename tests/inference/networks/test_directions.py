@@ -9,6 +9,7 @@ from sbi_active.inference.networks.mixture_density import (
     TrainingBudget,
     train_mixture_density,
 )
+from sbi_active.inference.sampling.adam import Adam
 from sbi_active.seeding import forked_generators
 
 NUM, SD = 300, 2.0
@@ -40,7 +41,7 @@ def test_a_network_of_many_numbers_comes_near_the_exact_posterior():
         network = MixtureDensity().build(theta, condition, 1)
         train_mixture_density(
             network,
-            torch.optim.Adam(network.parameters(), lr=1.5e-2),
+            Adam(network.parameters(), rate=1.5e-2),
             theta,
             condition,
             train_rows=torch.arange(3_600),

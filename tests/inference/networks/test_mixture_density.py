@@ -5,6 +5,7 @@ from sbi_active.inference.networks.mixture_density import (
     TrainingBudget,
     train_mixture_density,
 )
+from sbi_active.inference.sampling.adam import Adam
 
 
 def network(dim=3, condition_dim=4, n=200, **settings):
@@ -28,7 +29,7 @@ def test_faithful_settings_condition_on_nothing_but_z_scores():
         net = getattr(settings, call)(theta, condition, *arguments)
         train_mixture_density(
             net,
-            torch.optim.Adam(net.parameters(), lr=1e-3),
+            Adam(net.parameters(), rate=1e-3),
             theta,
             condition,
             train_rows=torch.arange(180),

@@ -1,5 +1,6 @@
 """What everything that learns has in common."""
 
+import copy
 import inspect
 import os
 import pickle
@@ -51,10 +52,10 @@ def test_a_pickled_trainer_goes_on(trainer, estimator):
     whole = round_of(trainer(PRIOR, estimator, show_progress_bars=False))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # sbi's, of what its own trainers lose
-        copy = pickle.loads(pickle.dumps(whole))
+        loaded = pickle.loads(pickle.dumps(whole))
     x_o, action = torch.tensor([0.3]), torch.ones(1)
     beliefs = []
-    for inference in (whole, copy):
+    for inference in (whole, loaded):
         torch.manual_seed(1)
         inference.update(x_o, action=action, seed=0)
         round_of(inference)  # a network built anew
@@ -96,6 +97,24 @@ def test_settings_of_sbi_build_the_network(trainer, recwarn):
     assert 11 in {p.shape[0] for p in trained._neural_net.parameters()}
     round_of(trainer(PRIOR, show_progress_bars=False))
     assert not [w for w in recwarn if w.category is FutureWarning]
+
+
+@pytest.mark.parametrize("trainer", [ASBI, ALHI, SeqBED, SeqBED_B])
+def test_a_round_is_kept_alone_and_shares_no_memory(trainer):
+    """Rows of earlier rounds train nothing, and may be gigabytes."""
+    inference = trainer(PRIOR, show_progress_bars=False)
+    for num in (30, 20, 20):
+        belief = PRIOR if num == 30 else inference.belief
+        theta, x, action = PRIOR.sample((num,)), torch.ones(num, 2), torch.ones(num, 1)
+        given = {"action": action, "belief": belief}
+        inference.append_simulations(theta, x, **given)
+        for tensor in (theta, x, action):
+            tensor.fill_(torch.nan)
+        if num == 30:
+            inference._belief = copy.copy(PRIOR)
+    rows, outcomes, _ = inference.get_simulations()
+    assert len(rows) == len(outcomes) == 40
+    assert bool(rows.isfinite().all() and outcomes.isfinite().all())
 
 
 PARENTS = {ASBI: NPE_C, ALHI: NLE_A, SeqBED_B: NRE_B, SeqBED: NRE_C}
