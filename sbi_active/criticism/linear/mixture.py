@@ -53,42 +53,51 @@ def summed(
         model: Linear model with its prior.
         widths: Factors on the scales of effects' priors, equally likely.
     """
-    found = [integrated(gram, model, width) for width in widths]
-    log_z = np.stack([f[0] for f in found], 1) + log_weight[:, None]
-    log_z = log_z - np.log(len(widths))
+    log_z, means, covs = integrated(gram, model, widths)
+    log_z = log_z + log_weight[:, None] - np.log(len(widths))
     total = float(log_sum_exp(log_z.ravel()))
     p = np.exp(log_z - total).ravel()
-    means = np.stack([f[1] for f in found], 1).reshape(len(p), -1)
-    covs = np.stack([f[2] for f in found], 1).reshape(len(p), *gram[0, 1:, 1:].shape)
+    means = means.reshape(len(p), -1)
     mean = p @ means
     off = means - mean
-    cov = np.einsum("h,hij->ij", p, covs) + (p[:, None] * off).T @ off
-    return Mixture(total, mean, cov, log_z)
+    cov = np.einsum("h,hij->ij", p, covs.reshape(len(p), *covs.shape[2:]))
+    return Mixture(total, mean, cov + (p[:, None] * off).T @ off, log_z)
 
 
 def integrated(
-    gram: Array, model: LinearModel, width: float
+    gram: Array, model: LinearModel, widths: Sequence[float]
 ) -> tuple[Array, Array, Array]:
-    """Return evidences less their constants, and posterior moments of u."""
-    sd, off = model.widened(width), model.center - model.u
-    g, b, rr = gram[:, 1:, 1:], gram[:, 1:, 0], gram[:, 0, 0]
-    precision = sd[:, None] * g * sd + np.eye(len(sd))
+    """Return evidences less their constants, and posterior moments of u.
+
+    Args:
+        gram: Gram matrices of its rows, shape (h, 1 + d, 1 + d).
+        model: Linear model with its prior.
+        widths: Factors w on the scales of effects' priors.
+
+    Returns:
+        Shapes (h, w), (h, w, d) and (h, w, d, d).
+    """
+    sd = np.stack([model.widened(width) for width in widths])
+    g, b, rr = gram[:, None, 1:, 1:], gram[:, None, 1:, 0], gram[:, None, 0, 0]
+    off, eye = model.center - model.u, np.eye(sd.shape[1])
+    precision = sd[:, :, None] * g * sd[:, None] + eye
     # Columns of very different size, as of what jumps, keep their digits in units of
     # their own.
-    size = np.sqrt(np.einsum("hii->hi", precision))
-    own = size[:, :, None] * size[:, None]
-    cov = np.linalg.inv(precision / own) / own
+    size = np.sqrt(np.einsum("hwii->hwi", precision))
+    own = size[..., None] * size[..., None, :]
+    precision = precision / own
+    cov = np.linalg.inv(precision) / own
     pull = sd * b + off / sd
-    mean = np.einsum("hij,hj->hi", cov, pull)
-    log_z = -0.5 * (rr + ((off / sd) ** 2).sum() - (pull * mean).sum(1))
-    log_det = np.linalg.slogdet(precision / own)[1] + 2 * np.log(size).sum(1)
+    mean = np.einsum("hwij,hwj->hwi", cov, pull)
+    log_z = -0.5 * (rr + ((off / sd) ** 2).sum(1) - (pull * mean).sum(2))
+    log_det = np.linalg.slogdet(precision)[1] + 2 * np.log(size).sum(2)
     log_z = log_z - 0.5 * log_det  # and from here on about the prior's center
-    mean, cov = sd * mean - off, sd[:, None] * cov * sd
+    mean, cov = sd * mean - off, sd[:, :, None] * cov * sd[:, None]
     low, high = model.low - model.center, model.high - model.center
     some = np.isfinite(low) | np.isfinite(high)
     if some.any():
-        own = np.sqrt(np.einsum("hii->hi", cov))[:, some]
-        inside = log_inside(mean[:, some], own, low[some], high[some])
-        before = log_inside(np.zeros(some.sum()), sd[some], low[some], high[some])
-        log_z = log_z + inside.sum(1) - before.sum()
+        own = np.sqrt(np.einsum("hwii->hwi", cov))[..., some]
+        inside = log_inside(mean[..., some], own, low[some], high[some])
+        before = log_inside(np.zeros(some.sum()), sd[:, some], low[some], high[some])
+        log_z = log_z + inside.sum(2) - before.sum(1)
     return log_z, mean + model.center, cov
