@@ -14,7 +14,7 @@ from sbi_active.criticism.forces.dictionary import FORMS, FREE
 from sbi_active.criticism.forces.library import trajectories
 
 TIMES = torch.linspace(0.1, 2.0, 20, dtype=torch.float64)
-STEP, SD, MASS = 0.02, 0.003, 2.0
+STEP, SD, MASS = 0.05, 0.003, 2.0
 PRIOR = BoxUniform(torch.tensor([5.0, 0.0]), torch.tensor([15.0, 1.0]))
 
 
@@ -23,12 +23,12 @@ def swing(theta, action, *, force=None):
     g, c = theta.double().T[..., None]
     q, u = action[:, :1].double().clone(), action[:, 1:].double()
     v, found = torch.zeros_like(q), []
-    for k in range(100):
+    for k in range(40):
         t = k * STEP
         drive = u * np.sin(3 * t) - g * torch.sin(q) - c * v
         v = v + STEP * (drive + total_force(force, q, v, t)) / MASS
         q = q + STEP * v
-        if (k + 1) % 5 == 0:
+        if k % 2:
             found.append(q[:, 0])
     return torch.stack(found, 1).to(theta.dtype)
 

@@ -7,7 +7,7 @@ from torch.distributions import HalfNormal, Independent, Normal
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials
 
-NUM_TRIALS, NUM_SAMPLES, STEPS = 8, 20, 2
+NUM_TRIALS, NUM_SAMPLES, STEPS = 8, 20, 1
 TIMES = torch.linspace(0.2, 4.0, NUM_SAMPLES, dtype=torch.float64)
 SENSOR = 0.01
 PRIOR = Independent(Normal(torch.tensor([2.0, 0.3]), torch.tensor([0.5, 0.1])), 1)

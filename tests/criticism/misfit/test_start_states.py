@@ -24,12 +24,12 @@ def level(theta, action, *, start=0.0, drag=0.0, bias=0.0, hidden=0.0):
     """Return x' = -theta x - drag x |x| + action sin 3t from a start, (n, k)."""
     k, u = theta[:, 0].double(), action[:, 0].double()
     x = torch.zeros_like(k) + start
-    found, dt = [], 0.025
-    for i in range(SAMPLES * 4):
+    found, dt = [], 0.05
+    for i in range(SAMPLES * 2):
         t = torch.tensor(dt * i, dtype=torch.float64)
         x = x + dt * (-k * x - drag * x * x.abs() + u * torch.sin(3 * t))
         x = x + dt * hidden * torch.cos(5 * t)
-        if i % 4 == 3:
+        if i % 2:
             found.append(x + bias)
     return torch.stack(found, 1).to(theta.dtype)
 
