@@ -123,10 +123,7 @@ TABLES = {
     ),
     "Pouring": (
         "pouring --summary",
-        "pouring.around --summary",
-        "pouring.refined --summary",
         "pouring.material --summary",
-        "pouring.loop --summary",
     ),
 }
 
