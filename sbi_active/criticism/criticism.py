@@ -140,11 +140,6 @@ class Criticism:
         self.actions = actions
         #: Sampling of the trajectories; None if not looked for.
         self.sampling: Sampling | None = None
-        if thin:
-            with stage("rate of sampling", show_progress=show_progress):
-                trials, self.sampling = thinned_to_need(
-                    model, prior, trials, self.effects, seed=seed
-                )
         self.trials = trials
         self._parts = model, trials, self.effects
         if summaries is None:
@@ -161,6 +156,7 @@ class Criticism:
             self._parts = short.model, short.trials, short.effects
             self.num_summaries = len(short.weight)
         self._warm_up = require_warm_up(warm_up, *self._parts[1:])
+        self._thins = thin and not summaries
         #: Trials that every model misses by far more than the others.
         self.set_aside: tuple[OutlyingTrial, ...] = ()
         self._look()
@@ -174,18 +170,28 @@ class Criticism:
 
     def _look(self) -> None:
         """Make the models of the trials that are there."""
-        model, trials, effects = self._parts
         with stage("a look at the simulator", show_progress=self.show_progress):
-            parts = model, self.prior, trials.fit, effects
-            self.rivals = RivalSet(
-                *parts, actions=self.actions, seed=self.seed, warm_up=self._warm_up
-            )
+            self.rivals = self._models()
+            if self._thins:
+                self._thins = False
+                model, trials, effects = self._parts
+                self.trials, self.sampling = thinned_to_need(self.rivals, trials)
+                if self.trials is not trials:
+                    self._parts = model, self.trials, effects
+                    self.rivals = self._models()
             #: Effects that linear evidence set aside; None where all are fitted.
             self._linear, self.screening = linear_models(self.rivals)
         self._is_large = self._linear is not None and is_large(self.rivals.library)
         self._fewer = {"num_draws": FEW_DRAWS} if self._is_large else {}
         # Each model's held-out errors would take as much as the verdict.
-        self._scored = None if self._is_large else trials.held_out
+        self._scored = None if self._is_large else self._parts[1].held_out
+
+    def _models(self) -> RivalSet:
+        model, trials, effects = self._parts
+        own = model, self.prior, trials.fit, effects
+        return RivalSet(
+            *own, actions=self.actions, seed=self.seed, warm_up=self._warm_up
+        )
 
     def _judge(self) -> Verdict:
         """Return what the models say."""

@@ -2,57 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
-from torch.distributions import Distribution
 
 from sbi_active.criticism.data.sampling import Sampling, suggested_sampling, thinned
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.linear.search import Search
+from sbi_active.criticism.linear.sensor import sensor_of
 from sbi_active.criticism.results import ModelKey
-from sbi_active.seeding import derive_seed
-from sbi_active.simulation import SimulatorModel
+from sbi_active.criticism.rivals.noise_grid import measurement_sds
+from sbi_active.criticism.steps.tracing import log_priors
 
 
-def thinned_to_need(
-    model: SimulatorModel,
-    prior: Distribution,
-    trials: Trials,
-    effects: Sequence[Effect],
-    *,
-    seed: int,
-) -> tuple[Trials, Sampling | None]:
+def thinned_to_need(rivals: RivalSet, trials: Trials) -> tuple[Trials, Sampling | None]:
     """Return trials without samples that the bare model's fit shows to be redundant.
 
     Trials are thinned only if ``measurement_sd`` declares the sensor's error: errors
     beyond it are the simulator's, and smooth.
 
     Args:
-        model: The bare simulator.
-        prior: Prior of its parameters.
-        trials: All trials; those that may be fitted are.
-        effects: Effects, of which those of scope "trial" belong to the bare model.
-        seed: Seed of the fit.
+        rivals: The models of the trials that may be fitted.
+        trials: All trials.
 
     Returns:
         The trials, as they are where nothing is to be left out; and what was found of
         their sampling, None if it was not looked at.
     """
-    fit = trials.fit
+    fit = rivals.trials
     own = fit.sample_times is not None
-    times = fit.sample_times if own else model.sample_times
-    declared = getattr(model.noise, "measurement_sd", None) is not None
-    if not declared or times is None:
+    times = fit.sample_times if own else rivals.model.sample_times
+    if (
+        times is None
+        or measurement_sds(rivals.model.noise, rivals.measurements) is None
+    ):
         return trials, None
-    nuisances = [effect for effect in effects if effect.scope == "trial"]
-    seed = derive_seed(seed, "thinning")
-    rivals = RivalSet(model, prior, fit, nuisances, seed=seed)
-    rival = rivals.rival(ModelKey())
-    found = rivals.search(ModelKey())
+    sensor = sensor_of(rivals)
+    bare = Search(rivals, sensor, log_priors(rivals.library, ())).model(ModelKey())
     left = np.full(fit.x.numel(), np.nan)
-    left[rivals.measurements.position] = rival.residual(found.modes[:1])[0][0]
+    left[rivals.measurements.position] = sensor.unit * bare.residual
     sampling = suggested_sampling(fit, left.reshape(fit.x.shape), times)
     if sampling.every == 1:
         return trials, sampling

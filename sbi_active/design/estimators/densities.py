@@ -292,9 +292,13 @@ def noise_members(
     if not usable or not bool((mean.isfinite() & (sd > 0)).all()):
         return []
     classes = [(mean[label == k], sd[label == k]) for k in range(len(enough))]
+    counts = [len({row.tobytes() for row in m.numpy()}) for m, _ in classes]
     members: list[LogDensities] = []
     for factor in factors:
-        mixtures = [_NoiseKernels(m, s, factor) for m, s in classes]
+        mixtures = [
+            _NoiseKernels(*own, factor, num)
+            for own, num in zip(classes, counts, strict=True)
+        ]
         members.append(
             lambda new, parts=mixtures: torch.stack([part(new) for part in parts], 1)
         )
@@ -302,12 +306,12 @@ def noise_members(
 
 
 class _NoiseKernels:
-    """The density of one class, by means and deviations (n, q).
+    """The density of one class, by means and deviations (n, q), num of them distinct.
 
     A tenth is a Gaussian of all draws, for what lies between the kernels.
     """
 
-    def __init__(self, mean: Tensor, sd: Tensor, factor: float) -> None:
+    def __init__(self, mean: Tensor, sd: Tensor, factor: float, num: int) -> None:
         n, q = mean.shape
         center = mean.mean(0)
         apart = mean - center
@@ -317,8 +321,7 @@ class _NoiseKernels:
         unit = noise.mean(0).rsqrt()
         spread = torch.linalg.eigvalsh(unit[:, None] * covariance * unit)
         d = max(1, int((spread > 1).sum()))
-        num = max(2, len(mean.unique(dim=0)))
-        h = min(factor * silverman(num, d), 1.0)
+        h = min(factor * silverman(max(2, num), d), 1.0)
         self.knots = center + math.sqrt(1 - h**2) * apart
         self.factors = torch.linalg.cholesky(noise.diag_embed() + h**2 * covariance)
         self.center = center
