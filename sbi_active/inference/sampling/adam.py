@@ -42,7 +42,11 @@ class Adam:
         self.decay, self.fused = decay, fused
         self._mean = [torch.zeros_like(p) for p in self.parameters]
         self._square = [torch.zeros_like(p) for p in self.parameters]
-        self._steps = [torch.zeros(()) for _ in self.parameters]
+        # Counts of one kernel are where it runs, and in single precision.
+        self._steps = [
+            torch.zeros((), dtype=torch.float32, device=p.device if fused else "cpu")
+            for p in self.parameters
+        ]
 
     def forget_gradients(self) -> None:
         """Leave no gradient behind."""
@@ -63,7 +67,7 @@ class Adam:
             [self._square[k] for k in moved],
             [],
             [self._steps[k] for k in moved],
-            fused=self.fused,
+            fused=self.fused or None,  # None takes what is fast on the device
             amsgrad=False,
             beta1=0.9,
             beta2=0.999,

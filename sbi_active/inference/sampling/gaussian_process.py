@@ -324,6 +324,8 @@ def _hyperparameters(
             method="L-BFGS-B",
             options={"maxiter": settings.num_steps},
         )
+        if not math.isfinite(found.fun):  # nowhere near: what is most probable before
+            return center, -negative_log_evidence(center.numpy())[0]
     return torch.from_numpy(found.x), -float(found.fun)
 
 
