@@ -25,7 +25,6 @@ from sbi_active.tasks.box_collision.model import (
     PARAMETER_NAMES,
     positions,
 )
-from sbi_active.tasks.box_collision.reference import BoxCollisionReference
 from sbi_active.tasks.box_collision.scene import LocalScene, load_mujoco
 
 __all__ = ["BoxCollisionTask", "LeftTable", "Variant"]
@@ -62,8 +61,6 @@ class BoxCollisionTask(Task):
         left_table: Outcome off the table: "invalid", or the paper's code (-1, -1, -1),
             which receives noise as any position.
         theta_true: Another real system, within [0, 1]; None takes the target's.
-        reference_budget: Simulations that :meth:`reference` may spend on a posterior;
-            0 gives no reference.
 
     Attributes:
         num_rounds: Trials in the paper.
@@ -93,7 +90,6 @@ class BoxCollisionTask(Task):
         noise: float = 0.005,
         left_table: LeftTable = "invalid",
         theta_true: Sequence[float] | Tensor | None = None,
-        reference_budget: int = 0,
     ) -> None:
         load_mujoco()
         _require("target", target, TARGETS)
@@ -108,7 +104,7 @@ class BoxCollisionTask(Task):
                 " choose another truth"
             )
         self.target, self.variant, self.left_table = target, variant, left_table
-        self.noise, self.reference_budget = noise, reference_budget
+        self.noise = noise
         self.prior = BoxUniform(torch.zeros(3), torch.ones(3))
         self.actions = DiscreteActions(ACTIONS, names=["speed"], units=["m/s"])
         self.simulator = SimulatorModel(
@@ -169,22 +165,6 @@ class BoxCollisionTask(Task):
             for speed in REPRODUCED
         }
 
-    def reference(self, action: Tensor, x: Tensor) -> BoxCollisionReference | None:
-        """Return the posterior given trials by importance sampling, nearly exact.
-
-        Args:
-            action: Shape (t, 1).
-            x: Shape (t, 3); NaN where a trial was invalid.
-
-        Returns:
-            The posterior; None if ``reference_budget`` is 0.
-        """
-        if not self.reference_budget:
-            return None
-        return BoxCollisionReference(
-            self.simulator, action, x, num_simulations=self.reference_budget
-        )
-
     def _options(self) -> dict[str, Any]:
         return {
             "target": self.target,
@@ -192,7 +172,6 @@ class BoxCollisionTask(Task):
             "noise": self.noise,
             "left_table": self.left_table,
             "theta_true": self.theta_true,
-            "reference_budget": self.reference_budget,
         }
 
 

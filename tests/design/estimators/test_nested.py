@@ -53,7 +53,7 @@ def test_six_numbers_that_four_parameters_make():
     assert NestedGain().problems(rows) == []
     gain, error = estimate(rows, prior)
     exact, exact_error = OscillatorReference([], []).expected_information_gain(
-        model.ACTIONS[index], num_outer=400, num_inner=2_000
+        model.ACTIONS[index], num_outer=200, num_inner=50_000
     )
     error = (error**2 + exact_error**2).sqrt()
     assert ((gain - exact).abs() < 3 * error + 0.1).all()
