@@ -29,25 +29,15 @@ class CampaignDetails:
         posterior: Sampling method for beliefs of "alhi", "nlhi" and "seqbed", see
             :class:`.ALHI`.
         eliminate: Whether candidates far behind the leader get no further samples.
-        design_on: Simulations to design on: "fresh" ones, or those of the "training" at
-            no further cost. The estimates are then too high, the more so the fewer
-            rows.
-        min_probability_valid: Smallest probability of a measurement. Actions below it
-            are chosen neither for the parameters nor at random.
-        repeat: Whether an action may be chosen again.
         num_scored: Simulations of each executed action, from the belief before the
             trial, that its outcome is compared with.
     """
 
     posterior: str = "importance"
     eliminate: bool = True
-    design_on: Literal["fresh", "training"] = "fresh"
-    min_probability_valid: float = 0.0
-    repeat: bool = True
     num_scored: int = 2_000
 
     def __post_init__(self) -> None:
-        require_one_of(self, design_on=("fresh", "training"))
         advice = "use about 2000: no tail probability is below 1 / (num_scored + 1)"
         require_least(self, advice, num_scored=100)
 

@@ -5,7 +5,6 @@ import time
 import pytest
 import torch
 
-from sbi_active.campaign.options import CampaignDetails
 from sbi_active.seeding import row_normals
 from tests.campaign.problem import campaign, draws
 
@@ -46,7 +45,6 @@ def test_asking_for_the_posterior_trains_it_and_changes_nothing_else():
     [
         ({"estimator": "posterior"}, ("design",)),
         ({"refine": False}, ("belief",)),
-        ({"details": CampaignDetails(design_on="training")}, ("design",)),
     ],
 )
 def test_on_demand_it_is_trained_for_what_needs_it(changes, asks):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -67,9 +66,8 @@ class Planner:
         self._state, self.effects = state, (*effects,)
         options = state.options
         none = torch.empty(0, actions.action_dim)
-        least = options.details.min_probability_valid
         price = pricing(cost, actions)
-        self._limits = DesignLimits(actions, constraint, none, price, least)
+        self._limits = DesignLimits(actions, constraint, none, price)
         # A wrong shape is an error here, and not in a later round.
         permitted(self._limits)
         listed = actions.listed()
@@ -143,19 +141,11 @@ class Planner:
             alarmed: Whether the simulator no longer explains the trials; then what is
                 to be learned about its parameters does not count.
         """
-        details = self._state.options.details
-        told = [t.action for t in self._state.trials if t.is_measured]
-        limits = self._limits
-        if told and not details.repeat:
-            limits = replace(limits, exclude=torch.stack(told))
-        allowed = {
-            "constraint": limits.constraint,
-            "exclude": limits.exclude,
-            "min_probability_valid": limits.least,
-        }
+        limits, allowed = self._limits, {"constraint": self._limits.constraint}
         if not self._designs:
             return self._select(index, learner, self._designer, **allowed), "random"
         if target == "auto" and self._checks(index):
+            told = [t.action for t in self._state.trials if t.is_measured]
             places = most_unlike(permitted(limits), told)
             designer = RandomDesigner(places, workers=self._state.options.workers)
             return self._select(index, learner, designer), "check"
@@ -177,8 +167,8 @@ class Planner:
                 )
             design, own = learner.design(index, limits), "theta"
         else:
-            model, rows = learner.round.model(index), learner.round.simulations
-            about: Any = {"target": own, "cost": limits.price, "simulations": rows}
+            model = learner.round.model(index)
+            about: Any = {"target": own, "cost": limits.price}
             chosen = index, learner, self._designer, model
             design = self._select(*chosen, **about, **allowed)
             if model.was_asked:
@@ -221,7 +211,7 @@ def permitted(limits: DesignLimits) -> ActionSpace:
         ValueError: If nothing is permitted.
     """
     actions = limits.actions
-    if limits.constraint is None and not len(limits.exclude):
+    if limits.constraint is None:
         return actions
     values, _ = limits.listed()
     if values is None:

@@ -29,15 +29,10 @@ class Round:
 
     Args:
         learner: Learner whose belief the round begins at.
-
-    Attributes:
-        simulations: Simulations that the last training was on, where the design is to
-            rest on them; else None.
     """
 
     def __init__(self, learner: Any) -> None:
         self._learner = learner
-        self.simulations: Simulations | None = None
         self.close()
 
     def close(self) -> None:
@@ -62,9 +57,7 @@ class Round:
         learner = self._learner
         if Enumeration.of(learner.prior) is not None:
             return RoundModel(None)
-        is_fresh = learner.state.options.details.design_on == "fresh"
-        can_wait = learner.inference.amortized and is_fresh
-        is_due = learner.trains_each_round or not can_wait
+        is_due = learner.trains_each_round or not learner.inference.amortized
         return RoundModel(
             lambda: self.trained(index), self.trained(index) if is_due else None
         )
@@ -101,24 +94,16 @@ class Round:
         learner, state = self._learner, self._learner.state
         if not self._is_trained:
             with state.stage(index, "simulation"):
-                num_simulations, num_missing = self._appended(index)
+                rows, num_simulations, num_missing = self._rows(index)
+                learner.inference.append_simulations(
+                    rows.theta, rows.x, action=rows.action, belief=learner.belief
+                )
             own = forked_generators(state.seed, "train", len(state.explained))
             with state.stage(index, "training"), own:
                 learner.inference.train()
             state.account(index, num_simulations, num_missing)
             self._is_trained = True
         return learner.inference.build_posterior()
-
-    def _appended(self, index: int) -> tuple[int, int]:
-        """Simulate rows for the training; return their number, and of the missing."""
-        learner = self._learner
-        rows, num_simulations, num_missing = self._rows(index)
-        if learner.state.options.details.design_on == "training":
-            self.simulations = rows
-        learner.inference.append_simulations(
-            rows.theta, rows.x, action=rows.action, belief=learner.belief
-        )
-        return num_simulations, num_missing
 
     def _rows(self, index: int) -> tuple[Simulations, int, int]:
         """Simulate the round: parameters from the belief, actions from the space.

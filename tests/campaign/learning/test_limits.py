@@ -54,11 +54,3 @@ def test_a_constraint_is_kept_by_actions_about_the_model(constraint, side):
         c.tell([1.0], action=[2.0])
     trial = c.ask(target="model")
     assert side * float(trial.action) > 0
-
-
-def test_no_action_comes_twice_without_repeats():
-    c = campaign("nsbi", repeat=False)
-    c.run(measured, num_rounds=4)
-    assert sorted(float(t.action) for t in c.history) == pytest.approx([0.1, 1, 2, 3])
-    with pytest.raises(ValueError, match="expected a permitted action; got none of 4"):
-        c.ask()
