@@ -20,11 +20,6 @@ Count = Callable[[], tuple[int, int | None]]
 _inside = threading.local()
 
 
-def is_asked_for(show_progress: bool) -> bool:
-    """Return whether a bar or the log is to tell of anything."""
-    return show_progress or LOGGER.isEnabledFor(logging.INFO)
-
-
 @contextmanager
 def stage(
     what: str, *, show_progress: bool = False, count: Count | None = None
@@ -36,7 +31,8 @@ def stage(
         show_progress: Whether to draw a bar.
         count: Steps done, from which the time that is left is estimated.
     """
-    if getattr(_inside, "any", False) or not is_asked_for(show_progress):
+    asked = show_progress or LOGGER.isEnabledFor(logging.INFO)
+    if getattr(_inside, "any", False) or not asked:
         yield
         return
     _inside.any = True
@@ -52,10 +48,8 @@ class News:
 
     Args:
         what: Name of the work.
-        expected: Seconds that it took before; None if it is the first.
-        before: Place where that was, such as "trial 3".
         has_bar: Whether to draw a bar.
-        count: Steps done, from which the seconds are estimated in place of that.
+        count: Steps done, from which the seconds that are left are estimated.
 
     Attributes:
         long: Seconds from which a stage is worth a line of the log.
@@ -70,17 +64,11 @@ class News:
     sign: ClassVar[float] = 30.0
 
     def __init__(
-        self,
-        what: str,
-        *,
-        expected: float | None = None,
-        before: str = "",
-        has_bar: bool = False,
-        count: Count | None = None,
+        self, what: str, *, has_bar: bool = False, count: Count | None = None
     ) -> None:
-        self._what, self._expected, self._before = what, expected, before
-        self._has_bar, self._count = has_bar, count
+        self._what, self._has_bar, self._count = what, has_bar, count
         self._done: tuple[int, int | None] = (0, None)
+        self._expected: float | None = None  # seconds in all
         self._bar: Any = None
         self._said_at: float | None = None
         self._over = threading.Event()
@@ -90,36 +78,22 @@ class News:
     @contextmanager
     def told(self) -> Iterator[None]:
         """Report the block."""
-        self._begin()
+        self._thread.start()
+        how = "ended with an error after"
         try:
             yield
-        except BaseException:
-            self._end("ended with an error after")
-            raise
-        self._end("took")
-
-    def _begin(self) -> None:
-        """Say how long it will take where that is known to be long."""
-        if self._expected is not None and self._expected > self.long:
-            self._say(f"about {in_words(self._expected)}, as in {self._before}")
-        self._thread.start()
-
-    def _end(self, how: str) -> None:
-        """Say how long it took where that was long, and take the bar away."""
-        self._over.set()
-        self._thread.join()
-        if self._bar is not None:
-            self._bar.close()
-        if self._said_at is not None:
-            LOGGER.info("%s %s %s", self._what, how, in_words(self._seconds))
+            how = "took"
+        finally:
+            self._over.set()
+            self._thread.join()
+            if self._bar is not None:
+                self._bar.close()
+            if self._said_at is not None:
+                LOGGER.info("%s %s %s", self._what, how, in_words(self._seconds))
 
     @property
     def _seconds(self) -> float:
         return time.perf_counter() - self._start
-
-    def _say(self, text: str) -> None:
-        self._said_at = self._seconds
-        LOGGER.info("%s, %s", self._what, text)
 
     def _follow(self) -> None:
         while not self._over.wait(self.tick):
@@ -127,29 +101,27 @@ class News:
             self._look(seconds)
             due = self.long if self._said_at is None else self._said_at + self.sign
             if seconds > due:
-                self._say(f"{in_words(seconds)} so far; {self._outlook(seconds)}")
+                self._said_at = seconds
+                text = f"{in_words(seconds)} so far{self._outlook(seconds)}"
+                LOGGER.info("%s, %s", self._what, text)
             if self._has_bar and (seconds > self.shown or self._bar is not None):
                 self._draw(seconds)
 
     def _look(self, seconds: float) -> None:
         """Estimate the time from the steps that were done, as each is."""
-        if self._count is None:
-            return
-        done = self._count()
+        done = (0, None) if self._count is None else self._count()
         if done != self._done:
             self._done, (num, total) = done, done
             self._expected = seconds * total / num if num and total else None
 
     def _outlook(self, seconds: float) -> str:
         num, total = self._done
-        if self._count is not None:
-            steps = f"{num} done" if total is None else f"{num} of {total} done"
-            if self._expected is None:
-                return steps
-            return f"{steps}, about {in_words(max(self._expected - seconds, 0))} left"
+        if self._count is None:
+            return ""
+        steps = f"; {num} done" if total is None else f"; {num} of {total} done"
         if self._expected is None:
-            return "it is the first, so that nothing tells how long it will take"
-        return f"in {self._before} it took {in_words(self._expected)}"
+            return steps
+        return f"{steps}, about {in_words(max(self._expected - seconds, 0))} left"
 
     def _draw(self, seconds: float) -> None:
         from tqdm.auto import tqdm

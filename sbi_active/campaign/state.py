@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -13,13 +13,13 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active import progress
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.telling import Facts, Status
 from sbi_active.design.design import Design
 from sbi_active.display.notebook import card, facts
 from sbi_active.display.table import number
 from sbi_active.inference.emulation.pool import Batch
-from sbi_active.progress import News, is_asked_for
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.workers.store import Meter
 
@@ -345,25 +345,16 @@ class CampaignState:
             "belief stands"
         )
 
-    @contextmanager
-    def watched(self, index: int, name: str) -> Iterator[None]:
-        """Show progress while the block runs, by how long it took the last time.
+    def watched(self, index: int, name: str) -> AbstractContextManager[None]:
+        """Show progress while the block runs.
 
         Args:
             index: Index of the trial that the work is for; of the next one where it is
                 for none.
             name: Name of the work.
         """
-        if not is_asked_for(self.show_progress):
-            yield
-            return
         what = f"trial {index}: {name}" if index < len(self.trials) else name
-        before = next((t for t in self.trials[:index][::-1] if name in t.seconds), None)
-        expected = None if before is None else before.seconds[name]
-        place = "" if before is None else f"trial {before.index}"
-        bar = self.show_progress
-        with News(what, expected=expected, before=place, has_bar=bar).told():
-            yield
+        return progress.stage(what, show_progress=self.show_progress)
 
     @contextmanager
     def stage(self, index: int, name: str) -> Iterator[None]:
