@@ -133,7 +133,10 @@ def test_a_table_with_inputs_that_is_not_understood(rows, header, message):
             "x of trial a measured within the time of its input 'u', 0 to 0.001; got "
             "x at 0.02",
         ),
-        ({"inputs": ["a,0,1", "a,0,2"]}, "each sample once; .* rows 1 and 2 of inputs"),
+        (
+            {"inputs": ["a,0,1", "a,0,2", "b,0,1"]},
+            "each sample once; .* row 2 .*inputs",
+        ),
     ],
 )
 def test_another_table_that_is_not_understood(arguments, message):
