@@ -13,9 +13,14 @@ import numpy as np
 import pandas as pd
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.data.columns import PREFIXES, TRIAL, Column
+from sbi_active.criticism.data.columns import TRIAL, Column
 from sbi_active.criticism.data.units import TIME
 
+#: What to do about a column that varies within a trial.
+IF_IT_VARIES = (
+    "call it input_* if it is commanded over time and x_* if it is measured, give a "
+    "start_* its value at the start in each row, or give each trial its own name"
+)
 EMPTY = ("", "nan", "none", "na", "<na>")
 
 
@@ -136,7 +141,7 @@ class Cells:
             raise ValueError(
                 f"expected one value of {column.header} in each trial; got "
                 f"{values[one]} in {self.row(one)} and {values[i]} in {self.place(i)} "
-                f"of {self.file(i)}; {_if_it_varies(column.header)}"
+                f"of {self.file(i)}; {IF_IT_VARIES}"
             )
         return own
 
@@ -161,21 +166,6 @@ class Cells:
 def _digits(value: float) -> str:
     """Return a number that names a trial, with all its digits; 1.0 and 1 are one."""
     return str(int(value)) if float(value).is_integer() else repr(float(value))
-
-
-def _if_it_varies(header: str) -> str:
-    """Return what to do about a column that varies within a trial."""
-    if header.startswith(PREFIXES["action"]):
-        name = PREFIXES["input"] + header.removeprefix(PREFIXES["action"])
-        return (
-            f"call it {name} if it is commanded over time, or give each trial its name"
-        )
-    if header.startswith(PREFIXES["start"]):
-        return "give its value at the start in each row, or call it x_*"
-    return (
-        "give each trial its own name, x_* to what is measured over time, and input_* "
-        "to what is commanded"
-    )
 
 
 def _remedy(column: Column, text: str) -> str:

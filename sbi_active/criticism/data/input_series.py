@@ -16,6 +16,8 @@ from sbi_active.expected import require
 from sbi_active.messages import warn
 
 Hold = Literal["previous", "linear"]
+#: Times and values of a series in a trial, of which the last may be missing.
+Piece = tuple[Array, Array]
 
 #: Median steps from which a step is a gap.
 GAP = 5.0
@@ -131,27 +133,20 @@ def _on_one_grid(
     """
     known = "input_hold 'previous' or 'linear'"
     require(hold in get_args(Hold), known, repr(hold), "choose one")
-    lengths = {
+    pieces = {
         name: [
-            _length(f"input {name!r} of trial {trial}", u, t)
+            _piece(f"input {name!r} of trial {trial}", u, t)
             for trial, u, t in zip(names, value, stamps[name], strict=True)
         ]
         for name, value in series.items()
     }
-    grid = _grid(stamps, lengths, names)
-    if grid is None:
-        own = next(iter(stamps.values()))[0].clone()
-        return {name: value.clone() for name, value in series.items()}, own
+    grid = _grid(pieces, names)
     found = {
-        name: torch.stack(
-            [
-                torch.from_numpy(_at(grid, t[:k].numpy(), u[:k].numpy(), hold))
-                for t, u, k in zip(stamps[name], value, lengths[name], strict=True)
-            ]
-        )
-        for name, value in series.items()
+        name: np.stack([_at(grid, t[: len(u)], u, hold) for t, u in each])
+        for name, each in pieces.items()
     }
-    return found, torch.from_numpy(grid)
+    held = {name: torch.from_numpy(value) for name, value in found.items()}
+    return held, torch.from_numpy(grid)
 
 
 def held_at(
@@ -227,8 +222,8 @@ def _stamps(series: Mapping[str, Tensor], times: Any) -> dict[str, Tensor]:
     return found
 
 
-def _length(what: str, values: Tensor, times: Tensor) -> int:
-    """Return how many values a series has, or raise where it is none."""
+def _piece(what: str, values: Tensor, times: Tensor) -> Piece:
+    """Return times and values of a series without what pads them, or raise."""
     length, last = int(times.isfinite().sum()), int(values.isfinite().sum())
     for name, given, num in (("time", times, length), ("value", values, last)):
         for (k,) in (~given[:num].isfinite()).nonzero().tolist():  # else it is padding
@@ -254,28 +249,20 @@ def _length(what: str, values: Tensor, times: Tensor) -> int:
         f"{last} values and {length} times of {what}",
         "pass what does not vary in time as the action, action_* in a table",
     )
-    return last
+    return times[:length].numpy(), values[:last].numpy()
 
 
-def _grid(
-    stamps: Mapping[str, Tensor],
-    lengths: Mapping[str, list[int]],
-    names: Sequence[str],
-) -> Array | None:
-    """Return the grid, None if all are on one that is uniform already."""
-    every = [*stamps.values()]
-    first = every[0][0]
-    whole = all(k == len(first) for each in lengths.values() for k in each)
-    same = all(t.shape == every[0].shape and bool((t == first).all()) for t in every)
-    if whole and same:
-        steps = first.diff()
-        if bool(((steps - steps.mean()).abs() <= SAME * steps.mean()).all()):
-            return None
-    known = [
-        [t[i][t[i].isfinite()].numpy() for t in every] for i in range(len(every[0]))
-    ]
-    step = min(float(np.median(np.diff(t))) for own in known for t in own)
-    ends = [(min(t[0] for t in own), max(t[-1] for t in own)) for own in known]
+def _grid(pieces: Mapping[str, Sequence[Piece]], names: Sequence[str]) -> Array:
+    """Return the grid; that of all series where it is uniform already."""
+    every = [piece for each in pieces.values() for piece in each]
+    first, _ = every[0]
+    steps = np.diff(first)
+    same = all(np.array_equal(t, first) and len(t) == len(u) for t, u in every)
+    if same and (np.abs(steps - steps.mean()) <= SAME * steps.mean()).all():
+        return first.copy()
+    step = min(float(np.median(np.diff(t))) for t, _ in every)
+    by_trial = zip(*pieces.values(), strict=True)
+    ends = [(min(t[0] for t, _ in o), max(t[-1] for t, _ in o)) for o in by_trial]
     low, high = min(begin for begin, _ in ends), max(end for _, end in ends)
     _require_one_origin(ends, low, names)
     # Where the last time is between two steps, the grid goes up to the next.

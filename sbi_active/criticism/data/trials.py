@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -335,24 +336,13 @@ class Trials:
         # Where the first trial is left out, the others repeat the first that is kept.
         new = {int(place): i for i, place in reversed([*enumerate(first)])}
         new |= {int(old): i for i, old in enumerate(at)}
-        repeat_of = torch.tensor([new[int(place)] for place in first])
-        times = self.sample_times
-        some = Trials(
-            self.action[at],
-            self.x[at],
-            role=[self.role[i] for i in at],
-            index=self.index[at],
-            order=self.order,
-            sample_times=times if times is None or times.ndim == 1 else times[at],
-            repeat_of=repeat_of,
-            action_labels=self.action_labels,
-            channel_labels=self.channel_labels,
-            inputs=rows_at(self.inputs, at),
-            input_times=self.input_times,
-            input_labels=self.input_labels,
-            start=rows_at(self.start, at),
-        )
-        some.action_is_label = self.action_is_label
+        some = copy.copy(self)
+        some.action, some.x, some.index = self.action[at], self.x[at], self.index[at]
+        some.role = [self.role[i] for i in at]
+        some.repeat_of = root(torch.tensor([new[int(place)] for place in first]))
+        if self.sample_times is not None and self.sample_times.ndim > 1:
+            some.sample_times = self.sample_times[at]
+        some.inputs, some.start = rows_at(self.inputs, at), rows_at(self.start, at)
         if self._names is not None:  # of trials that may be there twice now
             some._names = tuple(self._names[i] for i in at)
         return some

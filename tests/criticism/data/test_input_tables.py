@@ -93,7 +93,7 @@ def test_inputs_come_from_another_file_on_their_own_grid():
         (
             ["a,0,1,5", "a,1,2,5"],
             "trial,time,action_u,x_y",
-            "got 1.0 in row 1 and 2.0 in row 2 .* call it input_u if it is commanded",
+            "got 1.0 in row 1 and 2.0 in row 2 .* call it input_. if it is commanded",
         ),
         (
             ["a,0,1,5", "a,1,1,5", "a,2,1,5", "a,9,1,5", "a,10,1,5"],
