@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sbi_active.criticism import Trials
-from sbi_active.criticism.data.recordings import read_trials
+from sbi_active.criticism.data.tables import read_trials
 
 
 def read_two_deep(path):

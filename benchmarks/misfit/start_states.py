@@ -31,7 +31,7 @@ from benchmarks.criticism.intervals import rate
 from benchmarks.rows import benchmark
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
-from sbi_active.criticism.report.words import TOLD
+from sbi_active.criticism.report.words import FEW_DRAWS
 from sbi_active.criticism.results import NONE
 from sbi_active.display.table import Table
 
@@ -169,7 +169,7 @@ def score_case(number: int, hidden: int) -> dict[str, object]:
         "simulations": loop.rivals.simulator.num_simulations,
         "simulator_seconds": spent[0],
         "ess_alone": float(alone.min()),
-        "not_printed": int((alone < TOLD.draws).sum()),
+        "not_printed": int((alone < FEW_DRAWS).sum()),
         "inside": inside,
         "intervals": intervals,
     }

@@ -24,6 +24,7 @@ from sbi_active.criticism.effects.trial_conditions import (
     has_own_times,
 )
 from sbi_active.criticism.results import CATCH_ALLS, NONE
+from sbi_active.expected import require
 from sbi_active.inference.beliefs.enumerated import Enumeration
 from sbi_active.messages import warn
 from sbi_active.seeding import forked_generators
@@ -48,13 +49,14 @@ def with_noise(
     first = torch.where(fit.repeat_of < 0, torch.arange(len(fit)), fit.repeat_of)
     groups = [fit.x[first == i] for i in first.unique()]
     most = max(len(group) for group in groups)
-    if most < fewest_repeats:
-        raise ValueError(
-            "expected measurement noise, declared or estimated from at least "
-            f"{fewest_repeats} repeats of one action; got a deterministic simulator "
-            f"without noise and at most {most} trials of one action, so that nothing "
-            "tells noise from effect; declare SimulatorModel(fn, noise=...)"
-        )
+    require(
+        most >= fewest_repeats,
+        "measurement noise, declared or estimated from at least "
+        f"{fewest_repeats} repeats of one action",
+        f"a deterministic simulator without noise and at most {most} trials of one "
+        "action, so that nothing tells noise from effect",
+        "declare SimulatorModel(fn, noise=...)",
+    )
     repeated = [group for group in groups if len(group) > 1]
     noisy = copy.copy(model)
     has_time = model.sample_times is not None
@@ -88,35 +90,41 @@ def require_fitting(
     actions: ActionSpace | None,
 ) -> None:
     """Raise if the parts of a loop do not fit together."""
-    if Enumeration.of(prior) is not None:
-        raise ValueError(
-            "expected a prior of continuous parameters; got one with parameters of a "
-            "few values; declare the choice as an Effect, which is compared with none"
-        )
+    require(
+        Enumeration.of(prior) is None,
+        "a prior of continuous parameters",
+        "one with parameters of a few values",
+        "declare the choice as an Effect, which is compared with none",
+    )
     own = model.parameter_names
     default = [f"theta_{i + 1}" for i in range(prior.event_shape[0])]
     require_distinct(effects, default if own is None else own)
     require_nested(effects)
     reserved = (NONE, *CATCH_ALLS)
-    taken = [e.name for e in effects if e.name in reserved]
-    if taken:
-        raise ValueError(
-            f"expected effects not named {', '.join(reserved)}; got {taken[0]!r}; "
-            "choose another name: noise inflation is tried in any case"
+    expected = f"effects not named {', '.join(reserved)}"
+    for effect in effects:
+        is_free = effect.name not in reserved
+        require(is_free, expected, repr(effect.name), "choose another name")
+        require(
+            not (effect.hook == "action" and trials.action_is_label),
+            "effects on the inputs where the action is the trial's number",
+            f"{effect.name!r} on the action",
+            "declare hook='input'",
         )
-    num = int(trials.fit.valid.sum())
-    if num < 2:
-        raise ValueError(
-            f"expected at least two valid trials to fit; got {num}; measure more, "
-            "since one trial fits any model"
-        )
-    if actions is not None and actions.action_dim != trials.action.shape[1]:
-        raise ValueError(
-            f"expected actions of dimension {trials.action.shape[1]}, that of the "
-            f"trials; got {actions.action_dim}; give the space they were drawn from"
-        )
-    _require_no_labels_changed(trials, effects)
-    _warn_unused(model, trials)
+    num, advice = int(trials.fit.valid.sum()), "measure more: one trial fits any model"
+    require(num > 1, "at least two valid trials to fit", num, advice)
+    if actions is not None:
+        dim, own_dim = actions.action_dim, trials.action.shape[1]
+        expected = f"actions of dimension {own_dim}, that of the trials"
+        require(dim == own_dim, expected, dim, "give the space they were drawn from")
+    for name in ("inputs", "start"):
+        if getattr(trials, name) is not None and name not in model.conditions:
+            warn(
+                f"SA210 the trials have {name}, and the simulator's function takes no "
+                f"argument {name!r}: they are not used; write fn(theta, action, *, "
+                f"{name})",
+                stacklevel=stack_level(),
+            )
     if trials.inputs is not None and has_own_times(model, trials):
         times, grid = model.sample_times, trials.input_times
         assert times is not None
@@ -129,24 +137,15 @@ def require_fitting(
     theta, action = _some_rows(prior, trials)
     if model.noise is not None:
         x = model.mean(theta, action, **_conditions(model, trials, theta))
-        if not bool(x.isfinite().any()):
-            raise ValueError(
-                "expected a simulator that gives numbers at the trials' actions; got "
-                "NaN or inf throughout; check its units and those of the actions"
-            )
+        require(
+            bool(x.isfinite().any()),
+            "a simulator that gives numbers at the trials' actions",
+            "NaN or inf throughout",
+            "check its units and those of the actions",
+        )
     # Compares every effect with the simulator at its null.
     context = conditions_of_trials(trials, _some_trials(trials), model)
     AugmentedSimulator(model, effects, check=(theta, action, context))
-
-
-def _require_no_labels_changed(trials: Trials, effects: Sequence[Effect]) -> None:
-    """Raise if an effect would change an action that is only a trial's number."""
-    for effect in effects:
-        if effect.hook == "action" and trials.action_is_label:
-            raise ValueError(
-                "expected effects on the inputs where the action is the trial's "
-                f"number; got {effect.name!r} on the action; declare hook='input'"
-            )
 
 
 def require_warm_up(warm_up: float, trials: Trials, effects: Sequence[Effect]) -> float:
@@ -156,47 +155,30 @@ def require_warm_up(warm_up: float, trials: Trials, effects: Sequence[Effect]) -
         ValueError: If it is negative, there is nothing to tell of, x has no times, or a
             trial is no longer than that.
     """
-    if not 0 <= warm_up < float("inf"):
-        raise ValueError(
-            f"expected warm_up >= 0; got {warm_up}; pass a time in the unit of the "
-            "sample times, or 0"
-        )
+    is_time, given = 0 <= warm_up < float("inf"), f"warm_up = {warm_up:g}"
+    require(is_time, "warm_up >= 0", warm_up, "pass a time, or 0")
     if warm_up == 0:
         return 0.0
-    if not any(e.scope == "trial" for e in effects):
-        raise ValueError(
-            f"expected effects of scope 'trial' with warm_up = {warm_up:g}; got none; "
-            "declare the nuisances that the first samples of a trial tell of, or leave "
-            "warm_up out"
-        )
+    require(
+        any(e.scope == "trial" for e in effects),
+        f"effects of scope 'trial' with {given}",
+        "none",
+        "declare the nuisances that the first samples of a trial tell of, or leave "
+        "warm_up out",
+    )
     times = trials.sample_times
     if times is None:
         raise ValueError(
-            f"expected sample_times with warm_up; got warm_up = {warm_up:g} and none; "
-            "give Trials(sample_times=...)"
+            f"expected sample_times with warm_up; got {given} and none; give "
+            "Trials(sample_times=...)"
         )
     stamps = times.expand(len(trials), -1).nan_to_num(-torch.inf)
     span = stamps.amax(1) - times.expand(len(trials), -1)[:, 0]
-    short = [trials.names[i] for i in range(len(trials)) if span[i] <= warm_up]
-    if short:
-        raise ValueError(
-            f"expected trials longer than warm_up = {warm_up:g}; got "
-            f"{float(span.min()):g} in trial {short[0]}; pass a shorter warm_up, in "
-            "the unit of the sample times"
-        )
+    for name, own in zip(trials.names, span.tolist(), strict=True):
+        expected, got = f"trials longer than {given}", f"{own:g} in trial {name}"
+        advice = "pass a shorter warm_up, in the unit of the sample times"
+        require(own > warm_up, expected, got, advice)
     return float(warm_up)
-
-
-def _warn_unused(model: SimulatorModel, trials: Trials) -> None:
-    """Warn of what was recorded and the simulator's function does not take."""
-    for name in ("inputs", "start"):
-        if getattr(trials, name) is not None and name not in model.conditions:
-            warn(
-                f"SA210 the trials have {name}, and the simulator's function takes no "
-                f"argument {name!r}: they are not used; write fn(theta, action, *, "
-                f"{name})",
-                stacklevel=stack_level(),
-            )
 
 
 def _warn_outside(trials: Trials, actions: ActionSpace) -> None:

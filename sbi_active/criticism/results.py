@@ -95,6 +95,10 @@ class Residuals:
     roughness: Array | None = None
     names: tuple[str, ...] = ()
 
+    def called(self, position: int) -> str:
+        """Return the name of a trial, or its position without names."""
+        return self.names[position] if self.names else str(position)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Evidence:

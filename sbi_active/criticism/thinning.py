@@ -9,6 +9,7 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.sensor import sensor_of
+from sbi_active.criticism.report.words import caution
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.noise_grid import measurement_sds
 from sbi_active.criticism.steps.tracing import log_priors
@@ -48,14 +49,8 @@ def thinned_to_need(rivals: RivalSet, trials: Trials) -> tuple[Trials, Sampling 
 
 def in_words(found: Sampling) -> str:
     """Return a text on the samples that were left out, and why."""
-    return (
-        f"SA525 of {1 / found.step:.3g} samples a second every "
-        f"{_ordinal(found.every)} is used ({1 / found.suggested_step:.3g} a second; "
-        "inputs as given): of what the bare model leaves, neighboring innovations of "
-        f"an autocorrelated error have a correlation of up to {found.before:.2f} at "
-        "higher rates, so that evidence would count the same motion several times, "
-        f"and of {found.after:.2f} at this one; thin=False uses all"
-    )
+    every = _ordinal(found.every)
+    return caution("SA525", 1 / found.step, every, 1 / found.suggested_step, found)
 
 
 def _ordinal(number: int) -> str:

@@ -11,16 +11,12 @@ import pandas as pd
 
 from sbi_active.arrays import Array
 from sbi_active.callers import stack_level
-from sbi_active.criticism.data.recordings import find_recordings
-from sbi_active.criticism.data.table_rows import (
-    is_stamp,
-    read_csv,
-    require_real,
-    seconds,
-)
+from sbi_active.criticism.data.cells import Cells, read_csv
+from sbi_active.criticism.data.columns import find_columns
+from sbi_active.criticism.data.tables import find_recordings
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.data.units import TIME, split, to_si
-from sbi_active.expected import did_you_mean
+from sbi_active.expected import did_you_mean, require
 from sbi_active.messages import warn
 from sbi_active.mujoco.models.names import held_places, names_of, start_places
 from sbi_active.mujoco.simulator import Channel
@@ -66,36 +62,51 @@ def trials_of(
     """
     if isinstance(recordings, pd.DataFrame | Mapping | str | Path):
         recordings = [recordings]
-    if not len(recordings):
-        raise ValueError("expected at least one recording; got none; pass logs")
-    names = [c.name for c in channels]
-    logs = [log for given in recordings for log in _logs(given)]
-    frames = [_frame(model, k, log, channels, inputs) for k, log in enumerate(logs)]
-    times = [frame[TIME].to_numpy(float) for frame in frames]
-    x = [frame[names].to_numpy(float) for frame in frames]
-    for k, values in enumerate(x):
-        for channel, own in zip(channels, values.T, strict=True):
-            _note_angles(model, channel, own, f"recording {k}")
-    if len(names) == 1:
+    logs: list[Any] = []
+    for given in recordings:
+        is_folder = isinstance(given, str | Path) and Path(given).is_dir()
+        logs += find_recordings(Path(given)) if is_folder else [given]
+    require(bool(logs), "at least one recording", "none", "pass logs")
+    cells = [
+        _cells(model, f"recording {k}", log, channels, inputs)
+        for k, log in enumerate(logs)
+    ]
+    times = [log.time for log in cells]
+    x = [
+        np.stack([log.numbers(column, empty=True) for column in log.columns["x"]], 1)
+        for log in cells
+    ]
+    series = {
+        name: [log.numbers(log.columns["input"][i]) for log in cells]
+        for i, name in enumerate(inputs)
+    }
+    for k, (log, time, values) in enumerate(zip(cells, times, x, strict=True)):
+        _require_seconds(time, float(model.opt.timestep), log.source)
+        for name, own in series.items():
+            require_in_range(model, name, own[k], log.source)
+        for channel, column in zip(channels, values.T, strict=True):
+            _note_angles(model, channel, column, log.source)
+    if len(channels) == 1:
         x = [part[:, 0] for part in x]
     same = all(t.shape == times[0].shape and (t == times[0]).all() for t in times)
-    starts = [c for c in frames[0].columns if c.startswith(START)]
     return Trials(
         None,
         x,
         sample_times=times[0] if same else times,
-        inputs={
-            name: [f[_column(name, f, names)].to_numpy(float) for f in frames]
-            for name in inputs
-        }
-        or None,
+        inputs=series or None,
         input_times=times if inputs else None,
         start={
-            c.removeprefix(START): [float(f[c].iloc[0]) for f in frames] for c in starts
+            column.name.removeprefix(START): [_first(log, i) for log in cells]
+            for i, column in enumerate(cells[0].columns["start"])
         }
         or None,
         channel_labels=[f"{c.name} [{c.unit}]" if c.unit else c.name for c in channels],
     )
+
+
+def _first(log: Cells, i: int) -> float:
+    """Return the start state in the first row of a log."""
+    return float(log.numbers(log.columns["start"][i], empty=True)[0])
 
 
 def require_in_range(model: Any, name: str, values: Array, what: str) -> None:
@@ -123,110 +134,51 @@ def require_in_range(model: Any, name: str, values: Array, what: str) -> None:
         )
 
 
-def _logs(given: Any) -> Sequence[Any]:
-    """Return a log, or the files of a folder of logs."""
-    is_folder = isinstance(given, str | Path) and Path(given).is_dir()
-    return find_recordings(Path(given)) if is_folder else [given]
-
-
-def _frame(
-    model: Any, k: int, given: Any, channels: Sequence[Channel], inputs: Sequence[str]
-) -> pd.DataFrame:
-    """Return a log whose columns are as they should be, in SI."""
-    names = [channel.name for channel in channels]
-    what = f"recording {k}"
+def _cells(
+    model: Any,
+    what: str,
+    given: Any,
+    channels: Sequence[Channel],
+    inputs: Sequence[str],
+) -> Cells:
+    """Return the columns of a log that a model takes, in SI."""
     if isinstance(given, str | Path):
         what = f"{what} ({given})"
         given = read_csv(Path(given))
     frame = pd.DataFrame(given)
-    units = dict(split(str(c).strip()) for c in frame.columns)
-    if len(units) < len(frame.columns):
-        raise ValueError(
-            f"expected each column once in {what}; got {', '.join(frame.columns)}; "
-            "keep one"
-        )
-    frame.columns = [*units]
+    frame.columns = [str(c).strip() for c in frame.columns]
+    names, own = [channel.name for channel in channels], [split(c)[0] for c in frame]
     starts = [START + name for name in (*start_places(model), *held_places(model))]
-    controls = [_column(name, frame, names) for name in inputs]
-    wanted = [TIME, *controls, *names]
-    spare = [c for c in frame.columns if c not in {*wanted, *starts}]
-    for name in wanted:
-        if name not in frame.columns:
-            hint = did_you_mean(name, spare, "rename or add it")
-            raise ValueError(
-                f"expected a column {name!r} in {what}; got {', '.join(frame.columns)};"
-                f" {hint}"
-            )
-    for name in spare:
-        if name.startswith(START):
-            hint = did_you_mean(name, starts, f"did you mean {starts[0]!r}?")
-            raise ValueError(
-                f"expected start states of joints in {what}; got {name!r}; {hint}"
-            )
-    used = wanted + [c for c in frame if c in starts]
-    known = {TIME: "s", **{channel.name: channel.unit for channel in channels}}
-    scales = {c: _factor(c, units[c], known.get(c, ""), what) for c in used}
-    frame = _as_numbers(frame, scales, what)
-    for name in [TIME, *controls]:
-        lost = np.flatnonzero(~np.isfinite(frame[name].to_numpy(float)))
-        if len(lost):
-            raise ValueError(
-                f"expected finite {name!r} in {what}; got NaN or inf in row {lost[0]}; "
-                "fill in what was commanded, or cut the log there"
-            )
-    if (np.diff(frame[TIME].to_numpy(float)) <= 0).any():
-        row = int(np.flatnonzero(np.diff(frame[TIME].to_numpy(float)) <= 0)[0]) + 1
-        raise ValueError(
-            f"expected a time that increases in {what}; got {frame[TIME][row]:g} in "
-            f"row {row}; sort the log, and split it where it starts again"
+    for name in own:
+        require(
+            not name.startswith(START) or name in starts,
+            f"start states of joints in {what}",
+            repr(name),
+            did_you_mean(name, starts, f"did you mean {starts[0]!r}?"),
         )
-    _require_seconds(frame[TIME].to_numpy(float), float(model.opt.timestep), what)
-    for name, column in zip(inputs, controls, strict=True):
-        require_in_range(model, name, frame[column].to_numpy(float), what)
-    return frame
-
-
-def _factor(name: str, unit: str, expected: str, what: str) -> float:
-    """Return the factor from the unit of a log's header to that of the model."""
-    if not unit:
-        return 1.0
-    factor, si = to_si(unit) or (1.0, "")
-    if not si or (expected and si != expected):
-        raise ValueError(
-            f"expected {name!r} in {expected or 'a unit of SI'}; got [{unit}] in "
-            f"{what}; convert the numbers, or leave their unit out"
+    # A column that an input shares with a sensor is the sensor's.
+    columns = {
+        TIME: TIME,
+        "x": names,
+        "input": [
+            control if name in names or control in own else name
+            for name, control in ((name, f"{name} control") for name in inputs)
+        ],
+        "start": [name for name in starts if name in own],
+    }
+    found = find_columns([*frame.columns], columns=columns, source=what)
+    units = {TIME: "s", **{channel.name: channel.unit for channel in channels}}
+    for column in (column for group in found.values() for column in group):
+        name, told = split(column.header)
+        expected = units.get(name, "")
+        is_known = not told or (to_si(told) and expected in ("", column.unit))
+        require(
+            bool(is_known),
+            f"{name!r} in {expected or 'a unit of SI'}",
+            f"[{told}] in {what}",
+            "convert the numbers, or leave their unit out",
         )
-    return factor
-
-
-def _as_numbers(
-    frame: pd.DataFrame, scales: Mapping[str, float], what: str
-) -> pd.DataFrame:
-    """Return a log whose columns are numbers, dates as seconds since the first.
-
-    Args:
-        frame: The log.
-        scales: Factor of each column that is used.
-        what: Name of the log in messages.
-    """
-    frame = frame.copy()
-    for name, scale in scales.items():
-        cells: Any = frame[name]
-        if name == TIME and is_stamp(cells):
-            frame[name] = seconds(cells, what)
-            continue
-        require_real(cells, name, what)
-        blank = cells.map(lambda cell: str(cell).strip() == "")
-        numbers: Any = pd.to_numeric(cells.where(~blank), errors="coerce")
-        wrong = np.flatnonzero(numbers.isna() & cells.notna() & ~blank)
-        if len(wrong) and str(cells.iloc[wrong[0]]).strip().lower() != "nan":
-            raise ValueError(
-                f"expected numbers in column {name!r} of {what}; got "
-                f"{cells.iloc[wrong[0]]!r} in row {wrong[0]}; correct it, or leave "
-                "what was not read empty"
-            )
-        frame[name] = numbers * scale
-    return frame
+    return Cells({what: frame}, found, what)
 
 
 def _require_seconds(time: Array, step: float, what: str) -> None:
@@ -285,9 +237,3 @@ def _note_angles(model: Any, channel: Channel, x: Array, what: str) -> None:
                 "Convert them",
                 stacklevel=stack_level(),
             )
-
-
-def _column(name: str, frame: pd.DataFrame, sensors: Sequence[str]) -> str:
-    """Return the column of an input; one that a sensor shares is the sensor's."""
-    own = f"{name} control"
-    return own if name in sensors or own in frame.columns else name

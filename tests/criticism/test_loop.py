@@ -295,7 +295,7 @@ def test_one_trial():
 def test_no_valid_trial_to_fit():
     role = ["fit", "fit", "held out"]
     x = torch.tensor([torch.nan, torch.nan, 1.0])
-    with pytest.raises(ValueError, match="at least one valid trial; got 2 trials"):
+    with pytest.raises(ValueError, match="at least two valid trials to fit; got 0"):
         Criticism(MODEL, PRIOR, Trials(torch.ones(3), x, role=role))
 
 

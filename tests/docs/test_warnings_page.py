@@ -41,12 +41,6 @@ def nodes() -> list[tuple[Path, ast.AST]]:
     ]
 
 
-def constants(node: ast.AST) -> list[str]:
-    """Return the fixed words of a text, what is filled in left out."""
-    found = [n.value for n in ast.walk(node) if isinstance(n, ast.Constant)]
-    return [value for value in found if isinstance(value, str)]
-
-
 def named() -> list[type]:
     """Return the classes of the library's own errors."""
     found = []
@@ -67,9 +61,6 @@ def texts(path: Path, node: ast.AST) -> list[ast.expr]:
     if isinstance(node, ast.Call):
         called = ast.unparse(node.func)
         return node.args if GATHERED.fullmatch(called) else []
-    if isinstance(node, ast.Tuple) and path.name == "cautions.py":
-        is_row = len(node.elts) == 2 and not constants(node.elts[0])
-        return [e for e in node.elts[1:] if is_row and constants(e)]  # holds, text
     if isinstance(node, ast.Tuple) and path.name == "trust.py":
         return node.elts[2:3]  # holds, figure, text
     return []

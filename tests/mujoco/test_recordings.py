@@ -49,7 +49,7 @@ def test_a_log_has_a_column_each_for_a_sensor_and_an_input_of_one_name():
     robot = from_mjcf(*arm, **given, recordings=[log])
     assert robot.trials.inputs["hinge"].unique().item() == pytest.approx(0.3)
     del log["hinge control"]
-    with pytest.raises(ValueError, match="column 'hinge control' in recording 0"):
+    with pytest.raises(ValueError, match="column hinge control .*recording 0"):
         from_mjcf(*arm, **given, recordings=[log])
 
 
@@ -66,16 +66,16 @@ def renamed(frame):
 
 
 def backwards(frame):
-    frame.loc[7, "time"] = 0.01
+    frame.loc[7, "time"] = 0.015
 
 
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
         (out_of_range, "within its ctrlrange, -5 to 5"),
-        (nan_input, "finite 'push' in recording 1; got NaN or inf in row 7"),
-        (renamed, "column 'push' in recording 1; .* did you mean 'pusher'"),
-        (backwards, "time that increases in recording 1"),
+        (nan_input, "finite number in column push, row 8; .* recording 1"),
+        (renamed, "column push for input; .* recording 1; did you mean 'pusher'"),
+        (backwards, "times that increase .* recording 1"),
     ],
 )
 def test_logs_that_do_not_fit_are_said(spoil, message):
@@ -136,7 +136,7 @@ def test_angles_that_wrap_or_are_degrees_are_said():
     ("changes", "message"),
     [
         ({"time": encoder_log()["time"] + 1.7e9}, "subtract the time at which"),
-        ({"angle": ["0.1 rad"] * 50}, "numbers in column 'angle'.*'0.1 rad' in row 0"),
+        ({"angle": ["0.1 rad"] * 50}, "number in column angle, row 1; got '0.1 rad'"),
     ],
 )
 def test_a_log_that_is_no_log_is_refused(changes, message):

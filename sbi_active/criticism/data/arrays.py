@@ -11,6 +11,7 @@ from torch import Tensor
 
 from sbi_active.arrays import measured
 from sbi_active.callers import stack_level
+from sbi_active.expected import require
 from sbi_active.messages import warn
 
 Role = Literal["fit", "held out"]
@@ -23,11 +24,12 @@ def padded(value: Any) -> Tensor:
     rows = [measured(np.nan if row is None else row) for row in value]
     if len({row.shape for row in rows}) <= 1:
         return torch.stack(rows) if rows else torch.empty(0)
-    if len({row.shape[1:] for row in rows}) > 1 or any(r.ndim == 0 for r in rows):
-        raise ValueError(
-            "expected observations that differ in their first axis alone; got shapes "
-            f"{[tuple(row.shape) for row in rows]}; give the same channels in each"
-        )
+    require(
+        len({row.shape[1:] for row in rows}) == 1 and all(r.ndim > 0 for r in rows),
+        "observations that differ in their first axis alone",
+        f"shapes {[tuple(row.shape) for row in rows]}",
+        "give the same channels in each",
+    )
     longest = max(len(row) for row in rows)
     x = torch.full((len(rows), longest, *rows[0].shape[1:]), torch.nan).double()
     for i, row in enumerate(rows):
@@ -51,17 +53,11 @@ def kept(mask: Any, x: Tensor) -> Tensor:
     keep = padded(mask)
     if keep.ndim == 1 and x.shape[1:] == (1,):
         keep = keep[:, None]
-    if keep.shape != x.shape:
-        raise ValueError(
-            f"expected a mask of shape {tuple(x.shape)}, that of x; got "
-            f"{tuple(keep.shape)}; give one an entry of x"
-        )
-    known = (keep == 0) | (keep == 1) | keep.isnan()
-    if not bool(known.all()):
-        raise ValueError(
-            "expected a mask of True and False, or 1 and 0; got "
-            f"{float(keep[~known][0]):g}; pass True where x is a measurement"
-        )
+    expected, got = f"a mask of shape {tuple(x.shape)}, that of x", tuple(keep.shape)
+    require(keep.shape == x.shape, expected, got, "give one an entry of x")
+    for value in keep[(keep != 0) & (keep != 1) & ~keep.isnan()].tolist():
+        advice = "pass True where x is a measurement"
+        require(False, "a mask of True and False, or 1 and 0", f"{value:g}", advice)
     return keep == 1
 
 
@@ -105,20 +101,19 @@ def root(repeat_of: Tensor) -> Tensor:
     num = len(repeat_of)
     own = torch.arange(num)
     inside = (repeat_of >= -1) & (repeat_of < num) & (repeat_of == repeat_of.round())
-    if not bool(inside.all()):
-        raise ValueError(
-            f"expected repeat_of among the positions 0 to {num - 1}, or -1 for none; "
-            f"got {repeat_of.tolist()}; pass the position of the trial it repeats"
-        )
+    require(
+        bool(inside.all()),
+        f"repeat_of among the positions 0 to {num - 1}, or -1 for none",
+        repeat_of.tolist(),
+        "pass the position of the trial it repeats",
+    )
     before = torch.where(repeat_of < 0, own, repeat_of.long())
     first = before
     for _ in range(num):
         first = before[first]
-    if not bool((before[first] == first).all()):
-        raise ValueError(
-            "expected repeats that lead back to a first trial; got "
-            f"{repeat_of.tolist()}, which runs in a circle; pass -1 for the first"
-        )
+    got, advice = f"{repeat_of.tolist()}, which runs in a circle", "pass -1 for it"
+    is_first = bool((before[first] == first).all())
+    require(is_first, "repeats that lead back to a first trial", got, advice)
     return first.where(first != own, torch.tensor(-1))
 
 
@@ -132,11 +127,9 @@ def require_names(names: Sequence[object] | None, num: int) -> tuple[str, ...] |
     if names is None:
         return None
     found = () if isinstance(names, str) else tuple(str(name).strip() for name in names)
-    if len(found) != num or "" in found or len({*found}) < num:
-        raise ValueError(
-            f"expected names of {num} trials, each another; got {names!r}; name each "
-            "trial, or leave names out"
-        )
+    each = len({*found}) == len(found) == num and "" not in found
+    expected = f"names of {num} trials, each another"
+    require(each, expected, repr(names), "name each trial, or leave names out")
     return found
 
 
@@ -153,11 +146,9 @@ def require_labels(
     if labels is None:
         return None
     found = () if isinstance(labels, str) else (*labels,)
-    if len(found) not in sizes or not all(isinstance(each, str) for each in found):
-        raise ValueError(
-            f"expected {name} of {sizes[0]} strings, one an entry; got {labels!r}; "
-            "pass a list of as many"
-        )
+    are = len(found) in sizes and all(isinstance(each, str) for each in found)
+    expected = f"{name} of {sizes[0]} strings, one an entry"
+    require(are, expected, repr(labels), "pass a list of as many")
     return found
 
 
@@ -173,28 +164,18 @@ def sample_times_of(times: Any, x: Tensor, names: Sequence[str]) -> Tensor | Non
         return None
     tensor = padded(times)
     n, k = x.shape[:2]
-    if tensor.shape not in ((k,), (n, k)):
-        raise ValueError(
-            f"expected sample_times of shape ({k},) or ({n}, {k}) for x of shape "
-            f"{tuple(x.shape)}; got {tuple(tensor.shape)}; give one an entry of x's "
-            "first axis"
-        )
-    stamps = tensor.expand(n, k)
+    each, shape = "give one an entry of x's first axis", tuple(tensor.shape)
+    expected = f"sample_times of shape ({k},) or ({n}, {k}) for x of {tuple(x.shape)}"
+    require(shape in ((k,), (n, k)), expected, shape, each)
     has_x = x.isfinite().reshape(n, k, -1).any(-1)
-    for i in range(n):
-        if bool((has_x[i] & ~stamps[i].isfinite()).any()):
-            raise ValueError(
-                f"expected as many sample_times as samples in each trial; got "
-                f"{int(stamps[i].isfinite().sum())} for "
-                f"{int(has_x[i].nonzero().max()) + 1} samples in trial {names[i]}; "
-                "give one an entry of x's first axis"
-            )
-        own = stamps[i][stamps[i].isfinite()]
-        if bool((own.diff() <= 0).any()):
-            raise ValueError(
-                f"expected sample_times that increase; got {own.tolist()[:6]}... "
-                f"in trial {names[i]}; sort its samples by time"
-            )
+    for stamps, has, name in zip(tensor.expand(n, k), has_x, names, strict=True):
+        own = stamps[stamps.isfinite()]
+        got = f"{len(own)} in trial {name}"
+        known = bool((stamps.isfinite() | ~has).all())
+        require(known, "a time of each sample in sample_times", got, each)
+        got = f"{own.tolist()[:6]}... in trial {name}"
+        increase = bool((own.diff() > 0).all())
+        require(increase, "sample_times that increase", got, "sort its samples by time")
     return tensor
 
 
@@ -219,18 +200,13 @@ def start_states(start: Any, num: int) -> Tensor | dict[str, Tensor] | None:
 
 def _starts(start: Any, num: int, ndim: int, name: str) -> Tensor:
     value = measured(start, name=name)
-    if value.ndim != ndim or len(value) != num:
-        raise ValueError(
-            f"expected start states of shape ({num}, d), or {{name: ({num},)}}; got "
-            f"{tuple(value.shape)} of {name!r}; give one a trial"
-        )
-    lost = ~value.reshape(num, -1).isfinite().all(-1)
-    if bool(lost.any()):
-        raise ValueError(
-            f"expected finite start states; got {name!r} without a number in trials "
-            f"{lost.nonzero()[:, 0].tolist()}; leave these trials out, or declare the "
-            "start as an effect of scope 'trial'"
-        )
+    expected = f"start states of shape ({num}, d), or {{name: ({num},)}}"
+    is_one = value.ndim == ndim and len(value) == num
+    require(is_one, expected, f"{tuple(value.shape)} of {name!r}", "give one a trial")
+    lost = (~value.reshape(num, -1).isfinite().all(-1)).nonzero()[:, 0].tolist()
+    got = f"{name!r} without a number in trials {lost}"
+    advice = "leave these out, or declare the start as an effect of scope 'trial'"
+    require(not lost, "finite start states", got, advice)
     return value
 
 
@@ -245,9 +221,7 @@ def roles_of(role: Sequence[Role] | None, n: int) -> list[Role]:
     """Return a role for each of n trials, "fit" where none is given."""
     given = ["fit"] * n if role is None else role
     roles: list[Any] = [str(each).replace("_", " ") for each in given]
-    if len(roles) != n or not {*roles} <= {"fit", "held out"}:
-        raise ValueError(
-            f"expected a role 'fit' or 'held out' for each of {n} trials; got {roles}; "
-            "give one each"
-        )
+    is_known = len(roles) == n and {*roles} <= {"fit", "held out"}
+    expected = f"a role 'fit' or 'held out' for each of {n} trials"
+    require(is_known, expected, roles, "give one each")
     return roles

@@ -12,9 +12,12 @@ from torch import Tensor
 from sbi_active.arrays import Array
 from sbi_active.callers import stack_level
 from sbi_active.criticism.data.arrays import padded
+from sbi_active.expected import require
 from sbi_active.messages import warn
 
 Hold = Literal["previous", "linear"]
+#: Times and values of a series in a trial, of which the last may be missing.
+Piece = tuple[Array, Array]
 
 #: Median steps from which a step is a gap.
 GAP = 5.0
@@ -49,20 +52,20 @@ def inputs_of(
     Raises:
         ValueError: If those functions or :func:`require_covered` raise it.
     """
+    given = "input_times alone"
+    require(inputs is not None or times is None, "inputs", given, "pass inputs=")
     if inputs is None:
-        if times is not None:
-            raise ValueError("expected inputs with input_times; got none; pass inputs=")
         return None, None
     series = _named_series(inputs, names)
-    if times is None:
-        length = next(iter(series.values())).shape[1]
-        if x_times is None or x_times.shape[-1] != length:
-            raise ValueError(
-                f"expected input_times, the time of each of {length} values of the "
-                "inputs; got none; pass them, in seconds from the origin of "
-                "sample_times"
-            )
+    length = next(iter(series.values())).shape[1]
+    if times is None and x_times is not None and x_times.shape[-1] == length:
         times = x_times
+    require(
+        times is not None,
+        f"input_times, the time of each of {length} values of the inputs",
+        "none",
+        "pass them, in seconds from the origin of sample_times",
+    )
     stamps = _stamps(series, times)
     grid = _on_one_grid(series, stamps, names, hold)
     if x_times is not None:
@@ -86,11 +89,27 @@ def _named_series(inputs: Any, names: Sequence[str]) -> dict[str, Tensor]:
         inputs = {"input": value}
         if value.ndim == 3 and value.shape[-1] > 1:
             inputs = {f"input {j + 1}": c for j, c in enumerate(value.unbind(-1))}
-    elif not inputs or not all(isinstance(name, str) for name in inputs):
-        raise ValueError(
-            f"expected inputs as {{name: series}}; got {[*inputs]}; name each input"
+    is_named = bool(inputs) and all(isinstance(name, str) for name in inputs)
+    require(is_named, "inputs as {name: series}", [*inputs], "name each input")
+    found, num = {}, len(names)
+    for name, value in inputs.items():
+        own = padded(value)
+        if own.ndim == 3 and own.shape[-1] == 1:
+            own = own[..., 0]
+        if own.ndim == 1 and len(own) > 1:
+            own = own.expand(num, -1).clone()
+        require(
+            own.ndim == 2 and len(own) == num and own.shape[1] > 1,
+            f"input {name!r} of shape ({num}, m), one series of two or more values a "
+            f"trial, (m,) for one that all share, or a list of {num}",
+            tuple(own.shape),
+            "pass what does not vary in time as the action",
         )
-    return {name: _series(name, value, names) for name, value in inputs.items()}
+        for i, k in own.isinf().nonzero().tolist():
+            got = f"inf in trial {names[i]}, value {k}"
+            require(False, f"finite values of input {name!r}", got, "correct it")
+        found[name] = own
+    return found
 
 
 def _on_one_grid(
@@ -112,31 +131,22 @@ def _on_one_grid(
         hold: "previous" holds each value until the next one, as a command is held;
             "linear" draws lines between them.
     """
-    if hold not in get_args(Hold):
-        raise ValueError(
-            f"expected input_hold 'previous' or 'linear'; got {hold!r}; choose one"
-        )
-    lengths = {
+    known = "input_hold 'previous' or 'linear'"
+    require(hold in get_args(Hold), known, repr(hold), "choose one")
+    pieces = {
         name: [
-            _length(f"input {name!r} of trial {trial}", u, t)
+            _piece(f"input {name!r} of trial {trial}", u, t)
             for trial, u, t in zip(names, value, stamps[name], strict=True)
         ]
         for name, value in series.items()
     }
-    grid = _grid(stamps, lengths, names)
-    if grid is None:
-        own = next(iter(stamps.values()))[0].clone()
-        return {name: value.clone() for name, value in series.items()}, own
+    grid = _grid(pieces, names)
     found = {
-        name: torch.stack(
-            [
-                torch.from_numpy(_at(grid, t[:k].numpy(), u[:k].numpy(), hold))
-                for t, u, k in zip(stamps[name], value, lengths[name], strict=True)
-            ]
-        )
-        for name, value in series.items()
+        name: np.stack([_at(grid, t[: len(u)], u, hold) for t, u in each])
+        for name, each in pieces.items()
     }
-    return found, torch.from_numpy(grid)
+    held = {name: torch.from_numpy(value) for name, value in found.items()}
+    return held, torch.from_numpy(grid)
 
 
 def held_at(
@@ -149,10 +159,18 @@ def held_at(
         own: Grid of the series, shape (m,).
         times: The other, shape (n,).
     """
-    slack = ON_TIME * (own[1] - own[0])
-    place = torch.searchsorted(own, times + slack, right=True) - 1
-    place = place.clamp(0, len(own) - 1)
+    place = _held(own.numpy(), times.numpy(), float(own[1] - own[0]))
     return {name: value[:, place] for name, value in series.items()}
+
+
+def _held(own: Array, times: Array, step: float) -> Array:
+    """Return the place of the last value before each time.
+
+    A value that rounding puts just after a time, by less than a thousandth step, is on
+    time.
+    """
+    place = np.searchsorted(own, times + ON_TIME * step, side="right") - 1
+    return np.clip(place, 0, len(own) - 1)
 
 
 def require_covered(
@@ -183,112 +201,68 @@ def require_covered(
 
 def _stamps(series: Mapping[str, Tensor], times: Any) -> dict[str, Tensor]:
     """Return the times of each input's values, shape (t, m)."""
-    if isinstance(times, Mapping) and {*times} != {*series}:
-        raise ValueError(
-            f"expected input_times of {', '.join(series)}; got those of "
-            f"{', '.join(map(str, times)) or 'none'}; give each input its own, or one "
-            "array for all"
-        )
+    of = times if isinstance(times, Mapping) else dict.fromkeys(series, times)
+    require(
+        {*of} == {*series},
+        f"input_times of {', '.join(series)}",
+        f"those of {', '.join(map(str, of)) or 'none'}",
+        "give each input its own, or one array for all",
+    )
     found = {}
     for name, value in series.items():
-        own = padded(times[name] if isinstance(times, Mapping) else times)
+        own = padded(of[name])
         found[name] = own.expand(len(value), -1) if own.ndim == 1 else own
-        if found[name].shape != value.shape:
-            raise ValueError(
-                f"expected input_times of shape ({value.shape[1]},) or "
-                f"{tuple(value.shape)} for input {name!r}; got {tuple(own.shape)}; "
-                "give one time a value"
-            )
-    return found
-
-
-def _series(name: str, value: Any, names: Sequence[str]) -> Tensor:
-    found, num = padded(value), len(names)
-    if found.ndim == 3 and found.shape[-1] == 1:
-        found = found[..., 0]
-    if found.ndim == 1 and len(found) > 1:
-        found = found.expand(num, -1).clone()
-    if found.ndim != 2 or len(found) != num or found.shape[1] < 2:
-        raise ValueError(
-            f"expected input {name!r} of shape ({num}, m), one series of two or more "
-            f"values a trial, (m,) for one that all share, or a list of {num}; got "
-            f"{tuple(found.shape)}; pass what does not vary in time as the action"
-        )
-    if bool(found.isinf().any()):
-        i, k = found.isinf().nonzero()[0].tolist()
-        raise ValueError(
-            f"expected finite values of input {name!r}; got inf in trial {names[i]}, "
-            f"value {k}; correct it"
+        require(
+            found[name].shape == value.shape,
+            f"input_times of shape ({value.shape[1]},) or {tuple(value.shape)} for "
+            f"input {name!r}",
+            tuple(own.shape),
+            "give one time a value",
         )
     return found
 
 
-def _length(what: str, values: Tensor, times: Tensor) -> int:
-    """Return how many values a series has, or raise where it is none."""
-    known = times.isfinite()
-    length = int(known.sum())
-    if not bool(known[:length].all()):
-        k = int((~known).nonzero()[0])
-        raise ValueError(
-            f"expected finite input_times; got {float(times[k])} for {what}, value "
-            f"{k}; give the time of each value"
-        )
+def _piece(what: str, values: Tensor, times: Tensor) -> Piece:
+    """Return times and values of a series without what pads them, or raise."""
+    length, last = int(times.isfinite().sum()), int(values.isfinite().sum())
+    for name, given, num in (("time", times, length), ("value", values, last)):
+        for (k,) in (~given[:num].isfinite()).nonzero().tolist():  # else it is padding
+            got = f"{float(given[k])} for {what}, value {k}".replace("nan", "NaN")
+            require(False, f"a {name} of each value", got, "fill it in")
     steps = times[:length].diff()
-    if bool((steps <= 0).any()):
-        k = int((steps <= 0).nonzero()[0])
+    middle = float(steps.median()) if len(steps) else 0.0
+    for (k,) in (steps <= 0).nonzero().tolist():
         raise ValueError(
             f"expected input_times that increase; got {float(times[k + 1]):g} after "
             f"{float(times[k]):g} for {what}, value {k + 1}; sort the values by time, "
             "and give each trial its own times"
         )
-    middle = float(steps.median()) if len(steps) else 0.0
-    if bool((steps > GAP * middle).any()):
-        k = int((steps > GAP * middle).nonzero()[0])
+    for (k,) in (steps > GAP * middle).nonzero().tolist():
         raise ValueError(
             f"expected inputs without gaps; got no value from {float(times[k]):g} to "
             f"{float(times[k + 1]):g} for {what}, where the median step is "
             f"{middle:g}; fill in what was commanded there, or split the trial"
         )
-    has = values.isfinite()
-    last = int(has.nonzero().max()) + 1 if bool(has.any()) else 0
-    if last < 2:
-        raise ValueError(
-            f"expected two or more values; got {last} of {what}; pass what does not "
-            "vary in time as the action, action_* in a table"
-        )
-    if not bool(has[:last].all()):
-        k = int((~has[:last]).nonzero()[0])
-        raise ValueError(
-            f"expected a value at each time; got NaN for {what}, value {k}; fill it "
-            "in, or leave the trial out"
-        )
-    if last > length:
-        raise ValueError(
-            f"expected as many input_times as values; got {length} for {last} of "
-            f"{what}; give one time a value"
-        )
-    return last
+    require(
+        2 <= last <= length,
+        "two or more values, and the time of each",
+        f"{last} values and {length} times of {what}",
+        "pass what does not vary in time as the action, action_* in a table",
+    )
+    return times[:length].numpy(), values[:last].numpy()
 
 
-def _grid(
-    stamps: Mapping[str, Tensor],
-    lengths: Mapping[str, list[int]],
-    names: Sequence[str],
-) -> Array | None:
-    """Return the grid, None if all are on one that is uniform already."""
-    every = [*stamps.values()]
-    first = every[0][0]
-    whole = all(k == len(first) for each in lengths.values() for k in each)
-    same = all(t.shape == every[0].shape and bool((t == first).all()) for t in every)
-    if whole and same:
-        steps = first.diff()
-        if bool(((steps - steps.mean()).abs() <= SAME * steps.mean()).all()):
-            return None
-    known = [
-        [t[i][t[i].isfinite()].numpy() for t in every] for i in range(len(every[0]))
-    ]
-    step = min(float(np.median(np.diff(t))) for own in known for t in own)
-    ends = [(min(t[0] for t in own), max(t[-1] for t in own)) for own in known]
+def _grid(pieces: Mapping[str, Sequence[Piece]], names: Sequence[str]) -> Array:
+    """Return the grid; that of all series where it is uniform already."""
+    every = [piece for each in pieces.values() for piece in each]
+    first, _ = every[0]
+    steps = np.diff(first)
+    same = all(np.array_equal(t, first) and len(t) == len(u) for t, u in every)
+    if same and (np.abs(steps - steps.mean()) <= SAME * steps.mean()).all():
+        return first.copy()
+    step = min(float(np.median(np.diff(t))) for t, _ in every)
+    by_trial = zip(*pieces.values(), strict=True)
+    ends = [(min(t[0] for t, _ in o), max(t[-1] for t, _ in o)) for o in by_trial]
     low, high = min(begin for begin, _ in ends), max(end for _, end in ends)
     _require_one_origin(ends, low, names)
     # Where the last time is between two steps, the grid goes up to the next.
@@ -330,7 +304,4 @@ def _at(grid: Array, times: Array, values: Array, hold: Hold) -> Array:
     """Return a series at the grid's times."""
     if hold == "linear":
         return np.interp(grid, times, values)
-    # A time that rounding puts just after a grid point is that point's.
-    slack = ON_TIME * (grid[1] - grid[0])
-    place = np.searchsorted(times, grid + slack, side="right") - 1
-    return values[np.clip(place, 0, len(values) - 1)]
+    return values[_held(times, grid, grid[1] - grid[0])]

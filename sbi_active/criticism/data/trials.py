@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -26,9 +27,8 @@ from sbi_active.criticism.data.arrays import (
     without_inf,
 )
 from sbi_active.criticism.data.input_series import Hold, inputs_of
-from sbi_active.criticism.data.recordings import read_trials
-from sbi_active.criticism.data.table import read_table
-from sbi_active.expected import suggests
+from sbi_active.criticism.data.tables import read_trials
+from sbi_active.expected import require, suggests
 
 Order = Literal["known", "unknown"]
 
@@ -122,46 +122,37 @@ class Trials:
         n = len(self.x)
         self.action_is_label = action is None
         if action is None:
-            if inputs is None and start is None:
-                raise ValueError(
-                    "expected actions, or inputs over time in their place; got "
-                    "neither; pass what was commanded in each trial"
-                )
+            require(
+                inputs is not None or start is not None,
+                "actions, or inputs over time in their place",
+                "neither",
+                "pass what was commanded in each trial",
+            )
             action = torch.arange(n)
         self.action = measured(action, name="action")
         if self.action.ndim == 1:
             self.action = self.action[:, None]
-        if self.action.ndim != 2 or len(self.action) != n or 0 in self.action.shape:
-            raise ValueError(
-                "expected actions (n, action_dim) and x with as many rows; got "
-                f"{tuple(self.action.shape)} and {tuple(self.x.shape)}; give one "
-                "action a trial"
-            )
-        if not bool(self.action.isfinite().all()):
-            raise ValueError(
-                "expected finite actions; got NaN or inf; give each trial the "
-                "action that was commanded"
-            )
+        shapes = tuple(self.action.shape), tuple(self.x.shape)
+        is_one_each = len(shapes[0]) == 2 and shapes[0][0] == n and 0 not in shapes[0]
+        expected = "actions (n, action_dim) and x with as many rows"
+        got = f"{shapes[0]} and {shapes[1]}"
+        require(is_one_each, expected, got, "give one action a trial")
+        is_finite = bool(self.action.isfinite().all())
+        advice = "give each trial the action that was commanded"
+        require(is_finite, "finite actions", "NaN or inf", advice)
         if self.x.ndim == 1:
             self.x = self.x[:, None]
-        if 0 in self.x.shape:
-            raise ValueError(
-                f"expected at least one number in x; got shape {tuple(self.x.shape)}; "
-                "pass what was measured, NaN for a trial without a measurement"
-            )
+        advice = "pass what was measured, NaN for a trial without a measurement"
+        got = f"shape {shapes[1]}"
+        require(0 not in self.x.shape, "at least one number in x", got, advice)
         if mask is not None:
             self.x = self.x.where(kept(mask, self.x), torch.nan)
         self.role = roles_of(role, n)
         self.index = self._rows("index", torch.arange(n) if index is None else index)
-        if not bool(self.index.isfinite().all()):
-            raise ValueError(
-                f"expected finite places in index; got {self.index.tolist()}; pass "
-                "each trial's place, or leave index out"
-            )
-        if order not in get_args(Order):
-            raise ValueError(
-                f"expected order 'known' or 'unknown'; got {order!r}; pass one of them"
-            )
+        places, is_finite = self.index.tolist(), bool(self.index.isfinite().all())
+        require(is_finite, "finite places in index", places, "pass each trial's place")
+        known = "order 'known' or 'unknown'"
+        require(order in get_args(Order), known, repr(order), "pass one of them")
         self.order: Order = order
         self._names = require_names(names, n)
         self.x = without_inf(self.x, self.names)
@@ -189,16 +180,11 @@ class Trials:
         self.channel_labels = require_labels(
             "channel_labels", channel_labels, [self.x.shape[-1], *one]
         )
-        if not bool(self.valid.any()):
-            raise ValueError(
-                f"expected at least one valid trial; got {n} trials without a "
-                "measurement; check x and mask for NaN"
-            )
-        if lost := [i for i in self.held_out_positions if not bool(self.valid[i])]:
-            raise ValueError(
-                f"expected measurements in the held-out trials; got NaN in "
-                f"{self.called(lost)}; hold out other trials"
-            )
+        got, is_any = f"{n} trials without a measurement", bool(self.valid.any())
+        require(is_any, "at least one valid trial", got, "check x and mask for NaN")
+        lost = [i for i in self.held_out_positions if not bool(self.valid[i])]
+        expected, got = "measurements in the held-out trials", self.called(lost)
+        require(not lost, expected, f"NaN in {got}", "hold out other trials")
 
     @classmethod
     def from_csv(
@@ -268,7 +254,7 @@ class Trials:
             >>> trials.x.shape, trials.channel_labels
             (torch.Size([2, 2]), ('h [m]',))
         """
-        found = read_table(frame, columns=columns, units=units, inputs=inputs)
+        found = read_trials(frame, columns=columns, units=units, inputs=inputs)
         return cls(**found, order=order, input_hold=input_hold)
 
     def __len__(self) -> int:
@@ -350,34 +336,21 @@ class Trials:
         # Where the first trial is left out, the others repeat the first that is kept.
         new = {int(place): i for i, place in reversed([*enumerate(first)])}
         new |= {int(old): i for i, old in enumerate(at)}
-        repeat_of = torch.tensor([new[int(place)] for place in first])
-        times = self.sample_times
-        some = Trials(
-            self.action[at],
-            self.x[at],
-            role=[self.role[i] for i in at],
-            index=self.index[at],
-            order=self.order,
-            sample_times=times if times is None or times.ndim == 1 else times[at],
-            repeat_of=repeat_of,
-            action_labels=self.action_labels,
-            channel_labels=self.channel_labels,
-            inputs=rows_at(self.inputs, at),
-            input_times=self.input_times,
-            input_labels=self.input_labels,
-            start=rows_at(self.start, at),
-        )
-        some.action_is_label = self.action_is_label
+        some = copy.copy(self)
+        some.action, some.x, some.index = self.action[at], self.x[at], self.index[at]
+        some.role = [self.role[i] for i in at]
+        some.repeat_of = root(torch.tensor([new[int(place)] for place in first]))
+        if self.sample_times is not None and self.sample_times.ndim > 1:
+            some.sample_times = self.sample_times[at]
+        some.inputs, some.start = rows_at(self.inputs, at), rows_at(self.start, at)
         if self._names is not None:  # of trials that may be there twice now
             some._names = tuple(self._names[i] for i in at)
         return some
 
     def _of(self, role: Role) -> Trials:
         positions = [i for i, r in enumerate(self.role) if r == role]
-        if not positions:
-            raise ValueError(
-                f"expected a trial of role {role!r}; got none of {len(self)}; change it"
-            )
+        got = f"none of {len(self)}"
+        require(bool(positions), f"a trial of role {role!r}", got, "change it")
         return self.select(positions)
 
     def settings(self) -> Tensor:
@@ -392,9 +365,7 @@ class Trials:
 
     def _rows(self, name: str, value: Any) -> Tensor:
         tensor = measured(value, name=name)
-        if tensor.shape != (len(self),):
-            raise ValueError(
-                f"expected {name} of shape ({len(self)},), one a trial; got "
-                f"{tuple(tensor.shape)}; give one each"
-            )
+        expected = f"{name} of shape ({len(self)},), one a trial"
+        shape = tuple(tensor.shape)
+        require(shape == (len(self),), expected, shape, "give one each")
         return tensor

@@ -13,7 +13,6 @@ from scipy.optimize import brentq
 from scipy.spatial.distance import cdist
 from scipy.special import gammaln
 
-from sbi_active.actions import ActionSpace
 from sbi_active.criticism.criticism import Criticism
 from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.next_trial.candidates import following
@@ -66,10 +65,7 @@ class Choice:
 
 
 def choose(
-    report: Report,
-    actions: ActionSpace,
-    tested: Sequence[TestedTrial],
-    settling: Settling,
+    report: Report, tested: Sequence[TestedTrial], settling: Settling
 ) -> Choice | None:
     """Return the permitted action that puts a verdict to the test most.
 
@@ -81,17 +77,21 @@ def choose(
 
     Args:
         report: Report with its plan.
-        actions: Permitted actions; no other is chosen.
         tested: Trials that were run before.
         settling: Least that a trial has to tell.
 
     Returns:
         None if no permitted action tells enough.
     """
-    told = _telling(report, actions, settling)
-    test = _testing(report, actions, settling)
-    name = report.tracing.model
-    is_new = all(trial.registered.purpose != f"tests {name}" for trial in tested)
+    plan, told, test = report.next_action, None, None
+    purpose = f"tests {report.tracing.model}"
+    if plan is not None and np.max(plan.information_gain) >= settling.tells:
+        between = f"tells {', '.join(plan.separates)} apart"
+        told = None if plan.action is None else Choice(plan.action, between)
+    for severe in report.severe_tests[:1]:  # the permitted one
+        if severe.is_permitted and severe.difference >= settling.differs:
+            test = Choice(severe.action, purpose)
+    is_new = all(trial.registered.purpose != purpose for trial in tested)
     chosen = (test or told) if is_new else (told or test)
     if chosen is None and report.verdict == UNEXPLAINED:
         return _untried(report)
@@ -115,26 +115,6 @@ def _untried(
     if distance[best] < same:
         return None
     return Choice(candidates[best], "shows the residual where no trial was")
-
-
-def _telling(report: Report, actions: ActionSpace, settling: Settling) -> Choice | None:
-    plan = report.next_action
-    if plan is None or plan.action is None:
-        return None
-    told = float(np.max(plan.information_gain))
-    action = torch.from_numpy(plan.action)[None].float()
-    if told < settling.tells or not bool(actions.contains(action)):
-        return None
-    return Choice(plan.action, f"tells {', '.join(plan.separates)} apart")
-
-
-def _testing(report: Report, actions: ActionSpace, settling: Settling) -> Choice | None:
-    for test in report.severe_tests:
-        action = torch.from_numpy(test.action)[None].float()
-        is_permitted = test.is_permitted and bool(actions.contains(action))
-        if is_permitted and test.difference >= settling.differs:
-            return Choice(test.action, f"tests {report.tracing.model}")
-    return None
 
 
 def failures(

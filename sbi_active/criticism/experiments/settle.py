@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sbi_active.actions import ActionSpace
 from sbi_active.criticism.criticism import Criticism
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.experiments.choice import (
@@ -28,6 +27,7 @@ from sbi_active.criticism.report.predicted import Registered, TestedTrial
 from sbi_active.criticism.report.report import Report
 from sbi_active.criticism.results import Array
 from sbi_active.criticism.rivals.further_trials import conditions_at, together
+from sbi_active.expected import require
 from sbi_active.messages import Explained, Message
 from sbi_active.simulation import SimulatorModel
 
@@ -84,7 +84,14 @@ def settle(
         VerdictError: If the comparison fails after a trial was run.
     """
     first = compare(trials)
-    actions = _require_actions(first)
+    expected = "the permitted actions with real_system"
+    require(first.actions is not None, expected, None, "pass actions=")
+    require(
+        not first.num_summaries,
+        "all numbers of x with real_system, whose outcome is predicted",
+        f"{first.num_summaries} summaries",
+        "pass summaries=0",
+    )
     journal = Journal(directory)
     journal.begin(digest=first.digest, num_trials=len(trials))
     tested = journal.tested()
@@ -99,7 +106,7 @@ def settle(
             said = {"verdict": report.verdict, "held": tested[-1].held}
             journal.write("judged", index=tested[-1].registered.index, **said)
         stopped = SETTLED * is_settled(report, tested, settling)
-        choice = None if stopped else choose(report, actions, tested, settling)
+        choice = None if stopped else choose(report, tested, settling)
         if choice is None:
             stopped = stopped or "no permitted action tells more"
         elif len(tested) >= max_trials:
@@ -136,11 +143,9 @@ def with_trial(
         ValueError: If x has another shape than that of the trials.
     """
     template, own_times = trials.template()
-    if np.size(x) != template.numel():
-        raise ValueError(
-            f"expected x of shape {tuple(template.shape)} from the real system; got "
-            f"{np.shape(x)}; return the numbers of one trial, NaN for those missing"
-        )
+    expected = f"x of shape {tuple(template.shape)} from the real system"
+    advice = "return the numbers of one trial, NaN for those missing"
+    require(np.size(x) == template.numel(), expected, np.shape(x), advice)
     new = torch.from_numpy(action)[None].to(trials.action)
     times = trials.sample_times
     if times is not None and own_times is not None and times.ndim > 1:
@@ -191,19 +196,6 @@ def _verdict(
         ) from error
 
 
-def _require_actions(criticism: Criticism) -> ActionSpace:
-    if criticism.actions is None:
-        raise ValueError(
-            "expected the permitted actions with real_system; got None; pass actions="
-        )
-    if criticism.num_summaries:
-        raise ValueError(
-            "expected all numbers of x with real_system, whose outcome is predicted; "
-            f"got {criticism.num_summaries} summaries; pass summaries=0"
-        )
-    return criticism.actions
-
-
 NAME = "trials.jsonl"
 #: Fields of a prediction that are arrays.
 ARRAYS = ("action", "mean", "sd", "position", "bare")
@@ -250,11 +242,8 @@ class Journal:
         if not self.events:
             return self.write("begun", **about)
         own = {name: self.events[0].get(name) for name in about}
-        if own != about:
-            raise ValueError(
-                f"expected the trials of {self.path}, {own}; got {about}; pass what "
-                "it was begun with, or another directory"
-            )
+        advice = "pass what it was begun with, or another directory"
+        require(own == about, f"the trials of {self.path}, {own}", about, advice)
         return None
 
     def tested(self) -> list[TestedTrial]:

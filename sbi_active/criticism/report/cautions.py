@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.stats import rankdata
@@ -20,7 +20,7 @@ from sbi_active.criticism.report.summary import (
     rests,
     suspects_in_words,
 )
-from sbi_active.criticism.report.words import called, number
+from sbi_active.criticism.report.words import FEW_DRAWS, caution, number
 from sbi_active.criticism.results import (
     NONE,
     OUTLIER,
@@ -37,37 +37,6 @@ from sbi_active.messages import Message
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.conditions import parameters_of
 
-#: Families of effects that blame an instrument, beside those on what is observed.
-INSTRUMENTS = ["sensor", "geometry"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Limits:
-    """Limits from which a caution is said; half or twice says more or fewer of them.
-
-    Attributes:
-        aliased: Rank correlation of an action with the order of the trials.
-        edge: Quantile of an effect's prior beyond which an estimate is at its edge.
-        few_samples: Effective samples of an evidence.
-        uncertain: Standard error of an evidence, nats.
-        negligible: Probability of a model whose evidence does not matter.
-        long: Entries a trial of x that may be a trajectory.
-        correlated: Correlation of neighboring residuals.
-        significant: Standard errors of that correlation.
-    """
-
-    aliased: float = 0.9
-    edge: float = 0.99
-    few_samples: int = 50
-    uncertain: float = 0.5
-    negligible: float = 0.01
-    long: int = 10
-    correlated: float = 0.3
-    significant: float = 4.0
-
-
-LIMITS = Limits()
-
 
 def cautions(
     report: Contents, trials: Trials, *, designed: bool = False
@@ -81,241 +50,162 @@ def cautions(
     """
     found = [
         *_of_trials(report, trials.fit, designed=designed),
-        *_of_outcomes(report),
-        *_of_evidence(report),
-        *_of_misses(report),
+        *_of_models(report),
         *_of_verdict(report),
-        *_of_phi(report),
     ]
-    return (*map(Message, dict.fromkeys(found)),)
+    said = [caution(code, *values) for code, holds, *values in found if holds]
+    return (*map(Message, dict.fromkeys([*said, *_withdrawn(report.tracing)])),)
 
 
-def _of_trials(report: Contents, trials: Trials, *, designed: bool) -> Iterator[str]:
-    num = int(trials.valid.sum())
-    if report.residuals.noise == "estimated" and report.tracing.misfit is None:
-        yield "SA501 noise undeclared: what differs by repeat passes for noise"
-    if num < FEW_TRIALS:
-        yield f"SA502 fewer than {FEW_TRIALS} trials ({num})"
+#: Code of a caution, whether it is said, and the values in its text.
+Case = tuple[Any, ...]
+
+
+def _of_trials(report: Contents, trials: Trials, *, designed: bool) -> Iterator[Case]:
+    num, tracing = int(trials.valid.sum()), report.tracing
     is_ordered = trials.order == "known"
-    if is_ordered and not trials.action_is_label and _aliased(trials):
-        yield "SA503 drift aliased with the order of actions, which were sorted"
-    if designed:
-        yield "SA504 actions chosen for information and not for deployment"
-    if is_ordered and (growth := report.growth):
-        yield (
-            f"SA529 residuals grow from trial to trial, {growth:.2g} times from the "
-            "first third to the last: a parameter may differ by trial; declare it as "
-            'an effect of scope "trial", or what drifts'
-        )
-
-
-def _of_outcomes(report: Contents) -> Iterator[str]:
+    is_sorted = is_ordered and not trials.action_is_label and _aliased(trials)
+    is_estimated = report.residuals.noise == "estimated" and tracing.misfit is None
+    growth = report.growth if is_ordered else None
+    yield "SA501", is_estimated
+    yield "SA502", num < FEW_TRIALS, FEW_TRIALS, num
+    yield "SA503", is_sorted
+    yield "SA504", designed
+    yield "SA529", growth, growth
     own = report.residuals
-    if report.residuals_after is not None and report.tracing.chosen:
+    if report.residuals_after is not None and tracing.chosen:
         own = report.residuals_after
     kinds = [
         "gave no measurement where the model is sure of one",
         "gave a measurement where the model is sure of none",
     ]
     disagreeing = [
-        f"trial{'s' * (len(which) > 1)} "
-        f"{', '.join(called(own.names, i) for i in which)} {what}"
+        f"trial{'s' * (len(which) > 1)} {', '.join(map(own.called, which))} {what}"
         for which, what in zip(surprising_outcomes(own), kinds, strict=True)
         if which
     ]
-    if disagreeing:
-        yield f"SA505 outcomes that disagree: {' and '.join(disagreeing)}"
+    yield "SA505", disagreeing, " and ".join(disagreeing)
     if own.roughness is not None:
         rough = own.roughness[own.roughness > 0]
-        yield (
-            f"SA506 the simulator jumps: x strays by {rough.min():.2g} to "
-            f"{rough.max():.2g} from a smooth function of the parameters, which "
-            "counts as an error beside the noise"
-        )
-    if correlation := _correlation(own):
-        is_timed = own.times is not None
-        remedy = "GaussianNoise or AutocorrelatedNoise" if is_timed else "sample_times"
-        yield (
-            "SA507 independent errors forced on a trajectory: neighboring residuals "
-            f"correlate by {correlation:.2f}; declare {remedy}"
-        )
+        yield "SA506", True, rough.min(), rough.max()
+    correlation, is_timed = _correlation(own), own.times is not None
+    remedy = "GaussianNoise or AutocorrelatedNoise" if is_timed else "sample_times"
+    yield "SA507", correlation, correlation, remedy
+    for trial in tracing.set_aside:
+        yield "SA513", True, trial.name, trial.times, "it is set aside"
+    for trial in () if report.evaluation is None else report.evaluation.missed:
+        how = f"missed by {number(trial.size)} {trial.unit}"
+        if math.isinf(trial.size):
+            how = "measured where the model is sure of no measurement"
+        yield "SA514", True, trial, how
 
 
-def _of_evidence(report: Contents) -> Iterator[str]:
+def _of_models(report: Contents) -> Iterator[Case]:
     tracing, detection = report.tracing, report.detection
-    matter = {NONE, tracing.model}
-    matter |= {n for n, p in tracing.probabilities.items() if p > LIMITS.negligible}
     weak = [
         f"{e.name} ({e.effective_sample_size:.0f} effective samples, {e.engine}, "
         f"+- {e.standard_error:.2g} nats)"
         for name, e in tracing.evidences.items()
-        if name in matter
-        and (
-            e.effective_sample_size < LIMITS.few_samples
-            or e.standard_error > LIMITS.uncertain
-        )
+        if (name in (NONE, tracing.model) or tracing.probabilities.get(name, 0) > 0.01)
+        and (e.effective_sample_size < FEW_DRAWS or e.standard_error > 0.5)
     ]
-    if weak:
-        yield f"SA508 evidence uncertain of {', '.join(weak)}"
-    if detection.alarm and not detection.by_evidence:
-        yield "SA509 the alarm rests on the chi-square alone: a cause is a suggestion"
-    if tracing.chosen and tracing.misfit is None and tracing.p_value < REFUTED:
-        yield (
-            f"SA510 {tracing.verdict} explains the most, and not all: its chi-square "
-            f"has p < {REFUTED:g}, so that something else is missing too"
-        )
+    yield "SA508", weak, ", ".join(weak)
+    yield "SA509", detection.alarm and not detection.by_evidence
+    misses = tracing.chosen and tracing.misfit is None and tracing.p_value < REFUTED
+    yield "SA510", misses, tracing
     if detection.lower_p_value <= TOO_SMALL:
-        small = abs(detection.least_chi_square / detection.degrees_of_freedom) ** 0.5
-        yield (
-            "SA523 residuals are far smaller than the declared noise allows, "
-            f"{small:.2g} of its standard deviation: declare the error of the "
-            "measurement in the unit of x"
-        )
-
-
-def _of_misses(report: Contents) -> Iterator[str]:
-    """Yield sentences on trials far off, and on parameters at bounds, one each."""
-    evaluation, tracing = report.evaluation, report.tracing
-    for trial in tracing.set_aside:
-        yield (
-            f"SA513 trial {trial.name} is far outside what the other trials show, "
-            f"{trial.times:.3g} times their error: it is set aside; check its record"
-        )
-    for trial in () if evaluation is None else evaluation.missed:
-        how = f"missed by {number(trial.size)} {trial.unit}"
-        if math.isinf(trial.size):
-            how = "measured where the model is sure of no measurement"
-        yield (
-            f"SA514 held-out trial {trial.name} is far outside what the verdict's "
-            f"model predicts, {how}: check its record and its unit"
-        )
+        variance = abs(detection.least_chi_square / detection.degrees_of_freedom)
+        yield "SA523", True, variance**0.5
     for p in tracing.bounds.parameters:
         where = "in the bare model" if p.model == NONE else f"with {p.model}"
         moved = f" with the bound moved the best fit has {p.beyond:.3g};"
-        yield (
-            f"SA103 {p.name} is at a bound of its prior {where}, the {p.side} one "
-            f"({p.bound:.6g});{'' if math.isnan(p.beyond) else moved} move the bound, "
-            "or say why"
-        )
+        yield "SA103", True, p, where, "" if math.isnan(p.beyond) else moved
+    edge = _at_edge(tracing, getattr(report.prior, "effects", ()))
+    yield "SA515", edge, ", ".join(effect.name for effect, _ in edge)
+    for effect, phi in edge:
+        # Families that blame an instrument, beside those on what is observed.
+        blames = effect.hook == "observation" or effect.family in ("sensor", "geometry")
+        size = f"{number(float(phi[np.argmax(np.abs(phi))]))} {effect.units}".strip()
+        yield "SA516", blames, effect.name, size
 
 
-def _of_verdict(report: Contents) -> Iterator[str]:
+def _of_verdict(report: Contents) -> Iterator[Case]:
     tracing, verdict = report.tracing, report.verdict
     if tracing.chosen and report.evaluation is not None:
         before, after = report.rmse
-        if after >= before:
-            yield f"SA512 {_no_better(str(ModelKey(tracing.chosen)), before, after)}"
-    if verdict == OUTLIER:
-        yield (
-            f"SA521 {suspects_in_words(tracing)} does not agree with the others: check "
-            "its record, then correct, withdraw or repeat it"
-        )
-    if tracing.instead_of:
-        code, why = _withdrawn(tracing)
-        p = tracing.probabilities.get(tracing.instead_of)
-        share = "" if p is None else f" (probability {p:.2g})"
-        yield f"{code} {tracing.instead_of}{share} is not named, {why}"
-    elif len(tracing.needed) == 1:
-        yield (
-            f"SA522 {verdict} {rests(tracing)}: without it the Bayes factor against "
-            "the bare model is below 20"
-        )
-    if not tracing.robust:
-        yield "SA517 not robust to its prior"
-    if verdict == UNEXPLAINED and not tracing.chosen and not tracing.bounds.replaces:
-        yield (
-            "SA518 no declared effect explains the data, and what stands in its place "
-            "does not extrapolate"
-        )
-    if _may_be_force(report):
-        yield (
-            "SA530 what is left may be a force: add those of force_effects to the "
-            "effects"
-        )
-    if verdict == SCATTER:
-        yield "SA519 scatter is larger than the declared noise, which is no cause"
-    if report.exploratory:
-        yield "SA520 exploratory: changed after the data were seen"
+        model = ModelKey(tracing.chosen)
+        yield "SA512", after >= before, model, NO_PART, before, after
+    yield "SA521", verdict == OUTLIER, suspects_in_words(tracing)
+    decides = not tracing.instead_of and len(tracing.needed) == 1
+    yield "SA522", decides, verdict, rests(tracing)
+    yield "SA517", not tracing.robust
+    is_left = verdict == UNEXPLAINED
+    names_none = is_left and not tracing.chosen and not tracing.bounds.replaces
+    yield "SA518", names_none
+    # What is left may be a force where the simulator takes forces, and none was tried.
+    is_left |= tracing.misfit is not None and not tracing.misfit.passes
+    is_tried = any(e.family.startswith((FAMILY, COUPLING)) for e in tracing.estimates)
+    if is_left and not is_tried:
+        taken = [p.name for p in parameters_of(report.simulator.fn)]
+        yield "SA530", "force" in taken
+    yield "SA519", verdict == SCATTER
+    yield "SA520", report.exploratory
 
 
-def _no_better(which: str, before: float, after: float, on: str = NO_PART) -> str:
-    return (
-        f"{which} does not lower the error on {on}: RMSE {before:.3g} before and "
-        f"{after:.3g} after"
-    )
-
-
-def _withdrawn(tracing: Tracing) -> tuple[str, str]:
-    """Return code and reason for which effects are not named."""
+def _withdrawn(tracing: Tracing) -> Iterator[str]:
+    """Yield why effects are not named, where that is so."""
+    if not tracing.instead_of:
+        return
+    p = tracing.probabilities.get(tracing.instead_of)
+    share = "" if p is None else f" (probability {p:.2g})"
     if tracing.bounds.replaces:
-        return "SA103", f"since {narrow_prior(tracing)}"
-    if tracing.refuted:
+        code, why = "SA103", narrow_prior(tracing)
+    elif tracing.refuted:
         where = tracing.refuted_on or NO_PART
-        return "SA512", f"since {_no_better('it', *tracing.refuted, where)}"
-    which = f"it {rests(tracing)}, and " if tracing.needed else ""
-    return "SA521", (
-        f"since {which}{suspects_in_words(tracing)} may as well have a gross error: "
-        "repeat its action before adding it"
-    )
+        code, _, why = caution("SA512", "it", where, *tracing.refuted).partition(" ")
+    else:
+        which = f"it {rests(tracing)}, and " if tracing.needed else ""
+        code, why = "SA521", f"{which}{suspects_in_words(tracing)} may as well have a "
+        why += "gross error: repeat its action before adding it"
+    yield f"{code} {tracing.instead_of}{share} is not named, since {why}"
 
 
-def _of_phi(report: Contents) -> Iterator[str]:
-    edge = _at_edge(report.tracing, getattr(report.prior, "effects", ()))
-    if edge:
-        names = ", ".join(effect.name for effect, _ in edge)
-        yield (
-            f"SA515 phi at its prior's edge ({names}): it is stronger than declared, "
-            "or stands in for another"
-        )
-    for effect, phi in edge:
-        size = f"{number(float(phi[np.argmax(np.abs(phi))]))} {effect.units}".strip()
-        if effect.hook == "observation" or effect.family in INSTRUMENTS:
-            yield f"SA516 {effect.name} of {size} is more than an instrument gets wrong"
-
-
-def _aliased(trials: Trials) -> bool:
+def _aliased(trials: Trials, *, limit: float = 0.9) -> bool:
     """Return whether an entry of the action goes with the order of execution."""
     order = rankdata(trials.index.numpy())
     return any(
         len(value) > 2
         and np.ptp(value) > 0
-        and abs(np.corrcoef(order, rankdata(value))[0, 1]) > LIMITS.aliased
+        and abs(np.corrcoef(order, rankdata(value))[0, 1]) > limit
         for value in trials.action.numpy().T
     )
 
 
-def _may_be_force(report: Contents) -> bool:
-    """Return whether something is left, and a simulator that takes forces has none."""
-    misfit = report.tracing.misfit
-    is_left = report.verdict == UNEXPLAINED or misfit is not None and not misfit.passes
-    families = [e.family for e in report.tracing.estimates]
-    if not is_left or any(f.startswith((FAMILY, COUPLING)) for f in families):
-        return False
-    return "force" in [p.name for p in parameters_of(report.simulator.fn)]
+def _correlation(own: Residuals, *, long: int = 10, least: float = 0.3) -> float:
+    """Return that of neighbors in x's first axis; 0 where it is no reason to warn.
 
-
-def _correlation(own: Residuals) -> float:
-    """Return that of neighbors in x's first axis; 0 where it is no reason to warn."""
+    Args:
+        own: Residuals, standardized.
+        long: Entries a trial of x that may be a trajectory.
+        least: Correlation that is one; so are four of its standard errors.
+    """
     z = own.refitted
     is_declared = own.times is not None and own.correlation != 0.0
     pairs = np.stack([z[:, :-1].ravel(), z[:, 1:].ravel()])
     pairs = pairs[:, np.isfinite(pairs).all(0)]
     num = pairs.shape[1]
-    if is_declared or z.shape[1] < LIMITS.long or num < 3 or not pairs.std(1).all():
+    if is_declared or z.shape[1] < long or num < 3 or not pairs.std(1).all():
         return 0.0
     found = float(np.corrcoef(pairs)[0, 1])
-    least = max(LIMITS.correlated, LIMITS.significant / np.sqrt(num))
-    return found if found > least else 0.0
+    return found if found > max(least, 4 / np.sqrt(num)) else 0.0
 
 
 def _at_edge(tracing: Tracing, effects: Sequence[Effect]) -> list[tuple[Effect, Array]]:
     """Return effects of the verdict whose phi is at its edge given all, and phi."""
     evidence = tracing.evidences.get(tracing.model)
-    if evidence is None:
-        return []
     found = []
     for effect in effects:
-        if effect.name in tracing.chosen:
+        if effect.name in tracing.chosen and evidence is not None:
             columns = [evidence.names.index(name) for name in effect.phi_names]
             phi = evidence.draws[:, columns].mean(0)
             if _is_extreme(effect, phi):
@@ -323,7 +213,7 @@ def _at_edge(tracing: Tracing, effects: Sequence[Effect]) -> list[tuple[Effect, 
     return found
 
 
-def _is_extreme(effect: Effect, mean: Array) -> bool:
+def _is_extreme(effect: Effect, mean: Array, *, edge: float = 0.99) -> bool:
     """Return whether phi is further from the null than almost all of its prior."""
     with forked_generators(0, "edge"):
         draws = effect.sample(2_000).numpy()
@@ -331,8 +221,8 @@ def _is_extreme(effect: Effect, mean: Array) -> bool:
     finite = np.isfinite(null)
     center = np.where(finite, null, 0.0)
     distance, own = np.abs(draws - center), np.abs(mean - center)
-    beyond = (own > np.quantile(distance, LIMITS.edge, axis=0)) & finite
+    beyond = (own > np.quantile(distance, edge, axis=0)) & finite
     # From an infinite null the far end is the one away from it.
-    low, high = np.quantile(draws, [1 - LIMITS.edge, LIMITS.edge], axis=0)
+    low, high = np.quantile(draws, [1 - edge, edge], axis=0)
     far = np.where(null > 0, mean < low, mean > high) & ~finite
     return bool((beyond | far).any())

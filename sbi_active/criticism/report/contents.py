@@ -15,7 +15,7 @@ from torch.distributions import Distribution
 from sbi_active.criticism.contradictions import SevereTest
 from sbi_active.criticism.data.units import split
 from sbi_active.criticism.report.predicted import TestedTrial
-from sbi_active.criticism.report.words import TOLD, called, setting
+from sbi_active.criticism.report.words import setting
 from sbi_active.criticism.results import (
     NONE,
     UNEXPLAINED,
@@ -125,17 +125,15 @@ class Contents:
 
         The ratio of "log predictive density" and "coverage" is their difference.
         """
-        columns = ["metric", "before", "after", "ratio", "interval"]
+        columns = pd.Index(["metric", "before", "after", "ratio", "interval"])
         if self.evaluation is None:
-            return pd.DataFrame(columns=pd.Index(columns))
+            return pd.DataFrame(columns=columns)
         table = self.evaluation.table
         ends = zip(table["low"], table["high"], strict=True)
         interval = [
-            (float(low), float(high)) if np.isfinite([low, high]).all() else None
-            for low, high in ends
+            (float(a), float(b)) if np.isfinite(a + b) else None for a, b in ends
         ]
-        table = table.assign(interval=pd.Series(interval, dtype=object))
-        return table.loc[:, columns]
+        return table.assign(interval=pd.Series(interval, dtype=object))[columns]
 
     @property
     def rmse(self) -> tuple[float, float]:
@@ -150,15 +148,13 @@ class Contents:
         Values are means and deviations of posteriors. A model that misses the trials
         has its best fit, with a deviation that includes the misfit.
         """
-        evidences, missing = self.tracing.evidences, [np.nan, np.nan]
-        bare = evidences[NONE]
-        rows = {n: _moments(bare, i) + missing for i, n in enumerate(bare.names)}
-        after = evidences.get(self.tracing.model, bare)
-        for i, name in enumerate(() if after is bare else after.names):
-            rows[name] = rows.get(name, 2 * missing)[:2] + _moments(after, i)
-        names = ["before", "before_sd", "after", "after_sd"]
-        table = pd.DataFrame.from_dict(rows, orient="index", columns=pd.Index(names))
-        return table.rename_axis("parameter").reset_index()
+        bare = self.tracing.evidences[NONE]
+        after = self.tracing.evidences.get(self.tracing.model, bare)
+        parts = [_moments(bare, "before")]
+        parts += [] if after is bare else [_moments(after, "after")]
+        table = pd.concat(parts, axis=1).rename_axis("parameter")
+        columns = ["before", "before_sd", "after", "after_sd"]
+        return table.reindex(columns=pd.Index(columns)).reset_index()
 
     @property
     def residuals_by_trial(self) -> pd.DataFrame:
@@ -183,7 +179,7 @@ class Contents:
             when = np.nan if times is None else float(times[t, k])
             size = float(root_mean_square(left[t, :, c]))
             deviations = float(root_mean_square(z[t]))
-            name = called(found.names, int(t))
+            name = found.called(int(t))
             rows.append((name, float(found.index[t]), deviations, size, int(c), when))
         columns = ["trial", "index", "deviations", "size", "channel", "time"]
         table = pd.DataFrame(rows, columns=pd.Index(columns))
@@ -230,7 +226,7 @@ class Contents:
     def prior_draws(self, stream: str) -> Array:
         """Return draws of the prior, shape (m, dim), the same for a stream."""
         with forked_generators(0, stream):
-            return self.prior.sample(torch.Size([TOLD.prior_draws])).double().numpy()
+            return self.prior.sample(torch.Size([2_000])).double().numpy()
 
     @property
     def tests(self) -> list[str]:
@@ -270,15 +266,15 @@ def root_mean_square(x: Array, axis: int | tuple[int, ...] | None = None) -> Arr
     return np.sqrt(total.sum(axis) / np.maximum(seen.sum(axis), 1))
 
 
-def _moments(evidence: Evidence, i: int) -> list[float]:
-    """Return a parameter's mean and deviation in a model.
+def _moments(evidence: Evidence, when: str) -> pd.DataFrame:
+    """Return mean and deviation of each parameter in a model.
 
     Of one that misses the trials draws are spread by the misfit, and moved within the
     prior: their mean is no fit.
     """
-    draws, center = evidence.draws[:, i], evidence.draws[:, i].mean()
-    if evidence.best is not None:
-        center = evidence.best[i]
-    elif evidence.narrow is not None:
-        center = evidence.narrow[:, i].mean()
-    return [float(center), float(draws.std())]
+    draws = evidence.draws if evidence.narrow is None else evidence.narrow
+    num = len(evidence.names)
+    center = [column.mean() for column in draws.T[:num]]
+    center = center if evidence.best is None else evidence.best[:num]
+    sd = [column.std() for column in evidence.draws.T[:num]]
+    return pd.DataFrame({when: center, f"{when}_sd": sd}, index=[*evidence.names])

@@ -9,7 +9,7 @@ import numpy as np
 
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.summary import added
-from sbi_active.criticism.report.words import TOLD
+from sbi_active.criticism.report.words import phrase
 from sbi_active.criticism.results import Array, Evaluation, Residuals, Tracing
 from sbi_active.display.page import Picture
 
@@ -23,15 +23,6 @@ METRICS = {
     "energy score": "energy score",
     "log predictive density": "log predictive density [nats]",
     "coverage": "share inside the central 90 %",
-}
-
-CAPTIONS = {
-    "residuals": "Residuals of the models refitted to all trials, in standard "
-    "deviations of the prediction; the band is two of them. Each row has its scale, "
-    "logarithmic beyond the band where residuals are large.",
-    "probabilities": "Posterior probability of the models that were tried.",
-    "before_after": "One line a scored trial; the bars are over all of them. "
-    "Lower is better for the first two, higher for the third; the dotted line is 90 %.",
 }
 
 
@@ -55,7 +46,7 @@ def figures(report: Contents) -> dict[str, Figure]:
 
 def pictured(name: str) -> Picture:
     """Return the place of the figure with a name."""
-    return Picture(name, CAPTIONS[name], CAPTIONS[name])
+    return Picture(name, phrase(f"figure, {name}"), phrase(f"figure, {name}"))
 
 
 def plot_residuals(
@@ -89,7 +80,7 @@ def plot_residuals(
     labels = action_labels
     if labels is None:
         labels = [f"action {i + 1}" for i in range(before.action.shape[1])]
-    shown = min(len(labels), TOLD.panels)
+    shown = min(len(labels), 3)
     several = before.x[0].size > 1
     columns = shown + 1 + several
     figure, axes = _subplots(len(rows), columns, width=3.3, height=2.5)
@@ -150,8 +141,6 @@ def plot_before_after(evaluation: Evaluation) -> Figure:
     Returns:
         The figure.
     """
-    from matplotlib.ticker import FuncFormatter
-
     metrics = [name for name in METRICS if name in evaluation.before]
     figure, axes = _subplots(1, len(metrics), width=2.5, height=2.7)
     for ax, name in zip(axes[0], metrics, strict=True):
@@ -162,15 +151,12 @@ def plot_before_after(evaluation: Evaluation) -> Figure:
             places = np.full(pairs.shape[1], x)
             ax.plot(places, pairs[x], ".", ms=5, color=color, alpha=0.6)
             ax.plot([x] * len(total), total[when], "k_", ms=22, mew=2, zorder=3)
-        positive = pairs[np.isfinite(pairs) & (pairs > 0)]
         if name in ("rmse", "energy score"):
-            if _spread(positive) > 10:
-                _plain_log(ax)
-            else:
-                ax.set_ylim(bottom=0)
-        if name == "log predictive density" and _spread(-pairs[pairs < 0]) > 20:
+            positive = pairs[np.isfinite(pairs) & (pairs > 0)]
+            is_wide = positive.size and positive.max() > 10 * positive.min()
+            ax.set(yscale="log") if is_wide else ax.set_ylim(bottom=0)
+        if name == "log predictive density" and np.nanmin(pairs) < -200:
             ax.set_yscale("symlog", linthresh=10)
-            ax.yaxis.set_major_formatter(FuncFormatter(_signed))
         if name == "coverage":
             ax.axhline(0.9, color="#333333", lw=0.8, ls=":")
             ax.set_ylim(-0.04, 1.04)
@@ -203,7 +189,7 @@ def _by_entry(
 
 
 def _scatter(ax: Axes, place: Array, each: Array, color: str) -> None:
-    """Draw all entries of a trial at its place, and their root mean square."""
+    """Draw all entries of a trial at its place."""
     many = each.shape[1] > 1
     ax.plot(place, each, ".", ms=3 if many else 7, alpha=0.45 if many else 0.9, c=color)
 
@@ -213,7 +199,7 @@ def _trial_axis(ax: Axes, residuals: Residuals) -> None:
     index, names = residuals.index, residuals.names
     ax.set_xlabel("trial")
     numbered = all(n == f"{i:.15g}" for n, i in zip(names, index, strict=False))
-    if numbered or len(names) > TOLD.ticks:
+    if numbered or len(names) > 16:
         locator: Any = ax.xaxis.get_major_locator()
         locator.set_params(integer=True)
         return
@@ -225,24 +211,11 @@ def _residual_axis(ax: Axes, each: Array) -> None:
     ax.axhline(0, color="#555555", lw=0.8, zorder=0)
     finite = each[np.isfinite(each)]
     largest = max(float(np.abs(finite).max(initial=0.0)) * 1.15, 3.5)
-    if largest > TOLD.logarithmic:
+    if largest > 12.0:
         largest *= 1.4
         ax.set_yscale("symlog", linthresh=2)
-        decades = 10.0 ** np.arange(1, np.floor(np.log10(largest)) + 1)
-        ticks = [*(-decades[::-1]), -2.0, 0.0, 2.0, *decades]
-        ax.set_yticks(ticks, [_signed(t) for t in ticks])
-        ax.minorticks_off()
     ax.set_ylim(-largest, largest)
     _plain(ax)
-
-
-def _plain_log(ax: Axes) -> None:
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    ax.set_yscale("log")
-    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    ax.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _plain(ax: Axes) -> None:
@@ -255,14 +228,6 @@ def _plain(ax: Axes) -> None:
 
 def _entries(z: Array) -> Array:
     return z.reshape(len(z), -1)
-
-
-def _signed(value: float, _: int | None = None) -> str:
-    return f"{value:g}".replace("-", "\N{MINUS SIGN}")
-
-
-def _spread(values: Array) -> float:
-    return float(values.max() / values.min()) if values.size else 1.0
 
 
 def _subplots(

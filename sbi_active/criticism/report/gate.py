@@ -7,7 +7,6 @@ holds, the simulator predicts trials that it was not fitted to within their erro
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
@@ -15,7 +14,7 @@ import numpy as np
 
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.summary import not_told_from
-from sbi_active.criticism.report.words import listed, number, stated
+from sbi_active.criticism.report.words import listed, number, phrase, stated
 from sbi_active.criticism.results import NONE, OUTLIER, ModelKey
 
 Decision = Literal[
@@ -35,34 +34,6 @@ EXIT_CODES: dict[Decision, int] = {
     "WRONG_MODEL": 13,
     "NOT_ENOUGH_DATA": 14,
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class GateSettings:
-    """Settings of the gate.
-
-    Attributes:
-        fewest: Trials that have to be scored.
-        level: Tail probability of the chi-square of the scored trials below which the
-            simulator misses them, as for held-out trials of a verdict.
-        covered: Share of numbers within their 90 % intervals below which it misses
-            them, if the size of the noise is not declared.
-        open: Width of a posterior, in prior deviations, above which a parameter is
-            hardly known.
-        likely: Probability of the bare model below which trials decide nothing, though
-            they raise no alarm.
-        kept: Share of a bound that a wider one keeps, where it would change its sign.
-    """
-
-    fewest: int = 3
-    level: float = 0.01
-    covered: float = 0.7
-    open: float = 0.5
-    likely: float = 0.2
-    kept: float = 0.1
-
-
-GATE = GateSettings()
 
 
 @dataclass(frozen=True)
@@ -92,136 +63,118 @@ class Gate:
         return f"{self.decision}: {self.reason}"
 
 
-def gate_of(report: Contents) -> Gate:
+def gate_of(
+    report: Contents,
+    *,
+    fewest: int = 3,
+    level: float = 0.01,
+    covered: float = 0.7,
+    likely: float = 0.2,
+) -> Gate:
     """Return the decision on the simulator that a report is of.
 
     Args:
         report: Report with the error before and after.
+        fewest: Trials that have to be scored.
+        level: Tail probability of the chi-square of the scored trials below which the
+            simulator misses them, as for held-out trials of a verdict.
+        covered: Share of numbers within their 90 % intervals below which it misses
+            them, if the size of the noise is not declared.
+        likely: Probability of the bare model below which trials decide nothing, though
+            they raise no alarm.
     """
-    return next(_conditions(report))
-
-
-def _conditions(report: Contents) -> Iterator[Gate]:
-    """Yield the decisions whose conditions hold, the first that decides first."""
     tracing, scored = report.tracing, report.evaluation
     num = 0 if scored is None else len(scored.trials)
-    if scored is None or num < GATE.fewest:
-        yield Gate(
-            "NOT_ENOUGH_DATA",
-            f"{num} trials were scored that had no part in the fit, and {GATE.fewest} "
-            "are needed; measure more",
-            {"scored": num},
-        )
-        return
-    yield from _beyond_prior(report)
+    if scored is None or num < fewest:
+        reason = phrase("gate, scored", num, fewest)
+        return Gate("NOT_ENOUGH_DATA", reason, {"scored": num})
+    if (narrow := _beyond_prior(report, level)) is not None:
+        return narrow
     if report.verdict == OUTLIER:
-        yield Gate(
-            "NOT_ENOUGH_DATA",
-            "one trial does not agree with the others; check and repeat it",
-            {"trials": [tracing.trial_names.get(i, i) for i in tracing.outliers][:1]},
-        )
+        names = [tracing.trial_names.get(i, i) for i in tracing.outliers]
+        return Gate("NOT_ENOUGH_DATA", phrase("gate, outlier"), {"trials": names[:1]})
     before, after = report.rmse
     errors = {"before": before, "after": after}
+    table = report.residuals_by_trial.head(1).dropna(axis="columns")
+    worst = {"worst": next(iter(table.to_dict("records")), {})}
     if report.verdict != NONE:
-        yield from _wrong(report, errors)
+        return _wrong(report, errors, worst)
     missed = [trial.name for trial in scored.missed]
-    inside = scored.after["coverage"] if report.verdict == NONE else np.ones(1)
-    uncovered = np.isnan(scored.p_value) and np.mean(inside) < GATE.covered
-    if missed or scored.p_value < GATE.level or uncovered:
+    uncovered = np.isnan(scored.p_value) and np.mean(scored.after["coverage"]) < covered
+    if missed or scored.p_value < level or uncovered:
         which = f"trials {listed(missed)}" if missed else f"the {num} scored trials"
-        yield Gate(
-            "WRONG_MODEL",
-            f"{which} are far outside what the simulator predicts",
-            {"trials": missed, **_residuals(report)},
-        )
+        details = {"trials": missed, **worst}
+        return Gate("WRONG_MODEL", phrase("gate, missed", which), details)
     if found := report.combinations:
-        yield Gate("NOT_IDENTIFIABLE", str(found), {"combinations": found.to_dict()})
-    if wide := _open(report):
-        yield Gate(
-            "NOT_ENOUGH_DATA",
-            f"the trials hardly tell {listed(wide)}; measure more",
-            {"parameters": wide},
-        )
+        return Gate("NOT_IDENTIFIABLE", str(found), {"combinations": found.to_dict()})
+    if wide := _hardly_known(report):
+        reason = phrase("gate, open", listed(wide))
+        return Gate("NOT_ENOUGH_DATA", reason, {"parameters": wide})
     p = report.probabilities.get(NONE, 1.0)
-    if p < GATE.likely:
+    if p < likely:
         other = max(report.probabilities, key=report.probabilities.__getitem__)
-        told = f"no alarm, though {other} is likelier ({stated(p)} for none)"
-        yield Gate("NOT_ENOUGH_DATA", f"{told}; measure more", {"effects": [other]})
-    yield Gate(
-        "SHIP",
-        f"the simulator predicts {num} trials that had no part in its fit, with a root "
-        f"mean square error of {number(errors['before'])}",
-        {"scored": num, **errors},
-    )
+        reason = phrase("gate, likelier", other, stated(p))
+        return Gate("NOT_ENOUGH_DATA", reason, {"effects": [other]})
+    reason = phrase("gate, ships", num, number(before))
+    return Gate("SHIP", reason, {"scored": num, **errors})
 
 
-def _beyond_prior(report: Contents) -> Iterator[Gate]:
-    """Yield that the prior is too narrow, if a wider one explains the trials."""
+def _beyond_prior(report: Contents, level: float, *, kept: float = 0.1) -> Gate | None:
+    """Return that the prior is too narrow, if a wider one explains the trials.
+
+    Args:
+        report: Report with bounds at which parameters are.
+        level: Tail probability from which the wider prior explains them.
+        kept: Share of a bound that a wider one keeps, where it would change its sign.
+    """
     bounds = report.tracing.bounds
-    explains = bool(bounds.replaces) or bounds.p_value > GATE.level
+    explains = bool(bounds.replaces) or bounds.p_value > level
     found = {(p.name, p.side): p for p in bounds.parameters if p.model == NONE}
-    moved = [*found.values()]
-    if not (moved and explains and report.detection.alarm):
-        return
-    said = [f"{p.name} at its {p.side} bound {p.bound:.6g}" for p in moved]
+    if not (found and explains and report.detection.alarm):
+        return None
     box: dict[str, dict[str, float]] = {}
-    for p in moved:
+    for (name, side), p in found.items():
         wider = p.bound + 2 * (p.beyond - p.bound)  # as much again beyond the fit
-        keeps_sign = wider * p.bound >= 0
-        end = wider if keeps_sign else GATE.kept * p.bound
-        box.setdefault(p.name, {})[p.side] = end
+        box.setdefault(name, {})[side] = (
+            wider if wider * p.bound >= 0 else kept * p.bound
+        )
+    said = [f"{n} at its {side} bound {p.bound:.6g}" for (n, side), p in found.items()]
     ends = [f"{name}: {v:.4g}" for name, side in box.items() for v in side.values()]
-    yield Gate(
-        "OUT_OF_PRIOR",
-        f"{listed(said)}, and with a wider prior no effect is needed; widen it to "
-        f"{', '.join(ends)}",
-        {"bounds": [asdict(p) for p in moved], "box": box},
-    )
+    reason = phrase("gate, bounds", listed(said), ", ".join(ends))
+    details = {"bounds": [asdict(p) for p in found.values()], "box": box}
+    return Gate("OUT_OF_PRIOR", reason, details)
 
 
-def _wrong(report: Contents, errors: dict[str, float]) -> Iterator[Gate]:
-    """Yield that effects do not lower the error, or that something is missing."""
+def _wrong(report: Contents, errors: dict[str, float], worst: dict[str, Any]) -> Gate:
+    """Return that effects do not lower the error, or that something is missing."""
     tracing, effects = report.tracing, [*report.tracing.chosen]
     no_better = not errors["after"] < errors["before"]
     if tracing.refuted or (effects and no_better):
         before, after = tracing.refuted or (errors["before"], errors["after"])
         name = tracing.instead_of or str(ModelKey(tracing.chosen))
-        yield Gate(
-            "NO_IMPROVEMENT",
-            f"{name} does not lower the error on trials that had no part in the fit: "
-            f"{number(before)} to {number(after)}",
-            {"effects": effects, "before": before, "after": after},
-        )
-        return
+        reason = phrase("gate, no better", name, number(before), number(after))
+        details = {"effects": effects, "before": before, "after": after}
+        return Gate("NO_IMPROVEMENT", reason, details)
     others = not_told_from(tracing, effects)
-    where = _residuals(report)
     if effects and not tracing.beside:
-        told = f"the simulator lacks {report.verdict}"
+        lacks = report.verdict
         if others:
-            told += f", or {', '.join(others)}, which no permitted action tells from it"
-        change = f"{number(errors['before'])} to {number(errors['after'])}"
-        reason = f"{told}; with it the error goes from {change}; add it and ask again"
+            lacks += (
+                f", or {', '.join(others)}, which no permitted action tells from it"
+            )
+        reason = phrase("gate, lacks", lacks, *map(number, errors.values()))
     else:
         helping = f"; {ModelKey(tracing.beside)} helps" if tracing.beside else ""
-        reason = (
-            f"the simulator misses the trials ({report.verdict}){helping}; most in "
-            f"trial {where['worst']['trial']}"
-        )
-    yield Gate(
-        "WRONG_MODEL", reason, {"effects": effects, "or": others, **errors, **where}
-    )
+        trial = worst["worst"]["trial"]
+        reason = phrase("gate, misses", report.verdict, helping, trial)
+    details = {"effects": effects, "or": others, **errors, **worst}
+    return Gate("WRONG_MODEL", reason, details)
 
 
-def _residuals(report: Contents) -> dict[str, Any]:
-    """Return the trial, channel and time of the largest residual."""
-    table = report.residuals_by_trial.head(1).dropna(axis="columns")
-    return {"worst": next(iter(table.to_dict("records")), {})}
-
-
-def _open(report: Contents) -> list[str]:
-    """Return the parameters that the trials hardly tell."""
+def _hardly_known(report: Contents, *, limit: float = 0.5) -> list[str]:
+    """Return the parameters whose posteriors are half as wide as the prior or more."""
     evidence = report.tracing.evidences[NONE]
     prior = report.prior_draws("gate")
     dim = min(prior.shape[1], evidence.draws.shape[1])
     width = evidence.draws[:, :dim].std(0) / prior[:, :dim].std(0)
-    return [n for n, w in zip(evidence.names, width, strict=False) if w > GATE.open]
+    return [n for n, w in zip(evidence.names, width, strict=False) if w > limit]

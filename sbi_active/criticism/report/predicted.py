@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from sbi_active.arrays import Array
-from sbi_active.display.page import Section
-from sbi_active.display.table import Table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,28 +98,3 @@ class TestedTrial:
         """Return the root mean square by which a prediction missed, units of x."""
         x = np.ravel(self.x)[self.registered.position]
         return float(np.sqrt(np.nanmean((x - predicted) ** 2)))
-
-
-def predicted_section(
-    tested: Sequence[TestedTrial], settings: Sequence[str], stopped: str
-) -> Section:
-    """Return the table "predicted, then measured".
-
-    Args:
-        tested: Trials in the order in which they were run.
-        settings: Action of each of them, in words.
-        stopped: Reason to run no more of them.
-    """
-    rows = []
-    for trial, setting in zip(tested, settings, strict=True):
-        own = trial.registered
-        held = "held" if trial.held else f"failed, {trial.distance:.2g} deviations"
-        held = held if trial.is_measured else "no measurement"
-        words = *trial.in_words(), held, own.verdict, trial.after
-        rows.append((f"{own.index:g}: {setting}", *words))
-    names = ("trial", "predicted (90 %)", "measured", "prediction")
-    return Section(
-        "Predicted, then measured",
-        [f"Each was predicted before it was run; then it ended: {stopped}."],
-        table=Table((*names, "verdict before", "after"), rows),
-    )

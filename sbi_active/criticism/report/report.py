@@ -15,9 +15,9 @@ from sbi_active.criticism.report.cautions import cautions
 from sbi_active.criticism.report.contents import Contents
 from sbi_active.criticism.report.figures import figures
 from sbi_active.criticism.report.gate import Gate, gate_of
-from sbi_active.criticism.report.sections import cautions_with_codes, page
-from sbi_active.criticism.report.summary import (
-    first_paragraph,
+from sbi_active.criticism.report.sections import (
+    cautions_with_codes,
+    page,
     sentences,
     verdict_line,
 )
@@ -27,10 +27,6 @@ from sbi_active.display.notebook import card, items, table
 from sbi_active.display.table import Table
 from sbi_active.messages import Message
 from sbi_active.plain import plain
-
-#: Parts of the reasons of a verdict where every model misses, in :meth:`to_dict`.
-MISFIT = ("helps", "named", "open_forms", "instead", "left_out")
-MISFIT += ("sensor", "passes", "size", "time_scale", "weights")
 
 
 class Report(Contents):
@@ -52,7 +48,7 @@ class Report(Contents):
         likely = sorted(shares.items(), key=lambda item: -item[1])[:5]
         return card(
             verdict_line(self),
-            first_paragraph(self),
+            " ".join(sentences(self)),
             table(
                 Table(("model", "probability"), [(n, f"{p:.2f}") for n, p in likely])
             ),
@@ -89,24 +85,14 @@ class Report(Contents):
                 # By the fitted trials alone they would contradict the verdict.
                 "probabilities": self.probabilities if holds else None,
                 "credible_set": self.credible_set if holds else None,
-                "misfit": misfit
-                and {name: getattr(misfit, name) for name in MISFIT}
-                | {"support": {n: asdict(own) for n, own in misfit.support.items()}},
+                "misfit": misfit and asdict(misfit),
                 "equivalent": self.equivalent,
                 **{name: table.to_dict("records") for name, table in tables.items()},
                 "next_action": plan,
                 "severe_tests": [asdict(test) for test in self.severe_tests],
                 "gate": self.gate.to_dict(),
                 "digest": self.digest,
-                "sections": [
-                    {
-                        "title": section.title,
-                        "text": section.text,
-                        "items": section.items,
-                        "table": section.table and asdict(section.table),
-                    }
-                    for section in made.sections
-                ],
+                "sections": [*map(asdict, made.sections)],
             }
         )
 

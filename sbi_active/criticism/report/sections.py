@@ -1,47 +1,79 @@
-"""Sections of a report: residuals, errors before and after, next action, record."""
+"""The page of a report: its prose by ``report.jinja``, with tables and figures."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from functools import cache
+from math import isnan
+from typing import Any
 
 import numpy as np
 
 from sbi_active.criticism.data.units import split
-from sbi_active.criticism.report import models
 from sbi_active.criticism.report.contents import Contents, by_channel, root_mean_square
 from sbi_active.criticism.report.figures import METRICS, pictured
-from sbi_active.criticism.report.predicted import predicted_section
 from sbi_active.criticism.report.summary import (
+    NO_PART,
     added,
-    first_paragraph,
+    label,
+    limits,
+    narrow_prior,
+    not_told_from,
     sizes,
-    verdict_line,
+    suspects_in_words,
+    verdict_in_words,
 )
-from sbi_active.criticism.report.words import TOLD, called, listed, number, probability
-from sbi_active.criticism.results import (
-    NONE,
-    SCATTER,
-    UNEXPLAINED,
-    Array,
-    Evaluation,
-    NextAction,
-    Residuals,
+from sbi_active.criticism.report.tables import shown, small_sets, tables_of
+from sbi_active.criticism.report.words import (
+    FEW_DRAWS,
+    counted,
+    listed,
+    number,
+    probability,
+    stated,
 )
-from sbi_active.criticism.under_misfit import Misfit
+from sbi_active.criticism.results import NONE, ModelKey
+from sbi_active.criticism.steps.detection import LEVEL
 from sbi_active.display.page import Page, Section
-from sbi_active.display.table import Table
 from sbi_active.messages import Message, place
-
-SEVERE = (
-    "The free residual is the bare model and a smooth function of the action, both as "
-    "fitted to the trials; the difference is the root mean square over x, in standard "
-    "deviations of the verdict's prediction, noise included."
-)
 
 
 def page(report: Contents) -> Page:
     """Return a report as a page, the verdict its title."""
-    return Page(verdict_line(report), [*_sections(report)], [first_paragraph(report)])
+    tables, pictures = tables_of(report), {"Effects": pictured("probabilities")}
+    pictures |= {"Residuals": pictured("residuals")}
+    pictures |= {"Error before and after": pictured("before_after")}
+    if not report.has_probabilities:
+        del pictures["Effects"]
+    if report.evaluation is None:
+        del pictures["Error before and after"]
+    sections = []
+    head, *parts = _prose(report).split("\n## ")
+    for part in parts:
+        title, *blocks = _blocks(f"{part}\n")
+        items = [block[2:] for block in blocks if block.startswith("- ")]
+        text = [block for block in blocks if not block.startswith("- ")]
+        table, picture = tables.get(title), pictures.get(title)
+        warns = title == "Warnings"
+        sections.append(Section(title, text, items, table, picture, warns))
+    line, *paragraph = _blocks(head)
+    return Page(line, sections, [" ".join(paragraph)])
+
+
+def sentences(report: Contents) -> tuple[str, str, str, str]:
+    """Return what is missing, the error before and after, what is left, what next."""
+    _, missing, errors, left, following = _head(report)
+    return missing, errors, left, following
+
+
+def verdict_line(report: Contents) -> str:
+    """Return the verdict with what limits it, in one line."""
+    return _head(report)[0]
+
+
+def _head(report: Contents) -> list[str]:
+    """Return the first line and the four sentences."""
+    return _blocks(_prose(report, sections=False))
 
 
 def cautions_with_codes(report: Contents) -> list[tuple[str, str]]:
@@ -53,298 +85,203 @@ def cautions_with_codes(report: Contents) -> list[tuple[str, str]]:
     return found
 
 
-def _sections(report: Contents) -> Iterator[Section]:
-    if report.warnings:
-        items = [f"{c} {said}".strip() for c, said in cautions_with_codes(report)]
-        yield Section("Warnings", items=items, warns=True)
-    if report.tracing.misfit is not None:
-        yield models.admitted_models(report, report.tracing.misfit)
-    yield models.effects(report)
-    yield models.equivalences(report)
-    yield residuals(report)
-    yield by_trial(report)
-    yield before_and_after(report)
-    yield models.parameters(report)
-    if report.tested:
-        settings = [report.setting(t.registered.action) for t in report.tested]
-        yield predicted_section(report.tested, settings, report.stopped)
-    yield next_action(report)
-    yield _record(report)
+def _blocks(prose: str) -> list[str]:
+    """Return paragraphs and items, a line each; a title ends in its own line."""
+    return [" ".join(b.split()) for b in re.split(r"\n\s*\n", prose) if b.strip()]
 
 
-def next_action(report: Contents) -> Section:
-    """Return the action that tells most, and what no permitted action tells."""
-    chosen, title, misfit = report.next_action, "Next action", report.tracing.misfit
-    tests = [*_tests(report)]
-    tried = [_tried(report)] if report.tracing.chosen else []
-    if chosen is None:
-        none = "None was asked for: there is no set of permitted actions."
-        return Section(title, [none, *tried], items=tests)
-    text = [_told(report, chosen)]
-    if misfit is not None and len(chosen.separates) > 1:
-        text.append(_by_error(misfit))
-    text += [*tried, *[SEVERE] * bool(tests)]
-    items = (*_by_range(report, chosen), *_inseparable(report, chosen), *tests)
-    return Section(title, text, items=items)
+@cache
+def _template() -> Any:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
 
-
-def _told(report: Contents, chosen: NextAction) -> str:
-    """Return the action, or the reason not to choose one."""
-    best = float(np.nanmax(chosen.information_gain, initial=0.0))
-    if chosen.action is not None:
-        between = f" between {', '.join(chosen.separates)}" * bool(chosen.separates)
-        action = report.setting(chosen.action)
-        return f"{action}: at least {best:.2f} nats{between} (a lower bound)."
-    misfit, one = report.tracing.misfit, chosen.separates[:1]
-    found = (
-        "no permitted action tells more about which declared model is right than "
-        f"{max(best, 0.001):.3f} nats."
+    made = Environment(
+        loader=PackageLoader("sbi_active.criticism", "report"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    if len(chosen.separates) == 1:
-        how = f"predicts left-out {misfit.left_out} so well" if misfit else "is left"
-        found = f"of the declared models only {one[0]} {how}."
-    if report.verdict == NONE:
-        return f"Stop: {found}"
-    rest = {
-        UNEXPLAINED: " Declare what else the simulator may lack.",
-        SCATTER: " Repeat an action to see how large it is.",
+    for form in (number, probability, stated, listed, counted):
+        made.filters[form.__name__] = form
+    return made.get_template("report.jinja")
+
+
+def _prose(report: Contents, *, sections: bool = True) -> str:
+    """Return first line, sentences and sections, blank lines between paragraphs."""
+    tracing, misfit, plan = report.tracing, report.tracing.misfit, report.next_action
+    words = {e.name: " ".join(e.describe.split()) for e in tracing.estimates}
+    words = {name: said.rstrip(".") for name, said in words.items() if said}
+    named = [f"{n} ({words[n]})" if n in words else n for n in tracing.chosen]
+    evaluation, table = report.evaluation, report.residuals_by_trial
+    folds = evaluation is not None and evaluation.scheme != "held out"
+    withdrawn = folds and (tracing.refuted or tracing.bounds.replaces)
+    scores = report.before_after.set_index("metric").to_dict("index")
+    helpful = None
+    if misfit is not None:
+        refuted = tracing.instead_of if tracing.refuted else ""
+        name = str(ModelKey(misfit.helps)) if misfit.helps else refuted
+        helpful = misfit.of(name) if name else None
+    evidences = tracing.evidences
+    models = [evidences[n] for n in (NONE, tracing.model) if n in evidences]
+    inseparable = [] if plan is None else [*plan.inseparable]
+    beyond = frozenset(() if plan is None else plan.outside_separates)
+    inseparable += [beyond] if plan is not None and plan.outside is not None else []
+    is_misfit = misfit is not None and bool(tracing.chosen)
+    others = [
+        f"{label(tracing, name)} ({stated(report.probabilities[name])})"
+        for name in report.credible_set
+        if name != report.verdict and not tracing.instead_of
+    ]
+    gain = np.zeros(1) if plan is None else plan.information_gain
+    likeliest = max(tracing.probabilities, key=tracing.probabilities.__getitem__)
+    needs_none = report.verdict != NONE and tracing.bounds.p_value > LEVEL
+    values: dict[str, Any] = {
+        "verdict": verdict_in_words(report),
+        "likelier": likeliest if report.verdict == NONE != likeliest else None,
+        "limits": limits(tracing),
+        "needs_none": needs_none and not tracing.bounds.replaces,
+        "narrow_prior": narrow_prior(tracing),
+        "same": not_told_from(tracing, tracing.chosen or [report.verdict]),
+        "missed": () if evaluation is None else evaluation.missed,
+        "described": listed(named) or report.verdict,
+        "suspects": suspects_in_words(tracing),
+        "added": added(report),
+        "sizes": lambda *values: sizes(report, *values),
+        "not_excluded": others,
+        "no_part": NO_PART,
+        "helpful": helpful,
+        "bare": misfit and misfit.of(NONE),
+        "scored": tracing.instead_of if withdrawn else added(report),
+        "rmse": scores.get("rmse"),
+        "worst": table.iloc[0].to_dict() if len(table) > 1 else None,
+        "unit": "the prediction" if misfit is None else "the sensor",
+        "cautions": cautions_with_codes(report),
+        "timed": misfit is not None and not isnan(misfit.time_scale),
+        "support": misfit and {n: misfit.support[n] for n in misfit.helps},
+        "has_p": report.has_probabilities,
+        "left_out": len(small_sets(report)),
+        "groups": _groups(report),
+        "not_shown": len(table) - len(shown(report)),
+        "several": by_channel(report.residuals.x, report.residuals).shape[2] > 1,
+        "whole": tracing.model if is_misfit else report.verdict,
+        "pairs": _pairs(report),
+        "few_draws": any(e.effective_sample_size < FEW_DRAWS for e in models),
+        "moves": _moves(report),
+        "most_told": float(np.nanmax(gain, initial=0.0)),
+        "tried": _tried(report),
+        "inseparable": [*dict.fromkeys(inseparable)],
+        "outside_group": beyond,
+        "engines": _engines(report),
+        **_sizes_left(report),
     }
-    return found[0].upper() + found[1:] + rest.get(report.verdict, "")
+    return _template().render(report=report, sections=sections, **values)
 
 
-def _by_error(misfit: Misfit) -> str:
-    """Return the weights of rivals where all of them are wrong."""
-    shares = ", ".join(f"{n} {probability(w)}" for n, w in misfit.weights.items())
-    return (
-        "Every model misses, so that probabilities among them are too sure. Here they "
-        f"count by their errors on left-out {misfit.left_out}: {shares}; what each "
-        "leaves is a part of its prediction. What nobody declared is not among them, "
-        "and the outcome may agree with none."
-    )
+def _sizes_left(report: Contents) -> dict[str, Any]:
+    """Return root mean square residuals in units of x, and in deviations."""
+    models = [("the bare model", report.residuals)]
+    if report.residuals_after is not None:
+        models.append((added(report), report.residuals_after))
+    misfit, sensor, each = report.tracing.misfit, report.sensor, []
+    for name, own in models:
+        size = f"{root_mean_square(own.refitted):.2f}"
+        if misfit is not None:
+            left = by_channel(own.x - own.mean, own)
+            size = number(float(root_mean_square(left / misfit.sensor)))
+            size += f" ({sizes(report, root_mean_square(left, (0, 1)))})"
+        each.append(f"{size} with {name}")
+    found = models[-1][1]
+    left = by_channel(found.x - found.mean, found)
+    own, in_sensors = root_mean_square(left, (0, 1)), ""
+    if sensor is not None and sensor.shape in ((1,), own.shape):
+        own = own if len(sensor) > 1 else root_mean_square(left)[None]
+        in_sensors = ", ".join(f"{size:.2g}" for size in own / sensor)
+    return {
+        "each_size": each,
+        "left_in_units": own,
+        "left_in_sensors": in_sensors,
+        "left_in_predictions": root_mean_square(found.refitted),
+    }
+
+
+def _groups(report: Contents) -> list[tuple[frozenset[str], str]]:
+    """Return the groups of models that nothing separates, or not these trials."""
+    tracing, aliases = report.tracing, []
+    for pair in tracing.aliases:  # pairs with names in common are one group
+        touching = [group for group in aliases if group & pair]
+        aliases = [group for group in aliases if group not in touching]
+        aliases.append(pair.union(*touching))
+    near = [group for group in tracing.near if group not in tracing.equivalent]
+    same = "nearly the same here, apart by less than the noise; repeated trials may "
+    return [
+        *(
+            (group, "no permitted action separates them")
+            for group in tracing.equivalent
+        ),
+        *((g, "not separated by these trials; another action may") for g in near),
+        *((group, f"{same}separate them") for group in aliases),
+    ]
+
+
+def _pairs(report: Contents) -> list[str]:
+    """Return the scores of each trial, where they are too few for an interval."""
+    evaluation, found = report.evaluation, []
+    if evaluation is None or len(evaluation.trials) >= 8:
+        return []
+    which = "held-out trial" if evaluation.scheme == "held out" else "trial"
+    for i, trial in enumerate(evaluation.trials):
+        name = evaluation.names[i] if evaluation.names else int(trial)
+        each = [
+            f"{METRICS[metric]} {number(float(evaluation.before[metric][i]))} -> "
+            f"{number(float(evaluation.after[metric][i]))}"
+            for metric in ("rmse", "log predictive density")
+        ]
+        found.append(f"{which} {name}: {', '.join(each)}")
+    return found
+
+
+def _moves(report: Contents) -> list[str]:
+    """Return the moves of parameters from the bare fit, the farthest first."""
+    table, found = report.parameters.dropna(subset=["before", "after"]), []
+    shift = (table["after"] - table["before"]).to_numpy()
+    sd = np.maximum(table["before_sd"].to_numpy(), np.finfo(float).tiny)
+    far = np.abs(shift) / sd
+    for i in [i for i in np.argsort(-far) if far[i] >= 1]:
+        times = "more than 1000" if far[i] > 1_000 else f"{far[i]:.2g}"
+        after = number(table["after"].iloc[i])
+        found.append(
+            f"{table['parameter'].iloc[i]} by {shift[i]:+.3g} to {after} ({times} of "
+            "its standard deviations)"
+        )
+    return found
 
 
 def _tried(report: Contents) -> str:
     """Return the actions that were executed."""
     if report.action_is_label:
-        return "No other inputs were tried than those of these trials."
+        return "inputs were tried than those of these trials"
     action = np.unique(report.residuals.action, axis=0)
     if len(action) == 1:
-        return f"No other action was tried than {report.setting(action[0])}."
-    entries = [*zip(map(split, report.action_labels), action.T, strict=True)]
+        return f"action was tried than {report.setting(action[0])}"
+    ends = zip(
+        map(split, report.action_labels), action.min(0), action.max(0), strict=True
+    )
     ranges = [
-        f"{name} from {column.min():.4g} to {column.max():.4g} {unit}".rstrip()
-        for (name, unit), column in entries[: TOLD.entries]
+        f"{name} from {low:.4g} to {high:.4g} {unit}".rstrip()
+        for (name, unit), low, high in ends
     ]
-    rest = len(entries) - len(ranges)
-    tried = ", ".join(ranges) + (f", and {rest} more entries" if rest else "")
-    return f"No other action was tried than these {len(action)}: {tried}."
+    more = [f"and {len(ranges) - 3} more entries"] if len(ranges) > 3 else []
+    tried = ", ".join([*ranges[:3], *more])
+    return f"action was tried than these {len(action)}: {tried}"
 
 
-def _by_range(report: Contents, chosen: NextAction) -> Iterator[str]:
-    """Yield actions that separate forms of a force, in the tried range and beyond."""
-    for where, action, gain in (
-        ("within the range tried", chosen.within, chosen.within_gain),
-        ("beyond the range tried", chosen.beyond, chosen.beyond_gain),
-    ):
-        if action is not None:
-            told = f"at least {gain:.2f} nats between {', '.join(chosen.separates)}"
-            yield f"{where}, {report.setting(action)}: {told}"
-
-
-def _inseparable(report: Contents, chosen: NextAction) -> Iterator[str]:
-    """Yield each group that no permitted action separates, and what would."""
-    beyond = None if chosen.outside is None else frozenset(chosen.outside_separates)
-    groups = [*chosen.inseparable, *([] if beyond is None else [beyond])]
-    for group in dict.fromkeys(groups):
-        told = f"no permitted action separates {listed(sorted(group))}"
-        if group == beyond and chosen.outside is not None:
-            told += (
-                f"; {report.setting(chosen.outside)}, which is not permitted, would: "
-                f"at least {chosen.outside_gain:.2f} nats"
-            )
-        yield told
-
-
-def _tests(report: Contents) -> Iterator[str]:
-    """Yield each severe test, with how far a free residual's prediction is there."""
-    for test, where in zip(report.severe_tests, report.tests, strict=True):
-        yield (
-            f"the verdict is put to the test most {where}, where its prediction and "
-            f"that of a free residual differ by {number(test.difference)} of its "
-            "standard deviations"
-        )
-
-
-def _record(report: Contents) -> Section:
-    evidences = report.tracing.evidences
-    moved = sorted(name for name, e in evidences.items() if e.engine == "smc")
-    linear = [name for name, e in evidences.items() if e.engine == "linear"]
-    told = [f"the comparison cost {report.num_simulations:,} simulated trials"]
-    if linear:
-        process = " with a residual process in each" if report.tracing.misfit else ""
-        told.append(f"evidence by linearized models{process}")
-    if len(moved) + len(linear) < len(evidences):
-        told.append("evidence by least squares and importance sampling")
-    if moved:
-        why = "evidence by sequential Monte Carlo, where that did not serve"
-        told.append(f"{why}: {', '.join(moved)}")
-    if report.digest:
-        declared = "hash of noise, effects and priors, declared before the data"
-        told.append(f"{declared}: {report.digest}")
-    return Section("Record", items=told)
-
-
-def residuals(report: Contents) -> Section:
-    """Return the size of the residuals before and after.
-
-    Where every model misses, a prediction is as wide as the misfit: residuals are then
-    told in deviations of the sensor.
-    """
-    models = [("bare model", report.residuals)]
-    if report.residuals_after is not None:
-        models.append((f"with {added(report)}", report.residuals_after))
-    by = _by_prediction if report.tracing.misfit is None else _by_sensor
-    told, table = by(report, models)
-    before, detection = report.residuals, report.detection
-    noise = {
-        "declared": "The noise is declared.",
-        "estimated": "The noise is uncertain, and what it may be is summed over.",
-        "stochastic": "The noise is the simulator's own.",
-    }[before.noise]
-    p = detection.p_value
-    least = f"p {f'= {p:.2g}' if p >= TOLD.smallest_p else f'< {TOLD.smallest_p:g}'}"
-    text = [
-        told,
-        f"{noise} Chi-square of the bare model "
-        f"{detection.chi_square:.1f} on {detection.degrees_of_freedom:.1f} degrees of "
-        f"freedom, {least}; log Bayes factor against it "
-        f"{detection.log_bayes_factor:.1f} nats, where "
-        f"{detection.threshold:.1f} raises the alarm.",
+def _engines(report: Contents) -> list[str]:
+    """Return how evidence was found, with the models where that did not serve."""
+    of: dict[str, list[str]] = {}
+    for name, evidence in report.tracing.evidences.items():
+        of.setdefault(evidence.engine, []).append(name)
+    ways = {"linear": "linearized models", "smc": "sequential Monte Carlo"}
+    ways["importance"] = "least squares and importance sampling"
+    return [
+        ways.get(engine, engine) + f" ({', '.join(sorted(names))})" * (engine == "smc")
+        for engine, names in of.items()
     ]
-    if before.times is not None:
-        text.append(f"Correlation of neighboring errors {before.correlation:.2f}.")
-    return Section("Residuals", text, table=table, picture=pictured("residuals"))
-
-
-def _by_prediction(
-    report: Contents, models: list[tuple[str, Residuals]]
-) -> tuple[str, Table]:
-    rows = [[name, *_sizes(z.refitted)] for name, z in models]
-    header = ["residuals [sd]", "root mean square", "beyond 2"]
-    told = (
-        "Observation minus prediction, in standard deviations of the prediction: a "
-        "root mean square of about 1, and 5 % beyond 2, where the model holds. Models "
-        "are fitted to all trials."
-    )
-    return told, Table(header, rows)
-
-
-def _by_sensor(
-    report: Contents, models: list[tuple[str, Residuals]]
-) -> tuple[str, Table]:
-    assert report.sensor is not None
-    rows = []
-    for name, found in models:
-        left = by_channel(found.x - found.mean, found)
-        size = sizes(report, root_mean_square(left, (0, 1)))
-        rows.append([name, size, number(float(root_mean_square(left / report.sensor)))])
-    header = ["residuals", "in units of x", "in deviations of the sensor"]
-    sensor = sizes(report, report.sensor)
-    told = "Root mean square of what each model leaves; the sensor's error is"
-    return f"{told} {sensor}.", Table(header, rows)
-
-
-def by_trial(report: Contents) -> Section:
-    """Return the root mean square residual of the worst trials, and where it is."""
-    tracing, table = report.tracing, report.residuals_by_trial
-    found = report.residuals_after or report.residuals
-    channels = report.channels(by_channel(found.x, found).shape[2])
-    rows = [
-        [trial.name, "", number(trial.size), "set aside: on the fit to the others"]
-        for trial in tracing.set_aside
-    ]
-    shown = table.head(max(TOLD.trials - len(rows), 0))
-    for one in shown.to_dict("records"):
-        name, unit = channels[one["channel"]]
-        where = [name] * (len(channels) > 1)
-        where += [] if np.isnan(one["time"]) else [f"t = {number(one['time'])} s"]
-        size = f"{number(one['size'])} {unit}".rstrip()
-        rows.append([one["trial"], size, number(one["deviations"]), ", ".join(where)])
-    model = "the bare model" if report.residuals_after is None else added(report)
-    rest = len(table) - len(shown)
-    text = f"Root mean square with {model}, the worst first"
-    text += f"; {rest} more {'is' if rest == 1 else 'are'} no worse." if rest else "."
-    of = "the prediction" if tracing.misfit is None else "the sensor"
-    where = " where it is largest" if len(channels) > 1 else ""
-    header = ["trial", f"in units of x{where}", f"in deviations of {of}", "largest"]
-    return Section("Residuals by trial", [text], table=Table(header, rows))
-
-
-def before_and_after(report: Contents) -> Section:
-    """Return the error before and after, on trials that had no part in it."""
-    evaluation, title = report.evaluation, "Error before and after"
-    if evaluation is None:
-        return Section(title, ["No trial was scored."])
-    rows = [
-        [
-            METRICS.get(str(name), str(name)),
-            *map(number, (before, after, ratio)),
-            "" if interval is None else " to ".join(map(number, interval)),
-        ]
-        for name, before, after, ratio, interval in report.before_after.itertuples(
-            index=False
-        )
-    ]
-    num, whole = len(evaluation.trials), report.verdict
-    if report.tracing.misfit is not None and report.tracing.chosen:
-        whole = report.tracing.model
-    same = sum(verdict == whole for verdict in evaluation.selected)
-    scheme = f"{num} held-out trials, which had no part in choosing or fitting."
-    if evaluation.scheme != "held out":
-        scheme = (
-            f"{num} trials, each predicted by models that were chosen and fitted "
-            f"without it ({evaluation.scheme}); {same} of {num} such verdicts are "
-            f"{whole}, that of all trials."
-        )
-    text = [
-        scheme,
-        "RMSE and energy score are in units of x: less is better, and their ratio is "
-        "after / before. Of the other two it is the difference, after - before: more "
-        "density is better, and the share should be 0.9.",
-    ]
-    if num < TOLD.pairs:
-        text.append(
-            f"Below {TOLD.pairs} trials an interval over trials covers too little; "
-            "these are the pairs:"
-        )
-    header = ["metric", "before", "after", "ratio or difference", "90 % interval"]
-    return Section(
-        title,
-        text,
-        items=_pairs(evaluation) if num < TOLD.pairs else (),
-        table=Table(header, rows),
-        picture=pictured("before_after"),
-    )
-
-
-def _pairs(evaluation: Evaluation) -> list[str]:
-    """Return the RMSE and the log density of each scored trial, before and after."""
-    found = []
-    for i, trial in enumerate(evaluation.trials):
-        each = [
-            f"{METRICS[name]} {number(float(evaluation.before[name][i]))} -> "
-            f"{number(float(evaluation.after[name][i]))}"
-            for name in ("rmse", "log predictive density")
-        ]
-        which = "held-out trial" if evaluation.scheme == "held out" else "trial"
-        name = called(evaluation.names, i) if evaluation.names else int(trial)
-        found.append(f"{which} {name}: {', '.join(each)}")
-    return found
-
-
-def _sizes(z: Array) -> list[str]:
-    """Return the root mean square, and the share beyond 2."""
-    z = z[np.isfinite(z)]
-    if not z.size:
-        return ["", ""]
-    return [f"{root_mean_square(z):.2f}", f"{100 * np.mean(np.abs(z) > 2):.0f} %"]

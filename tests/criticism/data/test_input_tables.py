@@ -93,7 +93,7 @@ def test_inputs_come_from_another_file_on_their_own_grid():
         (
             ["a,0,1,5", "a,1,2,5"],
             "trial,time,action_u,x_y",
-            "got 1.0 in row 1 and 2.0 in row 2 .* call it input_u if it is commanded",
+            "got 1.0 in row 1 and 2.0 in row 2 .* call it input_. if it is commanded",
         ),
         (
             ["a,0,1,5", "a,1,1,5", "a,2,1,5", "a,9,1,5", "a,10,1,5"],
@@ -133,7 +133,10 @@ def test_a_table_with_inputs_that_is_not_understood(rows, header, message):
             "x of trial a measured within the time of its input 'u', 0 to 0.001; got "
             "x at 0.02",
         ),
-        ({"inputs": ["a,0,1", "a,0,2"]}, "each sample once; .* rows 1 and 2 of inputs"),
+        (
+            {"inputs": ["a,0,1", "a,0,2", "b,0,1"]},
+            "each sample once; .* row 2 .*inputs",
+        ),
     ],
 )
 def test_another_table_that_is_not_understood(arguments, message):

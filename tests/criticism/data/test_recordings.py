@@ -61,7 +61,7 @@ def test_what_is_wrong_is_said_with_its_file_and_row():
     with pytest.warns(UserWarning, match="hold no number") as noted:
         Trials.from_csv("runs")
     (one,) = [str(note.message) for note in noted]
-    assert "1 of 2 cells of column x_height[m] in runs/b.csv hold no number" in one
+    assert "of column x_height[m] in runs hold no number: row 2 (trial b)" in one
     assert noted[0].filename == __file__
 
 

@@ -92,7 +92,11 @@ SHORT = "trial,time,action_v,x_y"
 @pytest.mark.parametrize(
     ("rows", "header", "message"),
     [
-        (["1,2,3"], "trial,action_v,x_y", "got trial without time in trials.csv; add"),
+        (
+            ["1,2,3"],
+            "trial,action_v,x_y",
+            "columns trial, time, .*; got trial, .*trials.csv",
+        ),
         (["1,0,1,2,3"], f"{SHORT},mass", "got mass in trials.csv; rename or"),
         (
             ["1,0,1,2,3"],
@@ -115,14 +119,18 @@ SHORT = "trial,time,action_v,x_y"
         (
             ["1,0,1,5", "2,0,1,4", "1,0,1,5"],
             SHORT,
-            "= 0 s in rows 1 and 3 .* trial 1; remove",
+            "= 0 s in row 1 and row 3 .trial 1. of trials.csv; remove",
         ),
         (["1,0,1,5", "2,0,1,5"], SHORT, "the same numbers in trials 1 and 2 of trials"),
         (["1,0,1,5,fit", "1,1,1,4,held out"], f"{SHORT},role", "value of role in each"),
         (["1,0,1,5,3", "2,0,1,4,3"], f"{SHORT},index", "got index 3 in rows 1 and 2"),
         (["1\t0\t1\t5"], "trial\ttime\taction_v\tx_y", r"by commas.*sep='\\t'\)\)"),
-        (["1,0,5,1,5,2"], SHORT, "first, 4; got 6 in line 2 of trials.csv; write dec"),
-        ([], "", "names of columns and rows; got nothing in trials.csv"),
+        (
+            ["1,0,5,1,5,2"],
+            SHORT,
+            "got 'Expected 4 fields in line 2, saw 6' in tr",
+        ),
+        ([], "", "names of columns, .* got 'No columns .* in trials.csv"),
         (["1,0,1,"], SHORT, "at least one valid trial"),
     ],
 )

@@ -26,7 +26,7 @@ def test_it_is_named_and_has_no_part_in_the_verdict():
     alone = loop(own.select(others)).trace()
     assert report.tracing.verdict == alone.verdict
     assert report.tracing.probabilities == alone.probabilities
-    lines = str(report).split("Residuals by trial")[1].splitlines()
+    lines = str(report).split("By trial")[1].splitlines()
     assert next(line for line in lines if "set aside" in line).split()[0] == "3"
 
 

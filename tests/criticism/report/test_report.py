@@ -11,7 +11,7 @@ from sbi.utils import BoxUniform
 
 from sbi_active.criticism import Trials, joint_prior
 from sbi_active.criticism.contradictions import SevereTest
-from sbi_active.criticism.report.summary import sentences
+from sbi_active.criticism.report.sections import sentences
 from sbi_active.criticism.report.words import with_error
 from sbi_active.criticism.under_misfit import Misfit, ModelError, Support
 from tests.criticism.report.reports import (

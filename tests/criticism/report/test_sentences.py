@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from sbi_active.criticism.report.summary import sentences
+from sbi_active.criticism.report.sections import sentences
 from tests.criticism.report.reports import flat, report, tracing
 
 

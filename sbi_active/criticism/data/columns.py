@@ -1,0 +1,166 @@
+"""Roles and units of the columns of a table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from sbi_active.criticism.data.units import TIME, split, time_unit, to_si
+from sbi_active.expected import did_you_mean, require
+
+TRIAL = "trial"
+#: Beginnings of the names of columns that there may be several of.
+PREFIXES = {"action": "action_", "x": "x_", "input": "input_", "start": "start_"}
+OPTIONAL = ("role", "index", "repeat_of")
+KEYS = (TRIAL, TIME, *PREFIXES, *OPTIONAL)
+
+#: Names of columns by what they are, where they have names of their own.
+Told = Mapping[str, str | Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of numbers, in SI where its unit is known.
+
+    Attributes:
+        header: Name of the column in the table.
+        name: Name without the beginning and the unit.
+        unit: Unit of its numbers here; "" if none was said.
+        factor: Factor from the table's numbers to that unit.
+    """
+
+    header: str
+    name: str
+    unit: str = ""
+    factor: float = 1.0
+
+    @property
+    def label(self) -> str:
+        """Name and unit, as in "speed [m/s]"."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+
+def find_columns(
+    headers: Sequence[str],
+    *,
+    columns: Told | None = None,
+    units: Mapping[str, str] | None = None,
+    source: str = "the table",
+) -> dict[str, list[Column]]:
+    """Return the columns by what they are, by their names or as the user says.
+
+    Args:
+        headers: Names of all columns.
+        columns: Names of those that are "trial", "time", "action", "x", "input",
+            "start", "role", "index" or "repeat_of"; others are then ignored. None goes
+            by the names.
+        units: Units by column, with or without what stands in its brackets.
+        source: Name of the table in messages.
+
+    Raises:
+        ValueError: If a column is missing, unknown or there twice, or has two units.
+    """
+    if columns is None:
+        roles, single = _by_name(headers, source), (TRIAL, TIME, *OPTIONAL)
+    else:
+        roles, single = _as_told(headers, columns, source), (TIME, *OPTIONAL)
+    for role in single:
+        got = f"{', '.join(roles[role])} in {source}"
+        require(len(roles[role]) <= 1, f"one column for {role}", got, "keep one")
+    used = [header for group in roles.values() for header in group]
+    names = [split(header)[0] for header in headers]
+    for header in used:
+        same = [h for h, n in zip(headers, names, strict=True) if n == split(header)[0]]
+        got = f"{' and '.join(same)} in {source}"
+        require(len(same) == 1, "each quantity once", got, "remove or rename one")
+    return {
+        role: [_column(role, header, units or {}, source) for header in group]
+        for role, group in roles.items()
+    }
+
+
+def require_columns(
+    found: Mapping[str, Sequence[Column]], needed: Sequence[str], source: str
+) -> None:
+    """Raise if a table lacks columns.
+
+    Args:
+        found: Columns by what they are.
+        needed: Kinds of columns that it needs.
+        source: Name of the table in messages.
+    """
+    there = [column.header for group in found.values() for column in group]
+    names = [f"{PREFIXES[role]}*" if role in PREFIXES else role for role in needed]
+    require(
+        all(found[role] for role in needed),
+        f"columns {', '.join(names)}",
+        f"{', '.join(there) or 'none of these'} in {source}",
+        "name them, as in action_speed, x_distance[m] (action_none, of ones, where "
+        "nothing was set), or say which columns are what",
+    )
+
+
+def _by_name(headers: Sequence[str], source: str) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {key: [] for key in KEYS}
+    unknown = []
+    for header in headers:
+        name = split(header)[0]
+        of_prefix = (role for role, start in PREFIXES.items() if name.startswith(start))
+        found.get(next(of_prefix, name), unknown).append(header)
+    # A table in which nothing has such a name is said to lack those.
+    is_understood = found["input"] or (found["action"] and found["x"])
+    require(
+        not (unknown and is_understood),
+        f"columns {', '.join(f'{prefix}*' for prefix in PREFIXES.values())}, {TRIAL}, "
+        f"{TIME}, {', '.join(OPTIONAL)}",
+        f"{', '.join(unknown)} in {source}",
+        "rename or remove what is none of these, or say which columns are what",
+    )
+    return found
+
+
+def _as_told(
+    headers: Sequence[str], columns: Told, source: str
+) -> dict[str, list[str]]:
+    for key in columns:
+        known = f"columns of {', '.join(KEYS)}"
+        require(key in KEYS, known, key, "say which columns are these")
+    of = {split(name)[0]: name for name in headers} | {name: name for name in headers}
+    found: dict[str, list[str]] = {key: [] for key in KEYS}
+    for role, value in columns.items():
+        for name in as_list(value):
+            require(
+                name in of,
+                f"a column {name} for {role}",
+                f"{', '.join(headers)} in {source}",
+                did_you_mean(name, headers, "correct the name"),
+            )
+            found[role].append(of[name])
+    return found
+
+
+def _column(role: str, header: str, units: Mapping[str, str], source: str) -> Column:
+    name, unit = split(header)
+    given = units.get(header, units.get(name, ""))
+    require(
+        not (unit and given and unit != given),
+        f"one unit of column {header}",
+        f"[{unit}] in the header of {source} and {given} in units",
+        "convert the numbers, or correct one",
+    )
+    unit = unit or given or (time_unit(header) if role == TIME else "")
+    factor, si = to_si(unit) or (1.0, unit)
+    require(
+        role != TIME or si in ("", "s"),
+        "times in s, ms, us, ns, min or h",
+        f"{unit} in column {header} of {source}",
+        "convert them",
+    )
+    for prefix in PREFIXES.values():
+        name = name.removeprefix(prefix)
+    return Column(header, name, si, factor)
+
+
+def as_list(value: str | Sequence[str]) -> list[str]:
+    """Return a name, or several, as a list."""
+    return [value] if isinstance(value, str) else [*value]
