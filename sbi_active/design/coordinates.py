@@ -41,10 +41,7 @@ class Coordinates:
         self.action_dim = actions.action_dim
         self._boxes: list[tuple[slice, BoxActions]] = []
         self._lists: list[tuple[slice, Tensor]] = []
-        start = 0
-        for part in actions.parts():
-            columns = slice(start, start + part.action_dim)
-            start = columns.stop
+        for part, columns in actions.entries():
             values = part.listed()
             if values is not None:
                 self._lists.append((columns, values))
