@@ -178,9 +178,7 @@ def eliminate(
         leader=int(active[race.leader]),
         seed=seed,
         probability_valid=num_valid / num_counted.double(),
-        num_samples=torch.tensor(
-            [runs * (len(a) + len(b)) for a, b in zip(*gains, strict=True)]
-        ),
+        runs=runs,
         estimator=type(evaluator.estimator).__name__,
         bound=evaluator.bound,
         num_simulations=sampler.num_drawn,
@@ -203,6 +201,7 @@ def choose(
     eligible: Tensor,
     leader: int,
     seed: int,
+    runs: int = 1,
     **known: Any,
 ) -> Design:
     """Return the design of the leading candidate.
@@ -215,6 +214,7 @@ def choose(
         eligible: Mask of the candidates that may be chosen, shape (a,), bool.
         leader: The candidate of the largest utility.
         seed: Seed of the draws behind probabilities.
+        runs: Simulations of each contribution.
         **known: Fields of the :class:`.Design` that are known already.
     """
     price, report = limits.cost(action), halves[1]
@@ -231,6 +231,9 @@ def choose(
         difference_standard_error=paired_errors(report, leader),
         probability_best=probability_best,
         index=leader,
+        num_samples=torch.tensor(
+            [runs * (len(a) + len(b)) for a, b in zip(*halves, strict=True)]
+        ),
         cost=None if limits.price is None else price,
         **naming(limits.actions),
         **known,

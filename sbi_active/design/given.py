@@ -229,9 +229,6 @@ class GivenGains:
             leader=int(index[race.leader]),
             seed=self.seed,
             probability_valid=share,
-            num_samples=torch.tensor(
-                [len(a) + len(b) for a, b in zip(*halves, strict=True)]
-            ),
             estimator=type(self.estimator).__name__,
             bound="none",  # the model may have seen the rows
             num_simulations=0,
