@@ -24,7 +24,7 @@ from sbi_active.design.estimators.base import (
 from sbi_active.design.estimators.model_index import ModelIndexGain, RivalSampler
 from sbi_active.design.evaluator import GainEvaluator
 from sbi_active.design.given import GivenGains
-from sbi_active.design.limits import DesignLimits, pricing, rows_of, warn_missing
+from sbi_active.design.limits import DesignLimits, rows_of, warn_missing
 from sbi_active.design.sampler import CandidateSampler
 from sbi_active.design.search import (
     Evaluations,
@@ -190,13 +190,8 @@ class InformationGainDesigner(Shown):
         """
         at_least(num_actions, 1, "num_actions", 1)
         others = rows_of(self.actions, pending, "pending")
-        limits = DesignLimits(
-            self.actions,
-            constraint,
-            rows_of(self.actions, exclude, "exclude"),
-            pricing(cost, self.actions),
-            min_probability_valid,
-        )
+        allowed = constraint, exclude, cost, min_probability_valid
+        limits = DesignLimits.of(self.actions, *allowed)
         belief = getattr(model, "belief", None) if belief is None else belief
         seed = int(torch.randint(2**62, ())) if seed is None else seed
         num_others = len(others) + num_actions - 1

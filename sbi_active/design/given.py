@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -176,10 +176,10 @@ class GivenGains:
         shuffled = rows[torch.randperm(len(rows), generator=generator)]
         return [*shuffled.tensor_split(2)]
 
-    def _simulations(self, rows: Tensor) -> RowSimulations:
+    def _simulations(self, rows: Tensor) -> CandidateSimulations:
         given, action = self.rows, self.rows.action[rows]
         lost = given.status[rows] == Outcome.MISSING
-        return RowSimulations(
+        return CandidateSimulations(
             *(given.theta[rows], action[:1], given.x[rows][None]),
             missing=lost[None],
             each=action,
@@ -235,21 +235,6 @@ class GivenGains:
             stopped="simulations given",
             notes=(*said, *notes),
         )
-
-
-@dataclass(frozen=True)
-class RowSimulations(CandidateSimulations):
-    """Rows of which each has an action of its own, for estimators that score rows.
-
-    x has shape (1, n, *x_shape), ``each`` (n, action_dim), and ``action`` is the
-    first's.
-    """
-
-    each: Tensor = field(default_factory=lambda: torch.empty(0))
-
-    def rows(self) -> tuple[Tensor, Tensor]:
-        """Return the parameters, and what was drawn at each."""
-        return self.theta, self.each
 
 
 def _as_contributions(process: GaussianProcess, point: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torch.distributions import Distribution
 
 from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.design.design import Design, equal_errors, naming
-from sbi_active.design.limits import DesignLimits, rows_of, warn_missing
+from sbi_active.design.limits import DesignLimits, warn_missing
 from sbi_active.expected import Shown, suggests
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import MissingRowsWarning, Outcome, simulate
@@ -78,12 +78,8 @@ class RandomDesigner(Shown):
             ValueError: If a share of measurements is asked for without a simulator or a
                 belief, or no candidate reaches it.
         """
-        limits = DesignLimits(
-            self.actions,
-            constraint,
-            rows_of(self.actions, exclude, "exclude"),
-            least=min_probability_valid,
-        )
+        allowed = constraint, exclude, None, min_probability_valid
+        limits = DesignLimits.of(self.actions, *allowed)
         candidates, notes = limits.listed()
         if candidates is None:
             own = None if seed is None else derive_seed(seed, "candidates")

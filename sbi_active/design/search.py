@@ -13,7 +13,7 @@ from typing_extensions import override
 
 from sbi_active.actions import ActionSpace
 from sbi_active.design.coordinates import Coordinates
-from sbi_active.expected import Shown
+from sbi_active.expected import Shown, require_least
 from sbi_active.inference.sampling.adam import Adam
 from sbi_active.inference.sampling.gaussian_process import GaussianProcess
 from sbi_active.seeding import derive_seed
@@ -192,12 +192,8 @@ class GradientSearch(Search):
     each: int = 4
 
     def __post_init__(self) -> None:
-        counts = self.num_rounds, self.num_finalists, self.num_starts
-        if min(counts) < 1:
-            raise ValueError(
-                "expected num_rounds, num_finalists and num_starts >= 1; got "
-                f"{counts}; use about 6, 5 and 64"
-            )
+        least = {"num_rounds": 1, "num_finalists": 1, "num_starts": 1}
+        require_least(self, "use about 6, 5 and 64 of them", **least)
 
     @override
     def size(self, actions: ActionSpace) -> int:

@@ -89,10 +89,7 @@ def choose_estimator(
         num_rows: Fewest simulations of a candidate that an estimate will rest on; None
             are as many as these.
     """
-    num_outcomes, num_parameters = (
-        simulations.x[0, 0].numel(),
-        simulations.theta.shape[1],
-    )
+    num_outcomes = simulations.x[0, 0].numel()
     declared = simulations.mean is not None and simulations.noise is not None
     by_noise, notes = None, []
     if declared or simulations.replicate is not None:
@@ -100,7 +97,7 @@ def choose_estimator(
             by_noise = EntropyGain()
         else:
             linear = LinearGain(max_bent=MAX_BENT)
-            many = declared and num_parameters > MAX_NESTED_PARAMETERS
+            many = declared and simulations.theta.shape[1] > MAX_NESTED_PARAMETERS
             if many and linear.suits(simulations, num_rows or len(simulations.theta)):
                 return linear, []
             by_noise = NestedGain()

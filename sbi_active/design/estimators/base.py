@@ -31,6 +31,10 @@ class CandidateSimulations:
         missing: Rows lost to a fault that has nothing to do with the parameters, shape
             (a, n), bool, the replicate's included; None for none. They are ignored,
             unlike outcomes without a measurement, whose NaN is information.
+        sd: Standard deviations of the noise around the mean, as x, where rivals have
+            noise of their own; else None.
+        each: Actions of the rows of one candidate, shape (n, action_dim), where every
+            row has its own; else None.
     """
 
     theta: Tensor
@@ -40,6 +44,8 @@ class CandidateSimulations:
     noise: NoiseModel | None = None
     replicate: Tensor | None = None
     missing: Tensor | None = None
+    sd: Tensor | None = None
+    each: Tensor | None = None
 
     @property
     def counted(self) -> Tensor:
@@ -83,6 +89,8 @@ class CandidateSimulations:
 
     def rows(self) -> tuple[Tensor, Tensor]:
         """Return theta and action of every outcome in turn, a * n rows each."""
+        if self.each is not None:
+            return self.theta, self.each
         num_actions, num_samples = self.x.shape[:2]
         return (
             self.theta.repeat(num_actions, 1),
@@ -109,7 +117,7 @@ class CandidateSimulations:
         return replace(self, theta=torch.cat([self.theta, other.theta]), **parts)
 
     def _parts(self) -> dict[str, Tensor]:
-        names = ("x", "mean", "replicate", "missing")
+        names = ("x", "mean", "replicate", "missing", "sd")
         parts = {name: getattr(self, name) for name in names}
         return {name: part for name, part in parts.items() if part is not None}
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.inference.sampling.weights import silverman
 
 NUM_FOLDS = 4  # a choice: fits of three quarters of the rows, four times
@@ -44,28 +45,29 @@ def cross_fit(
     return result
 
 
-def patterns_of_numbers(
-    x: Tensor, counted: Tensor, smallest: int
-) -> list[tuple[Tensor, Tensor]]:
-    """Group counted outcomes (n, q) by which of their numbers are present.
+def by_pattern(
+    simulations: CandidateSimulations, smallest: int
+) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
+    """Yield outcomes that count by which of their numbers are present.
 
-    Returns rows, shape (k,), and the numbers present, shape (p,), of each group;
-    patterns of fewer rows than the smallest join those without a number.
+    Each group has a candidate's number, rows (k,), the numbers present (p,) and their
+    values (k, p); patterns of fewer rows than the smallest join those without a number.
     """
-    rows = torch.nonzero(counted)[:, 0]
-    present = x[rows].isfinite()
-    patterns, label = torch.unique(present, dim=0, return_inverse=True)
-    groups, rest = [], []
-    for k, pattern in enumerate(patterns):
-        members = rows[label == k]
-        columns = torch.nonzero(pattern)[:, 0]
-        if len(columns) and len(members) >= smallest:
-            groups.append((members, columns))
-        else:
-            rest.append(members)
-    if rest:
-        groups.append((torch.cat(rest).sort().values, torch.empty(0).long()))
-    return groups
+    for a, counted in enumerate(simulations.counted):
+        x = simulations.x[a].flatten(1).double()
+        rows = torch.nonzero(counted)[:, 0]
+        patterns, label = torch.unique(x[rows].isfinite(), dim=0, return_inverse=True)
+        rest = []
+        for k, pattern in enumerate(patterns):
+            members = rows[label == k]
+            columns = torch.nonzero(pattern)[:, 0]
+            if len(columns) and len(members) >= smallest:
+                yield a, members, columns, x[members][:, columns]
+            else:
+                rest.append(members)
+        if rest:
+            members = torch.cat(rest).sort().values
+            yield a, members, torch.empty(0).long(), x[members, :0]
 
 
 @dataclass(frozen=True)

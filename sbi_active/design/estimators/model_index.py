@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -18,10 +17,10 @@ from sbi_active.design.estimators.base import (
 from sbi_active.design.estimators.densities import (
     MOST_NUMBERS,
     NUM_FOLDS,
+    by_pattern,
     class_members,
     cross_fit,
     noise_members,
-    patterns_of_numbers,
 )
 from sbi_active.seeding import derive_seed
 
@@ -67,16 +66,6 @@ class NoisyRivalPredictive(RivalPredictive, Protocol):
             has the same outcome without noise.
         """
         ...
-
-
-@dataclass(frozen=True)
-class RivalSimulations(CandidateSimulations):
-    """Outcomes of rivals, and standard deviations of their noise, as x."""
-
-    sd: Tensor | None = None
-
-    def _parts(self) -> dict[str, Tensor]:
-        return super()._parts() | ({} if self.sd is None else {"sd": self.sd})
 
 
 class RivalSampler:
@@ -153,7 +142,7 @@ class RivalSampler:
         index = torch.arange(num_rivals).repeat(each)[:, None]
         x, *noise = torch.stack(rows, 1)
         mean, sd = noise or (None, None)
-        return RivalSimulations(index, action, x, mean=mean, sd=sd)
+        return CandidateSimulations(index, action, x, mean, sd=sd)
 
     def rewind(self) -> None:
         """Repeat the draws of the first call in the next."""
@@ -228,18 +217,16 @@ class ModelIndexGain(InformationGainEstimator):
         weight = self.probability[index] * len(self.probability)
         gain = torch.full(simulations.x.shape[:2], torch.nan, dtype=torch.float64)
         block = _blocks(simulations, index, len(self.probability))
-        known = simulations.mean, getattr(simulations, "sd", None)
-        for a, counted in enumerate(simulations.counted):
-            x = simulations.x[a].flatten(1).double()
-            for rows, columns in patterns_of_numbers(x, counted, 4 * self.few):
-                noise = [
-                    part[a].flatten(1)[rows][:, columns].double()
-                    for part in known
-                    if part is not None
-                ]
-                gain[a, rows] = weight[rows] * self._score(
-                    *(x[rows][:, columns], noise), rows, counted, index, block
-                )
+        known = simulations.mean, simulations.sd
+        for a, rows, columns, x in by_pattern(simulations, 4 * self.few):
+            noise = [
+                part[a].flatten(1)[rows][:, columns].double()
+                for part in known
+                if part is not None
+            ]
+            counted = simulations.counted[a]
+            score = self._score(x, noise, rows, counted, index, block)
+            gain[a, rows] = weight[rows] * score
         return gain
 
     def _score(

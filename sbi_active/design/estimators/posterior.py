@@ -21,8 +21,8 @@ from sbi_active.design.estimators.base import (
 )
 from sbi_active.design.estimators.densities import (
     Reduction,
+    by_pattern,
     cross_fit,
-    patterns_of_numbers,
 )
 from sbi_active.design.estimators.emulator import NUM_CHOOSING, kernel, linear
 from sbi_active.design.estimators.entropy import nearest_neighbor_entropy
@@ -119,7 +119,7 @@ class ParameterGain(InformationGainEstimator):
     ) -> None:
         self.target = numbers_of(index)
         self.num_marginal, self.few = num_marginal, few
-        self._marginal: tuple[Distribution, list[NormalScores], float] | None = None
+        self._marginal: tuple[Distribution, list[Features], float] | None = None
 
     def _contributions(
         self, model: Any, simulations: CandidateSimulations, belief: Distribution
@@ -128,26 +128,24 @@ class ParameterGain(InformationGainEstimator):
             with forked_generators(0, "marginal"):
                 draws = belief.sample(torch.Size([self.num_marginal]))
             draws = self.target(draws).double()
-            maps = [NormalScores(column) for column in draws.T]
+            maps = [normal_scores(column) for column in draws.T]
             self._marginal = belief, maps, _dependence(_map(maps, draws))
         _, scores, dependence = self._marginal
         u = _map(scores, self.target(simulations.theta).double())
         shape = simulations.x.shape[:2]
         gain = torch.full(shape, torch.nan, dtype=torch.float64)
-        for a, counted in enumerate(simulations.counted):
-            x = simulations.x[a].flatten(1).double()
-            for rows, columns in patterns_of_numbers(x, counted, self.few):
-                if len(rows) < 8:  # no density to fit: nothing is learned
-                    gain[a, rows] = -dependence
-                    continue
-                given = x[rows][:, columns]
-                log_q = _score(u[rows], given)
-                gain[a, rows] = log_q - log_normal(u[rows]) - dependence
+        for a, rows, _, x in by_pattern(simulations, self.few):
+            if len(rows) < 8:  # no density to fit: nothing is learned
+                gain[a, rows] = -dependence
+                continue
+            gain[a, rows] = _score(u[rows], x) - log_normal(u[rows]) - dependence
         return gain
 
 
-class NormalScores:
-    r"""A smooth monotone map of one parameter to about the standard normal.
+def normal_scores(
+    draws: Tensor, *, nearly_normal: float = 0.02, num_quantiles: int = 33
+) -> Features:
+    r"""Return a smooth monotone map of one parameter to about the standard normal.
 
     It is linear where the parameter is close to normal, else :math:`\Phi^{-1}(F)` with
     a distribution function F that interpolates a few quantiles monotonically.
@@ -160,32 +158,23 @@ class NormalScores:
     References:
         Fritsch & Carlson, SIAM Journal on Numerical Analysis 1980.
     """
+    center, scale = draws.mean(), draws.std().clamp_min(1e-30)
+    z, edge = (draws - center) / scale, 0.5 / len(draws)
+    share = torch.linspace(0, 1, num_quantiles).double()
+    quantile, first = np.unique(z.quantile(share).numpy(), return_index=True)
+    if _dependence(z[:, None]) < nearly_normal or len(quantile) < 3:
+        return lambda theta: (theta - center) / scale
+    curve = PchipInterpolator(quantile, share.numpy()[first])
 
-    def __init__(
-        self, draws: Tensor, *, nearly_normal: float = 0.02, num_quantiles: int = 33
-    ) -> None:
-        self.center, self.scale = draws.mean(), draws.std().clamp_min(1e-30)
-        self.curve: PchipInterpolator | None = None
-        z = (draws - self.center) / self.scale
-        self.edge = 0.5 / len(draws)
-        if _dependence(z[:, None]) < nearly_normal:
-            return
-        share = torch.linspace(0, 1, num_quantiles).double()
-        quantile, first = np.unique(z.quantile(share).numpy(), return_index=True)
-        if len(quantile) > 2:
-            self.curve = PchipInterpolator(quantile, share.numpy()[first])
+    def scores(theta: Tensor) -> Tensor:
+        z = ((theta - center) / scale).clamp(quantile[0], quantile[-1])
+        share = torch.from_numpy(curve(z.numpy()))
+        return torch.special.ndtri(share.clamp(edge, 1 - edge))
 
-    def __call__(self, theta: Tensor) -> Tensor:
-        """Return the scores of parameters, shape (n,)."""
-        z = (theta - self.center) / self.scale
-        if self.curve is None:
-            return z
-        low, high = self.curve.x[0], self.curve.x[-1]
-        share = torch.from_numpy(self.curve(z.clamp(low, high).numpy()))
-        return torch.special.ndtri(share.clamp(self.edge, 1 - self.edge))
+    return scores
 
 
-def _map(scores: list[NormalScores], theta: Tensor) -> Tensor:
+def _map(scores: list[Features], theta: Tensor) -> Tensor:
     return torch.stack([f(t) for f, t in zip(scores, theta.T, strict=True)], 1)
 
 
