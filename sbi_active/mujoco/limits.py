@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -191,15 +192,9 @@ def _with_sensors(simulator: SimulatorModel, edits: list[Any]) -> SimulatorModel
         Machine(m.source.edited(*edits), m.parameters, edit=m.edit)
         for m in function.machines
     ]
-    names = [edit.name for edit in edits]
-    own = MujocoFunction(
-        machines,
-        channels_of(machines[0].model, names),
-        roles=function.roles,
-        start=function.start,
-        threads=function.threads,
-        recorded=function.recorded,
-    )
+    own = copy.copy(function)
+    own.machines, own.readout, own.times = tuple(machines), None, None
+    own.channels = channels_of(own.model, [edit.name for edit in edits])
     return SimulatorModel(own, inputs=simulator.inputs)
 
 

@@ -24,12 +24,12 @@ from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.expected import suggests
 from sbi_active.mujoco.models.machine import Machine
-from sbi_active.mujoco.models.names import names_of, start_places
+from sbi_active.mujoco.models.names import names_of, scalar_joints, start_places
 from sbi_active.mujoco.models.spec import Source
 from sbi_active.mujoco.recordings import require_in_range
 from sbi_active.mujoco.residuals import free_parameters, from_residuals
 from sbi_active.mujoco.robot import Robot, require_usable, robot_of
-from sbi_active.mujoco.sensors import AddedSensor
+from sbi_active.mujoco.sensors import AddedSensor, channels_of
 from sbi_active.mujoco.simulator import MODEL, RECORDING, Channel, MujocoFunction
 from sbi_active.mujoco.transforms import Signal, SignalReadout
 from sbi_active.simulation import AutocorrelatedNoise
@@ -197,11 +197,8 @@ def _readable(
     source: Source, signals: Sequence[Signal]
 ) -> tuple[Source, tuple[Channel, ...]]:
     """Return a source with a sensor of every signal, and the channels."""
-    model = source.compile()
-    joints = {
-        n for n, place in start_places(model).items() if " " not in n and place >= 0
-    }
-    edits, reads = [], {}
+    joints = scalar_joints(source.compile())
+    edits, reads = [], []
     for signal in signals:
         if signal.kind in STATES:
             joint = signal.name.removesuffix(STATES[signal.kind])
@@ -210,26 +207,24 @@ def _readable(
                     f"expected the state of a hinge or slide; got {signal.name!r}; "
                     "pass sensors of other joints"
                 )
-            reads[signal.name] = f"state {signal.name}"
+            reads.append(f"state {signal.name}")
             what = "velocity" if signal.kind == SPEED else "position"
-            edits.append(AddedSensor(reads[signal.name], joint, what))
+            edits.append(AddedSensor(reads[-1], joint, what))
         elif signal.kind == "MjSensor":
-            reads[signal.name] = signal.name
+            reads.append(signal.name)
         else:
             raise ValueError(
                 f"expected sensors, positions or velocities; got {signal.name!r} of "
                 f"type {signal.kind}; pass a residual_fn, which knows what it is"
             )
     source = source.edited(*edits)
-    model = source.compile()
-    own = names_of(model, "sensor")
-    channels = []
-    for signal in signals:
-        i = own.index(reads[signal.name])
-        for k in range(signal.width):
-            name = signal.name if signal.width == 1 else f"{signal.name}[{k}]"
-            channels.append(Channel(name, int(model.sensor_adr[i]) + k))
-    return source, tuple(channels)
+    names = (
+        s.name if s.width == 1 else f"{s.name}[{k}]"
+        for s in signals
+        for k in range(s.width)
+    )
+    pairs = zip(names, channels_of(source.compile(), reads), strict=True)
+    return source, tuple(Channel(name, c.place) for name, c in pairs)
 
 
 @dataclass
