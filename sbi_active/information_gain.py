@@ -10,7 +10,7 @@ __getattr__ = former_names(
         "CandidateSimulations": (
             "sbi_active.design.estimators.base:CandidateSimulations"
         ),
-        "ContrastiveGain": "sbi_active.design.estimators.contrast:ContrastiveGain",
+        "ContrastiveGain": "sbi_active.design.estimators.contrast:InfoNCEGain",
         "EntropyGain": "sbi_active.design:EntropyGain",
         "InfoNCEGain": "sbi_active.design.estimators.contrast:InfoNCEGain",
         "InformationGainEstimator": "sbi_active.design:InformationGainEstimator",

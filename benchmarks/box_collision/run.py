@@ -26,6 +26,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.numerical.methods import FAITHFUL
 from benchmarks.rounds import (
     Cells,
     Rows,
@@ -37,7 +38,7 @@ from benchmarks.rounds import (
 )
 from benchmarks.rows import column, published, read, resumed
 from sbi_active import Campaign, CampaignOptions
-from sbi_active.campaign.learning.methods import METHODS, find_method
+from sbi_active.campaign.learning.methods import METHODS
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
@@ -293,7 +294,7 @@ def run_trial(
 
 def options_of(method: str, setting: str) -> CampaignOptions:
     """Return a setting's options, with what is the method's own in them."""
-    own = find_method(method).faithful
+    own = FAITHFUL[method]
     if setting == "learned":
         estimator = own.get("estimator", "posterior")
         return replace(SETTINGS[setting], estimator=estimator)

@@ -65,26 +65,23 @@ class MixedActions(ActionSpace):
 
     @override
     def sample(self, sample_shape: Sequence[int], *, seed: int | None = None) -> Tensor:
-        columns = [
-            part.sample(
-                sample_shape,
-                seed=None if seed is None else derive_seed(seed, "part", i),
-            )
-            for i, part in enumerate(self._parts)
-        ]
+        columns = []
+        for i, part in enumerate(self._parts):
+            own = None if seed is None else derive_seed(seed, "part", i)
+            columns.append(part.sample(sample_shape, seed=own))
         return torch.cat(columns, -1)
 
     @override
     def contains(self, action: Tensor) -> Tensor:
-        columns = torch.as_tensor(action).split([p.action_dim for p in self._parts], -1)
-        inside = [p.contains(c) for p, c in zip(self._parts, columns, strict=True)]
+        rows = torch.as_tensor(action)
+        inside = [part.contains(rows[..., own]) for part, own in self.entries()]
         return torch.stack(inside).all(0)
 
     @override
     def permits(self, action: Tensor) -> Tensor:
-        columns = torch.as_tensor(action).split([p.action_dim for p in self._parts], -1)
-        each = [p.permits(c) for p, c in zip(self._parts, columns, strict=True)]
-        return torch.stack(each).all(0)
+        rows = torch.as_tensor(action)
+        inside = [part.permits(rows[..., own]) for part, own in self.entries()]
+        return torch.stack(inside).all(0)
 
     @property
     def input_times(self) -> Tensor:
@@ -105,12 +102,8 @@ class MixedActions(ActionSpace):
 
     def _signals(self) -> tuple[SignalActions, slice]:
         """Return the part that has signals, and its entries of an action."""
-        found, begin = [], 0
-        for part in self._parts:
-            end = begin + part.action_dim
-            if isinstance(part, SignalActions):
-                found.append((part, slice(begin, end)))
-            begin = end
+        every = self.entries()
+        found = [(p, own) for p, own in every if isinstance(p, SignalActions)]
         if len(found) != 1:
             raise ValueError(
                 f"expected one part of signals; got {len(found)} in {self}; join one "
@@ -120,9 +113,9 @@ class MixedActions(ActionSpace):
 
     def listed(self) -> Tensor | None:
         """Return all combinations, the last part varying fastest."""
-        values = [part.listed() for part in self._parts]
         rows = torch.empty(1, 0)
-        for value in values:
+        for part in self._parts:
+            value = part.listed()
             if value is None:
                 return None
             rows = torch.cat(

@@ -116,12 +116,9 @@ class SignalActions(BoxActions):
 
     @override
     def __repr__(self) -> str:
-        limits = {
-            "amplitude": self._amplitude,
-            "rate": self._rate,
-            "duration": self._duration,
-        }
-        given = [f"{name}={value}" for name, value in limits.items() if value]
+        names = "amplitude", "rate", "duration"
+        limits = zip(names, (self._amplitude, self._rate, self._duration), strict=True)
+        given = [f"{name}={value}" for name, value in limits if value]
         inside = super().__repr__().removeprefix("BoxActions(").removesuffix(")")
         return f"SignalActions({', '.join([inside, *given])})"
 
@@ -196,9 +193,8 @@ class SignalActions(BoxActions):
             return inside
         for name, u in self.inputs(action.double()).items():
             low, high = _both(_of(self._amplitude, name))
-            slack = self.rounding * max(
-                abs(x) if math.isfinite(x) else 0 for x in (low, high)
-            )
+            sizes = [abs(x) for x in (low, high) if math.isfinite(x)]
+            slack = self.rounding * max(sizes, default=0)
             inside &= (u >= low - slack).all(1) & (u <= high + slack).all(1)
             most = _of(self._rate, name)
             if most is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -66,6 +66,13 @@ class ActionSpace(ABC):
     def parts(self) -> list[ActionSpace]:
         """Return the spaces that this one is the product of."""
         return [self]
+
+    def entries(self) -> Iterator[tuple[ActionSpace, slice]]:
+        """Yield each part with its entries of an action."""
+        begin = 0
+        for part in self.parts():
+            yield part, slice(begin, begin + part.action_dim)
+            begin += part.action_dim
 
     def _label(self, names: Sequence[str] | None, units: Sequence[str] | None) -> None:
         dim = self.action_dim

@@ -115,11 +115,8 @@ def find_summaries(actions: ActionSpace) -> tuple[SummaryAction, int] | None:
     Raises:
         ValueError: If several do.
     """
-    found, entry = [], 0
-    for part in actions.parts():
-        if isinstance(part, SummaryAction):
-            found.append((part, entry))
-        entry += part.action_dim
+    every = actions.entries()
+    found = [(p, own.start) for p, own in every if isinstance(p, SummaryAction)]
     if len(found) > 1:
         raise ValueError(
             f"expected one SummaryAction; got {len(found)} in {actions!r}; pass all "

@@ -171,15 +171,10 @@ class ModelVersion:
 
 
 #: Fields of a trial that was not scored.
-UNSCORED: dict[str, Any] = {
-    "information_gained": None,
-    "surprise": None,
-    "belief_error": None,
-    "log_score": None,
-    "misfit": None,
-    "outlyingness": None,
-    "version": None,
-}
+UNSCORED: dict[str, Any] = dict.fromkeys(
+    ("information_gained", "surprise", "belief_error", "log_score", "misfit")
+    + ("outlyingness", "version")
+)
 
 
 def tensor_of(listed: Any) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import product
 
 import torch
@@ -40,10 +41,7 @@ class Coordinates:
         self.action_dim = actions.action_dim
         self._boxes: list[tuple[slice, BoxActions]] = []
         self._lists: list[tuple[slice, Tensor]] = []
-        start = 0
-        for part in actions.parts():
-            columns = slice(start, start + part.action_dim)
-            start = columns.stop
+        for part, columns in actions.entries():
             values = part.listed()
             if values is not None:
                 self._lists.append((columns, values))
@@ -101,26 +99,14 @@ class Coordinates:
             settings=IN_CUBE,
         )
 
-    def spaced(self, point: Tensor, score: Tensor, num: int, apart: float) -> Tensor:
-        """Return indices of the best points (n, dim) not close to better ones."""
-        chosen: list[int] = []
-        for i in score.argsort(descending=True).tolist():
-            if len(chosen) == num:
-                break
-            if not bool((self.distance(point[chosen], point[i]) < apart).any()):
-                chosen.append(i)
-        return torch.tensor(chosen).long()
-
     def spread(self, num: int, seed: int) -> Tensor:
         """Return points that fill the space, shape (num, dim).
 
         Every combination of categories has about as many, scrambled Sobol points of its
         own; where there are more combinations than points they are drawn at random.
         """
-        total = 1
-        for size in self.sizes:
-            total *= size
         generator = torch.Generator().manual_seed(derive_seed(seed, "categories"))
+        total = math.prod(self.sizes)
         if total > num:
             columns = [
                 torch.randint(k, (num, 1), generator=generator) for k in self.sizes
@@ -132,9 +118,8 @@ class Coordinates:
         points = []
         for k in order:
             category = torch.tensor(every[k]).double().expand(each, -1)
-            points.append(
-                torch.cat([self._sobol(each, derive_seed(seed, k)), category], 1)
-            )
+            inside = self._sobol(each, derive_seed(seed, k))
+            points.append(torch.cat([inside, category], 1))
         return torch.stack(points, 1).flatten(0, 1)[:num]
 
     def _sobol(self, num: int, seed: int) -> Tensor:

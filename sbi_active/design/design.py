@@ -151,14 +151,6 @@ class Design:
         return drawn
 
 
-def action_name(actions: ActionSpace) -> str:
-    """Return the name of a scalar action with its unit."""
-    if actions.action_dim > 1:
-        return "action"
-    unit = actions.units[0]
-    return actions.names[0] + (f" [{unit}]" if unit else "")
-
-
 def action_labels(actions: ActionSpace) -> tuple[str, ...]:
     """Return the names of an action's entries with their units."""
     pairs = zip(actions.names, actions.units, strict=True)
@@ -174,11 +166,9 @@ def are_categories(actions: ActionSpace) -> tuple[bool, ...]:
 
 def naming(actions: ActionSpace) -> dict[str, Any]:
     """Return the fields of a :class:`Design` that name its actions."""
-    return {
-        "name": action_name(actions),
-        "labels": action_labels(actions),
-        "categorical": are_categories(actions),
-    }
+    labels = action_labels(actions)
+    name = labels[0] if len(labels) == 1 else "action"
+    return {"name": name, "labels": labels, "categorical": are_categories(actions)}
 
 
 def equal_errors(error: Tensor) -> dict[str, Tensor]:

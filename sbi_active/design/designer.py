@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -21,9 +21,11 @@ from sbi_active.design.estimators.base import (
     at_least,
     standard_error,
 )
+from sbi_active.design.estimators.model_index import ModelIndexGain, RivalSampler
+from sbi_active.design.evaluator import GainEvaluator
 from sbi_active.design.given import GivenGains
-from sbi_active.design.limits import DesignLimits, pricing, rows_of, warn_missing
-from sbi_active.design.problem import DesignProblem, GainEvaluator
+from sbi_active.design.limits import DesignLimits, rows_of, warn_missing
+from sbi_active.design.sampler import CandidateSampler
 from sbi_active.design.search import (
     Evaluations,
     ExhaustiveSearch,
@@ -31,7 +33,7 @@ from sbi_active.design.search import (
     Objective,
     Search,
 )
-from sbi_active.design.target import Target
+from sbi_active.design.target import Target, target_estimator
 from sbi_active.expected import Shown, suggests
 from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed
@@ -188,94 +190,106 @@ class InformationGainDesigner(Shown):
         """
         at_least(num_actions, 1, "num_actions", 1)
         others = rows_of(self.actions, pending, "pending")
-        limits = DesignLimits(
-            self.actions,
-            constraint,
-            rows_of(self.actions, exclude, "exclude"),
-            pricing(cost, self.actions),
-            min_probability_valid,
-        )
-        problem = DesignProblem(
-            target=target,
-            given_estimator=self.estimator,
-            model=model,
-            simulator=simulator,
-            belief=getattr(model, "belief", None) if belief is None else belief,
-            limits=limits,
-            search=self.search,
-            num_samples=self.num_samples,
-            eliminate=self.eliminate,
-            workers=self.workers,
-            most_numbers=self.most_numbers,
-            others=others,
-            simulations=simulations,
-            budget=budget,
-            seed=int(torch.randint(2**62, ())) if seed is None else seed,
+        allowed = constraint, exclude, cost, min_probability_valid
+        limits = DesignLimits.of(self.actions, *allowed)
+        belief = getattr(model, "belief", None) if belief is None else belief
+        seed = int(torch.randint(2**62, ())) if seed is None else seed
+        num_others = len(others) + num_actions - 1
+        estimator = target_estimator(
+            target, self.estimator, model, simulator, belief, simulations, num_others
         )
         if simulations is not None:
-            if num_actions > 1 or len(others):
-                raise ValueError(
-                    "expected one action and none pending with simulations=, rows of "
-                    f"single outcomes; got {num_actions} and {len(others)} pending; "
-                    "leave out simulations="
-                )
-            return GivenGains(problem).design()
-        steps = [_by_simulation(problem)]
-        for k in range(1, num_actions):
+            rows = GivenGains(simulations, estimator, model, belief, limits, seed)
+            return rows.design(self.search)
+
+        def evaluator(probed: Tensor, others: Tensor, seed: int) -> GainEvaluator:
+            if target == "model":
+                rivals = RivalSampler(model, seed)
+                return GainEvaluator(rivals, ModelIndexGain(rivals.probability), model)
+            assert simulator is not None
+            assert belief is not None
+            # A model was learned from whole outcomes.
+            learns = estimator is not None and estimator.needs_model
+            most_numbers = math.inf if learns else self.most_numbers
+            about = simulator, belief, probed, seed, self.workers, others, most_numbers
+            return GainEvaluator(CandidateSampler(*about), estimator, model, belief)
+
+        listed, notes = limits.listed()
+        budget = self._budget(budget, listed)
+        steps: list[Design] = []
+        for k in range(num_actions):
+            own = derive_seed(seed, "action", k) if k else seed
+            probed = listed
+            if probed is None:
+                probed = self.actions.sample((16,), seed=derive_seed(own, "probed"))
+            gains = evaluator(probed, others, own)
+            steps.append(self._selected(gains, limits, budget, own, notes))
             others = torch.cat([others, steps[-1].action[None]])
-            own = derive_seed(problem.seed, "action", k)
-            steps.append(_by_simulation(replace(problem, others=others, seed=own)))
         design = as_batch(steps)
         warn_missing(design.num_missing, design.num_simulations)
         return design
 
+    def _budget(self, budget: int | None, listed: Tensor | None) -> int:
+        """Return the simulations of an action in all.
 
-def _by_simulation(problem: DesignProblem, *, search_share: int = 12) -> Design:
-    """Return the design of one action.
+        Raises:
+            ValueError: If the budget is too small.
+        """
+        if budget is None:
+            size = self.search.size(self.actions) if listed is None else len(listed)
+            return self.num_samples * size
+        if listed is not None and budget < 8 * len(listed):
+            raise ValueError(
+                f"expected a budget >= {8 * len(listed)}, 8 a candidate; got {budget}; "
+                "allow more simulations or fewer candidates"
+            )
+        return budget
 
-    An action that a search evaluates gets one of so many shares of ``num_samples``.
+    def _selected(
+        self,
+        evaluator: GainEvaluator,
+        limits: DesignLimits,
+        budget: int,
+        seed: int,
+        notes: Sequence[str],
+        *,
+        search_share: int = 12,
+    ) -> Design:
+        """Return the design of one action.
 
-    Raises:
-        ValueError: If the budget is too small.
-    """
-    limits, search, seed = problem.limits, problem.search, problem.seed
-    listed, notes = limits.listed()
-    budget, probed = problem.budget, listed
-    if budget is None:
-        size = search.size(limits.actions) if listed is None else len(listed)
-        budget = problem.num_samples * size
-    if listed is not None and budget < 8 * len(listed):
-        raise ValueError(
-            f"expected a budget >= {8 * len(listed)}, 8 a candidate; got {budget}; "
-            "allow more simulations or fewer candidates"
-        )
-    if probed is None:
-        probed = limits.actions.sample((16,), seed=derive_seed(seed, "probed"))
-    evaluator = GainEvaluator(problem, probed)
-    num_samples = max(8, problem.num_samples // search_share // 4 * 4)
+        An action that a search evaluates gets one of so many shares of ``num_samples``.
+        """
+        num_samples = max(8, self.num_samples // search_share // 4 * 4)
 
-    def evaluate(action: Tensor) -> Evaluations:
-        """Estimate the utility at parameters that are the same from call to call."""
-        evaluator.sampler.rewind()
-        drawn = evaluator.draw(num_samples, evaluator.add(action))
-        gain, cost = evaluator(drawn), limits.cost(action)
-        valid, counted = drawn.num_valid()
-        error = torch.stack([standard_error(row) for row in gain])
-        return Evaluations(
-            action, gain.nanmean(1) / cost, error / cost, valid / counted.double()
-        )
+        def evaluate(action: Tensor) -> Evaluations:
+            """Estimate the utility, at the same parameters from call to call."""
+            evaluator.sampler.rewind()
+            drawn = evaluator.draw(num_samples, action)
+            gain, cost = evaluator(drawn), limits.cost(action)
+            valid, counted = drawn.num_valid()
+            error = torch.stack([standard_error(row) for row in gain])
+            return Evaluations(
+                action, gain.nanmean(1) / cost, error / cost, valid / counted.double()
+            )
 
-    action = search.finalists(
-        Objective(
-            actions=limits.actions,
+        objective = Objective(
+            actions=self.actions,
             permitted=limits,
             evaluate=evaluate,
-            num_evaluations=search.num_evaluations(budget, num_samples),
+            num_evaluations=self.search.num_evaluations(budget, num_samples),
             seed=derive_seed(seed, "search"),
             min_probability_valid=limits.least,
         )
-    )
-    return eliminate(evaluator, action, budget, notes=notes)
+        return eliminate(
+            evaluator,
+            limits,
+            self.search.finalists(objective),
+            budget,
+            num_samples=self.num_samples,
+            share=0.5 if self.eliminate else 1.0,
+            seed=seed,
+            notes=notes,
+        )
 
 
 def _find_search(search: str | Search, actions: ActionSpace) -> Search:
@@ -288,7 +302,7 @@ def _find_search(search: str | Search, actions: ActionSpace) -> Search:
         )
         search = "gradient"
     if search == "auto":
-        return GradientSearch() if actions.listed() is None else ExhaustiveSearch()
+        search = "gradient" if actions.listed() is None else "exhaustive"
     if search not in SEARCHES:
         raise ValueError(
             f"expected search among 'auto', {', '.join(map(repr, SEARCHES))}; got "

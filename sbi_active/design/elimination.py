@@ -11,8 +11,8 @@ from torch import Tensor
 
 from sbi_active.design.design import Design, naming
 from sbi_active.design.estimators.base import CandidateSimulations, standard_error
+from sbi_active.design.evaluator import GainEvaluator
 from sbi_active.design.limits import DesignLimits
-from sbi_active.design.problem import GainEvaluator
 from sbi_active.seeding import derive_seed
 
 
@@ -101,9 +101,13 @@ def paired_errors(contributions: Sequence[Tensor], chosen: int) -> Tensor:
 
 def eliminate(
     evaluator: GainEvaluator,
+    limits: DesignLimits,
     action: Tensor,
     budget: int,
     *,
+    num_samples: int,
+    share: float,
+    seed: int,
     notes: Sequence[str] = (),
     most: int = 4,
 ) -> Design:
@@ -111,18 +115,23 @@ def eliminate(
 
     Args:
         evaluator: Evaluator that simulates and estimates.
+        limits: Limits and costs of the actions.
         action: Candidates, shape (a, action_dim).
         budget: Simulations in all, those of the evaluator so far included.
+        num_samples: Simulations a candidate on average.
+        share: Share of these that every candidate gets at first.
+        seed: Seed of the draws behind probabilities.
         notes: Notes on the candidates, the last of the design's.
         most: Times ``num_samples`` that a candidate may get at most.
     """
-    problem, sampler = evaluator.problem, evaluator.sampler
-    limits, num_samples = problem.limits, problem.num_samples
-    num_actions, others = len(action), evaluator.num_others
-    place = evaluator.add(action)
-    size = max(8, num_samples // (2 if problem.eliminate else 1))
-    size = min(size, (budget - sampler.num_drawn) // (num_actions + others)) // 4 * 4
-    first = evaluator.draw(size, place)
+    sampler, num_actions = evaluator.sampler, len(action)
+
+    def affordable(num: int, num_candidates: int) -> int:
+        each = (budget - sampler.num_drawn) // (num_candidates + evaluator.num_others)
+        return min(num, each // 4 * 4)
+
+    size = affordable(max(8, int(share * num_samples)) // 4 * 4, num_actions)
+    first = evaluator.draw(size, action, halves=True)
     said = [*evaluator.notes, *evaluator.estimator.remarks(first)]
     halves = _halves(first)
     num_valid, num_counted = first.num_valid()
@@ -144,19 +153,15 @@ def eliminate(
     runs = 2 if evaluator.replicates else 1
     while True:
         estimate(active, halves)
-        race = Race.run([weight[a] * gains[0][a] for a in active], problem.seed)
+        race = Race.run([weight[a] * gains[0][a] for a in active], seed)
         keep = race.in_reach
         spent = 2 * len(halves[0].theta) * runs
-        more = min(
-            spent,
-            most * num_samples - spent,
-            (budget - sampler.num_drawn) // (int(keep.sum()) + others) // 4 * 4,
-        )
+        more = affordable(min(spent, most * num_samples - spent), int(keep.sum()))
         stopped = race.reason() or ("budget spent" if more < 8 else None)
         if stopped is not None:
             break
         active = active[keep]
-        drawn = evaluator.draw(more, place[active])
+        drawn = evaluator.draw(more, action[active])
         for count, new in zip((num_valid, num_counted), drawn.num_valid(), strict=True):
             count[active] += new
         halves = [
@@ -171,11 +176,9 @@ def eliminate(
         halves=gains,
         eligible=eligible,
         leader=int(active[race.leader]),
-        seed=problem.seed,
+        seed=seed,
         probability_valid=num_valid / num_counted.double(),
-        num_samples=torch.tensor(
-            [runs * (len(a) + len(b)) for a, b in zip(*gains, strict=True)]
-        ),
+        runs=runs,
         estimator=type(evaluator.estimator).__name__,
         bound=evaluator.bound,
         num_simulations=sampler.num_drawn,
@@ -198,6 +201,7 @@ def choose(
     eligible: Tensor,
     leader: int,
     seed: int,
+    runs: int = 1,
     **known: Any,
 ) -> Design:
     """Return the design of the leading candidate.
@@ -210,6 +214,7 @@ def choose(
         eligible: Mask of the candidates that may be chosen, shape (a,), bool.
         leader: The candidate of the largest utility.
         seed: Seed of the draws behind probabilities.
+        runs: Simulations of each contribution.
         **known: Fields of the :class:`.Design` that are known already.
     """
     price, report = limits.cost(action), halves[1]
@@ -226,6 +231,9 @@ def choose(
         difference_standard_error=paired_errors(report, leader),
         probability_best=probability_best,
         index=leader,
+        num_samples=torch.tensor(
+            [runs * (len(a) + len(b)) for a, b in zip(*halves, strict=True)]
+        ),
         cost=None if limits.price is None else price,
         **naming(limits.actions),
         **known,

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.distributions import Distribution
 
 from sbi_active.design.coordinates import Coordinates, cells
 from sbi_active.design.design import Design
@@ -16,8 +18,8 @@ from sbi_active.design.estimators.base import (
     CandidateSimulations,
     InformationGainEstimator,
 )
-from sbi_active.design.problem import DesignProblem
-from sbi_active.design.search import Evaluations, Objective
+from sbi_active.design.limits import DesignLimits
+from sbi_active.design.search import Evaluations, Objective, Search, presence
 from sbi_active.inference.sampling.gaussian_process import GaussianProcess
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import Outcome, Simulations
@@ -38,13 +40,15 @@ class GivenGains:
     rows one by one.
 
     Args:
-        problem: Problem of the design, with the rows.
+        rows: Simulations at hand.
+        estimator: Estimator of the information; None is chosen by what the model says.
+        model: Model that the estimator needs.
+        belief: Distribution of the parameters.
+        limits: Limits and costs of the actions.
+        seed: Seed of all draws.
         fewest: Number of rows that a candidate needs.
         num_cells: Number of cells into which the rows of a continuous space are
             averaged.
-
-    Attributes:
-        estimator: Estimator of the information.
 
     Raises:
         TypeError: If the rows are no simulations.
@@ -52,9 +56,18 @@ class GivenGains:
     """
 
     def __init__(
-        self, problem: DesignProblem, *, fewest: int = 16, num_cells: int = 128
+        self,
+        rows: Simulations,
+        estimator: InformationGainEstimator | None,
+        model: Any,
+        belief: Distribution | None,
+        limits: DesignLimits,
+        seed: int,
+        *,
+        fewest: int = 16,
+        num_cells: int = 128,
     ) -> None:
-        rows, dim = problem.simulations, problem.limits.actions.action_dim
+        dim = limits.actions.action_dim
         if not isinstance(rows, Simulations):
             raise TypeError(
                 "expected Simulations(theta, action, x) for simulations=; got "
@@ -65,24 +78,29 @@ class GivenGains:
                 f"expected simulations of actions (n, {dim}); got "
                 f"{tuple(rows.action.shape)}; pass those of this space"
             )
-        self.problem, self.rows = problem, rows
+        self.rows, self.model, self.belief = rows, model, belief
+        self.limits, self.seed = limits, seed
         self.fewest, self.num_cells = fewest, num_cells
-        self.estimator = problem.estimator() or self._by_model()
+        if estimator is None:
+            if model is None:
+                raise ValueError(
+                    "expected a model with simulations=; got None; pass the trained "
+                    "model, or leave out simulations="
+                )
+            some = self._simulations(torch.arange(len(rows))[:256])
+            estimator = choose_estimator(model, some)[0]
+        self.estimator = estimator
 
-    def _by_model(self, num_rows: int = 256) -> InformationGainEstimator:
-        """Return the estimator by what the model can say of some rows."""
-        if self.problem.model is None:
-            raise ValueError(
-                "expected a model with simulations=; got None; pass the trained model, "
-                "or leave out simulations="
-            )
-        rows = torch.arange(len(self.rows))[:num_rows]
-        return choose_estimator(self.problem.model, self._simulations(rows))[0]
+    def design(self, search: Search) -> Design:
+        """Return the design by these rows; nothing is simulated.
 
-    def design(self) -> Design:
-        """Return the design by these rows; nothing is simulated."""
-        listed, notes = self.problem.limits.listed()
-        return self._of_space() if listed is None else self._of_list(listed, notes)
+        Args:
+            search: Search of a space without end.
+        """
+        listed, notes = self.limits.listed()
+        if listed is None:
+            return self._of_space(search)
+        return self._of_list(listed, notes)
 
     def _of_list(self, action: Tensor, notes: Sequence[str]) -> Design:
         """Return the design of candidates by their own rows.
@@ -112,7 +130,7 @@ class GivenGains:
             )
         return self._chosen(action, halves, share, notes)
 
-    def _of_space(self) -> Design:
+    def _of_space(self, search: Search) -> Design:
         """Return the design of the finalists of a search.
 
         Raises:
@@ -124,65 +142,53 @@ class GivenGains:
                 f"and continuous actions; got {type(self.estimator).__name__}; use "
                 "estimator='posterior', or leave out simulations="
             )
-        limits = self.problem.limits
+        limits = self.limits
         space = Coordinates(limits.actions)
         everything = torch.arange(len(self.rows))
         averages = [self._averages(space, half) for half in self._split(everything)]
         first, _ = averages[0]
         price = limits.cost(first.action)
-        action = self.problem.search.finalists(
-            Objective(
-                actions=limits.actions,
-                permitted=limits,
-                evaluate=_nothing,
-                num_evaluations=0,
-                seed=derive_seed(self.problem.seed, "search"),
-                min_probability_valid=limits.least,
-                known=replace(
-                    first,
-                    utility=first.utility / price,
-                    standard_error=first.standard_error / price,
-                ),
-            )
+        utility, error = first.utility / price, first.standard_error / price
+        known = replace(first, utility=utility, standard_error=error)
+        objective = Objective(
+            actions=limits.actions,
+            permitted=limits,
+            evaluate=lambda action: known,
+            num_evaluations=0,
+            seed=derive_seed(self.seed, "search"),
+            min_probability_valid=limits.least,
+            known=known,
         )
+        action = search.finalists(objective)
         point = space.points(action)
         halves, shares = [], []
         for part, num in averages:
             knots = space.points(part.action)
             gain = space.regression(knots, part.utility, part.standard_error)
             halves.append([*_as_contributions(gain, point)])
-            valid = part.probability_valid
-            share = torch.ones(len(point)).double()
-            if bool((valid < 1).any()):
-                error = (valid * (1 - valid) / num + 1e-4).sqrt()
-                share = space.regression(knots, valid, error)(point)[0][:, 0]
-            shares.append(share.clamp(0, 1))
+            valid = presence(space, part, num)
+            share = torch.ones(len(point)) if valid is None else valid(point)[0][:, 0]
+            shares.append(share.double().clamp(0, 1))
         return self._chosen(action, halves, torch.stack(shares).mean(0))
 
     def _split(self, rows: Tensor) -> list[Tensor]:
-        seed = derive_seed(self.problem.seed, "split")
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(derive_seed(self.seed, "split"))
         shuffled = rows[torch.randperm(len(rows), generator=generator)]
         return [*shuffled.tensor_split(2)]
 
-    def _simulations(self, rows: Tensor) -> RowSimulations:
-        given = self.rows
+    def _simulations(self, rows: Tensor) -> CandidateSimulations:
+        given, action = self.rows, self.rows.action[rows]
         lost = given.status[rows] == Outcome.MISSING
-        return RowSimulations(
-            given.theta[rows],
-            given.action[rows][:1],
-            given.x[rows][None],
+        return CandidateSimulations(
+            *(given.theta[rows], action[:1], given.x[rows][None]),
             missing=lost[None],
-            each=given.action[rows],
+            each=action,
         )
 
     def _gain(self, rows: Tensor) -> Tensor:
         """Return contributions of rows, shape (n,)."""
-        problem = self.problem
         with single_thread():
-            return self.estimator(
-                problem.model, self._simulations(rows), problem.belief
-            )[0]
+            return self.estimator(self.model, self._simulations(rows), self.belief)[0]
 
     def _averages(self, space: Coordinates, rows: Tensor) -> tuple[Evaluations, Tensor]:
         """Return averages of rows over cells, and the number of rows in each."""
@@ -206,11 +212,11 @@ class GivenGains:
         share: Tensor,
         notes: Sequence[str] = (),
     ) -> Design:
-        limits, seed = self.problem.limits, self.problem.seed
+        limits = self.limits
         known = torch.tensor([bool(g.isfinite().any()) for g in halves[0]])
         eligible, cost = known & limits.reached_by(share), limits.cost(action)
         index = torch.nonzero(eligible)[:, 0]
-        race = Race.run([halves[0][a] / cost[a] for a in index], seed)
+        race = Race.run([halves[0][a] / cost[a] for a in index], self.seed)
         few = int((~known).sum())
         said = [IN_SAMPLE, *limits.excluded_note(eligible | ~known)]
         if few:
@@ -221,32 +227,14 @@ class GivenGains:
             halves=halves,
             eligible=eligible,
             leader=int(index[race.leader]),
-            seed=seed,
+            seed=self.seed,
             probability_valid=share,
-            num_samples=torch.tensor(
-                [len(a) + len(b) for a, b in zip(*halves, strict=True)]
-            ),
             estimator=type(self.estimator).__name__,
             bound="none",  # the model may have seen the rows
             num_simulations=0,
             stopped="simulations given",
             notes=(*said, *notes),
         )
-
-
-@dataclass(frozen=True)
-class RowSimulations(CandidateSimulations):
-    """Rows of which each has an action of its own, for estimators that score rows.
-
-    x has shape (1, n, *x_shape), ``each`` (n, action_dim), and ``action`` is the
-    first's.
-    """
-
-    each: Tensor = field(default_factory=lambda: torch.empty(0))
-
-    def rows(self) -> tuple[Tensor, Tensor]:
-        """Return the parameters, and what was drawn at each."""
-        return self.theta, self.each
 
 
 def _as_contributions(process: GaussianProcess, point: Tensor) -> Tensor:
@@ -263,7 +251,3 @@ def _as_contributions(process: GaussianProcess, point: Tensor) -> Tensor:
         size = influence.square().sum(1).sqrt().clamp_min(1e-30)
         ratio = (variance[:, 0].sqrt() / size).clamp_min(1.0)
         return mean + influence.shape[1] * ratio[:, None] * influence
-
-
-def _nothing(action: Tensor) -> Evaluations:
-    raise AssertionError("no evaluation is allowed on given simulations")

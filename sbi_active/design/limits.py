@@ -33,6 +33,19 @@ class DesignLimits:
     price: Callable[[Tensor], Tensor] | None = None
     least: float = 0.0
 
+    @classmethod
+    def of(
+        cls,
+        actions: ActionSpace,
+        constraint: Callable[[Tensor], Tensor] | None = None,
+        exclude: Tensor | None = None,
+        cost: Callable[[Tensor], Tensor] | Tensor | None = None,
+        least: float = 0.0,
+    ) -> DesignLimits:
+        """Return limits as users declare them, see :func:`pricing`."""
+        rows = rows_of(actions, exclude, "exclude")
+        return cls(actions, constraint, rows, pricing(cost, actions), least)
+
     def __call__(self, action: Tensor) -> Tensor:
         """Return a mask of permitted actions (n, action_dim), shape (n,), bool."""
         inside = self.actions.permits(action)
@@ -124,12 +137,12 @@ class DesignLimits:
 
     def _tolerance(self, same: float = 0.01) -> Tensor:
         """Return differences within which two actions are the same, (action_dim,)."""
-        parts = []
-        for part in self.actions.parts():
-            if isinstance(part, BoxActions):
-                parts.append(same * (part.high - part.low))
-            else:
-                parts.append(torch.full((part.action_dim,), 1e-6))
+        parts = [
+            same * (part.high - part.low)
+            if isinstance(part, BoxActions)
+            else torch.full((part.action_dim,), 1e-6)
+            for part in self.actions.parts()
+        ]
         return torch.cat(parts)
 
 

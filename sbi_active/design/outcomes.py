@@ -12,7 +12,7 @@ joint ones.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -44,27 +44,17 @@ def join_outcomes(
     a, p = len(candidates.action), len(others.action)
     beside = others.action.flatten().expand(a, -1)
 
-    def together(name: str) -> Tensor | None:
+    parts: dict[str, Any] = {}
+    for name in ("x", "mean", "replicate"):
         own, other = getattr(candidates, name), getattr(others, name)
-        if own is None or other is None:
-            return None
-        other = other.transpose(0, 1).expand(a, -1, p, *other.shape[2:])
-        return torch.cat([own[:, :, None], other], 2)
-
-    missing = None
+        if own is not None and other is not None:
+            other = other.transpose(0, 1).expand(a, -1, p, *other.shape[2:])
+            parts[name] = torch.cat([own[:, :, None], other], 2)
     if candidates.missing is not None or others.missing is not None:
-        missing = ~candidates.counted | ~others.counted.all(0)
-    x = together("x")
-    assert x is not None
-    return replace(
-        candidates,
-        action=torch.cat([candidates.action, beside], 1),
-        x=x,
-        mean=together("mean"),
-        replicate=together("replicate"),
-        missing=missing,
-        noise=None if candidates.noise is None else _joint(candidates.noise),
-    )
+        parts["missing"] = ~candidates.counted | ~others.counted.all(0)
+    action = torch.cat([candidates.action, beside], 1)
+    noise = None if candidates.noise is None else _joint(candidates.noise)
+    return replace(candidates, action=action, noise=noise, **parts)
 
 
 def conditional_gain(
@@ -72,14 +62,13 @@ def conditional_gain(
     model: Any,
     simulations: CandidateSimulations,
     belief: Distribution | None,
-    *,
-    action_dim: int,
+    num_others: int,
 ) -> Tensor:
     """Return contributions to what candidates tell beyond the others, (a, n).
 
-    The simulations come from :func:`join_outcomes`; the model is for single outcomes,
-    of actions of ``action_dim`` numbers.
+    The simulations come from :func:`join_outcomes`; the model is for single outcomes.
     """
+    action_dim = simulations.action.shape[1] // (1 + num_others)
     joint = None if model is None else JointLikelihood(model, action_dim)
     others = replace(
         simulations,
@@ -138,13 +127,9 @@ class _JointNoise(NoiseModel):
         times: Tensor | None = None,
         parameters: Tensor | None = None,
     ) -> Tensor:
-        if seeds is not None:
-            raise ValueError(
-                "expected seeds=None for joint outcomes; got some; draw the noise "
-                "of each outcome by itself"
-            )
-        flat = self.each.sample(mean.flatten(0, 1), times=times, parameters=parameters)
-        return flat.reshape(mean.shape)
+        stacked = mean.flatten(0, 1)
+        drawn = self.each.sample(stacked, seeds, times=times, parameters=parameters)
+        return drawn.reshape(mean.shape)
 
     def log_prob(
         self,
@@ -154,10 +139,8 @@ class _JointNoise(NoiseModel):
         times: Tensor | None = None,
         parameters: Tensor | None = None,
     ) -> Tensor:
-        mean = mean.expand_as(x)
-        flat = self.each.log_prob(
-            x.flatten(0, 1), mean.flatten(0, 1), times=times, parameters=parameters
-        )
+        stacked = x.flatten(0, 1), mean.expand_as(x).flatten(0, 1)
+        flat = self.each.log_prob(*stacked, times=times, parameters=parameters)
         return flat.reshape(x.shape[:2]).sum(1)
 
 
@@ -166,19 +149,6 @@ def _joint(noise: NoiseModel) -> NoiseModel:
     if isinstance(noise, GaussianNoise) and noise.posterior is None:
         return noise
     return _JointNoise(noise)
-
-
-@dataclass(frozen=True)
-class _Directions:
-    """Principal directions of the outcomes of one action.
-
-    Attributes:
-        center: Mean of the whitened outcomes, shape (N,).
-        rows: Orthonormal directions, shape (k, N).
-    """
-
-    center: Tensor
-    rows: Tensor
 
 
 class LinearSummaries:
@@ -212,7 +182,8 @@ class LinearSummaries:
     ) -> None:
         self.left_out = 0.0
         self._noise, self._num_kept, self._num_rows = noise, num_kept, num_rows
-        self._known: dict[bytes, _Directions] = {}
+        # Mean of the whitened outcomes of an action (N,), their directions (k, N).
+        self._known: dict[bytes, tuple[Tensor, Tensor]] = {}
 
     @property
     def noise(self) -> GaussianNoise:
@@ -235,10 +206,14 @@ class LinearSummaries:
             if not bool(whole.any()):
                 continue
             if key not in self._known:
-                self._known[key] = self._directions(white[whole][: self._num_rows])
-            own = self._known[key]
-            off = white[whole] - own.center
-            short = off @ own.rows.T
+                some = white[whole][: self._num_rows]
+                center = some.mean(0)
+                every = torch.linalg.svd(some - center, full_matrices=False)[2]
+                # Without a copy all that are not kept would stay in memory.
+                self._known[key] = center, every[: self._num_kept].clone()
+            center, directions = self._known[key]
+            off = white[whole] - center
+            short = off @ directions.T
             rest.append(off.square().sum(1) - short.square().sum(1))
             padding = 0, self._num_kept - short.shape[1]
             summaries[whole] = torch.nn.functional.pad(short, padding)
@@ -246,12 +221,6 @@ class LinearSummaries:
             lost = 0.5 * float(torch.cat(rest).mean().clamp_min(0.0))
             self.left_out = max(self.left_out, lost)
         return found
-
-    def _directions(self, white: Tensor) -> _Directions:
-        center = white.mean(0)
-        rows = torch.linalg.svd(white - center, full_matrices=False)[2]
-        # Without a copy all that are not kept would stay in memory.
-        return _Directions(center, rows[: self._num_kept].clone())
 
     def note(self, num_numbers: int) -> str:
         """Return a note on what is compared in place of how many numbers."""

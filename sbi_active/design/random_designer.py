@@ -12,7 +12,7 @@ from torch.distributions import Distribution
 
 from sbi_active.actions.discrete import Actions, action_space
 from sbi_active.design.design import Design, equal_errors, naming
-from sbi_active.design.limits import DesignLimits, rows_of, warn_missing
+from sbi_active.design.limits import DesignLimits, warn_missing
 from sbi_active.expected import Shown, suggests
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import MissingRowsWarning, Outcome, simulate
@@ -78,19 +78,15 @@ class RandomDesigner(Shown):
             ValueError: If a share of measurements is asked for without a simulator or a
                 belief, or no candidate reaches it.
         """
-        limits = DesignLimits(
-            self.actions,
-            constraint,
-            rows_of(self.actions, exclude, "exclude"),
-            least=min_probability_valid,
-        )
+        allowed = constraint, exclude, None, min_probability_valid
+        limits = DesignLimits.of(self.actions, *allowed)
         candidates, notes = limits.listed()
         if candidates is None:
             own = None if seed is None else derive_seed(seed, "candidates")
             candidates = limits.drawn(own)[: 32 if min_probability_valid > 0 else 1]
         num = len(candidates)
         unknown = torch.full((num,), torch.nan, dtype=torch.float64)
-        valid, num_simulations, num_missing = unknown, 0, 0
+        valid, num_samples, num_missing = unknown, 0, 0
         eligible = torch.ones(num).bool()
         if min_probability_valid > 0:
             belief = getattr(model, "belief", None) if belief is None else belief
@@ -101,12 +97,22 @@ class RandomDesigner(Shown):
                     "both, or leave min_probability_valid at 0"
                 )
             seed = int(torch.randint(2**62, ())) if seed is None else seed
-            status = self._outcomes(simulator, belief, candidates, seed)
+            num_samples = self.num_samples
+            with forked_generators(seed, "theta"):
+                theta = belief.sample(torch.Size([num_samples]))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
+                status = simulate(
+                    simulator,
+                    theta.repeat(num, 1),
+                    candidates.repeat_interleave(num_samples, 0),
+                    seed=derive_seed(seed, "x"),
+                    workers=self.workers,
+                ).status.reshape(num, num_samples)
             counted = (status != Outcome.MISSING).sum(1)
             valid = (status == Outcome.OK).sum(1).double() / counted
-            num_simulations = status.numel()
-            num_missing = num_simulations - int(counted.sum())
-            warn_missing(num_missing, num_simulations)
+            num_missing = num * num_samples - int(counted.sum())
+            warn_missing(num_missing, num * num_samples)
             eligible = limits.reached_by(valid)
         with forked_generators(seed):
             remaining = torch.nonzero(eligible)[:, 0]
@@ -119,28 +125,9 @@ class RandomDesigner(Shown):
             probability_valid=valid,
             bound="none",
             index=chosen,
-            num_simulations=num_simulations,
+            num_simulations=num * num_samples,
             **naming(self.actions),
-            num_samples=torch.full((num,), num_simulations // num).long(),
+            num_samples=torch.full((num,), num_samples).long(),
             num_missing=num_missing,
             notes=(*limits.excluded_note(eligible), *notes),
         )
-
-    def _outcomes(
-        self,
-        simulator: Callable[..., Any],
-        belief: Distribution,
-        values: Tensor,
-        seed: int,
-    ) -> Tensor:
-        """Simulate candidates at the same parameters; statuses, shape (a, n)."""
-        n = self.num_samples
-        with forked_generators(seed, "theta"):
-            theta = belief.sample(torch.Size([n]))
-        rows = theta.repeat(len(values), 1), values.repeat_interleave(n, 0)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
-            drawn = simulate(
-                simulator, *rows, seed=derive_seed(seed, "x"), workers=self.workers
-            )
-        return drawn.status.reshape(len(values), n)

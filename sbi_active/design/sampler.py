@@ -23,7 +23,7 @@ from sbi_active.simulation import (
 )
 from sbi_active.simulation.noise.whitening import is_known_gaussian
 from sbi_active.simulation.simulator import require_noise
-from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
+from sbi_active.simulation.workers.settings import Workers
 
 
 class CandidateSampler:
@@ -32,18 +32,16 @@ class CandidateSampler:
     Args:
         simulator: ``simulator(theta, action)``.
         belief: Distribution of the parameters.
-        action: Candidates, shape (a, action_dim).
+        probed: Actions to look at the simulator with, shape (a, action_dim).
         seed: Seed of all draws.
         workers: Workers that run the simulations.
         others: Actions whose outcomes will be known as well, shape (p, action_dim);
-            every draw then holds joint outcomes
-            (:func:`.join_outcomes`). None for none.
+            every draw then holds joint outcomes (:func:`.join_outcomes`).
         most_numbers: Number of an outcome's numbers beyond which
             :class:`.LinearSummaries` stand for them, where noise is declared that
             allows for it; infinite keeps all.
 
     Attributes:
-        action: Candidates, to which more may be added between draws.
         declared: Whether the simulator declares its noise around an output that does
             not change from run to run.
         num_drawn: Simulations so far.
@@ -55,20 +53,16 @@ class CandidateSampler:
         self,
         simulator: Callable[..., Any],
         belief: Distribution,
-        action: Tensor,
+        probed: Tensor,
         seed: int,
-        workers: Workers = IN_PROCESS,
-        others: Tensor | None = None,
-        *,
-        most_numbers: float = float("inf"),
+        workers: Workers,
+        others: Tensor,
+        most_numbers: float,
     ) -> None:
         self.simulator, self.belief = simulator, belief
-        self.action, self.seed = action, seed
-        self.others = action[:0] if others is None else others
-        self.workers = workers
-        self.num_drawn = self.num_missing = 0
-        self._num_waves = 0
-        self.declared = self._probe()
+        self.seed, self.workers, self.others = seed, workers, others
+        self.num_drawn = self.num_missing = self._num_waves = 0
+        self.declared = self._probe(probed)
         self.summaries: LinearSummaries | None = None
         noise = getattr(simulator, "noise", None)
         many = self.declared and self._num_numbers > most_numbers
@@ -76,9 +70,9 @@ class CandidateSampler:
             self.summaries = LinearSummaries(noise)
 
     def draw(
-        self, num_samples: int, candidates: Tensor, *, replicates: bool
+        self, num_samples: int, action: Tensor, *, replicates: bool
     ) -> CandidateSimulations:
-        """Simulate candidates (k,) at fresh parameters, the same for all.
+        """Simulate candidates (a, action_dim) at fresh parameters, the same for all.
 
         With replicates half of the simulations repeat the parameters of the others,
         unless the noise is declared.
@@ -88,21 +82,20 @@ class CandidateSampler:
         num = num_samples // 2 if paired else num_samples
         with forked_generators(self.seed, "theta", self._num_waves):
             theta = self.belief.sample((num,))
-        drawn = self._draw(theta, self.action[candidates], paired, "")
+        drawn = self._draw(theta, action, paired, "")
         if drawn is not None and len(self.others):
             beside = self._draw(theta, self.others, paired, "others")
             drawn = None if beside is None else join_outcomes(drawn, beside)
         if drawn is None:  # what is declared as noise-free is not
             self.declared = False
-            return self.draw(num_samples, candidates, replicates=replicates)
+            return self.draw(num_samples, action, replicates=replicates)
         return drawn
 
     @property
     def notes(self) -> list[str]:
         """Notes on the summaries that stand for an outcome."""
-        if self.summaries is None:
-            return []
-        return [self.summaries.note(self._num_numbers)]
+        short = self.summaries
+        return [] if short is None else [short.note(self._num_numbers)]
 
     def rewind(self) -> None:
         """Repeat the parameters and the noise of the first draw in the next."""
@@ -116,85 +109,82 @@ class CandidateSampler:
         Twice where paired; None if the declared mean turns out to change from run to
         run. The label is the seeds': outcomes that are joined have noise of their own.
         """
-        num = len(theta)
-
-        def run(
-            simulator: Callable[..., Any], action: Tensor, key: str
-        ) -> tuple[Tensor, Tensor]:
-            seed = derive_seed(self.seed, label + key, self._num_waves)
-            drawn = self._simulate(simulator, _rows(theta, action), seed)
-            self.num_drawn += len(drawn)
-            self.num_missing += drawn.counts["missing"]
-            shape = (len(action), num)
-            x = drawn.x.reshape(*shape, *drawn.x.shape[1:])
-            return x, (drawn.status == Outcome.MISSING).reshape(shape)
-
         if self.declared:
-            assert isinstance(self.simulator, SimulatorModel)
-            noise, short = self.simulator.noise, self.summaries
-            assert noise is not None
-            means, lost = [], []
-            # Many numbers are kept in memory for one action at a time.
-            for some in action.split(len(action) if short is None else 1):
-                mean, missing = run(self.simulator.mean, some, "x")
-                rows = _rows(theta, some)
-                outcomes = mean.flatten(0, 1)
-                if self._num_waves == 1 and self._lost_by_luck(rows, outcomes):
-                    return None
-                if short is not None:
-                    mean, noise = short(some[0], mean[0])[None], short.noise
-                means.append(mean)
-                lost.append(missing)
-            mean, missing = torch.cat(means), torch.cat(lost)
-            noise_seed = derive_seed(self.seed, label + "noise", self._num_waves)
-            if label:  # they are not compared but measured together
-                seeds = row_seeds(noise_seed, len(action) * num)
-            else:  # the same noise for all candidates
-                seeds = row_seeds(noise_seed, num).repeat(len(action))
-            x = noise.sample(mean.flatten(0, 1), seeds).float().reshape(mean.shape)
-            return CandidateSimulations(
-                theta, action, x, mean, noise, missing=_if_any(missing)
-            )
-        x, missing = run(self.simulator, action, "x")
+            return self._draw_declared(theta, action, label)
+        x, missing = self._run(self.simulator, theta, action, label + "x")
         again = None
         if paired:
-            again, lost = run(self.simulator, action, "again")
+            again, lost = self._run(self.simulator, theta, action, label + "again")
             missing |= lost
         return CandidateSimulations(
             theta, action, x, replicate=again, missing=_if_any(missing)
         )
 
+    def _draw_declared(
+        self, theta: Tensor, action: Tensor, label: str
+    ) -> CandidateSimulations | None:
+        assert isinstance(self.simulator, SimulatorModel)
+        noise, short = self.simulator.noise, self.summaries
+        assert noise is not None
+        means, lost = [], []
+        # Many numbers are kept in memory for one action at a time.
+        for some in action.split(len(action) if short is None else 1):
+            mean, missing = self._run(self.simulator.mean, theta, some, label + "x")
+            if self._num_waves == 1 and self._lost_by_luck(theta, some, mean):
+                return None
+            if short is not None:
+                mean, noise = short(some[0], mean[0])[None], short.noise
+            means.append(mean)
+            lost.append(missing)
+        mean = torch.cat(means)
+        seed = derive_seed(self.seed, label + "noise", self._num_waves)
+        if label:  # they are not compared but measured together
+            seeds = row_seeds(seed, len(action) * len(theta))
+        else:  # the same noise for all candidates
+            seeds = row_seeds(seed, len(theta)).repeat(len(action))
+        x = noise.sample(mean.flatten(0, 1), seeds).float().reshape(mean.shape)
+        missing = _if_any(torch.cat(lost))
+        return CandidateSimulations(theta, action, x, mean, noise, missing=missing)
+
+    def _run(
+        self, simulator: Callable[..., Any], theta: Tensor, action: Tensor, key: str
+    ) -> tuple[Tensor, Tensor]:
+        """Return outcomes (a, n, *x_shape) and which are missing (a, n)."""
+        rows = theta.repeat(len(action), 1), action.repeat_interleave(len(theta), 0)
+        drawn = self._simulate(simulator, rows, key, self._num_waves)
+        self._count(drawn)
+        shape = (len(action), len(theta))
+        x = drawn.x.reshape(*shape, *drawn.x.shape[1:])
+        return x, (drawn.status == Outcome.MISSING).reshape(shape)
+
     def _lost_by_luck(
-        self, rows: tuple[Tensor, Tensor], mean: Tensor, most: int = 64
+        self, theta: Tensor, action: Tensor, mean: Tensor, most: int = 64
     ) -> bool:
         """Simulate some rows without a measurement again: is there one this time.
 
         Then presence is random given the parameters, and only replicates tell how much.
         """
-        present = mean.flatten(1).isfinite()
-        lost = torch.nonzero(~present.all(1))[:, 0]
-        if len(lost) == 0:
+        present = mean.flatten(2).isfinite()
+        a, i = torch.nonzero(~present.all(2), as_tuple=True)
+        if len(a) == 0:
             return False
-        lost = lost[:: -(-len(lost) // most)]
+        some = slice(None, None, -(-len(a) // most))
+        a, i = a[some], i[some]
         assert isinstance(self.simulator, SimulatorModel)
-        theta, action = (part[lost] for part in rows)
-        seed = derive_seed(self.seed, "retry")
-        again = self._simulate(self.simulator.mean, (theta, action), seed)
-        self.num_drawn += len(again)
-        self.num_missing += again.counts["missing"]
+        again = self._simulate(self.simulator.mean, (theta[i], action[a]), "retry")
+        self._count(again)
         known = again.status != Outcome.MISSING
-        same = again.x.flatten(1).isfinite() == present[lost]
+        same = again.x.flatten(1).isfinite() == present[a, i]
         return not bool(same[known].all())
 
-    def _probe(self, num: int = 16) -> bool:
+    def _probe(self, probed: Tensor, num: int = 16) -> bool:
         """Look at a few rows: is there noise, and is the declared mean reproducible."""
         with forked_generators(self.seed, "probe"):
             theta = self.belief.sample((num,))
-        action = self.action[torch.arange(num) % len(self.action)]
+        rows = theta, probed[torch.arange(num) % len(probed)]
 
         def run(simulator: Callable[..., Any], key: str) -> Tensor:
-            seed = derive_seed(self.seed, "probe", key)
-            return self._simulate(simulator, (theta, action), seed).x
+            return self._simulate(simulator, rows, "probe", key).x
 
         x = run(self.simulator, "first")
         self._num_numbers = x[0].numel()
@@ -206,11 +196,16 @@ class CandidateSampler:
         return bool((reproducible[reproducible.isfinite()] == 1).all())
 
     def _simulate(
-        self, simulator: Callable[..., Any], rows: tuple[Tensor, Tensor], seed: int
+        self, simulator: Callable[..., Any], rows: tuple[Tensor, Tensor], *key: Any
     ) -> Simulations:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MissingRowsWarning)  # they are counted
+            seed = derive_seed(self.seed, *key)
             return simulate(simulator, *rows, seed=seed, workers=self.workers)
+
+    def _count(self, drawn: Simulations) -> None:
+        self.num_drawn += len(drawn)
+        self.num_missing += drawn.counts["missing"]
 
 
 @dataclass(frozen=True)
@@ -222,11 +217,6 @@ class _Reproducible:
     def __call__(self, theta: Tensor, action: Tensor) -> Tensor:
         same = self.model.is_deterministic(theta, action)
         return torch.full((len(theta), 1), float(same))
-
-
-def _rows(theta: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-    """Return parameters and actions of every row, action by action."""
-    return theta.repeat(len(action), 1), action.repeat_interleave(len(theta), 0)
 
 
 def _if_any(missing: Tensor) -> Tensor | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -12,7 +13,7 @@ from typing_extensions import override
 
 from sbi_active.actions import ActionSpace
 from sbi_active.design.coordinates import Coordinates
-from sbi_active.expected import Shown
+from sbi_active.expected import Shown, require_least
 from sbi_active.inference.sampling.adam import Adam
 from sbi_active.inference.sampling.gaussian_process import GaussianProcess
 from sbi_active.seeding import derive_seed
@@ -38,17 +39,13 @@ class Evaluations:
 
     def join(self, other: Evaluations) -> Evaluations:
         """Return these and others."""
-        return Evaluations(
-            *(torch.cat([a, b]) for a, b in zip(self._all(), other._all(), strict=True))
-        )
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Evaluations(*(torch.cat(pair) for pair in pairs))
 
     def known(self) -> Evaluations:
         """Return the evaluations that are numbers."""
         keep = self.utility.isfinite() & self.standard_error.isfinite()
-        return Evaluations(*(part[keep] for part in self._all()))
-
-    def _all(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        return self.action, self.utility, self.standard_error, self.probability_valid
+        return Evaluations(*(part[keep] for part in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -74,6 +71,15 @@ class Objective:
     seed: int
     min_probability_valid: float = 0.0
     known: Evaluations | None = None
+
+    @cached_property
+    def space(self) -> Coordinates:
+        """Actions as points of a unit cube and categories."""
+        return Coordinates(self.actions)
+
+    def allows(self, point: Tensor) -> Tensor:
+        """Return a mask of permitted points (n, dim), shape (n,), bool."""
+        return self.permitted(self.space.actions(point))
 
 
 class Search(Shown, ABC):
@@ -186,12 +192,8 @@ class GradientSearch(Search):
     each: int = 4
 
     def __post_init__(self) -> None:
-        counts = self.num_rounds, self.num_finalists, self.num_starts
-        if min(counts) < 1:
-            raise ValueError(
-                "expected num_rounds, num_finalists and num_starts >= 1; got "
-                f"{counts}; use about 6, 5 and 64"
-            )
+        least = {"num_rounds": 1, "num_finalists": 1, "num_starts": 1}
+        require_least(self, "use about 6, 5 and 64 of them", **least)
 
     @override
     def size(self, actions: ActionSpace) -> int:
@@ -217,10 +219,10 @@ class GradientSearch(Search):
 
     @override
     def finalists(self, objective: Objective) -> Tensor:
-        space = Coordinates(objective.actions)
+        space = objective.space
         found, left = objective.known, objective.num_evaluations
         if found is None:
-            first = self._permitted(objective, space, -(-left // 2), "first")
+            first = self._spread(objective, -(-left // 2), "first")
             found = objective.evaluate(space.actions(first))
             left -= len(first)
         for r in range(self.num_rounds if left > 0 else 0):
@@ -229,30 +231,25 @@ class GradientSearch(Search):
                 continue
             left -= num
             point, score, utility = self._ascended(
-                objective, space, found.known(), self.optimism, f"round {r}"
+                objective, found.known(), f"round {r}", self.optimism
             )
-            with torch.no_grad():
-                covariance = utility.covariance(point)
-            best = self._batch(point, score, covariance, num, space)
+            best = self._chosen(space, point, score, utility.covariance(point), num)
             if len(best) == 0:
                 break
             found = found.join(objective.evaluate(space.actions(point[best])))
-        point, score, _ = self._ascended(
-            objective, space, found.known(), 0.0, "finalists"
-        )
-        best = space.spaced(point, score, self.num_finalists, self.apart)
+        point, score, _ = self._ascended(objective, found.known(), "finalists", 0.0)
+        none = torch.zeros(len(point), len(point)).double()
+        best = self._chosen(space, point, score, none, self.num_finalists)
         return space.actions(point[best])
 
-    def _permitted(
-        self, objective: Objective, space: Coordinates, num: int, key: str
-    ) -> Tensor:
+    def _spread(self, objective: Objective, num: int, key: str) -> Tensor:
         """Return permitted points that fill the space, shape (num, dim)."""
         seed = derive_seed(objective.seed, key)
-        point = space.spread(num, seed)
-        if bool(objective.permitted(space.actions(point)).all()):
+        point = objective.space.spread(num, seed)
+        if bool(objective.allows(point).all()):
             return point
-        drawn = space.spread(32 * num, seed)
-        point = drawn[objective.permitted(space.actions(drawn))]
+        drawn = objective.space.spread(32 * num, seed)
+        point = drawn[objective.allows(drawn)]
         if len(point) < min(num, self.fewest):
             raise ValueError(
                 f"expected a constraint that permits a part of {objective.actions!r}; "
@@ -262,53 +259,43 @@ class GradientSearch(Search):
         return point[:num]
 
     def _ascended(
-        self,
-        objective: Objective,
-        space: Coordinates,
-        found: Evaluations,
-        optimism: float,
-        key: str,
+        self, objective: Objective, found: Evaluations, key: str, optimism: float
     ) -> tuple[Tensor, Tensor, GaussianProcess]:
         """Return permitted points (s, dim), where ascents started and ended.
 
         Beside them are their scores (s,), and the regression of the utility.
         """
-        score, utility = _score(objective, space, found, optimism)
-        start = self._permitted(objective, space, self.num_starts, key)
-        known = space.points(found.action)
-        start = torch.cat([start, known[objective.permitted(found.action)]])
+        score, utility = _score(objective, found, optimism)
+        known = objective.space.points(found.action)
+        known = known[objective.permitted(found.action)]
+        start = torch.cat([self._spread(objective, self.num_starts, key), known])
         with torch.enable_grad():
-            end = ascend(
-                score,
-                start,
-                num_continuous=space.num_continuous,
-                permitted=lambda z: objective.permitted(space.actions(z)),
-                repulsion=0.3 * float(found.utility.std()),
-            )
+            end = ascend(score, start, objective, 0.3 * float(found.utility.std()))
         point = torch.cat([end, start])  # an ascent may end lower than it started
         with torch.no_grad():
             return point, score(point), utility
 
-    def _batch(
+    def _chosen(
         self,
+        space: Coordinates,
         point: Tensor,
         score: Tensor,
         covariance: Tensor,
         num: int,
-        space: Coordinates,
     ) -> Tensor:
-        """Return the points of a round, one after the other.
+        """Return indices of the best points, one after the other, none close to others.
 
         Each is chosen as if those before had been evaluated: what it may hope for falls
         with the variance that they leave (GP-BUCB). An evaluation beside another, on
         common random numbers, tells nothing new. Of points (m, dim) with scores (m,)
-        that hold what may be hoped for, and the regression's covariance (m, m).
+        that hold what may be hoped for, and the regression's covariance (m, m), zero
+        where nothing is hoped for.
         """
 
         def hope() -> Tensor:
             return self.optimism * covariance.diagonal().clamp_min(0.0).sqrt()
 
-        least = 1e-6 * float(covariance.diagonal().amax())
+        least = 1e-6 * float(covariance.diagonal().amax()) or 1.0
         mean = score - hope()
         taken = torch.zeros(len(point)).bool()
         chosen: list[int] = []
@@ -324,10 +311,9 @@ class GradientSearch(Search):
 def ascend(
     score: Score,
     start: Tensor,
-    *,
-    num_continuous: int,
-    permitted: Callable[[Tensor], Tensor],
+    objective: Objective,
     repulsion: float,
+    *,
     num_steps: int = 50,
     step: float = 0.03,
     reach: float = 0.1,
@@ -338,15 +324,13 @@ def ascend(
         score: Score of points (s, dim), differentiable in the first entries, shape
             (s,).
         start: Starts, shape (s, dim).
-        num_continuous: Entries that move, in a unit cube.
-        permitted: Function of points (s, dim) that says which are permitted, shape
-            (s,), bool.
+        objective: Objective that says which points are permitted.
         repulsion: The penalty on two points that coincide, in units of the score.
         num_steps: Number of steps.
         step: Length of the first steps.
         reach: Distance at which the penalty has fallen to .6.
     """
-    c = num_continuous
+    c = objective.space.num_continuous
     fixed = start[:, c:]
     other = (fixed[:, None] != fixed[None]).any(-1) | torch.eye(len(start)).bool()
     u = start[:, :c].clone().requires_grad_(True)
@@ -362,38 +346,47 @@ def ascend(
         optimizer.step()
         with torch.no_grad():
             u.clamp_(0, 1)
-            inside = permitted(torch.cat([u, fixed], 1))
+            inside = objective.allows(torch.cat([u, fixed], 1))
             u.copy_(torch.where(inside[:, None], u, before))
         optimizer.rate = step * (0.1 + 0.9 * left)
     return torch.cat([u.detach(), fixed], 1)
 
 
+def presence(
+    space: Coordinates, found: Evaluations, num: Tensor | float
+) -> GaussianProcess | None:
+    """Return a regression of the probability of a measurement; None where it is 1.
+
+    Args:
+        space: Space of the actions.
+        found: Evaluations with shares of measurements.
+        num: Number of simulations behind each share.
+    """
+    share = found.probability_valid.double()
+    if bool((share == 1).all()):
+        return None
+    error = (share * (1 - share) / num + 1e-4).sqrt()
+    return space.regression(space.points(found.action), share, error)
+
+
 def _score(
-    objective: Objective,
-    space: Coordinates,
-    found: Evaluations,
-    optimism: float,
-    *,
-    penalty: float = 10.0,
+    objective: Objective, found: Evaluations, optimism: float, *, penalty: float = 10.0
 ) -> tuple[Score, GaussianProcess]:
     """Return the score to ascend, and the regression of the utility in it.
 
     The penalty is on a measurement that is too improbable, a unit of probability.
     """
+    space, least = objective.space, objective.min_probability_valid
     point = space.points(found.action)
     utility = space.regression(point, found.utility, found.standard_error)
-    least, share = objective.min_probability_valid, found.probability_valid.double()
-    presence = None
-    if least > 0 and bool((share < 1).any()):
-        error = (share * (1 - share) / 100 + 1e-4).sqrt()
-        presence = space.regression(point, share, error)
+    valid = presence(space, found, 100) if least > 0 else None
 
     def score(z: Tensor) -> Tensor:
         mean, variance = utility(z)
         height = (mean + optimism * variance.sqrt())[:, 0]
-        if presence is None:
+        if valid is None:
             return height
-        lacking = (least - presence(z)[0][:, 0]).clamp_min(0.0)
+        lacking = (least - valid(z)[0][:, 0]).clamp_min(0.0)
         return height - penalty * utility.scale[0] * lacking
 
     return score, utility

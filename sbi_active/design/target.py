@@ -10,7 +10,12 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.design.estimators.automatic import find_estimator
+from sbi_active.design.estimators.base import InformationGainEstimator
+from sbi_active.design.estimators.linear import LinearGain
+from sbi_active.design.estimators.posterior import ParameterGain
 from sbi_active.seeding import forked_generators
+from sbi_active.simulation import Simulations
 
 #: "theta", "model", names of parameters, or a function of parameters (n, theta_dim).
 Target = str | Sequence[str] | Callable[..., Tensor]
@@ -21,6 +26,90 @@ def name_of(target: Target) -> str:
     if callable(target):
         return getattr(target, "__name__", type(target).__name__)
     return target if isinstance(target, str) else ", ".join(target)
+
+
+def target_estimator(
+    target: Target,
+    given: str | InformationGainEstimator,
+    model: Any,
+    simulator: Any,
+    belief: Distribution | None,
+    simulations: Simulations | None,
+    num_others: int,
+) -> InformationGainEstimator | None:
+    """Return the estimator; None where simulations or rivals are to decide.
+
+    Args:
+        target: Target of the design.
+        given: Estimator as the designer was given it, or its name.
+        model: Model that it may need.
+        simulator: Simulator of the parameters.
+        belief: Distribution of the parameters.
+        simulations: Rows at hand; None simulates.
+        num_others: Number of actions whose outcomes will be known as well.
+
+    Raises:
+        ValueError: If what the target or the estimator needs is lacking.
+    """
+    own = ("auto",) if target == "model" else ("auto", "linear")
+    if target != "theta" and given not in own:
+        raise ValueError(
+            f"expected estimator={' or '.join(map(repr, own))} for "
+            f"target={name_of(target)!r}; got {given!r}; leave out estimator="
+        )
+    if target == "model":
+        if not isinstance(model, Sequence) or simulations is not None:
+            got = type(model).__name__ if simulations is None else "given simulations"
+            raise ValueError(
+                f"expected a sequence of rivals for target='model'; got {got}; pass "
+                "objects with probability and predict(action, num_samples, seed)"
+            )
+        if num_others:
+            raise ValueError(
+                "expected one action at a time and none pending for "
+                f"target='model'; got {num_others} others; ask for them in turn"
+            )
+        return None
+    if simulator is None and simulations is None:
+        raise ValueError(
+            "expected a simulator; got None; pass the one that the belief's "
+            "parameters belong to"
+        )
+    if belief is None:
+        raise ValueError(
+            "expected belief=, the distribution of the parameters; got none, and "
+            "the model has none; pass the belief of this round"
+        )
+    if simulations is not None and num_others:
+        raise ValueError(
+            "expected one action and none pending with simulations=, rows of single "
+            f"outcomes; got {num_others} others; leave out simulations="
+        )
+    if target != "theta":
+        is_linear = given == "linear"
+        if not callable(target):
+            index = places(target, simulator)
+            return LinearGain(index) if is_linear else ParameterGain(index)
+        quantity = Quantity(target, simulator, belief)
+        if is_linear:
+            return LinearGain(quantity)
+        return ParameterGain(quantity, num_marginal=quantity.num_draws)
+    estimator = find_estimator(given)
+    if estimator is None or not estimator.needs_model:
+        return estimator
+    if model is None:
+        raise ValueError(
+            f"expected a model for {type(estimator).__name__}; got None; pass "
+            "the trained posterior, or estimator='auto'"
+        )
+    if num_others and not hasattr(model, "log_likelihood"):
+        raise ValueError(
+            "expected an estimator of the joint information of several actions, by the "
+            f"noise or by a model with log_likelihood; got {type(estimator).__name__} "
+            f"on {type(model).__name__}, which knows single outcomes; use "
+            "estimator='auto', or one action at a time without pending ones"
+        )
+    return estimator
 
 
 def places(names: str | Sequence[str], simulator: Any) -> list[int]:

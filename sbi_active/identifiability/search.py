@@ -205,12 +205,11 @@ def _best_formula(
 
 def _forms(subset: tuple[int, ...], low: Array) -> Iterator[list[Term]]:
     """Sums and products; of pairs also products with an exponential."""
-    mixed = len(subset) == 2
     for logs in itertools.product((False, True), repeat=len(subset)):
-        if (len({*logs}) > 1 and not mixed) or (logs[0] and low[subset[0]] <= 0):
-            continue
-        if all(low[i] > 0 or not log for i, log in zip(subset, logs, strict=True)):
-            yield [Term(i, log=log) for i, log in zip(subset, logs, strict=True)]
+        terms = [Term(i, log=log) for i, log in zip(subset, logs, strict=True)]
+        is_one_kind = len(subset) == 2 or len({*logs}) == 1
+        if is_one_kind and all(low[t.index] > 0 or not t.log for t in terms):
+            yield terms
 
 
 def _least_shifted(
@@ -346,17 +345,11 @@ def rounded(
             if width(tried, covariance, prior) <= limit:
                 break
         weight = tried
-    halves = 2 * weight
-    if (
-        all(t.log for t in terms)
-        and (halves % 1 == 0).all()
-        and (weight % 1 != 0).any()
-    ):
-        weight = halves  # a^2 * b rather than a * b^0.5
-    kept = [
-        replace(t, weight=float(w)) for t, w in zip(terms, weight, strict=True) if w
-    ]
-    return Combination(tuple(kept))
+    has_halves = (2 * weight % 1 == 0).all() and (weight % 1 != 0).any()
+    if has_halves and all(t.log for t in terms):
+        weight = 2 * weight  # a^2 * b rather than a * b^0.5
+    pairs = zip(terms, weight, strict=True)
+    return Combination(tuple(replace(t, weight=float(w)) for t, w in pairs if w))
 
 
 def roundings(value: float) -> Iterator[float]:

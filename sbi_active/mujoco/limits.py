@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -15,11 +16,7 @@ from sbi_active.arrays import Array
 from sbi_active.mujoco.models.machine import Machine
 from sbi_active.mujoco.models.names import names_of, require_name, scalar_joints
 from sbi_active.mujoco.robot import Robot
-from sbi_active.mujoco.sensors import (
-    ActuatorSensor,
-    JointSensor,
-    channels_of,
-)
+from sbi_active.mujoco.sensors import AddedSensor, channels_of
 from sbi_active.mujoco.simulator import MujocoFunction
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import SimulatorModel
@@ -88,18 +85,16 @@ class MotionLimits:
         model = function.model
         if position is None:
             position = _ranges(model, "joint", model.jnt_limited, model.jnt_range)
-        if torque is None:
+        forces: Mapping[str, Any] | None = torque
+        if forces is None:
             own = model.actuator_forcelimited, model.actuator_forcerange
-            forces: Mapping[str, Any] = _ranges(model, "actuator", *own)
-        else:
-            forces = torque
-        joints = scalar_joints(model)
-        actuators = names_of(model, "actuator")
+            forces = _ranges(model, "actuator", *own)
+        joints, actuators = scalar_joints(model), names_of(model, "actuator")
         #: Sensor to add, label, lowest and highest value.
         watched = [
-            *_watched(position, joints, "", "joint"),
-            *_watched(velocity or {}, joints, " velocity", "joint"),
-            *_watched(forces, actuators, " torque", "actuator"),
+            *_watched(position, joints, "", "position"),
+            *_watched(velocity or {}, joints, " velocity", "velocity"),
+            *_watched(forces, actuators, " torque", "force"),
         ]
         if not watched:
             raise ValueError(
@@ -171,25 +166,22 @@ def _ranges(
 
 
 def _watched(
-    limits: Mapping[str, Any], known: list[str], what: str, kind: str
-) -> list[tuple[Any, str, float, float]]:
+    limits: Mapping[str, Any], known: list[str], ending: str, what: Any
+) -> list[tuple[AddedSensor, str, float, float]]:
     """Return the sensor, the label and the limits of each."""
     found = []
     for name, limit in limits.items():
-        require_name(name, known, kind)
+        require_name(name, known, "actuator" if what == "force" else "joint")
+        label = name + ending
         low, high = limit if np.ndim(limit) else (-limit, limit)
         if not low < high or math.isinf(low) and math.isinf(high):
             raise ValueError(
-                f"expected limits of {name}{what} that leave room; got {limit}; pass "
+                f"expected limits of {label} that leave room; got {limit}; pass "
                 "(low, high), or one positive number for both sides"
             )
-        label = name + what
-        sensor = f"limit of {label}"  # beside one that the MJCF may have
-        if kind == "actuator":
-            edit: Any = ActuatorSensor(sensor, name)
-        else:
-            edit = JointSensor(sensor, name, is_speed=bool(what))
-        found.append((edit, label, float(low), float(high)))
+        # beside one that the MJCF may have
+        sensor = AddedSensor(f"limit of {label}", name, what)
+        found.append((sensor, label, float(low), float(high)))
     return found
 
 
@@ -200,15 +192,9 @@ def _with_sensors(simulator: SimulatorModel, edits: list[Any]) -> SimulatorModel
         Machine(m.source.edited(*edits), m.parameters, edit=m.edit)
         for m in function.machines
     ]
-    names = [edit.name for edit in edits]
-    own = MujocoFunction(
-        machines,
-        channels_of(machines[0].model, names),
-        roles=function.roles,
-        start=function.start,
-        threads=function.threads,
-        recorded=function.recorded,
-    )
+    own = copy.copy(function)
+    own.machines, own.readout, own.times = tuple(machines), None, None
+    own.channels = channels_of(own.model, [edit.name for edit in edits])
     return SimulatorModel(own, inputs=simulator.inputs)
 
 

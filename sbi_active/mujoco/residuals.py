@@ -23,21 +23,12 @@ def free_parameters(params: Any) -> tuple[Bounded, ...]:
         ValueError: If there is none, or bounds are not finite and in order.
     """
     names = params.get_non_frozen_parameter_names()
-    low, high = params.get_bounds()
     if not names:
         raise ValueError(
             "expected a parameter that is not frozen; got none; free the unknown ones"
         )
-    for name, a, b in zip(names, low, high, strict=True):
-        if not (np.isfinite([a, b]).all() and a < b):
-            raise ValueError(
-                f"expected finite bounds min_value < max_value of {name!r}; got {a:g} "
-                f"and {b:g}; correct them, or freeze the parameter"
-            )
-    return tuple(
-        Bounded(name, float(a), float(b))
-        for name, a, b in zip(names, low, high, strict=True)
-    )
+    each = zip(names, *params.get_bounds(), strict=True)
+    return tuple(Bounded(name, float(low), float(high)) for name, low, high in each)
 
 
 def from_residuals(residual_fn: Any, params: Any, *, noise: Any) -> Robot:

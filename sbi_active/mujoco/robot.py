@@ -15,7 +15,6 @@ from sbi_active.actions import ActionSpace, MixedActions
 from sbi_active.actions.signals import SignalActions
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.expected import suggests
-from sbi_active.mujoco.idle import warn_of_idle
 from sbi_active.mujoco.models.machine import Machine
 from sbi_active.mujoco.models.names import (
     element_id,
@@ -31,6 +30,7 @@ from sbi_active.mujoco.models.spec import Source
 from sbi_active.mujoco.recordings import require_in_range, trials_of
 from sbi_active.mujoco.sensors import added_sensors, channels_of
 from sbi_active.mujoco.simulator import MODEL, MujocoFunction
+from sbi_active.mujoco.typical import warn_of_idle
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.noise.base import NoiseModel
 
@@ -143,9 +143,7 @@ def from_mjcf(
     sources = [_read(given, sensors) for given in every]
     declared = bounded(sources[0].compile(), parameters)
     machines = [Machine(source, declared) for source in sources]
-    require_alike(machines)
-    for each in machines:
-        each.require_inertia()
+    require_usable(machines)
     machine = machines[0]
     channels = channels_of(machine.model, sensors)
     space, driven = _inputs(machine.model, inputs)
@@ -168,15 +166,39 @@ def from_mjcf(
         start=_start(machine.model, start),
         threads=threads,
     )
+    inputs = None if space is None else actions  # pyright: ignore[reportAssignmentType]
+    errors = _noise(machine.model, channels, noise)
+    return robot_of(function, errors, inputs, actions, trials)
+
+
+def robot_of(
+    function: MujocoFunction,
+    noise: Any,
+    inputs: Any,
+    actions: ActionSpace | None,
+    trials: Trials | None,
+) -> Robot:
+    """Return the robot of a function, a prior of its parameters beside it.
+
+    Args:
+        function: Function that runs MuJoCo.
+        noise: Noise of the sensors, as ``SimulatorModel`` takes it.
+        inputs: Space of signals that actions play; None for none.
+        actions: Actions that the robot may take.
+        trials: Recorded trials.
+    """
+    parameters, times = function.machines[0].parameters, function.times
     simulator = SimulatorModel(
         function,
-        noise=_noise(machine.model, channels, noise),
-        parameter_names=[p.name for p in declared],
-        channel_names=[_labeled(c) for c in channels],
-        sample_times=None if grid is None else torch.from_numpy(grid),
-        inputs=None if space is None else actions,  # pyright: ignore[reportArgumentType]
+        noise=noise,
+        parameter_names=[p.name for p in parameters],
+        channel_names=[
+            f"{c.name} [{c.unit}]" if c.unit else c.name for c in function.channels
+        ],
+        sample_times=None if times is None else torch.from_numpy(times),
+        inputs=inputs,
     )
-    prior = named_box(declared)
+    prior = named_box(parameters)
     warn_of_idle(simulator, prior, actions, trials)
     return Robot(simulator, prior, actions, trials)
 
@@ -186,8 +208,8 @@ def _read(given: Any, sensors: Sequence[str] | None) -> Source:
     return added_sensors(source, source.compile(), sensors)
 
 
-def require_alike(machines: Sequence[Machine]) -> None:
-    """Raise if models differ in what trials say of them by name."""
+def require_usable(machines: Sequence[Machine]) -> None:
+    """Raise if models differ in what trials say of them by name, or lack inertia."""
     for kind in ("joint", "actuator", "sensor"):
         names = [names_of(machine.model, kind) for machine in machines]
         for k, own in enumerate(names):
@@ -196,6 +218,8 @@ def require_alike(machines: Sequence[Machine]) -> None:
                     f"expected models with the same {kind}s; got {', '.join(own)} in "
                     f"model {k} beside {', '.join(names[0])}; name them alike"
                 )
+    for machine in machines:
+        machine.require_inertia()
 
 
 def from_spec(spec_or_path: Any) -> SimulatorModel:
@@ -207,10 +231,6 @@ def from_spec(spec_or_path: Any) -> SimulatorModel:
     machine = Machine(source, ())
     channels = channels_of(machine.model, sensors)
     return SimulatorModel(MujocoFunction([machine], channels))
-
-
-def _labeled(channel: Any) -> str:
-    return f"{channel.name} [{channel.unit}]" if channel.unit else channel.name
 
 
 def _inputs(model: Any, inputs: Any) -> tuple[SignalActions | None, list[str]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from sbi_active.mujoco.models.names import names_of, require_name, scalar_joints
 from sbi_active.mujoco.models.quantities import units_of
@@ -15,42 +15,28 @@ VELOCITY = " velocity"
 
 
 @dataclass(frozen=True)
-class JointSensor:
-    """Adds a sensor of a joint's position or velocity."""
+class AddedSensor:
+    """Adds a sensor of a joint's position or velocity, or of an actuator's force.
+
+    Attributes:
+        name: Name of the sensor.
+        owner: Name of the joint or the actuator.
+        what: Quantity that it reads.
+    """
 
     name: str
-    joint: str
-    is_speed: bool
+    owner: str
+    what: Literal["position", "velocity", "force"]
 
     def __call__(self, spec: Any) -> None:
         """Add it to a spec."""
-        mujoco = mujoco_of()
-        kinds = mujoco.mjtSensor
-        is_speed = self.is_speed
-        spec.add_sensor(
-            name=self.name,
-            type=kinds.mjSENS_JOINTVEL if is_speed else kinds.mjSENS_JOINTPOS,
-            objtype=mujoco.mjtObj.mjOBJ_JOINT,
-            objname=self.joint,
-        )
-
-
-@dataclass(frozen=True)
-class ActuatorSensor:
-    """Adds a sensor of an actuator's force or torque."""
-
-    name: str
-    actuator: str
-
-    def __call__(self, spec: Any) -> None:
-        """Add it to a spec."""
-        mujoco = mujoco_of()
-        spec.add_sensor(
-            name=self.name,
-            type=mujoco.mjtSensor.mjSENS_ACTUATORFRC,
-            objtype=mujoco.mjtObj.mjOBJ_ACTUATOR,
-            objname=self.actuator,
-        )
+        kinds, objects = mujoco_of().mjtSensor, mujoco_of().mjtObj
+        kind, owner = {
+            "position": (kinds.mjSENS_JOINTPOS, objects.mjOBJ_JOINT),
+            "velocity": (kinds.mjSENS_JOINTVEL, objects.mjOBJ_JOINT),
+            "force": (kinds.mjSENS_ACTUATORFRC, objects.mjOBJ_ACTUATOR),
+        }[self.what]
+        spec.add_sensor(name=self.name, type=kind, objtype=owner, objname=self.owner)
 
 
 def added_sensors(source: Source, model: Any, sensors: Sequence[str] | None) -> Source:
@@ -82,9 +68,8 @@ def added_sensors(source: Source, model: Any, sensors: Sequence[str] | None) -> 
     for name in sensors:
         require_name(name, known, "sensor or joint")
         if name not in own:
-            edits.append(
-                JointSensor(name, name.removesuffix(VELOCITY), name.endswith(VELOCITY))
-            )
+            what = "velocity" if name.endswith(VELOCITY) else "position"
+            edits.append(AddedSensor(name, name.removesuffix(VELOCITY), what))
     return source.edited(*edits)
 
 

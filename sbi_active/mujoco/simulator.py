@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sbi_active.arrays import Array
-from sbi_active.mujoco.models.changes import StateChange, require_changes
+from sbi_active.mujoco.models.changes import require_changes
 from sbi_active.mujoco.models.machine import Machine, Model, Rows
 from sbi_active.mujoco.models.names import (
     held_places,
@@ -166,25 +166,11 @@ class MujocoFunction:
         changes = require_changes("model", model)
         forces = require_changes("force", force)
         begin = 0.0 if grid is None else float(grid[0])
-        is_stepped = bool(forces) or any(isinstance(c, StateChange) for c in changes)
-        for k, own in _alike(which, wanted - begin, FEWEST[is_stepped]):
-            machine = self.machines[k]
-            rows = Rows(
-                _array(theta)[own],
-                {c: phi[own] for c, phi in changes.items()},
-                {f: phi[own] for f, phi in forces.items()},
-                {name: value[own] for name, value in starts.items()},
-                np.empty((len(own), 0)),
-            )
-            found[own] = self._run(
-                machine,
-                rows,
-                {name: u[own] for name, u in series.items()},
-                grid,
-                actions[own],
-                wanted[own],
-                watch,
-            )
+        rows = Rows(_array(theta), changes, forces, starts, np.empty((num, 0)))
+        for k, own in _alike(which, wanted - begin, FEWEST[rows.is_stepped]):
+            played = {name: u[own] for name, u in series.items()}
+            about = rows.at(own), played, grid, wanted[own], watch
+            found[own] = self._run(self.machines[k], *about)
         x = torch.from_numpy(found[..., 0] if len(self.channels) == 1 else found)
         return x.to(theta.dtype)
 
@@ -194,7 +180,6 @@ class MujocoFunction:
         rows: Rows,
         series: dict[str, Array],
         grid: Array | None,
-        actions: Array,
         times: Array,
         watch: Watch | None,
     ) -> Array:

@@ -23,17 +23,16 @@ from sbi_active.actions.waveforms import Recorded
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.expected import suggests
-from sbi_active.mujoco.idle import warn_of_idle
 from sbi_active.mujoco.models.machine import Machine
-from sbi_active.mujoco.models.names import names_of, start_places
+from sbi_active.mujoco.models.names import names_of, scalar_joints, start_places
 from sbi_active.mujoco.models.spec import Source
 from sbi_active.mujoco.recordings import require_in_range
 from sbi_active.mujoco.residuals import free_parameters, from_residuals
-from sbi_active.mujoco.robot import Robot, named_box, require_alike
-from sbi_active.mujoco.sensors import JointSensor
+from sbi_active.mujoco.robot import Robot, require_usable, robot_of
+from sbi_active.mujoco.sensors import AddedSensor, channels_of
 from sbi_active.mujoco.simulator import MODEL, RECORDING, Channel, MujocoFunction
 from sbi_active.mujoco.transforms import Signal, SignalReadout
-from sbi_active.simulation import AutocorrelatedNoise, SimulatorModel
+from sbi_active.simulation import AutocorrelatedNoise
 from sbi_active.simulation.noise.base import NoiseModel
 
 #: Unknown errors, from this share of a signal's deviation up to all of it, lasting from
@@ -89,49 +88,35 @@ def from_sysid(
     for group in groups:
         source, channels = _readable(Source(group.spec), signals)
         machines.append(Machine(source, declared, edit=edit))
-    require_alike(machines)
-    for machine in machines:
-        machine.require_inertia()
+    require_usable(machines)
     step = float(machines[0].model.opt.timestep)
-    is_sensor = [s.kind == "MjSensor" for s in signals for _ in range(s.width)]
-    readout = SignalReadout.of(transform, params, signals, np.array(is_sensor) * step)
-    kept = [k for k, c in enumerate(channels) if readout.keeps(c.name)]
-    channels = tuple(channels[k] for k in kept)
-    readout = readout.only(kept)
+    read = [s for s in signals for _ in range(s.width)]
+    enabled = None if transform is None else transform._enabled_sensors
+    kept = [k for k, s in enumerate(read) if enabled is None or s.name in enabled]
+    channels, read = [channels[k] for k in kept], [read[k] for k in kept]
+    stamp = step * np.array([s.kind == "MjSensor" for s in read])
+    readout = SignalReadout.of(transform, params, [s.name for s in read], stamp)
     sequences = [
         _Sequence.of(k, group, i, signals, step, readout, kept, machines[k].model)
         for k, group in enumerate(groups)
         for i in range(len(group.control))
     ]
     trials = _trials(sequences, channels)
-    recorded = [(s.model, s.start) for s in sequences]
-    roles: tuple[str, ...] = (RECORDING,)
-    if actions is None:
-        space: ActionSpace = _recorded(trials)
-    else:
-        space, roles = actions, tuple(actions.names)
+    space = _recorded(trials) if actions is None else actions
     times = trials.sample_times
-    grid = times if times is not None and times.ndim == 1 else None
+    grid = times.numpy() if times is not None and times.ndim == 1 else None
     function = MujocoFunction(
         machines,
         channels,
-        roles=roles,
-        times=None if grid is None else grid.numpy(),
+        roles=(RECORDING,) if actions is None else tuple(actions.names),
+        times=grid,
         threads=threads,
         readout=readout,
-        recorded=recorded,
+        recorded=[(s.model, s.start) for s in sequences],
     )
-    simulator = SimulatorModel(
-        function,
-        noise=_noise(trials) if noise is None else noise,
-        parameter_names=[p.name for p in declared],
-        channel_names=[c.name for c in channels],
-        sample_times=grid,
-        inputs=space if isinstance(space, SignalActions) else None,
-    )
-    prior = named_box(declared)
-    warn_of_idle(simulator, prior, space, trials)
-    return Robot(simulator, prior, space, trials)
+    noise = _noise(trials) if noise is None else noise
+    inputs = space if isinstance(space, SignalActions) else None
+    return robot_of(function, noise, inputs, space, trials)
 
 
 @dataclass
@@ -184,36 +169,36 @@ def _groups(given: Any) -> list[Any]:
 
 def _signals(groups: Sequence[Any]) -> list[Signal]:
     """Return the signals that all sequences have."""
-    found: list[Signal] | None = None
+    found: list[Signal] = []
     for group in groups:
         for series in group.sensordata:
-            mapping = series.signal_mapping
-            if mapping is None:
-                mapping = type(series).compute_all_sensor_mapping(group.gt_model)
             own = [
                 Signal(name, kind.name, len(np.atleast_1d(places)))
-                for name, (kind, places) in mapping.items()
+                for name, (kind, places) in _mapping(series, group).items()
             ]
-            if found is not None and own != found:
+            if found and own != found:
                 raise ValueError(
                     f"expected the same signals in all sequences; got "
                     f"{[s.name for s in own]} in {group.name!r} beside "
                     f"{[s.name for s in found]}; slice them by name"
                 )
             found = own
-    assert found is not None
     return found
+
+
+def _mapping(series: Any, group: Any) -> Any:
+    """Return kind and columns of each signal of a time series, by name."""
+    if series.signal_mapping is not None:
+        return series.signal_mapping
+    return type(series).compute_all_sensor_mapping(group.gt_model)
 
 
 def _readable(
     source: Source, signals: Sequence[Signal]
 ) -> tuple[Source, tuple[Channel, ...]]:
     """Return a source with a sensor of every signal, and the channels."""
-    model = source.compile()
-    joints = {
-        n for n, place in start_places(model).items() if " " not in n and place >= 0
-    }
-    edits, reads = [], {}
+    joints = scalar_joints(source.compile())
+    edits, reads = [], []
     for signal in signals:
         if signal.kind in STATES:
             joint = signal.name.removesuffix(STATES[signal.kind])
@@ -222,25 +207,24 @@ def _readable(
                     f"expected the state of a hinge or slide; got {signal.name!r}; "
                     "pass sensors of other joints"
                 )
-            reads[signal.name] = f"state {signal.name}"
-            edits.append(JointSensor(reads[signal.name], joint, signal.kind == SPEED))
+            reads.append(f"state {signal.name}")
+            what = "velocity" if signal.kind == SPEED else "position"
+            edits.append(AddedSensor(reads[-1], joint, what))
         elif signal.kind == "MjSensor":
-            reads[signal.name] = signal.name
+            reads.append(signal.name)
         else:
             raise ValueError(
                 f"expected sensors, positions or velocities; got {signal.name!r} of "
                 f"type {signal.kind}; pass a residual_fn, which knows what it is"
             )
     source = source.edited(*edits)
-    model = source.compile()
-    own = names_of(model, "sensor")
-    channels = []
-    for signal in signals:
-        i = own.index(reads[signal.name])
-        for k in range(signal.width):
-            name = signal.name if signal.width == 1 else f"{signal.name}[{k}]"
-            channels.append(Channel(name, int(model.sensor_adr[i]) + k))
-    return source, tuple(channels)
+    names = (
+        s.name if s.width == 1 else f"{s.name}[{k}]"
+        for s in signals
+        for k in range(s.width)
+    )
+    pairs = zip(names, channels_of(source.compile(), reads), strict=True)
+    return source, tuple(Channel(name, c.place) for name, c in pairs)
 
 
 @dataclass
@@ -274,9 +258,7 @@ class _Sequence:
         end = begin + (len(control.times) - 1) * step
         series = group.sensordata[i]
         _require_finite(group.control[i].data, f"controls in {what}")
-        mapping = series.signal_mapping or type(series).compute_all_sensor_mapping(
-            group.gt_model
-        )
+        mapping = _mapping(series, group)
         columns = np.concatenate(
             [np.atleast_1d(mapping[s.name][1]).astype(int) for s in signals]
         )[list(kept)]

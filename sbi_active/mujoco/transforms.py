@@ -21,83 +21,55 @@ class Signal:
     width: int
 
 
-@dataclass
+@dataclass(frozen=True)
 class SignalReadout:
     """The action of a transform on predicted signals, by channel.
 
     Attributes:
-        names: Names of the channels' signals.
         stamp: Time by which a reading is stamped late, (c,), s.
         delays: Place in (theta, fixed values) of each channel's delay, -1 for none.
         scales: Pairs of a place and whether it divides, a list a channel.
-        shifts: Pairs of a place and a sign, those that are divided too, a list each.
+        shifts: Pairs of a place and whether it is subtracted, a list a channel.
         fixed: Values of frozen parameters.
         window: Lowest and highest delay.
-        enabled: Signals that are returned; None for all.
     """
 
-    names: list[str]
     stamp: Array
     delays: list[int]
     scales: list[list[tuple[int, bool]]]
     shifts: list[list[tuple[int, bool]]]
     fixed: Array
-    window: tuple[float, float]
-    enabled: list[str] | None
+    window: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def of(
-        cls, transform: Any, params: Any, signals: Sequence[Signal], stamp: Array
+        cls, transform: Any, params: Any, names: Sequence[str], stamp: Array
     ) -> SignalReadout:
-        """Return the readout of a ``SignalTransform``, or of none."""
-        names = [s.name for s in signals for _ in range(s.width)]
-        width = len(names)
-        found = cls(
-            names,
-            stamp,
-            [-1] * width,
-            [[] for _ in range(width)],
-            [[] for _ in range(width)],
-            np.zeros(0),
-            (0.0, 0.0),
-            None,
-        )
+        """Return the readout of a ``SignalTransform``, or of none.
+
+        Args:
+            transform: The transform, or None.
+            params: A ``ParameterDict``.
+            names: Name of each channel's signal.
+            stamp: Time by which a reading is stamped late, (c,), s.
+        """
+        delays = [-1 for _ in names]
+        scales, shifts = ([[] for _ in names] for _ in range(2))
         if transform is None:
-            return found
-        places, found.fixed = _places(params)
-        for pattern, parameter, _ in transform._delays:
-            for c, name in enumerate(names):
+            return cls(stamp, delays, scales, shifts, np.zeros(0))
+        places, fixed = _places(params)
+        for c, name in enumerate(names):
+            for pattern, parameter, _ in transform._delays:
                 if fnmatch(name, pattern):
-                    found.delays[c] = places[parameter][0]
-        for given, into in (
-            (transform._gains, found.scales),
-            (transform._biases, found.shifts),
-        ):
-            for pattern, parameter, target in given:
-                for c, name in enumerate(names):
+                    delays[c] = places[parameter]
+            given = (transform._gains, scales[c]), (transform._biases, shifts[c])
+            for every, into in given:
+                for pattern, parameter, target in every:
                     # What is done to both sides alike changes no comparison.
                     if fnmatch(name, pattern) and target != "both":
-                        into[c].append((places[parameter][0], target == "measured"))
-        found.window = transform._compute_delay_bounds()
-        found.enabled = transform._enabled_sensors
-        return found
-
-    def keeps(self, name: str) -> bool:
-        """Return whether a channel is returned."""
-        return self.enabled is None or name.partition("[")[0] in self.enabled
-
-    def only(self, kept: Sequence[int]) -> SignalReadout:
-        """Return the readout of some channels."""
-        return SignalReadout(
-            [self.names[k] for k in kept],
-            self.stamp[list(kept)],
-            [self.delays[k] for k in kept],
-            [self.scales[k] for k in kept],
-            [self.shifts[k] for k in kept],
-            self.fixed,
-            self.window,
-            self.enabled,
-        )
+                        into.append((places[parameter], target == "measured"))
+        window = transform._compute_delay_bounds()
+        return cls(stamp, delays, scales, shifts, fixed, window)
 
     def late(self, theta: Array) -> Array:
         """Return by how much each channel reads what was there before, (n, c), s."""
@@ -127,16 +99,16 @@ class SignalReadout:
         return np.concatenate([theta, np.repeat(self.fixed[None], len(theta), 0)], 1)
 
 
-def _places(params: Any) -> tuple[dict[str, list[int]], Array]:
-    """Return places of each parameter's entries in theta, frozen ones behind it."""
+def _places(params: Any) -> tuple[dict[str, int], Array]:
+    """Return the first place of each parameter in theta, frozen ones behind it."""
     places, free = {}, 0
     fixed: list[float] = []
     for name in params.keys():  # noqa: SIM118
         parameter = params[name]
         if parameter.frozen:
-            places[name] = [params.size + len(fixed) + k for k in range(parameter.size)]
+            places[name] = params.size + len(fixed)
             fixed += parameter.as_vector().tolist()
         else:
-            places[name] = [free + k for k in range(parameter.size)]
+            places[name] = free
             free += parameter.size
     return places, np.array(fixed)

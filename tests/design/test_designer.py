@@ -231,7 +231,7 @@ def test_errors():
     with pytest.raises(ValueError, match="got identical x from two seeds"):
         designer.select(ExactModel(), lambda t, a: t * a)
 
-    with pytest.raises(ValueError, match="'auto', 'contrastive', 'entropy', "):
+    with pytest.raises(ValueError, match="'auto', 'entropy', 'info_nce', "):
         InformationGainDesigner(ACTIONS, estimator="knn")
     with pytest.raises(ValueError, match="expected a budget >= 32"):
         designer.select(ExactModel(), simulator, budget=31)

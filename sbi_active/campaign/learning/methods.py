@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 from torch.distributions import Distribution
 
-from sbi_active.campaign.options import CampaignDetails, CampaignOptions
+from sbi_active.campaign.options import CampaignOptions
 from sbi_active.inference import (
     ALHI,
     ASBI,
@@ -26,14 +26,11 @@ class Method:
     Attributes:
         designs: Whether actions are chosen for information, or drawn at random.
         build: Function that makes the trainer of a prior and a campaign's options.
-        faithful: Options of the setting of the method's authors that differ from those
-            of :meth:`.CampaignOptions.faithful`.
         refines: Whether its beliefs are refined, where the options ask for it.
     """
 
     designs: bool
     build: Callable[[Distribution, CampaignOptions], ActiveInference]
-    faithful: dict[str, Any]
     refines: bool = False
 
     def enumerates(self, options: CampaignOptions) -> bool:
@@ -65,25 +62,13 @@ def _seqbed(prior: Distribution, options: CampaignOptions) -> ActiveInference:
     return _sampled(prior, options, SeqBED)
 
 
-_ALHI = {
-    "estimator": "likelihood",
-    "details": CampaignDetails(posterior="kde", eliminate=False),
-}
-#: Options for 52,000 simulations a round, as the others: LFIRE learns from those.
-_SEQBED = {
-    "estimator": "ratio",
-    "density_estimator": LFIRE(),
-    "num_simulations": 41_500,
-    "num_samples": 500,
-}
-
 #: Name of a method: what it is.
 METHODS = {
-    "asbi": Method(True, _asbi, {}, refines=True),
-    "nsbi": Method(False, _asbi, {}, refines=True),
-    "alhi": Method(True, _sampled, _ALHI),
-    "nlhi": Method(False, _sampled, _ALHI),
-    "seqbed": Method(True, _seqbed, _SEQBED),
+    "asbi": Method(True, _asbi, refines=True),
+    "nsbi": Method(False, _asbi, refines=True),
+    "alhi": Method(True, _sampled),
+    "nlhi": Method(False, _sampled),
+    "seqbed": Method(True, _seqbed),
 }
 
 
@@ -99,16 +84,3 @@ def find_method(name: str) -> Method:
             f"{name!r}; choose one of these"
         )
     return METHODS[name]
-
-
-def faithful_options(name: str) -> CampaignOptions:
-    """Return the setting of a method's authors, for the numerical experiment.
-
-    This is :meth:`.CampaignOptions.faithful` for ASBI and NSBI; ALHI and NLHI have the
-    same network on x given (theta, action), beliefs by kernel density estimation and
-    nested Monte Carlo for the gain; SeqBED has LFIRE, at the same total of simulations.
-
-    Args:
-        name: Name of the method.
-    """
-    return replace(CampaignOptions.faithful(), **find_method(name).faithful)

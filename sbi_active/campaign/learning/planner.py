@@ -17,7 +17,7 @@ from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.design.design import Design, equal_errors, naming
 from sbi_active.design.designer import InformationGainDesigner
 from sbi_active.design.estimators.automatic import ESTIMATORS
-from sbi_active.design.limits import DesignLimits, pricing
+from sbi_active.design.limits import DesignLimits
 from sbi_active.design.random_designer import RandomDesigner
 from sbi_active.design.target import Target, name_of
 from sbi_active.seeding import derive_seed
@@ -65,9 +65,7 @@ class Planner:
         require_nested(effects)
         self._state, self.effects = state, (*effects,)
         options = state.options
-        none = torch.empty(0, actions.action_dim)
-        price = pricing(cost, actions)
-        self._limits = DesignLimits(actions, constraint, none, price)
+        self._limits = DesignLimits.of(actions, constraint, None, cost)
         # A wrong shape is an error here, and not in a later round.
         permitted(self._limits)
         listed = actions.listed()

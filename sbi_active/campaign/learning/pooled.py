@@ -179,7 +179,6 @@ class PooledLearner(Learner):
             leader=int(utility.argmax()),
             seed=seed,
             probability_valid=shares,
-            num_samples=torch.full((len(listed),), rows.shape[1]),
             estimator="PooledGain",
             bound="none",
             num_simulations=self.state.meter.spent - start,

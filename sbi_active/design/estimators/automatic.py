@@ -14,12 +14,7 @@ from sbi_active.design.estimators.base import (
     InformationGainEstimator,
     standard_error,
 )
-from sbi_active.design.estimators.contrast import (
-    ContrastiveGain,
-    InfoNCEGain,
-    LikelihoodGain,
-    RatioGain,
-)
+from sbi_active.design.estimators.contrast import InfoNCEGain, LikelihoodGain, RatioGain
 from sbi_active.design.estimators.entropy import EntropyGain
 from sbi_active.design.estimators.linear import LinearGain
 from sbi_active.design.estimators.nested import NestedGain
@@ -28,7 +23,6 @@ from sbi_active.messages import warn
 
 #: Name of an estimator: its class.
 ESTIMATORS: dict[str, type[InformationGainEstimator]] = {
-    "contrastive": ContrastiveGain,
     "entropy": EntropyGain,
     "info_nce": InfoNCEGain,
     "likelihood": LikelihoodGain,
@@ -37,6 +31,8 @@ ESTIMATORS: dict[str, type[InformationGainEstimator]] = {
     "posterior": PosteriorGain,
     "ratio": RatioGain,
 }
+#: Former name of an estimator: the name of the one in its place.
+FORMER = {"contrastive": "info_nce", "variational_nested": "likelihood"}
 #: Numbers of x up to which nearest neighbors are trusted.
 MAX_NEIGHBOR_OUTCOMES = 2
 #: Parameters up to which local draws of nested Monte Carlo meet a posterior: of 40
@@ -59,13 +55,13 @@ def find_estimator(
         return estimator
     if estimator == "auto":
         return None
-    if estimator == "variational_nested":
-        text = 'use estimator="likelihood", or "auto"'
+    if estimator in FORMER:
         warn(
-            f"SA701 estimator={estimator!r} goes in the next version: {text}",
+            f"SA701 estimator={estimator!r} goes in the next version: use "
+            f'estimator="{FORMER[estimator]}", or "auto"',
             stacklevel=stack_level(),
         )
-        return LikelihoodGain()
+        estimator = FORMER[estimator]
     if estimator not in ESTIMATORS:
         raise ValueError(
             f"expected estimator among 'auto', {', '.join(map(repr, ESTIMATORS))}; got "
@@ -93,24 +89,22 @@ def choose_estimator(
         num_rows: Fewest simulations of a candidate that an estimate will rest on; None
             are as many as these.
     """
-    num_rows = len(simulations.theta) if num_rows is None else num_rows
-    options: list[InformationGainEstimator] = []
     num_outcomes = simulations.x[0, 0].numel()
-    if simulations.mean is not None and simulations.noise is not None:
-        many = num_outcomes > 1 and simulations.theta.shape[1] > MAX_NESTED_PARAMETERS
-        linear = LinearGain(max_bent=MAX_BENT)
-        if many and linear.suits(simulations, num_rows):
-            return linear, []
-        options.append(EntropyGain() if num_outcomes == 1 else NestedGain())
-    elif simulations.replicate is not None:
-        few = num_outcomes <= MAX_NEIGHBOR_OUTCOMES
-        options.append(EntropyGain() if few else NestedGain())
-    notes = []
-    for option in options:
-        problems = option.problems(simulations)
+    declared = simulations.mean is not None and simulations.noise is not None
+    by_noise, notes = None, []
+    if declared or simulations.replicate is not None:
+        if num_outcomes <= (1 if declared else MAX_NEIGHBOR_OUTCOMES):
+            by_noise = EntropyGain()
+        else:
+            linear = LinearGain(max_bent=MAX_BENT)
+            many = declared and simulations.theta.shape[1] > MAX_NESTED_PARAMETERS
+            if many and linear.suits(simulations, num_rows or len(simulations.theta)):
+                return linear, []
+            by_noise = NestedGain()
+        problems = by_noise.problems(simulations)
         if not problems:
-            return option, notes
-        notes += [f"{type(option).__name__} not used: {text}" for text in problems]
+            return by_noise, []
+        notes = [f"{type(by_noise).__name__} not used: {text}" for text in problems]
     if hasattr(model, "log_posterior"):
         return PosteriorGain(), notes
     if hasattr(model, "log_likelihood"):
@@ -121,7 +115,8 @@ def choose_estimator(
         if not cautions:
             return bound, notes
         return RatioGain(), [*notes, *(f"not used: {text}" for text in cautions)]
-    return options[0], [*notes, "used all the same: there is no model"]
+    assert by_noise is not None
+    return by_noise, [*notes, "used all the same: there is no model"]
 
 
 def disagreements(

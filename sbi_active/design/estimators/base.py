@@ -31,6 +31,10 @@ class CandidateSimulations:
         missing: Rows lost to a fault that has nothing to do with the parameters, shape
             (a, n), bool, the replicate's included; None for none. They are ignored,
             unlike outcomes without a measurement, whose NaN is information.
+        sd: Standard deviations of the noise around the mean, as x, where rivals have
+            noise of their own; else None.
+        each: Actions of the rows of one candidate, shape (n, action_dim), where every
+            row has its own; else None.
     """
 
     theta: Tensor
@@ -40,6 +44,8 @@ class CandidateSimulations:
     noise: NoiseModel | None = None
     replicate: Tensor | None = None
     missing: Tensor | None = None
+    sd: Tensor | None = None
+    each: Tensor | None = None
 
     @property
     def counted(self) -> Tensor:
@@ -49,6 +55,11 @@ class CandidateSimulations:
         return ~self.missing
 
     @property
+    def present(self) -> Tensor:
+        """Numbers that there are of x and of replicates, (1 or 2, a, n, q), bool."""
+        return torch.stack([part.flatten(2).isfinite() for part in self.outcomes()])
+
+    @property
     def complete(self) -> Tensor:
         """Outcomes without any NaN, shape (a, n), bool; their replicates as well."""
         return self.completeness == 1
@@ -56,24 +67,21 @@ class CandidateSimulations:
     @property
     def completeness(self) -> Tensor:
         """Share of a row's outcomes, x and replicate, without NaN, shape (a, n)."""
-        parts = [part.flatten(2).isfinite().all(-1) for part in self.outcomes()]
-        return torch.stack(parts).double().mean(0) * self.counted
+        return self.present.all(-1).double().mean(0) * self.counted
 
     @property
     def partly_observed(self) -> Tensor:
         """Outcomes of which some numbers are present, shape (a, n), bool."""
-        present = [part.flatten(2).isfinite() for part in self.outcomes()]
-        partly = [part.any(-1) & ~part.all(-1) for part in present]
-        return torch.stack(partly).any(0) & self.counted
+        present = self.present
+        return (present.any(-1) & ~present.all(-1)).any(0) & self.counted
 
     def num_valid(self) -> tuple[Tensor, Tensor]:
         """Return the numbers of outcomes with a measurement, and of all, both (a,).
 
         A partly observed outcome has one; missing rows are not counted.
         """
-        parts = [part.flatten(2).isfinite().any(-1) for part in self.outcomes()]
-        valid = (torch.stack(parts) & self.counted).sum((0, 2))
-        return valid, len(parts) * self.counted.sum(1)
+        valid = self.present.any(-1) & self.counted
+        return valid.sum((0, 2)), len(valid) * self.counted.sum(1)
 
     def outcomes(self) -> list[Tensor]:
         """Return x and, where there are any, replicates."""
@@ -81,6 +89,8 @@ class CandidateSimulations:
 
     def rows(self) -> tuple[Tensor, Tensor]:
         """Return theta and action of every outcome in turn, a * n rows each."""
+        if self.each is not None:
+            return self.theta, self.each
         num_actions, num_samples = self.x.shape[:2]
         return (
             self.theta.repeat(num_actions, 1),
@@ -107,7 +117,7 @@ class CandidateSimulations:
         return replace(self, theta=torch.cat([self.theta, other.theta]), **parts)
 
     def _parts(self) -> dict[str, Tensor]:
-        names = ("x", "mean", "replicate", "missing")
+        names = ("x", "mean", "replicate", "missing", "sd")
         parts = {name: getattr(self, name) for name in names}
         return {name: part for name, part in parts.items() if part is not None}
 

@@ -13,7 +13,6 @@ from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution
 from typing_extensions import override
 
 from sbi_active.design.estimators.base import (
@@ -22,11 +21,73 @@ from sbi_active.design.estimators.base import (
     InformationGainEstimator,
     at_least,
 )
-from sbi_active.design.estimators.critic import Critic, RatioModel
 from sbi_active.seeding import derive_seed, forked_generators
 
 
-class RatioGain(InformationGainEstimator):
+class _Critic(InformationGainEstimator):
+    r"""Estimator by a function :math:`f(x, \theta | \xi)` of the model, in batches.
+
+    Attributes:
+        functions: Methods of a model that may be f, the first that it has.
+        batch_size: Rows in one pass of the network.
+    """
+
+    functions: ClassVar[tuple[str, ...]] = ("log_ratio",)
+    batch_size: int = 50_000
+
+    def _rows(self, model: Any, x: Tensor, theta: Tensor, action: Tensor) -> Tensor:
+        """Return f of x (n, *x_shape), theta (n, d) and action (n, k), shape (n,)."""
+        name = self._function(model)
+        parts = [p.split(self.batch_size) for p in _ordered(name, x, theta, action)]
+        batches = zip(*parts, strict=True)
+        values = [getattr(model, name)(*batch).double() for batch in batches]
+        return self._known(model, torch.cat(values))
+
+    def _table(self, model: Any, x: Tensor, theta: Tensor, action: Tensor) -> Tensor:
+        """Return f of every x (n, ...) with every theta (m, d) at one action, (n, m).
+
+        A model may have it as a method ``log_likelihood_table(x, theta, action)``: a
+        network whose condition is (theta, action) then runs m times, not n m times.
+        """
+        name = self._function(model)
+        all_pairs = getattr(model, f"{name}_table", None)
+        if all_pairs is not None:
+            values = all_pairs(*_ordered(name, x, theta, action))
+            return self._known(model, values.double())
+        n, m = len(x), len(theta)
+        every = x.repeat_interleave(m, 0), theta.repeat(n, 1), action.expand(n * m, -1)
+        return self._rows(model, *every).reshape(n, m)
+
+    def _function(self, model: Any) -> str:
+        for name in self.functions:
+            if hasattr(model, name):
+                return name
+        raise ValueError(
+            f"expected a model with {self.functions[-1]} for {type(self).__name__}; "
+            f"got {type(model).__name__}; pass one that has it, or choose "
+            "estimator='auto'"
+        )
+
+    def _known(self, model: Any, values: Tensor) -> Tensor:
+        lost = int(values.isnan().sum())
+        if lost:
+            raise ValueError(
+                f"expected numbers from {type(model).__name__}."
+                f"{self._function(model)} for {type(self).__name__}; got NaN in {lost} "
+                f"of {values.numel()} rows; give a model that says how probable an "
+                "outcome without a measurement is, x = NaN"
+            )
+        return values
+
+
+def _ordered(
+    name: str, x: Tensor, theta: Tensor, action: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the arguments in the order of a model's method."""
+    return (x, theta, action) if name == "log_likelihood" else (theta, x, action)
+
+
+class RatioGain(_Critic):
     r"""Mean log ratio of likelihood to marginal, the utility of LFIRE.
 
     .. math::
@@ -39,8 +100,9 @@ class RatioGain(InformationGainEstimator):
     (multi-class ratio estimation does, up to a function of x) take
     :class:`.InfoNCEGain`.
 
-    Args:
-        batch_size: Rows in one pass of the network.
+    The model has ``log_ratio(theta, x, action)``, :math:`\log q(x_i | \theta_i, \xi_i)
+    - \log q(x_i | \xi_i)` of every row, shape (n,). Rows of x are NaN where there was
+    no measurement.
 
     References:
         Thomas, Dutta, Corander, Kaski & Gutmann, Bayesian Analysis 2022 (LFIRE);
@@ -49,39 +111,33 @@ class RatioGain(InformationGainEstimator):
 
     rowwise = True
 
-    def __init__(self, *, batch_size: int = 50_000) -> None:
-        self.batch_size = batch_size
-
     def _contributions(
-        self, model: RatioModel, simulations: CandidateSimulations, belief: object
+        self, model: Any, simulations: CandidateSimulations, belief: Any
     ) -> Tensor:
-        critic = Critic(model, ("log_ratio",), type(self).__name__, self.batch_size)
         theta, action = simulations.rows()
         counted = simulations.counted.flatten()
         gain = torch.full(counted.shape, torch.nan, dtype=torch.float64)
-        gain[counted] = torch.stack(
-            [
-                critic.rows(x.flatten(0, 1)[counted], theta[counted], action[counted])
-                for x in simulations.outcomes()
-            ]
-        ).mean(0)
+        of_each = [
+            self._rows(model, x.flatten(0, 1)[counted], theta[counted], action[counted])
+            for x in simulations.outcomes()
+        ]
+        gain[counted] = torch.stack(of_each).mean(0)
         return gain.reshape(simulations.x.shape[:2])
 
 
-class _Contrast(InformationGainEstimator):
+class _Contrast(_Critic):
     r"""Log of f at an outcome's own parameters, less its mean over others.
 
     A contribution includes what parameters do to the evidence of outcomes that they are
     compared with; this has mean zero and makes the error honest.
 
     Attributes:
-        functions: Methods of a model that may be f, the first that it has.
         caution: Words where an estimate is near its limit, with {limit} and {where}.
+        num_contrastive: Number of parameters that each outcome is compared with.
     """
 
-    functions: ClassVar[tuple[str, ...]] = ("log_likelihood",)
     caution: ClassVar[str]
-    batch_size: int
+    num_contrastive: int
 
     @abstractmethod
     def _compared(
@@ -93,39 +149,33 @@ class _Contrast(InformationGainEstimator):
     def _limit(self, counted: Tensor) -> int:
         """Return the number whose log the estimate from counted rows is limited by."""
 
-    def _terms(self, own: Tensor, others: Tensor) -> Tensor:
-        """Return what the mean is of, from f (n,) at own parameters and at others."""
-        return others
-
     def _contributions(
         self, model: Any, simulations: CandidateSimulations, belief: Any
     ) -> Tensor:
-        critic = Critic(model, self.functions, type(self).__name__, self.batch_size)
         gain = torch.full(simulations.x.shape[:2], torch.nan, dtype=torch.float64)
         for a, counted in enumerate(simulations.counted):
             action = simulations.action[a]
             for rows, others in self._compared(counted, simulations, belief):
                 theta = simulations.theta[rows]
                 of_each = [
-                    self._of_rows(critic, x[a, rows], theta, others, action)
+                    self._of_rows(model, x[a, rows], theta, others, action)
                     for x in simulations.outcomes()
                 ]
                 gain[a, rows] = torch.stack(of_each).mean(0)
         return gain
 
     def _of_rows(
-        self, critic: Critic, x: Tensor, theta: Tensor, others: Tensor, action: Tensor
+        self, model: Any, x: Tensor, theta: Tensor, others: Tensor, action: Tensor
     ) -> Tensor:
         """Return contributions of outcomes of one candidate, shape (n,)."""
         n, m = len(x), len(others)
-        own = critic.rows(x, theta, action.expand(n, -1))
+        own = self._rows(model, x, theta, action.expand(n, -1))
         log_p = torch.empty(n, dtype=torch.float64)
         share = torch.zeros(m, dtype=torch.float64)  # in the evidences of all outcomes
         for block in torch.arange(n).split(max(64, self.batch_size // m)):
-            table = critic.table(x[block], others, action)
-            terms = self._terms(own[block], table)
-            log_p[block] = terms.logsumexp(1) - math.log(terms.shape[1])
-            share += terms.softmax(1)[:, -m:].nan_to_num(0.0).sum(0)
+            table = self._table(model, x[block], others, action)
+            log_p[block] = table.logsumexp(1) - math.log(m)
+            share += table.softmax(1).nan_to_num(0.0).sum(0)
         effect = torch.zeros(n, dtype=torch.float64)
         effect.index_add_(0, torch.arange(m) % n, share - share.mean())
         return torch.where(own == -torch.inf, own, own - log_p) - effect
@@ -163,10 +213,12 @@ class LikelihoodGain(_Contrast):
     :class:`.NestedGain` does better on few draws where the
     noise is declared.
 
+    The model has ``log_likelihood(x, theta, action)``, the log density of every row,
+    shape (n,), of x that may be NaN where there was no measurement;
+    ``exact_likelihood = True`` where it is not learned.
+
     Args:
         num_contrastive: Number of contrastive draws L.
-        seed: Seed of the draws.
-        batch_size: Rows in one pass of the network.
 
     Raises:
         ValueError: If ``num_contrastive`` is below 1.
@@ -195,16 +247,14 @@ class LikelihoodGain(_Contrast):
         'upper'
     """
 
+    functions = ("log_likelihood",)
     caution = (
         "LikelihoodGain is near log L = {limit} or above at {where}: few of the draws "
         "explain an outcome, and it is too large there; raise num_contrastive"
     )
 
-    def __init__(
-        self, *, num_contrastive: int = 500, seed: int = 0, batch_size: int = 50_000
-    ) -> None:
+    def __init__(self, *, num_contrastive: int = 500) -> None:
         self.num_contrastive = at_least(num_contrastive, 1, "num_contrastive", 100)
-        self.seed, self.batch_size = seed, batch_size
 
     @override
     def bound_on(self, model: Any) -> Bound:
@@ -216,62 +266,16 @@ class LikelihoodGain(_Contrast):
     def _compared(
         self, counted: Tensor, simulations: CandidateSimulations, belief: Any
     ) -> list[tuple[Tensor, Tensor]]:
-        rows = torch.nonzero(counted)[:, 0]
-        return [(rows, self._draw(belief, simulations))] if len(rows) else []
-
-    def _draw(
-        self, belief: Distribution | None, simulations: CandidateSimulations
-    ) -> Tensor:
         if belief is None:
             raise ValueError(
                 f"expected a belief for {type(self).__name__} to draw from; got None; "
                 "pass the distribution of theta in the simulations"
             )
+        rows = torch.nonzero(counted)[:, 0]
         key = zlib.crc32(simulations.theta.numpy(force=True).tobytes())
-        with forked_generators(derive_seed(self.seed, "contrastive", key)):
-            return belief.sample(torch.Size([self.num_contrastive]))
-
-
-class ContrastiveGain(LikelihoodGain):
-    r"""Prior contrastive estimation (PCE).
-
-    .. math::
-        U(\xi) = \frac1n \sum_{i=1}^n \log q(x_i | \theta_i, \xi)
-        - \log \hat p_i(x_i | \xi), \qquad
-        \hat p_i(x | \xi) = \frac{1}{L + 1} \left[ q(x | \theta_i, \xi)
-        + \sum_{l=1}^L q(x | \theta'_l, \xi) \right]
-
-    with :math:`\theta_i, \theta'_l \sim p`, :math:`x_i \sim p(x | \theta_i, \xi)`. It
-    tells :math:`\theta_i` from L others by x and is a lower bound for any positive
-    function q, so on simulations that q was not trained on a learned likelihood keeps
-    it below the information, if not close. With the exact one it rises to the
-    information with L. It cannot exceed log(L + 1), near which it does not rank.
-
-    Args:
-        num_contrastive: Number of contrastive draws L.
-        seed: Seed of the draws.
-        batch_size: Rows in one pass of the network.
-
-    References:
-        Foster, Jankowiak, O'Meara, Teh & Rainforth, AISTATS 2020; van den Oord, Li &
-        Vinyals, 2018 (the bound for any critic).
-    """
-
-    bound: Bound = "lower"
-    caution = (
-        "ContrastiveGain is near its largest value, log(L + 1) = {limit}, at {where}: "
-        "it is too small there and does not rank; raise num_contrastive"
-    )
-
-    @override
-    def bound_on(self, model: Any) -> Bound:
-        return self.bound
-
-    def _limit(self, counted: Tensor) -> int:
-        return self.num_contrastive + 1
-
-    def _terms(self, own: Tensor, others: Tensor) -> Tensor:
-        return torch.cat([own[:, None], others], 1)
+        with forked_generators(derive_seed(0, "contrastive", key)):
+            others = belief.sample(torch.Size([self.num_contrastive]))
+        return [(rows, others)] if len(rows) else []
 
 
 class InfoNCEGain(_Contrast):
@@ -295,7 +299,6 @@ class InfoNCEGain(_Contrast):
 
     Args:
         num_contrastive: L = K - 1, at most; blocks are as equal as they can be.
-        batch_size: Rows in one pass of the network.
 
     Raises:
         ValueError: If ``num_contrastive`` is below 1.
@@ -312,9 +315,8 @@ class InfoNCEGain(_Contrast):
         "small there and does not rank; raise num_contrastive"
     )
 
-    def __init__(self, *, num_contrastive: int = 127, batch_size: int = 50_000) -> None:
+    def __init__(self, *, num_contrastive: int = 127) -> None:
         self.num_contrastive = at_least(num_contrastive, 1, "num_contrastive", 100)
-        self.batch_size = batch_size
 
     def _limit(self, counted: Tensor) -> int:
         # the smallest block limits; candidates may have lost rows to faults

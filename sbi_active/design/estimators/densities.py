@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.inference.sampling.weights import silverman
 
 NUM_FOLDS = 4  # a choice: fits of three quarters of the rows, four times
@@ -44,28 +45,29 @@ def cross_fit(
     return result
 
 
-def patterns_of_numbers(
-    x: Tensor, counted: Tensor, smallest: int
-) -> list[tuple[Tensor, Tensor]]:
-    """Group counted outcomes (n, q) by which of their numbers are present.
+def by_pattern(
+    simulations: CandidateSimulations, smallest: int
+) -> Iterator[tuple[int, Tensor, Tensor, Tensor]]:
+    """Yield outcomes that count by which of their numbers are present.
 
-    Returns rows, shape (k,), and the numbers present, shape (p,), of each group;
-    patterns of fewer rows than the smallest join those without a number.
+    Each group has a candidate's number, rows (k,), the numbers present (p,) and their
+    values (k, p); patterns of fewer rows than the smallest join those without a number.
     """
-    rows = torch.nonzero(counted)[:, 0]
-    present = x[rows].isfinite()
-    patterns, label = torch.unique(present, dim=0, return_inverse=True)
-    groups, rest = [], []
-    for k, pattern in enumerate(patterns):
-        members = rows[label == k]
-        columns = torch.nonzero(pattern)[:, 0]
-        if len(columns) and len(members) >= smallest:
-            groups.append((members, columns))
-        else:
-            rest.append(members)
-    if rest:
-        groups.append((torch.cat(rest).sort().values, torch.empty(0).long()))
-    return groups
+    for a, counted in enumerate(simulations.counted):
+        x = simulations.x[a].flatten(1).double()
+        rows = torch.nonzero(counted)[:, 0]
+        patterns, label = torch.unique(x[rows].isfinite(), dim=0, return_inverse=True)
+        rest = []
+        for k, pattern in enumerate(patterns):
+            members = rows[label == k]
+            columns = torch.nonzero(pattern)[:, 0]
+            if len(columns) and len(members) >= smallest:
+                yield a, members, columns, x[members][:, columns]
+            else:
+                rest.append(members)
+        if rest:
+            members = torch.cat(rest).sort().values
+            yield a, members, torch.empty(0).long(), x[members, :0]
 
 
 @dataclass(frozen=True)
@@ -291,48 +293,42 @@ def noise_members(
     usable = 0 < mean.shape[1] <= MOST_NUMBERS and bool(enough.all())
     if not usable or not bool((mean.isfinite() & (sd > 0)).all()):
         return []
-    classes = [(mean[label == k], sd[label == k]) for k in range(len(enough))]
-    counts = [len({row.tobytes() for row in m.numpy()}) for m, _ in classes]
-    members: list[LogDensities] = []
-    for factor in factors:
-        mixtures = [
-            _NoiseKernels(*own, factor, num)
-            for own, num in zip(classes, counts, strict=True)
-        ]
-        members.append(
-            lambda new, parts=mixtures: torch.stack([part(new) for part in parts], 1)
-        )
-    return members
+
+    def member(factor: float) -> LogDensities:
+        classes = [label == k for k in range(len(enough))]
+        parts = [_noise_kernels(mean[own], sd[own], factor) for own in classes]
+        return lambda new: torch.stack([part(new) for part in parts], 1)
+
+    return [member(factor) for factor in factors]
 
 
-class _NoiseKernels:
-    """The density of one class, by means and deviations (n, q), num of them distinct.
+def _noise_kernels(mean: Tensor, sd: Tensor, factor: float) -> LogDensities:
+    """Return the log density of one class, by means and deviations (n, q).
 
     A tenth is a Gaussian of all draws, for what lies between the kernels.
     """
+    n = len(mean)
+    center = mean.mean(0)
+    apart = mean - center
+    covariance = apart.T @ apart / (n - 1)
+    noise = sd.square()
+    # directions in which the kernels would lie apart without smoothing
+    unit = noise.mean(0).rsqrt()
+    spread = torch.linalg.eigvalsh(unit[:, None] * covariance * unit)
+    num_distinct = len({row.tobytes() for row in mean.numpy()})
+    d = max(1, int((spread > 1).sum()))
+    h = min(factor * silverman(max(2, num_distinct), d), 1.0)
+    knots = center + math.sqrt(1 - h**2) * apart
+    factors = torch.linalg.cholesky(noise.diag_embed() + h**2 * covariance)
+    wide = torch.linalg.cholesky(noise.mean(0).diag() + covariance)
 
-    def __init__(self, mean: Tensor, sd: Tensor, factor: float, num: int) -> None:
-        n, q = mean.shape
-        center = mean.mean(0)
-        apart = mean - center
-        covariance = apart.T @ apart / (n - 1)
-        noise = sd.square()
-        # directions in which the kernels would lie apart without smoothing
-        unit = noise.mean(0).rsqrt()
-        spread = torch.linalg.eigvalsh(unit[:, None] * covariance * unit)
-        d = max(1, int((spread > 1).sum()))
-        h = min(factor * silverman(max(2, num), d), 1.0)
-        self.knots = center + math.sqrt(1 - h**2) * apart
-        self.factors = torch.linalg.cholesky(noise.diag_embed() + h**2 * covariance)
-        self.center = center
-        self.wide = torch.linalg.cholesky(noise.mean(0).diag() + covariance)
+    def log_density(x: Tensor) -> Tensor:
+        kernels = _log_normal(x - knots[:, None], factors)
+        inner = kernels.logsumexp(0) - math.log(n)
+        tail = _log_normal((x - center)[None], wide[None])[0]
+        return torch.logaddexp(inner + math.log1p(-0.1), tail + math.log(0.1))
 
-    def __call__(self, x: Tensor) -> Tensor:
-        """Return log densities, shape (m,), of outcomes, shape (m, q)."""
-        kernels = _log_normal(x - self.knots[:, None], self.factors)
-        log_density = kernels.logsumexp(0) - math.log(len(self.knots))
-        tail = _log_normal((x - self.center)[None], self.wide[None])[0]
-        return torch.logaddexp(log_density + math.log1p(-0.1), tail + math.log(0.1))
+    return log_density
 
 
 def _log_normal(apart: Tensor, factor: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from sbi_active.design.estimators.emulator import MeanEmulator
 from sbi_active.design.estimators.presence import Completeness
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, NoiseModel
-from sbi_active.support import support_of
+from sbi_active.support import within_support
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,21 +175,13 @@ def _pairwise(noise: NoiseModel, x: Tensor, mean: Tensor) -> Tensor:
 
 def log_belief(belief: Distribution, emulator: MeanEmulator, z: Tensor) -> Tensor:
     """Log density of the belief in the emulator's coordinates, shape (n,)."""
-    log_b = log_density(belief, emulator.parameters(z).float())
-    return log_b - torch.linalg.slogdet(emulator.transform).logabsdet
-
-
-def log_density(belief: Distribution, theta: Tensor) -> Tensor:
-    """Log density of the belief, -inf outside its support, shape (n,), float64."""
-    try:
-        inside = support_of(belief).check(theta)
-    except NotImplementedError:
-        inside = torch.ones(len(theta)).bool()
+    theta = emulator.parameters(z).float()
+    inside = within_support(belief, theta)
     log_b = torch.full((len(theta),), -torch.inf).double()
     if bool(inside.any()):
         density = getattr(belief, "smooth_log_prob", belief.log_prob)
         log_b[inside] = density(theta[inside]).double()
-    return log_b
+    return log_b - torch.linalg.slogdet(emulator.transform).logabsdet
 
 
 def _log_mean(log_term: Tensor, m: int, num: int) -> tuple[Tensor, Tensor]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -18,10 +17,10 @@ from sbi_active.design.estimators.base import (
 from sbi_active.design.estimators.densities import (
     MOST_NUMBERS,
     NUM_FOLDS,
+    by_pattern,
     class_members,
     cross_fit,
     noise_members,
-    patterns_of_numbers,
 )
 from sbi_active.seeding import derive_seed
 
@@ -69,16 +68,6 @@ class NoisyRivalPredictive(RivalPredictive, Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class RivalSimulations(CandidateSimulations):
-    """Outcomes of rivals, and standard deviations of their noise, as x."""
-
-    sd: Tensor | None = None
-
-    def _parts(self) -> dict[str, Tensor]:
-        return super()._parts() | ({} if self.sd is None else {"sd": self.sd})
-
-
 class RivalSampler:
     """Draw outcomes of rival models at candidates, as many of each model.
 
@@ -87,11 +76,11 @@ class RivalSampler:
 
     Args:
         rivals: Models.
-        action: Candidates, shape (a, action_dim).
         seed: Seed of all draws.
 
     Attributes:
         probability: Probability of the models, shape (K,), float64.
+        others: None: what is pending is no matter of rivals.
         summaries: None: outcomes are whole.
         notes: Notes on the draws, none.
         num_drawn: Outcomes so far.
@@ -102,38 +91,34 @@ class RivalSampler:
             positive or do not add up to one.
     """
 
+    others = notes = ()
     summaries = None
-    notes = ()
     num_missing = 0
 
-    def __init__(
-        self, rivals: Sequence[RivalPredictive], action: Tensor, seed: int
-    ) -> None:
-        self.rivals, self.action, self.seed = list(rivals), action, seed
-        values = [float(rival.probability) for rival in self.rivals]
-        self.probability = torch.tensor(values, dtype=torch.float64)
-        total = float(self.probability.sum())
+    def __init__(self, rivals: Sequence[RivalPredictive], seed: int) -> None:
+        values = [float(rival.probability) for rival in rivals]
+        probability = torch.tensor(values, dtype=torch.float64)
+        total = float(probability.sum())
         if len(values) < 2 or min(values) < 0 or abs(total - 1) > 1e-3:
             raise ValueError(
                 "expected two or more rivals whose probabilities are not negative and "
                 f"add up to 1; got {values}; normalize them"
             )
         # a rival of no probability has no part in the information
-        self.rivals = [r for r, p in zip(self.rivals, values, strict=True) if p > 0]
-        self.probability = self.probability[self.probability > 0] / total
+        self.rivals = [r for r, p in zip(rivals, values, strict=True) if p > 0]
+        self.probability = probability[probability > 0] / total
+        self.seed, self.num_drawn, self._num_waves = seed, 0, 0
         self._is_noisy = all(isinstance(r, NoisyRivalPredictive) for r in self.rivals)
-        self.num_drawn = 0
-        self._num_waves = 0
 
     def draw(
-        self, num_samples: int, candidates: Tensor, *, replicates: bool
+        self, num_samples: int, action: Tensor, *, replicates: bool
     ) -> CandidateSimulations:
         """Draw outcomes.
 
         Args:
             num_samples: Number of outcomes of a candidate; rounded to an even number of
                 each model.
-            candidates: Indices, shape (k,).
+            action: Candidates, shape (a, action_dim).
             replicates: Flag of the sampler it stands in for; it has no effect here.
 
         Raises:
@@ -141,10 +126,11 @@ class RivalSampler:
         """
         self._num_waves += 1
         seed = derive_seed(self.seed, "rivals", self._num_waves)
-        each = 2 * max(1, num_samples // (2 * len(self)))
+        num_rivals = len(self.rivals)
+        each = 2 * max(1, num_samples // (2 * num_rivals))
         rows = []
-        for action in self.action[candidates]:
-            drawn = [self._predict(k, action, each, seed) for k in range(len(self))]
+        for own in action:
+            drawn = [self._predict(k, own, each, seed) for k in range(num_rivals)]
             if len({part.shape for part in drawn}) > 1:
                 raise ValueError(
                     "expected outcomes of one shape from all rivals; got "
@@ -153,10 +139,10 @@ class RivalSampler:
                 )
             rows.append(torch.stack(drawn, 2).flatten(1, 2))
         self.num_drawn += len(rows) * rows[0].shape[1]
-        index = torch.arange(len(self)).repeat(each)[:, None]
+        index = torch.arange(num_rivals).repeat(each)[:, None]
         x, *noise = torch.stack(rows, 1)
         mean, sd = noise or (None, None)
-        return RivalSimulations(index, self.action[candidates], x, mean=mean, sd=sd)
+        return CandidateSimulations(index, action, x, mean, sd=sd)
 
     def rewind(self) -> None:
         """Repeat the draws of the first call in the next."""
@@ -190,9 +176,6 @@ class RivalSampler:
         stacked = torch.stack([part.to(dtype) for part in parts])
         return stacked[:, :, None] if x.ndim == 1 else stacked
 
-    def __len__(self) -> int:
-        return len(self.rivals)
-
 
 class ModelIndexGain(InformationGainEstimator):
     r"""Variational bound for the index k of the model.
@@ -221,7 +204,6 @@ class ModelIndexGain(InformationGainEstimator):
     """
 
     bound: Bound = "lower"
-    needs_noise = False
     needs_model = False
 
     def __init__(self, probability: Tensor, *, few: int = 16) -> None:
@@ -231,38 +213,70 @@ class ModelIndexGain(InformationGainEstimator):
         self, model: Any, simulations: CandidateSimulations, belief: Distribution | None
     ) -> Tensor:
         index = simulations.theta[:, 0].long()
-        num_models = len(self.probability)
         # as many draws of each model: weights restore the probabilities
-        weight = self.probability[index] * num_models
-        log_p = self.probability.log()
+        weight = self.probability[index] * len(self.probability)
         gain = torch.full(simulations.x.shape[:2], torch.nan, dtype=torch.float64)
-        block = _blocks(simulations, index, num_models)
-        sd = getattr(simulations, "sd", None)
-        for a, counted in enumerate(simulations.counted):
-            x = simulations.x[a].flatten(1).double()
-            groups = patterns_of_numbers(x, counted, 4 * self.few)
-            label = torch.zeros(len(x)).long()
-            for g, (rows, _) in enumerate(groups):
-                label[rows] = g
-            for rows, columns in groups:
-                inside = label == label[rows[0]]
-                noise = None
-                if simulations.mean is not None and sd is not None:
-                    parts = (simulations.mean[a], sd[a])
-                    center, width = (p.flatten(1)[rows][:, columns] for p in parts)
-                    noise = center.double(), width.double()
-                gain[a, rows] = weight[rows] * _score(
-                    x[rows][:, columns],
-                    noise,
-                    index=index,
-                    block=block,
-                    inside=inside & counted,
-                    counted=counted,
-                    rows=rows,
-                    log_p=log_p,
-                    few=self.few,
-                )
+        block = _blocks(simulations, index, len(self.probability))
+        known = simulations.mean, simulations.sd
+        for a, rows, columns, x in by_pattern(simulations, 4 * self.few):
+            noise = [
+                part[a].flatten(1)[rows][:, columns].double()
+                for part in known
+                if part is not None
+            ]
+            counted = simulations.counted[a]
+            score = self._score(x, noise, rows, counted, index, block)
+            gain[a, rows] = weight[rows] * score
         return gain
+
+    def _score(
+        self,
+        x: Tensor,
+        noise: list[Tensor],
+        rows: Tensor,
+        counted: Tensor,
+        index: Tensor,
+        block: Tensor,
+        *,
+        powers: tuple[float, ...] = (1.0, 0.5),
+    ) -> Tensor:
+        """Held-out log q(k | x) - log p_k of the rows of one pattern, shape (rows,).
+
+        The powers of a density are against too much confidence. Rows of a block (n,)
+        share a fold.
+        """
+        log_p, own, fold = self.probability.log(), index[rows], block % NUM_FOLDS
+        num_models = len(log_p)
+        # the same members in every fold, or they could not be compared
+        each = torch.stack(
+            [
+                torch.bincount(fold[rows[own == k]], minlength=NUM_FOLDS)
+                for k in range(num_models)
+            ]
+        )
+        enough = (each.sum(1) - each.amax(1)) >= self.few
+
+        def score(train: Tensor, test: Tensor) -> Tensor:
+            # log share of the pattern among each model's draws outside the fold
+            used = counted & torch.isin(fold, fold[rows[train]])
+            hits = torch.bincount(own[train], minlength=num_models) + 0.5
+            share = hits / (torch.bincount(index[used], minlength=num_models) + 1)
+            log_prior = log_p + share.log()
+            narrow = []
+            if len(noise) == 2:
+                center, width = (part[train] for part in noise)
+                narrow = noise_members(center, width, own[train], enough)
+            wide = class_members(x[train], own[train], enough, kernels=not narrow)
+            scores = []
+            for member in [*wide, *narrow]:
+                log_f = member(x[test])
+                for power in powers:
+                    log_q = (log_prior + power * log_f).log_softmax(1)
+                    log_q = log_q[torch.arange(len(test)), own[test]]
+                    scores.append(log_q - log_p[own[test]])
+            return torch.stack(scores)
+
+        return cross_fit(score, block[rows], log_p.exp()[own])
 
 
 def _blocks(
@@ -282,54 +296,3 @@ def _blocks(
         if len(distinct) < 2 * NUM_FOLDS:  # a fold would have none of the model
             block[own] = torch.arange(int(own.sum()))
     return block
-
-
-def _score(
-    x: Tensor,
-    noise: tuple[Tensor, Tensor] | None,
-    *,
-    index: Tensor,
-    block: Tensor,
-    inside: Tensor,
-    counted: Tensor,
-    rows: Tensor,
-    log_p: Tensor,
-    few: int,
-    powers: tuple[float, ...] = (1.0, 0.5),
-) -> Tensor:
-    """Held-out log q(k | x) - log p_k of the rows of one pattern, shape (rows,).
-
-    The powers of a density are against too much confidence.
-    """
-    num_models = len(log_p)
-    own = index[rows]
-
-    def log_shares(train: Tensor) -> Tensor:
-        """Log share of the pattern among each model's draws outside the fold."""
-        folds = set((block[rows[train]] % NUM_FOLDS).tolist())
-        used = counted & torch.tensor([int(b) % NUM_FOLDS in folds for b in block])
-        hits = torch.bincount(index[used & inside], minlength=num_models) + 0.5
-        return (hits / (torch.bincount(index[used], minlength=num_models) + 1)).log()
-
-    # the same members in every fold, or they could not be compared
-    fold = torch.nn.functional.one_hot(block[rows] % NUM_FOLDS, NUM_FOLDS)
-    each = torch.stack([fold[own == k].sum(0) for k in range(num_models)])
-    enough = (each.sum(1) - each.amax(1)) >= few
-
-    def score(train: Tensor, test: Tensor) -> Tensor:
-        log_prior = log_p + log_shares(train)
-        narrow = []
-        if noise is not None:
-            center, width = (part[train] for part in noise)
-            narrow = noise_members(center, width, own[train], enough)
-        wide = class_members(x[train], own[train], enough, kernels=not narrow)
-        scores = []
-        for member in [*wide, *narrow]:
-            log_f = member(x[test])
-            for power in powers:
-                log_q = (log_prior + power * log_f).log_softmax(1)
-                log_q = log_q[torch.arange(len(test)), own[test]]
-                scores.append(log_q - log_p[own[test]])
-        return torch.stack(scores)
-
-    return cross_fit(score, block[rows], log_p.exp()[own])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,11 +19,10 @@ from sbi_active.design.estimators.base import (
     InformationGainEstimator,
     numbers_of,
 )
-from sbi_active.design.estimators.critic import PosteriorModel
 from sbi_active.design.estimators.densities import (
     Reduction,
+    by_pattern,
     cross_fit,
-    patterns_of_numbers,
 )
 from sbi_active.design.estimators.emulator import NUM_CHOOSING, kernel, linear
 from sbi_active.design.estimators.entropy import nearest_neighbor_entropy
@@ -46,8 +45,8 @@ class PosteriorGain(InformationGainEstimator):
     action than for another. Outcomes at the same parameters are averaged, as they are
     not independent.
 
-    Args:
-        batch_size: Rows in one pass of the network; bounds memory.
+    The model has ``log_posterior(theta, x, action)``, the log density of every row,
+    shape (n,).
 
     References:
         Kim & Matsubara, Applied Intelligence 2025; Barber & Agakov, NeurIPS 2003.
@@ -55,27 +54,19 @@ class PosteriorGain(InformationGainEstimator):
 
     bound: Bound = "lower"
     rowwise = True
-
-    def __init__(self, *, batch_size: int = 50_000) -> None:
-        self.batch_size = batch_size
+    batch_size: int = 50_000  # rows in one pass of the network
 
     def _contributions(
-        self,
-        model: PosteriorModel,
-        simulations: CandidateSimulations,
-        belief: Distribution,
+        self, model: Any, simulations: CandidateSimulations, belief: Distribution
     ) -> Tensor:
         density = getattr(belief, "smooth_log_prob", belief.log_prob)
         log_p = density(simulations.theta)
+        theta, action = simulations.rows()
         gains = []
         for x in simulations.outcomes():
-            theta, action = simulations.rows()
-            rows = [
-                part.split(self.batch_size) for part in (theta, x.flatten(0, 1), action)
-            ]
-            log_q = torch.cat(
-                [model.log_posterior(*batch) for batch in zip(*rows, strict=True)]
-            )
+            rows = theta, x.flatten(0, 1), action
+            batches = zip(*(part.split(self.batch_size) for part in rows), strict=True)
+            log_q = torch.cat([model.log_posterior(*batch) for batch in batches])
             gains.append(log_q.reshape(x.shape[:2]) - log_p)
         return torch.stack(gains).mean(0)
 
@@ -117,7 +108,6 @@ class ParameterGain(InformationGainEstimator):
     """
 
     bound: Bound = "lower"
-    needs_noise = False
     needs_model = False
 
     def __init__(
@@ -129,7 +119,7 @@ class ParameterGain(InformationGainEstimator):
     ) -> None:
         self.target = numbers_of(index)
         self.num_marginal, self.few = num_marginal, few
-        self._marginal: tuple[Distribution, list[NormalScores], float] | None = None
+        self._marginal: tuple[Distribution, list[Features], float] | None = None
 
     def _contributions(
         self, model: Any, simulations: CandidateSimulations, belief: Distribution
@@ -138,26 +128,24 @@ class ParameterGain(InformationGainEstimator):
             with forked_generators(0, "marginal"):
                 draws = belief.sample(torch.Size([self.num_marginal]))
             draws = self.target(draws).double()
-            maps = [NormalScores(column) for column in draws.T]
+            maps = [normal_scores(column) for column in draws.T]
             self._marginal = belief, maps, _dependence(_map(maps, draws))
         _, scores, dependence = self._marginal
         u = _map(scores, self.target(simulations.theta).double())
         shape = simulations.x.shape[:2]
         gain = torch.full(shape, torch.nan, dtype=torch.float64)
-        for a, counted in enumerate(simulations.counted):
-            x = simulations.x[a].flatten(1).double()
-            for rows, columns in patterns_of_numbers(x, counted, self.few):
-                if len(rows) < 8:  # no density to fit: nothing is learned
-                    gain[a, rows] = -dependence
-                    continue
-                given = x[rows][:, columns]
-                log_q = _score(u[rows], given)
-                gain[a, rows] = log_q - log_normal(u[rows]) - dependence
+        for a, rows, _, x in by_pattern(simulations, self.few):
+            if len(rows) < 8:  # no density to fit: nothing is learned
+                gain[a, rows] = -dependence
+                continue
+            gain[a, rows] = _score(u[rows], x) - log_normal(u[rows]) - dependence
         return gain
 
 
-class NormalScores:
-    r"""A smooth monotone map of one parameter to about the standard normal.
+def normal_scores(
+    draws: Tensor, *, nearly_normal: float = 0.02, num_quantiles: int = 33
+) -> Features:
+    r"""Return a smooth monotone map of one parameter to about the standard normal.
 
     It is linear where the parameter is close to normal, else :math:`\Phi^{-1}(F)` with
     a distribution function F that interpolates a few quantiles monotonically.
@@ -170,32 +158,23 @@ class NormalScores:
     References:
         Fritsch & Carlson, SIAM Journal on Numerical Analysis 1980.
     """
+    center, scale = draws.mean(), draws.std().clamp_min(1e-30)
+    z, edge = (draws - center) / scale, 0.5 / len(draws)
+    share = torch.linspace(0, 1, num_quantiles).double()
+    quantile, first = np.unique(z.quantile(share).numpy(), return_index=True)
+    if _dependence(z[:, None]) < nearly_normal or len(quantile) < 3:
+        return lambda theta: (theta - center) / scale
+    curve = PchipInterpolator(quantile, share.numpy()[first])
 
-    def __init__(
-        self, draws: Tensor, *, nearly_normal: float = 0.02, num_quantiles: int = 33
-    ) -> None:
-        self.center, self.scale = draws.mean(), draws.std().clamp_min(1e-30)
-        self.curve: PchipInterpolator | None = None
-        z = (draws - self.center) / self.scale
-        self.edge = 0.5 / len(draws)
-        if _dependence(z[:, None]) < nearly_normal:
-            return
-        share = torch.linspace(0, 1, num_quantiles).double()
-        quantile, first = np.unique(z.quantile(share).numpy(), return_index=True)
-        if len(quantile) > 2:
-            self.curve = PchipInterpolator(quantile, share.numpy()[first])
+    def scores(theta: Tensor) -> Tensor:
+        z = ((theta - center) / scale).clamp(quantile[0], quantile[-1])
+        share = torch.from_numpy(curve(z.numpy()))
+        return torch.special.ndtri(share.clamp(edge, 1 - edge))
 
-    def __call__(self, theta: Tensor) -> Tensor:
-        """Return the scores of parameters, shape (n,)."""
-        z = (theta - self.center) / self.scale
-        if self.curve is None:
-            return z
-        low, high = self.curve.x[0], self.curve.x[-1]
-        share = torch.from_numpy(self.curve(z.clamp(low, high).numpy()))
-        return torch.special.ndtri(share.clamp(self.edge, 1 - self.edge))
+    return scores
 
 
-def _map(scores: list[NormalScores], theta: Tensor) -> Tensor:
+def _map(scores: list[Features], theta: Tensor) -> Tensor:
     return torch.stack([f(t) for f, t in zip(scores, theta.T, strict=True)], 1)
 
 
@@ -220,6 +199,9 @@ LOG_2PI = math.log(2 * math.pi)
 RIDGES = 10.0 ** torch.arange(-6.0, 3.0, dtype=torch.float64)
 
 Density = Callable[[Tensor, Tensor], Tensor]
+Features = Callable[[Tensor], Tensor]
+#: A function of outcomes, and its leave-one-out residuals.
+Regression = tuple[Features, Tensor]
 
 
 def conditional_members(u: Tensor, x: Tensor) -> list[Density]:
@@ -231,22 +213,26 @@ def conditional_members(u: Tensor, x: Tensor) -> list[Density]:
     has a share of the standard normal, so that no row costs more than a few nats. They
     are functions of u (k, s) and x (k, q), which may have no numbers, -> (k,).
     """
-    members: list[Density] = [_Residual.fit(u, None).density()]
+    members: list[Density] = [_around(u, x)]
     if x.shape[1] == 0:
         members.append(_mixture(u, x, lambda x: x))
     else:
         reduce = Reduction.fit(x, torch.cat([u, u.square()], 1))
-        z = reduce(x)
+
+        def quadratic(x: Tensor) -> Tensor:
+            z = reduce(x)
+            i, j = torch.triu_indices(z.shape[1], z.shape[1])
+            return torch.cat([z, z[:, i] * z[:, j]], 1).clamp(-30, 30)
+
         regressions = [
-            _linear(reduce.standard(x), u, reduce.standard),
-            _linear(_quadratic(z), u, lambda x: _quadratic(reduce(x))),
-            _kernel(z, u, reduce),
+            _linear(x, u, reduce.standard),
+            _linear(x, u, quadratic),
+            _kernel(reduce(x), u, reduce),
         ]
         for mean, residual in regressions:
-            members.append(_Residual.fit(residual, None).density(mean))
-            scale = _Residual.fit(residual, _quadratic(z))
-            members.append(scale.density(mean, lambda x: _quadratic(reduce(x))))
-        members.append(_mixture(u, z, reduce))
+            members.append(_around(residual, x, mean))
+            members.append(_around(residual, x, mean, quadratic))
+        members.append(_mixture(u, x, reduce))
     return [_defended(member) for member in members]
 
 
@@ -261,67 +247,50 @@ def _defended(member: Density, share: float = 0.02) -> Density:
     )
 
 
-@dataclass(frozen=True)
-class _Residual:
-    r"""Gaussian residuals, :math:`r \sim N(m, s^2(x) L L^\top)`.
+def _around(
+    residual: Tensor,
+    x: Tensor,
+    mean: Features | None = None,
+    features: Features | None = None,
+) -> Density:
+    r"""Return the density of residuals, :math:`r \sim N(m, s^2(x) L L^\top)`.
 
-    Attributes:
-        location: m, shape (s,).
-        factor: L, shape (s, s).
-        slope: Slope of log s in features of x; None if s is 1.
-        offset: Offset of log s.
+    Args:
+        residual: Residuals that it is fitted to, shape (n, s).
+        x: Outcomes, shape (n, q).
+        mean: Regression that they are those of; None for none.
+        features: Features that log s is linear in; None if s is 1.
     """
-
-    location: Tensor
-    factor: Tensor
-    slope: Tensor | None
-    offset: float
-
-    @staticmethod
-    def fit(residual: Tensor, features: Tensor | None) -> _Residual:
-        n, s = residual.shape
-        location = residual.mean(0)
-        centered = residual - location
-        covariance = centered.T @ centered / n + 1e-10 * torch.eye(s)
-        factor = torch.linalg.cholesky(covariance)
-        if features is None:
-            return _Residual(location, factor, None, 0.0)
+    n, s = residual.shape
+    location = residual.mean(0)
+    centered = residual - location
+    factor = torch.linalg.cholesky(centered.T @ centered / n + 1e-10 * torch.eye(s))
+    log_det = factor.diagonal().log().sum()
+    slope, offset = None, 0.0
+    if features is not None:
         white = torch.linalg.solve_triangular(factor, centered.T, upper=False)
         log_square = (white.square().mean(0) + 1e-3).log()
-        slope = _ridge(features, log_square[:, None])[0]
-        log_scale = (0.5 * (linear(features) @ slope)[:, 0]).clamp(-6, 6)
+        slope = _ridge(features(x), log_square[:, None])[0]
+        log_scale = (0.5 * (linear(features(x)) @ slope)[:, 0]).clamp(-6, 6)
         offset = 0.5 * float((white.square() / (2 * log_scale).exp()).mean().log())
-        return _Residual(location, factor, slope, offset)
 
-    def density(
-        self,
-        mean: Callable[[Tensor], Tensor] | None = None,
-        features: Callable[[Tensor], Tensor] | None = None,
-    ) -> Density:
-        log_det = self.factor.diagonal().log().sum()
+    def log_density(u: Tensor, x: Tensor) -> Tensor:
+        centered = (u if mean is None else u - mean(x)) - location
+        log_scale = torch.zeros(len(u), dtype=u.dtype)
+        if features is not None and slope is not None:
+            log_scale = 0.5 * (linear(features(x)) @ slope)[:, 0]
+            log_scale = log_scale.clamp(-6, 6) + offset
+        white = torch.linalg.solve_triangular(factor, centered.T, upper=False)
+        square = white.square().sum(0) / (2 * log_scale).exp()
+        return -0.5 * (square + u.shape[1] * (LOG_2PI + 2 * log_scale)) - log_det
 
-        def log_density(u: Tensor, x: Tensor) -> Tensor:
-            centered = (u if mean is None else u - mean(x)) - self.location
-            log_scale = torch.zeros(len(u), dtype=u.dtype)
-            if features is not None and self.slope is not None:
-                log_scale = 0.5 * (linear(features(x)) @ self.slope)[:, 0]
-                log_scale = log_scale.clamp(-6, 6) + self.offset
-            white = torch.linalg.solve_triangular(self.factor, centered.T, upper=False)
-            square = white.square().sum(0) / (2 * log_scale).exp()
-            return -0.5 * (square + u.shape[1] * (LOG_2PI + 2 * log_scale)) - log_det
-
-        return log_density
+    return log_density
 
 
-Regression = tuple[Callable[[Tensor], Tensor], Tensor]
-
-
-def _linear(
-    features: Tensor, u: Tensor, transform: Callable[[Tensor], Tensor]
-) -> Regression:
-    """Ridge regression and its leave-one-out residuals."""
-    slope, residual = _ridge(features, u)
-    return lambda x: linear(transform(x)) @ slope, residual
+def _linear(x: Tensor, u: Tensor, features: Features) -> Regression:
+    """Ridge regression on features of the outcomes."""
+    slope, residual = _ridge(features(x), u)
+    return lambda x: linear(features(x)) @ slope, residual
 
 
 def _ridge(features: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
@@ -379,15 +348,9 @@ def _smooth(z: Tensor, rest: Tensor, length: float) -> tuple[float, Tensor, Tens
     return min(fits, key=lambda fit: fit[0])
 
 
-def _quadratic(z: Tensor) -> Tensor:
-    i, j = torch.triu_indices(z.shape[1], z.shape[1])
-    return torch.cat([z, z[:, i] * z[:, j]], 1).clamp(-30, 30)
-
-
-def _mixture(
-    u: Tensor, z: Tensor, reduce: Callable[[Tensor], Tensor], most: int = 6
-) -> Density:
+def _mixture(u: Tensor, x: Tensor, reduce: Features, most: int = 6) -> Density:
     """Return the conditional density of a mixture of so many Gaussians of (z, u)."""
+    z = reduce(x)
     q, rows = z.shape[1], torch.cat([z, u], 1).numpy()
     joint = fitted_normals(rows, most, np.random.default_rng(0), num_iterations=40)
     given = replace(joint, means=joint.means[:, :q], factors=joint.factors[:, :q, :q])

@@ -122,9 +122,7 @@ def _that_matter(
 ) -> list[Effect]:
     """Return the effects that are no parameter and change the readings."""
     function: MujocoFunction = simulator.fn  # pyright: ignore[reportAssignmentType]
-    bare = SimulatorModel(
-        function, sample_times=simulator.sample_times, inputs=simulator.inputs
-    )
+    bare = simulator.without_noise()
     theta, action = call["theta"], call["action"]
     context = Context(
         index=torch.arange(len(theta), dtype=torch.float64),

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
@@ -16,15 +15,14 @@ from sbi_active.mujoco.models.names import element_id, start_places
 from sbi_active.mujoco.models.running import begin, start_states
 from sbi_active.mujoco.models.spec import mujoco_of
 from sbi_active.mujoco.simulator import MujocoFunction
+from sbi_active.mujoco.typical import SPREAD, typical_call
 from sbi_active.simulation import SimulatorModel
 
-#: Rows that are looked at, and states in each.
-NUM_ROWS, NUM_STATES = 4, 200
+#: States that are looked at in each row.
+NUM_STATES = 200
 #: Share of the states that are usual, and times their root mean square that others
 #: count for at most.
 USUAL, JOLT = 0.95, 10.0
-#: Where nothing says how the robot moves: rad or m from the start, s.
-SPREAD, SECONDS = 0.5, 1.0
 
 
 @dataclass(frozen=True)
@@ -77,7 +75,7 @@ def nominal(
     """
     function = simulator.fn
     assert isinstance(function, MujocoFunction)
-    call = _call(simulator, function, trials, actions)
+    call = typical_call(simulator, trials, actions)
     seen: list[dict[str, Array]] = []
     x = function(**call, watch=lambda *given: seen.append(_watched(*given)))
     together = {k: np.concatenate([s[k] for s in seen]) for k in seen[0]}
@@ -105,58 +103,6 @@ def nominal(
         ),
         call,
     )
-
-
-def _call(
-    simulator: SimulatorModel,
-    function: MujocoFunction,
-    trials: Trials | None,
-    actions: Any,
-) -> dict[str, Any]:
-    """Return arguments of a call of a few typical rows."""
-    machine = function.machines[0]
-    middle = torch.tensor(
-        [0.5 * (p.low + p.high) for p in machine.parameters], dtype=torch.float64
-    )
-    call: dict[str, Any] = {}
-    if trials is not None:
-        some = torch.linspace(0, len(trials) - 1, min(NUM_ROWS, len(trials))).long()
-        picked = trials.select(some.unique())
-        call["action"] = picked.action.double()
-        if picked.inputs is not None:
-            call |= {"inputs": picked.inputs, "input_times": picked.input_times}
-        if picked.start is not None:
-            call["start"] = picked.start
-        if picked.sample_times is not None:
-            times = picked.sample_times.expand(len(picked), -1)
-            last = times.nan_to_num(-torch.inf).amax(1, keepdim=True)
-            call["times"] = times.where(times.isfinite(), last).double()
-    elif simulator.inputs is not None or actions is not None:
-        space = simulator.inputs or actions
-        call["action"] = space.sample((NUM_ROWS,), seed=0).double()
-        if simulator.inputs is not None:
-            call["inputs"] = simulator.inputs.inputs(call["action"])
-            call["input_times"] = simulator.inputs.input_times
-    else:
-        call |= _released(machine.model)
-    num = len(call["action"])
-    if "times" not in call and function.times is None:
-        grid = torch.linspace(0, SECONDS, 51, dtype=torch.float64)
-        call["times"] = grid.expand(num, -1)
-    return {"theta": middle.expand(num, -1), **call}
-
-
-def _released(model: Any) -> dict[str, Any]:
-    """Return start states around that of the model."""
-    rng = np.random.default_rng(0)
-    start = {
-        name: torch.from_numpy(
-            model.qpos0[place] + SPREAD * rng.uniform(-1, 1, NUM_ROWS)
-        )
-        for name, place in start_places(model).items()
-        if place < model.nq and "[" not in name
-    }
-    return {"action": torch.zeros(NUM_ROWS, 1, dtype=torch.float64), "start": start}
 
 
 def _watched(model: Any, models: Sequence[Any], rows: Rows) -> dict[str, Array]:

@@ -68,6 +68,13 @@ class Bounded:
     quantity: Quantity | None = None
     edit: Callable[[Any, float], Any] | None = None
 
+    def __post_init__(self) -> None:
+        if not (np.isfinite([self.low, self.high]).all() and self.low < self.high):
+            raise ValueError(
+                f"expected finite bounds low < high of parameter {self.name!r}; got "
+                f"{self.low:g} and {self.high:g}; pass them in this order"
+            )
+
 
 @dataclass(frozen=True)
 class Writer:
@@ -114,22 +121,17 @@ def bounded(model: Any, parameters: Mapping[str, Any]) -> tuple[Bounded, ...]:
     found = []
     for name, given in parameters.items():
         try:
-            low, high, *rest = given
+            low, high, what = given if len(given) == 3 else (*given, name)
             low, high = float(low), float(high)
         except (TypeError, ValueError) as error:
             raise ValueError(
                 f"expected parameter {name!r} as (low, high), or (low, high, quantity "
                 f"or function of the spec); got {given!r}; pass its bounds"
             ) from error
-        if not (np.isfinite([low, high]).all() and low < high) or len(rest) > 1:
-            raise ValueError(
-                f"expected finite bounds low < high of parameter {name!r}; got "
-                f"{given!r}; pass them in this order"
-            )
-        if rest and callable(rest[0]):
-            found.append(Bounded(name, low, high, edit=rest[0]))
+        if callable(what):
+            found.append(Bounded(name, low, high, edit=what))
             continue
-        quantity = find_quantity(model, rest[0] if rest else name)
+        quantity = find_quantity(model, what)
         if low < 0 and not quantity.known.is_signed:
             raise ValueError(
                 f"expected bounds of {str(quantity)!r} from 0 on; got {low:g} to "

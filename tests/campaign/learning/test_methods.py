@@ -6,8 +6,9 @@ import cloudpickle
 import pytest
 import torch
 
+from benchmarks.numerical.methods import faithful_options
 from sbi_active import CampaignOptions, MixtureDensity
-from sbi_active.campaign.learning.methods import METHODS, faithful_options
+from sbi_active.campaign.learning.methods import METHODS
 from sbi_active.inference import LFIRE
 from tests.campaign.problem import OPTIONS, RATIOS, campaign, noisy
 from tests.campaign.sizes import REFINEMENT

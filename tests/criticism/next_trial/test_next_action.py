@@ -77,8 +77,8 @@ def test_the_gain_is_that_of_two_known_densities():
     names = ("none", "bias")
     candidates = BOTH.values[[0, 3]]
     rivals = [PredictedRival(c.rivals, ModelKey.of(n), 0.5, candidates) for n in names]
-    sampler = RivalSampler(rivals, candidates, 0)
-    simulations = sampler.draw(1_000, torch.arange(2), replicates=False)
+    sampler = RivalSampler(rivals, 0)
+    simulations = sampler.draw(1_000, candidates, replicates=False)
     gain = ModelIndexGain(sampler.probability)(None, simulations, None)
     for a, rows in enumerate(gain):
         draws = [r.predict(candidates[a], 10_000, 9)[:, 0].double() for r in rivals]

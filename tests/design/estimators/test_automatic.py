@@ -11,7 +11,7 @@ from sbi_active.design.estimators.automatic import (
     find_estimator,
 )
 from sbi_active.design.estimators.base import CandidateSimulations
-from sbi_active.design.estimators.contrast import ContrastiveGain, InfoNCEGain
+from sbi_active.design.estimators.contrast import InfoNCEGain
 from sbi_active.simulation import GaussianNoise
 from tests.linear_gaussian import (
     PRIOR,
@@ -82,10 +82,6 @@ def test_a_ratio_beyond_the_reach_of_info_nce_is_averaged():
 @pytest.mark.parametrize(
     ("estimator", "text"),
     [
-        (
-            ContrastiveGain(num_contrastive=63),
-            "near its largest value, log(L + 1) = 4.2",
-        ),
         (InfoNCEGain(num_contrastive=63), "near its largest value, log K = 4.2"),
         (LikelihoodGain(num_contrastive=64), "near log L = 4.2 nats or above"),
     ],
@@ -119,6 +115,13 @@ def test_a_ratio_whose_normalization_is_off_is_noticed():
     assert "nats below" in notes[0]
 
 
-def test_a_former_name_is_taken_for_one_version():
-    with pytest.warns(DeprecationWarning, match=r"use estimator=\"likelihood\""):
-        assert type(find_estimator("variational_nested")) is LikelihoodGain
+@pytest.mark.parametrize(
+    ("former", "name", "kind"),
+    [
+        ("variational_nested", "likelihood", LikelihoodGain),
+        ("contrastive", "info_nce", InfoNCEGain),
+    ],
+)
+def test_a_former_name_is_taken_for_one_version(former, name, kind):
+    with pytest.warns(DeprecationWarning, match=f'use estimator="{name}"'):
+        assert type(find_estimator(former)) is kind

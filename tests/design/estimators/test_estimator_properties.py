@@ -15,7 +15,7 @@ from sbi_active.design import (
 )
 from sbi_active.design.estimators.automatic import ESTIMATORS as NAMES
 from sbi_active.design.estimators.base import CandidateSimulations
-from sbi_active.design.estimators.contrast import ContrastiveGain, InfoNCEGain
+from sbi_active.design.estimators.contrast import InfoNCEGain
 from sbi_active.simulation import GaussianNoise
 from tests.linear_gaussian import (
     PRIOR,
@@ -35,7 +35,6 @@ class Everything(ExactLikelihoodAndPosterior, ExactRatio):
 
 
 ESTIMATORS = {
-    "contrastive": ContrastiveGain(num_contrastive=50),
     "entropy": EntropyGain(),
     "info_nce": InfoNCEGain(num_contrastive=31),
     "likelihood": LikelihoodGain(num_contrastive=50),

@@ -59,8 +59,8 @@ def information(rivals):
 
 
 def estimate(rivals, num_samples, seed=0):
-    sampler = RivalSampler(rivals, ACTIONS, seed)
-    rows = sampler.draw(num_samples, torch.arange(len(ACTIONS)), replicates=False)
+    sampler = RivalSampler(rivals, seed)
+    rows = sampler.draw(num_samples, ACTIONS, replicates=False)
     gain = ModelIndexGain(sampler.probability)(None, rows, None)
     return gain.mean(1), gain.std(1) / gain.shape[1] ** 0.5
 
@@ -96,8 +96,8 @@ FACTOR = torch.linalg.cholesky(SPREAD)
 def test_a_difference_hidden_in_a_long_trajectory():
     """The wave is small beside the spread, in a direction that has little of it."""
     rivals = [Trajectory(0.5, 0.0), Trajectory(0.5, 0.4)]
-    sampler = RivalSampler(rivals, ACTIONS[[0, 1, 2]], 0)
-    rows = sampler.draw(900, torch.arange(3), replicates=False)
+    sampler = RivalSampler(rivals, 0)
+    rows = sampler.draw(900, ACTIONS[:3], replicates=False)
     assert rows.x.shape == (3, 900, 200, 1)
     gain = ModelIndexGain(sampler.probability)(None, rows, None)
     error = gain.std(1) / gain.shape[1] ** 0.5
