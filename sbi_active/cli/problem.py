@@ -310,7 +310,7 @@ def open_campaign(
     if simulator is not None:
         declared |= {"simulator": None, "task": None, "option": []}
     require_trust(folder, declared, trusts=trust)
-    sys.path.append(declared.get("folder", ""))
+    sys.path += filter(None, [declared.get("folder")])  # where modules were found
     own = {} if simulator is None else {"simulator": simulator}
     model, prior, actions, effects = problem_of({**declared, **own}, needs=())
     if reader.state.version.effects:

@@ -170,18 +170,22 @@ def inspect(folder: Path) -> int:
         return 1
     header = made.header
     shapes = (header["shapes"] or {}).items()
-    lines = [
-        f"simulator: {made.simulator_name} {header['version']}".rstrip(),
-        f"created: {header['created'] or 'not noted'}",
+    for line in (
+        f"simulator: {shown(made.simulator_name)} {shown(header['version'])}".rstrip(),
+        f"created: {shown(header['created'] or 'not noted')}",
         *(f"{name}: {' x '.join(map(str, shape))} a row" for name, shape in shapes),
-        f"parameters: {', '.join(header['parameter_names'] or ['?'])}",
+        f"parameters: {', '.join(map(shown, header['parameter_names'] or ['?']))}",
         f"rows: {made.counts}; on disk: {made.num_bytes / 2**20:.2f} MiB",
-        f"drawn from: {', '.join(label or '?' for label in made.labels)}",
+        f"drawn from: {', '.join(shown(label or '?') for label in made.labels)}",
         "checksums: ok",
-    ]
-    for line in lines:  # a text from a file must not steer the terminal
-        print(line if line.isprintable() else ascii(line))
+    ):
+        print(line)
     return 0
+
+
+def shown(text: str) -> str:
+    """Return a text from a file so that it cannot steer the terminal."""
+    return text if text.isprintable() else ascii(text)
 
 
 @cli.command(cli.DIR)
