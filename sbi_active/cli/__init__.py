@@ -39,36 +39,32 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = sys.argv[1:] if argv is None else [*argv]
     if in_campaign(here := Path.cwd()):  # nothing is imported because it lies there
         sys.path[:] = [p for p in sys.path if p and Path(p).resolve() != here]
-    from sbi_active.cli import campaign, criticize, session, simulators, watch  # noqa: F401
+    elif str(here) not in sys.path:
+        sys.path.append(str(here))
+    from sbi_active.cli import campaign, criticize, simulators, watch  # noqa: F401
 
-    shell = os.environ.get(COMPLETE)
-    if shell:
+    if shell := os.environ.get(COMPLETE):
         return shell_complete(program, {}, NAME, COMPLETE, shell)
-    is_json, status, error = "--json" in words, 0, None
+    is_json = "--json" in words
     with contextlib.suppress(AttributeError, ValueError):
         # A terminal that has no such letter shows its number.
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore
     try:
         answer = _answer(words, is_json)
+        status = answer if isinstance(answer, int) else 0
         if isinstance(answer, Answer):
-            print(as_line(answer.data) if is_json else answer.text)
             status = answer.status
-        elif isinstance(answer, int):
-            status = answer
-        if sys.stdout is not None:
-            sys.stdout.flush()
-    except Exit as ended:  # of help and version
-        status = ended.exit_code
+            print(as_line(answer.data) if is_json else answer.text)
+        print(end="", flush=True)
     except (Exception, KeyboardInterrupt) as raised:
         error = failure(raised)
         status = error["status"]
         if not isinstance(raised, BrokenPipeError):  # as in "| head": nobody reads on
             say(error["message"])
-    with contextlib.suppress(AttributeError):  # of an output that was closed before
         try:
-            if error and is_json:
+            if is_json:
                 print(as_line({"error": error}))
-            sys.stdout.flush()  # type: ignore
+            print(end="", flush=True)
         except OSError:  # the end of the process has then nothing to complain of
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     return status
@@ -76,10 +72,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _answer(words: list[str], is_json: bool) -> object:
     """Run a command; the answer for programs has standard output for itself."""
+    # Words are UTF-8, whatever the locale.
+    words = [word.encode(errors="surrogateescape").decode() for word in words]
     with (
         output_to_errors() if is_json else contextlib.nullcontext(),
         warnings.catch_warnings(),
     ):
         warnings.showwarning = lambda message, *_: say(f"note: {message}")
-        with program.make_context(NAME, words) as context:
-            return program.invoke(context)
+        try:
+            with program.make_context(NAME, words) as context:
+                return program.invoke(context)
+        except Exit as ended:  # of help and version
+            return ended.exit_code

@@ -1,18 +1,16 @@
 """The program ``sbi-active``: how commands are declared, and the types of options.
 
-The values of options stand in words, in a file of TOML, or in a request of JSON;
-numbers also in tables.
+Values of options stand in words, in a file of TOML, or in a request of JSON.
 """
 
 from __future__ import annotations
 
 import csv
-import io
 import json
 import math
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,34 +24,33 @@ TASKS = (
 )
 #: Names of the methods, as in ``sbi_active.campaign.learning.methods.METHODS``.
 METHODS = ("asbi", "nsbi", "alhi", "nlhi", "seqbed")
-#: Options of the last version, now settings.
+#: Options of the last version, and the settings that they are now.
 FORMER = {
-    "num-simulations": "num_simulations",
+    "num_simulations": "num_simulations",
     "simulations": "num_simulations",
-    "num-samples": "num_samples",
-    "num-workers": "workers.num_workers",
-    "time-limit": "workers.time_limit",
+    "num_samples": "num_samples",
+    "num_workers": "workers.num_workers",
+    "time_limit": "workers.time_limit",
 }
 #: What float32 holds with all its digits, beside 0.
 SMALLEST, LARGEST = 2.0**-126, 2.0**128 - 2.0**104
 #: Options that no file and no request sets: where these are, and who is trusted.
 UNWRITTEN = ("config", "trust", "json")
-OF_FOLDER = "problem.toml"  # options of a folder of recordings
-BOUNDARY = "\0"  # between the words of an option of several; no word has it
+OPTION = re.compile(r"-[^\d.]")  # and no negative number
 
 
 class Text(click.ParamType):
-    """A word in UTF-8, whatever the locale; in a file or a request also a list."""
+    """A text; in a file or a request also a list, or a number."""
 
     name = "text"
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> str:
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
         """Return the text of a value."""
         text = ",".join(map(str, value)) if isinstance(value, list) else str(value)
         if text.startswith("--"):  # the next option
             said = f"Option {param.opts[0]!r} requires an argument."
             raise click.BadOptionUsage(param.opts[0], said, ctx)
-        return text.encode(errors="surrogateescape").decode()
+        return text
 
 
 class Numbers(Text):
@@ -65,67 +62,29 @@ class Numbers(Text):
         return [number_of(part) for part in text.split(",")]
 
 
-class Several(click.ParamType):
-    """All words up to the next option; in a file a list, or a table of NAME=VALUE."""
-
-    name = "words"
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> list[str]:
-        """Return the words of a value."""
-        if isinstance(value, dict):  # as in columns = {trial = "ball", x = "height"}
-            value = [f"{k}={TEXT.convert(v, param, ctx)}" for k, v in value.items()]
-        several = value.split(BOUNDARY) if isinstance(value, str) else value
-        several = several if isinstance(several, list) else [several]
-        return [TEXT.convert(word, param, ctx) for word in several]
-
-
-class Measured(click.ParamType):
-    """A number that was measured, or nan."""
-
-    name = "x"
-
-    def convert(self, value: Any, param: Any, ctx: Any) -> float:
-        """Return the number, which a slip of the pen is not."""
-        if re.match(r"-[^\d.]", str(value)):
-            raise click.NoSuchOption(value, ctx=ctx)
-        return number_of(str(value), is_outcome=True)
-
-
-TEXT, NUMBERS, MEASURED = Text(), Numbers(), Measured()
-SEVERAL, PAIRS = Several(), Several()  # given again, the last counts, or all do
-COUNT = click.IntRange(min=1)
+TEXT, NUMBERS, COUNT = Text(), Numbers(), click.IntRange(min=1)
 FILE, FOLDER = click.Path(path_type=Path), click.Path(path_type=Path, file_okay=False)
 
 
 class Command(click.Command):
-    """A command whose options of the type :class:`Several` take several words."""
+    """A command whose options that may be given again take several words as well."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Set the parameters of the context by words."""
-        several = {name: param.type for param in self.params for name in param.opts}
-        several = {n: kind for n, kind in several.items() if isinstance(kind, Several)}
-        taken: dict[str, list[str]] = {}
-        words, name, left = [], "", iter([] if ctx.resilient_parsing else args)
-        for word in left:
-            if re.match(r"-[^\d.]", word):
-                name, equals, value = word.partition("=")
-                setting = FORMER.get(name[2:]) if "--set" in several else None
-                if setting is not None:
-                    value = value if equals else next(left, "")
-                    taken.setdefault("--set", []).append(f"{setting}={value}")
-                elif name in several:
-                    before = taken.get(name, []) if several[name] is PAIRS else []
-                    taken[name] = [*before, *([value] if equals else [])]
-                    continue
-                else:
-                    words.append(word)
-                name = ""
-            elif name:
-                taken[name].append(word)
-            else:
-                words.append(word)
-        joined = [f"{name}={BOUNDARY.join(taken[name])}" for name in taken]
-        return super().parse_args(ctx, [*joined, *words] or args)
+        options = {
+            n: p for p in self.params if p.param_type_name == "option" for n in p.opts
+        }
+        words, name = [], ""
+        for word in args:
+            if OPTION.match(word):
+                name = word.partition("=")[0]
+                known = ("--", *options, *ctx.help_option_names)
+                if name not in known and not ctx.resilient_parsing:
+                    raise click.NoSuchOption(name, possibilities=[*options], ctx=ctx)
+            elif getattr(options.get(name), "multiple", False) and words[-1] != name:
+                words.append(name)
+            words.append(word)
+        return super().parse_args(ctx, words)
 
 
 program = click.Group(
@@ -142,25 +101,16 @@ click.version_option(package_name=NAME, **VERSION)(program)
 
 
 def command(
-    *params: click.Parameter, name: str = "", group: click.Group = program, **more: Any
-) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Make a function a command, whose docstring is its help.
+    *params: click.Parameter, group: click.Group = program, **settings: Any
+) -> Any:
+    """Return a decorator that makes a function a command, its docstring the help.
 
     Args:
         *params: Arguments and options of the command, in the order of the help.
-        name: Name of the command; that of the function otherwise.
         group: Commands that it belongs to.
-        **more: Settings of its context.
+        **settings: Settings of its context.
     """
-
-    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        settings = {**program.context_settings, **more}
-        title = name or function.__name__.strip("_")
-        help_text = function.__doc__
-        group.add_command(Command(title, settings, function, [*params], help=help_text))
-        return function
-
-    return decorate
+    return group.command(cls=Command, params=[*params], context_settings=settings)
 
 
 def option(
@@ -172,15 +122,14 @@ def option(
         name: Name with its dashes.
         help: Text that says what it does.
         type: Type of its value; None for a flag.
-        metavar: Value as the help shows it.
+        metavar: Value as the help shows it; if it ends in "...", several are taken.
         **settings: Further settings of :class:`click.Option`.
     """
-    if isinstance(type, Several):
-        settings["default"] = []
-    shows = settings.get("default") not in (None, "", [])
-    flag = {"is_flag": True} if type is None else {}
-    settings = {**flag, "show_default": shows, **settings}
-    return click.Option([name], help=help, type=type, metavar=metavar, **settings)
+    shows = settings.get("default") not in (None, "")
+    several = type is TEXT and bool(metavar) and str(metavar).endswith(" ...")
+    settings = {"is_flag": type is None or None, "show_default": shows, **settings}
+    settings |= {"help": help, "type": type, "metavar": metavar, "multiple": several}
+    return click.Option([name], **settings)
 
 
 def argument(name: str, metavar: str, type: Any = FOLDER, **more: Any) -> Any:
@@ -188,20 +137,21 @@ def argument(name: str, metavar: str, type: Any = FOLDER, **more: Any) -> Any:
     return click.Argument([name], metavar=metavar, type=type, **more)
 
 
-INTEGER = click.INT
 DIR = argument("folder", "DIR")
 A_TASK = option("--task", "with all that is declared of it", click.Choice(TASKS))
 OF_TASK = option(
-    "--option", "of the task: variant=sinh target=2", PAIRS, "NAME=VALUE ..."
+    "--option", "of the task: variant=sinh target=2", metavar="NAME=VALUE ..."
 )
-OF_CAMPAIGN = option(
-    "--set",
-    "fields of CampaignOptions: num_simulations=2000 workers.time_limit=3",
-    PAIRS,
-    "NAME=VALUE ...",
-)
+OF_CAMPAIGN = [
+    option(
+        "--set",
+        "fields of CampaignOptions: num_simulations=2000 workers.time_limit=3",
+        metavar="NAME=VALUE ...",
+    ),
+    *(option(f"--{n.replace('_', '-')}", "now by --set", hidden=True) for n in FORMER),
+]
 METHOD = option("--method", "by which it learns", click.Choice(METHODS), default="asbi")
-SEED = option("--seed", "of all that is random", INTEGER, default=0)
+SEED = option("--seed", "of all that is random", int, default=0)
 ROUNDS = option("--rounds", "real trials", COUNT, default=4)
 WORKERS = option("--workers", "processes", COUNT, default=1)
 JSON = option("--json", "for programs, errors too", None, expose_value=False)
@@ -216,37 +166,48 @@ SPACE = [
     option(
         "--actions",
         "for each entry LOW:HIGH, LOW:HIGH:COUNT or A,B,...; or one MODULE:NAME",
-        SEVERAL,
-        "SPEC ...",
+        metavar="SPEC ...",
     ),
     option("--noise", "standard deviation of x or its entries", NUMBERS, "SD[,SD...]"),
 ]
 PROBLEM = [A_TASK, OF_TASK, SIMULATOR, *SPACE]
 EFFECTS = option(
-    "--effects", "each a list of Effect, or gives one", SEVERAL, "MODULE:NAME ..."
+    "--effects", "each a list of Effect, or gives one", metavar="MODULE:NAME ..."
 )
 
 
-def take_config(
-    ctx: click.Context, _: click.Parameter, path: Path | None
+def take_file(
+    ctx: click.Context, param: click.Parameter, path: Path | None
 ) -> Path | None:
-    """Take from a TOML file what the command line leaves out."""
+    """Take from a file of TOML what the command line leaves out.
+
+    Args:
+        ctx: Context that gets the values.
+        param: The option --config, or the argument of a folder, whose problem.toml
+            counts where there is no other file.
+        path: The file, or the folder.
+    """
     if path is None or ctx.resilient_parsing:
         return path
+    file = path
+    if param.name != "config":
+        file = path / "problem.toml"
+        if ctx.default_map is not None or not file.is_file():
+            return path
     if sys.version_info >= (3, 11):
         import tomllib
     else:
         import tomli as tomllib
 
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        values = tomllib.loads(file.read_text(encoding="utf-8-sig"))
     except ValueError as error:
         raise ValueError(
-            f"expected TOML in {path}; got {error}; write options as in "
+            f"expected TOML in {file}; got {error}; write options as in "
             'theta-low = "0,1"'
         ) from error
-    found = named(ctx.command, values, str(path))
-    ctx.default_map = {k: _beside(path.parent, v) for k, v in found.items()}
+    found = named(ctx.command, values, str(file))
+    ctx.default_map = {name: beside(file.parent, v) for name, v in found.items()}
     return path
 
 
@@ -257,19 +218,8 @@ CONFIG = option(
     "FILE.toml",
     is_eager=True,
     expose_value=False,
-    callback=take_config,
+    callback=take_file,
 )
-
-
-def take_problem(ctx: click.Context, param: click.Parameter, folder: Path) -> Path:
-    """Take from a folder's problem.toml what no other file and no option gives."""
-    path = folder / OF_FOLDER
-    if ctx.default_map is None and path.is_file():
-        take_config(ctx, param, path)
-    return folder
-
-
-PROBLEM_FILE: Any = {"is_eager": True, "callback": take_problem}
 
 
 def named(
@@ -285,18 +235,30 @@ def named(
     Raises:
         ValueError: If a name is none of a parameter.
     """
-    known = [p.name for p in command.params if p.name and p.name not in UNWRITTEN]
-    found = {name.replace("-", "_"): value for name, value in values.items()}
-    former = {name.replace("-", "_"): now for name, now in FORMER.items()}
-    if "set" in known and (old := [name for name in found if name in former]):
-        settings = [f"{former[name]}={found.pop(name)}" for name in old]
-        found["set"] = [*found.get("set", []), *settings]
-    for name in {*found} - {*known}:
-        raise ValueError(
-            f"expected options among {', '.join(sorted(known)) or 'none'}; got "
-            f"{name!r} in {place}; remove it or write one of these"
-        )
-    return {name: value for name, value in found.items() if value is not None}
+    params: Any = {p.name: p for p in command.params if p.name not in UNWRITTEN}
+    found = {name.replace("-", "_"): v for name, v in values.items() if v is not None}
+    for name, value in found.items():
+        if name not in params:
+            raise ValueError(
+                f"expected options among {', '.join(sorted(params)) or 'none'}; got "
+                f"{name!r} in {place}; remove it or write one of these"
+            )
+        if params[name].multiple:
+            if isinstance(
+                value, dict
+            ):  # as in columns = {trial = "ball", x = "height"}
+                value = [f"{k}={TEXT.convert(v, None, None)}" for k, v in value.items()]
+            found[name] = value if isinstance(value, list) else [value]
+    return found
+
+
+def beside(folder: Path, value: Any) -> Any:
+    """Return options' values with the whole path of programs that lie in a folder."""
+    if isinstance(value, list | tuple):
+        return [beside(folder, part) for part in value]
+    file, colon, name = value.partition(":") if isinstance(value, str) else ("", "", "")
+    is_there = file.endswith(".py") and (folder / file).is_file()
+    return f"{(folder / file).resolve()}{colon}{name}" if is_there else value
 
 
 def pairs_of(texts: Sequence[str]) -> dict[str, str]:
@@ -322,15 +284,6 @@ def as_json(text: str) -> Any:
         return text
 
 
-def _beside(folder: Path, value: Any) -> Any:
-    """Return what a file says, with the path of programs that lie beside it."""
-    if isinstance(value, list):
-        return [_beside(folder, part) for part in value]
-    file, colon, name = value.partition(":") if isinstance(value, str) else ("", "", "")
-    is_there = file.endswith(".py") and (folder / file).is_file()
-    return f"{folder / file}{colon}{name}" if is_there else value
-
-
 def number_of(cell: str, place: str = "", *, is_outcome: bool = False) -> float:
     """Return a number as written, which float32 has to hold.
 
@@ -343,13 +296,12 @@ def number_of(cell: str, place: str = "", *, is_outcome: bool = False) -> float:
         ValueError: If it is anything else.
     """
     try:
-        value = math.nan if "_" in cell else float(cell)
+        value = math.inf if "_" in cell else float(cell)
     except ValueError:
         value = math.inf
-    if value == 0 or SMALLEST <= abs(value) <= LARGEST:
+    is_held = value == 0 or SMALLEST <= abs(value) <= LARGEST
+    if is_held or is_outcome and math.isnan(value):
         return value
-    if is_outcome and cell.strip().lower() == "nan":
-        return math.nan
     raise ValueError(
         f"expected finite numbers; got {cell!r:.80}{place}; write them with a point, "
         "as in 1.5 or 2e-3, without a unit, and within the range of float32"
@@ -362,14 +314,8 @@ def numbers_in(path: Path) -> list[float]:
     Raises:
         ValueError: If it is no table of numbers.
     """
-    try:
-        content = io.StringIO(path.read_text(encoding="utf-8-sig"), newline="")
-        rows = [*csv.reader(content, strict=True)]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(
-            f"expected a table of numbers, as text in UTF-8; got {path} ({error}); "
-            "save it so"
-        ) from error
+    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    rows = [*csv.reader(text.splitlines())]
     # A heading has no cell that begins like a number: 0.84 m and 0,84;1 are none.
     begins = re.compile(r"\s*(?:[-+]?\.?\d|[-+]?(?:nan|inf)\b|$)", re.IGNORECASE)
     first = 1 if rows and not any(map(begins.match, rows[0])) else 0

@@ -46,25 +46,26 @@ def say(said: object) -> None:
 
 def failure(error: BaseException) -> dict[str, Any]:
     """Return an error for programs: its class, its text, and the exit status."""
-    status, text = FAILED, f"{type(error).__name__}: {error}{place_of(error)}"
+    status, text = FAILED, located(error)
     if isinstance(error, KeyboardInterrupt):
-        status, text = INTERRUPTED, f"{str(error) or 'interrupted'}"
-        text += "; what was told before is kept"
+        status = INTERRUPTED
+        text = f"{str(error) or 'interrupted'}; what was told before is kept"
     elif isinstance(error, click.ClickException):
         status, text = MISUSED, error.format_message()
     elif isinstance(error, ValueError | OSError):
-        is_broken = isinstance(error, BrokenPipeError)
-        status, text = FAILED if is_broken else MISUSED, str(error)
+        status = FAILED if isinstance(error, BrokenPipeError) else MISUSED
+        text = str(error)
     message = TRACEBACK.sub(r"\3 (\1, line \2)", text)
     return {"type": type(error).__name__, "message": message, "status": status}
 
 
-def place_of(error: BaseException) -> str:
-    """Return where an error was raised, to be added to its text."""
-    frames = traceback.extract_tb(error.__traceback__)
-    if isinstance(error, SyntaxError) or not frames:  # whose text has it
-        return ""
-    return f" ({frames[-1].filename}, line {frames[-1].lineno})"
+def located(error: BaseException) -> str:
+    """Return the class and the text of an error, and where it was raised."""
+    text, frames = f"{type(error).__name__}: {error}", error.__traceback__
+    if isinstance(error, SyntaxError) or frames is None:  # whose text has it
+        return text
+    last = traceback.extract_tb(frames)[-1]
+    return f"{text} ({last.filename}, line {last.lineno})"
 
 
 def as_line(value: Any) -> str:

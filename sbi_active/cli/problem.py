@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import copy
 import importlib
-import inspect
 import math
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from operator import lt
 from pathlib import Path
 from typing import Any
 
@@ -18,19 +18,13 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace, BoxActions, DiscreteActions, MixedActions
 from sbi_active.campaign import Campaign, CampaignOptions
-from sbi_active.cli.declare import as_json, number_of, pairs_of
-from sbi_active.cli.output import place_of
-from sbi_active.cli.trusted import (
-    absolute,
-    in_campaign,
-    names_object,
-    read_declared,
-    require_trust,
-)
+from sbi_active.cli.declare import FORMER, as_json, number_of, pairs_of
+from sbi_active.cli.output import located
+from sbi_active.cli.trusted import names_object, read_declared, require_trust
 from sbi_active.criticism import Effect, generic_effects
 from sbi_active.expected import require
 from sbi_active.simulation import GaussianNoise, SimulatorModel
-from sbi_active.tasks import TASKS, Task, get_task  # pyright: ignore
+from sbi_active.tasks import Task, get_task  # pyright: ignore
 
 #: Actions of one space. A choice: each is stored in the campaign's folder and takes
 #: part in each design; twice as many take twice the memory, and half are still more
@@ -38,13 +32,11 @@ from sbi_active.tasks import TASKS, Task, get_task  # pyright: ignore
 MOST_ACTIONS = 100_000
 
 
-def load_object(name: str, folder: str | None = None, kind: Any = object) -> Any:
+def load_object(name: str, kind: Any = object) -> Any:
     """Import what a user names.
 
     Args:
         name: ``module:attribute``, or ``path/file.py:attribute``.
-        folder: Folder where paths begin and modules are looked for first; None is the
-            current one, in which no modules are looked for where it is a campaign's.
         kind: Class that it has to be of.
 
     Raises:
@@ -52,66 +44,55 @@ def load_object(name: str, folder: str | None = None, kind: Any = object) -> Any
             it is of another class.
     """
     module, _, attribute = name.partition(":")
-    if not module or not attribute:
-        raise ValueError(
-            f"expected MODULE:NAME; got {name!r}; write, say, my_robot:simulator"
-        )
-    file, here = None, Path.cwd() if folder is None else Path(folder)
-    if module.endswith(".py"):
-        file = Path(here, module).resolve()
-        if not file.is_file():
-            raise ValueError(f"expected a file; got none at {file}; check the path")
+    file = Path(module).resolve() if module.endswith(".py") else None
+    if file is not None:
         sys.path.insert(0, str(file.parent))
         module = file.stem
-    if str(here) not in sys.path and (folder is not None or not in_campaign(here)):
-        sys.path.insert(0 if file is None else len(sys.path), str(here))
     try:
         loaded = importlib.import_module(module)
+        origin = getattr(loaded, "__file__", None)
+        is_own = file is None or origin is not None and Path(origin).resolve() == file
+        found = getattr(loaded, attribute) if is_own else None
     except (Exception, SystemExit) as error:
         raise ValueError(
-            f"expected {name} to be imported, from {here} or as installed; got "
-            f"{type(error).__name__}: {error}{place_of(error)}; correct it"
+            "expected MODULE:NAME, such as my_robot:simulator, to be imported; got "
+            f"{located(error)} from {name}; correct it"
         ) from error
-    origin = getattr(loaded, "__file__", None)
-    if file is not None and (origin is None or Path(origin).resolve() != file):
+    if not is_own:
         raise ValueError(
-            f"expected a file whose name no other module has; got {file.name}, which "
+            f"expected a file whose name no other module has; got {module}.py, which "
             f"is also {origin or 'built in'}; rename the file"
         )
-    found = vars(loaded).get(attribute)
-    if found is None or not isinstance(found, kind):
+    if not isinstance(found, kind):
         raise ValueError(
-            f"expected a {kind.__name__} under {attribute!r} in {module!r}; got "
-            f"{type(found).__name__}; choose among "
-            f"{', '.join(n for n in vars(loaded) if not n.startswith('_'))}"
+            f"expected a {kind.__name__} under {name}; got {type(found).__name__}; "
+            "name another object"
         )
     return found
 
 
-def campaign_options(texts: Sequence[str]) -> CampaignOptions:
-    """Return the options of a campaign that --set gives."""
+def campaign_options(given: dict[str, Any]) -> CampaignOptions:
+    """Return the options of a campaign that --set gives, which are taken from these."""
+    former = {FORMER[name]: given.pop(name) for name in {*FORMER} & {*given}}
+    texts = {name: text for name, text in former.items() if text is not None}
     options = CampaignOptions()
-    for name, text in pairs_of(texts).items():
-        options = _changed(options, name, as_json(text))
+    for name, text in (texts | pairs_of(given.pop("set"))).items():
+        try:
+            options = _changed(options, name, as_json(text))
+        except (TypeError, AttributeError) as error:
+            raise ValueError(
+                f"expected a setting of a campaign; got {name}={text} ({error}); "
+                "correct it"
+            ) from error
     return options
 
 
 def _changed(settings: Any, name: str, value: Any) -> Any:
     """Return settings with a field of another value, or with a field of a field."""
     field, point, rest = name.partition(".")
-    known = getattr(settings, "__dataclass_fields__", {})
-    if field not in known:
-        raise ValueError(
-            f"expected a setting among {', '.join(known) or 'none'}; got {name}; write "
-            "one of these"
-        )
-    part = _changed(getattr(settings, field), rest, value) if point else value
-    try:
-        return replace(settings, **{field: part})
-    except TypeError as error:
-        raise ValueError(
-            f"expected another {name}; got {value!r} ({error}); correct it"
-        ) from error
+    if point:
+        value = _changed(getattr(settings, field), rest, value)
+    return replace(settings, **{field: value})
 
 
 def task_of(name: str, texts: Sequence[str]) -> Task:
@@ -133,10 +114,9 @@ def task_of(name: str, texts: Sequence[str]) -> Task:
     try:
         return get_task(name, **values)
     except (ImportError, FileNotFoundError, TypeError) as error:
-        known = "= or ".join([*inspect.signature(TASKS[name]).parameters, ""])
         raise ValueError(
             f"expected what {name!r} needs; got {values} ({error}); install it, or "
-            f"set --option {known}"
+            "correct --option"
         ) from error
 
 
@@ -149,43 +129,38 @@ def problem_of(
 
     Args:
         given: Values of the options ``PROBLEM``, ``EFFECTS``, "names" and "units" by
-            their names, as far as there are any; and as "folder" where the names of
-            programs begin, see :func:`load_object`.
+            their names, as far as there are any. They count before what a task has.
         needs: Parts without which nothing can be done.
 
     Raises:
         ValueError: If too much or too little is given, or it is not what it has to be.
     """
-    simulator, task, folder = map(given.get, ("simulator", "task", "folder"))
+    simulator, task = given.get("simulator"), given.get("task")
     if (task is None) == (simulator is None):
         raise ValueError(
             "expected --simulator or --task; got both or neither; name one, as in "
             "--simulator my_robot.py:fn"
         )
-    model: Any
-    bounded, found, own = prior_of(given), None, []
-    if task is None:
-        model = load_object(str(simulator), folder)
-    else:
-        whole: Any = task_of(task, given.get("option", ()))
-        if bounded is not None:
-            raise ValueError("expected no prior beside --task; got both; drop one")
-        model, bounded, found = whole.simulator, whole.prior, whole.actions
-        own = getattr(whole, "effects", list)()
-    actions, names, units = map(given.get, ("actions", "names", "units"))
-    space: Any = actions_of(actions, folder) if actions else found
-    if bounded is None and "prior" in needs:
+    whole: Any = None if task is None else task_of(task, given.get("option", ()))
+    model = load_object(str(simulator)) if whole is None else whole.simulator
+    prior = prior_of(given) or getattr(whole, "prior", None)
+    if prior is None and "prior" in needs:
         raise ValueError(
             "expected --theta-low and --theta-high, or --prior; got none; give bounds "
             "as in --theta-low=0,-1 --theta-high=1,1"
         )
+    actions, names, units = map(given.get, ("actions", "names", "units"))
+    space: Any = actions_of(actions) if actions else getattr(whole, "actions", None)
     if space is None and "actions" in needs:
         raise ValueError("expected --actions; got none; write, say, --actions 0:5:11")
     if space is not None and (names or units):
         labels = names.split(",") if names else space.names
         space._label(labels, units.split(",") if units else space.units)
-    own += effects_of(given.get("effects", ()), folder)
-    return with_noise(model, given.get("noise")), bounded, space, own
+    effects = [
+        *getattr(whole, "effects", list)(),
+        *effects_of(given.get("effects", ())),
+    ]
+    return with_noise(model, given.get("noise")), prior, space, effects
 
 
 def with_noise(simulator: Any, sd: Sequence[float] | None) -> Any:
@@ -202,11 +177,9 @@ def with_noise(simulator: Any, sd: Sequence[float] | None) -> Any:
     if sd is None:
         return simulator
     require(min(sd) > 0, "--noise > 0", sd, "give the standard deviation of x")
-    noise = GaussianNoise(torch.tensor(sd) if len(sd) > 1 else sd[0])
-    if not isinstance(simulator, SimulatorModel):
-        return SimulatorModel(simulator, noise=noise)
-    noisy = copy.copy(simulator)
-    noisy.noise = noise
+    is_model = isinstance(simulator, SimulatorModel)
+    noisy = copy.copy(simulator) if is_model else SimulatorModel(simulator)
+    noisy.noise = GaussianNoise(torch.tensor(sd) if len(sd) > 1 else sd[0])
     return noisy
 
 
@@ -214,23 +187,20 @@ def prior_of(given: Mapping[str, Any]) -> Distribution | None:
     """Return the prior that --prior, or --theta-low and --theta-high, name."""
     prior, low, high = map(given.get, ("prior", "theta_low", "theta_high"))
     if prior is not None:
-        return load_object(prior, given.get("folder"), kind=Distribution)
+        return load_object(prior, kind=Distribution)
     if low is None and high is None:
         return None
-    if low is None or high is None or len(low) != len(high):
-        raise ValueError(
-            f"expected --theta-low and --theta-high; got {low} and {high}; give one of "
-            "each a parameter"
-        )
-    if any(a >= b for a, b in zip(low, high, strict=True)):
-        raise ValueError(f"expected low below high; got {low} and {high}; swap them")
+    expected = "--theta-low below --theta-high, one of each a parameter"
+    low, high = low or [], high or []
+    is_box = len(low) == len(high) and all(map(lt, low, high))
+    require(is_box, expected, f"{low} and {high}", "give both")
     return BoxUniform(torch.tensor(low), torch.tensor(high))
 
 
-def actions_of(specs: Sequence[str], folder: str | None = None) -> ActionSpace:
+def actions_of(specs: Sequence[str]) -> ActionSpace:
     """Return the action space that --actions names."""
-    if names_object(specs):
-        return load_object(specs[0], folder, kind=ActionSpace)
+    if len(specs) == 1 and names_object(specs[0]):
+        return load_object(specs[0], kind=ActionSpace)
     entries = [_entry(spec) for spec in specs]
     values = [entry for entry in entries if isinstance(entry, list)]
     if len(values) == len(entries):
@@ -245,7 +215,7 @@ def actions_of(specs: Sequence[str], folder: str | None = None) -> ActionSpace:
         if isinstance(entry, list):
             parts.append(DiscreteActions(entry, names=names))
         else:
-            parts.append(BoxActions([entry[0]], [entry[1]], names=names))
+            parts.append(BoxActions(*entry, names=names))
     return MixedActions(*parts)
 
 
@@ -254,14 +224,13 @@ def _entry(spec: str) -> tuple[float, float] | list[float]:
     parts = spec.split(":")
     if len(parts) == 1:
         return [number_of(part) for part in spec.split(",")]
-    count = int(parts[2]) if len(parts) == 3 and parts[2].isdecimal() else 0
-    if len(parts) > 2 and count < 1:
-        raise ValueError(
-            f"expected LOW:HIGH:COUNT or A,B,...; got {spec!r}; write, say, 0:5:11"
-        )
     low, high = map(number_of, parts[:2])
+    if len(parts) == 2:
+        return low, high
+    count = int(parts[2]) if len(parts) == 3 and parts[2].isdecimal() else 0
+    require(count > 0, "LOW:HIGH:COUNT or A,B,...", repr(spec), "write, say, 0:5:11")
     _require_few(count)
-    return torch.linspace(low, high, count).tolist() if count else (low, high)
+    return torch.linspace(low, high, count).tolist()
 
 
 def _require_few(count: int) -> None:
@@ -269,11 +238,11 @@ def _require_few(count: int) -> None:
     require(count <= MOST_ACTIONS, f"at most {MOST_ACTIONS} actions", count, advice)
 
 
-def effects_of(names: Sequence[str], folder: str | None = None) -> list[Effect]:
+def effects_of(names: Sequence[str]) -> list[Effect]:
     """Return effects, each name that of a list or of a function that returns one."""
     effects: list[Effect] = []
     for name in names:
-        listed: Any = load_object(name, folder)
+        listed: Any = load_object(name)
         listed = listed() if callable(listed) else listed
         listed = [*listed] if isinstance(listed, Iterable) else [listed]
         if not all(isinstance(effect, Effect) for effect in listed):
@@ -298,8 +267,9 @@ def with_generic(
     """
     if not isinstance(simulator, SimulatorModel):
         simulator = SimulatorModel(simulator)
+    generic = generic_effects(simulator, space, prior=prior)
     found: dict[str, Effect] = {}
-    for effect in [*own, *generic_effects(simulator, space, prior=prior)]:
+    for effect in [*own, *generic]:
         found.setdefault(effect.name, effect)
     return [*found.values()]
 
@@ -320,42 +290,36 @@ def library_of(campaign: Campaign, effects: Sequence[str]) -> list[Effect]:
 def open_campaign(
     folder: Path,
     *,
-    simulates: bool,
     simulator: str | None = None,
     trust: bool = False,
     simulator_changed: bool = False,
-    repair: bool = False,
 ) -> Campaign:
-    """Return the campaign of a folder.
+    """Return the campaign of a folder, with its simulator.
 
     Args:
         folder: Folder of the campaign.
-        simulates: Whether its simulator is needed; else nothing of the folder is
-            imported.
         simulator: Place of the simulator; None if the folder says it.
         trust: Whether to import what the folder names.
         simulator_changed: Whether to take another simulator than before.
-        repair: Whether to give up what is damaged.
 
     Raises:
         ValueError: If there is no campaign, or its simulator is not known, or
             only the folder says so.
     """
-    reader = Campaign.load(folder, repair=repair)
-    if not simulates:
-        return reader
-    declared = read_declared(folder)
-    if simulator is not None:  # whose place begins here
-        declared |= {"simulator": absolute(simulator), "task": None}
-    require_trust(folder, declared, own=simulator, trusts=trust)
-    model, prior, actions, own = problem_of(declared, needs=())
+    reader, declared = Campaign.load(folder), read_declared(folder)
+    if simulator is not None:
+        declared |= {"simulator": None, "task": None, "option": []}
+    require_trust(folder, declared, trusts=trust)
+    sys.path += filter(None, [declared.get("folder")])  # where modules were found
+    own = {} if simulator is None else {"simulator": simulator}
+    model, prior, actions, effects = problem_of({**declared, **own}, needs=())
     if reader.state.version.effects:
-        own = with_generic(own, model, reader.actions, reader.first_prior)
+        effects = with_generic(effects, model, reader.actions, reader.first_prior)
     return Campaign.load(
         folder,
         simulator=model,
         prior=prior,
         actions=actions,
-        effects=own,
+        effects=effects,
         simulator_changed=simulator_changed,
     )

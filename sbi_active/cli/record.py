@@ -12,10 +12,9 @@ import json
 import math
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any
 
 from sbi_active.campaign.telling import (
     LOG,
@@ -28,28 +27,11 @@ from sbi_active.campaign.telling import (
     flat,
 )
 from sbi_active.cli.output import Answer
-from sbi_active.cli.trusted import read_declared
 from sbi_active.simulation.bank.store import Store
 
 
 class Unsure(Exception):  # noqa: N818
     """Only the campaign itself can judge what is told."""
-
-
-@dataclass(frozen=True)
-class Scored(Facts):
-    """A trial with what a campaign has found it to be."""
-
-    SCORES: ClassVar = ("information_gained", "surprise")
-
-    information_gained: float | None = None
-    surprise: float | None = None
-
-    @classmethod
-    def of(cls, trial: Any) -> Scored:
-        """Return a trial as a summary keeps it."""
-        scores = {name: getattr(trial, name) for name in cls.SCORES}
-        return cls(**vars(Facts.of(trial)), **scores)
 
 
 def digest(folder: Path) -> str:
@@ -63,7 +45,7 @@ def digest(folder: Path) -> str:
     return ""
 
 
-class Record(Telling[Scored]):
+class Record(Telling[Any]):
     """A campaign's record, known without computing: a part of its interface.
 
     Args:
@@ -71,21 +53,21 @@ class Record(Telling[Scored]):
 
     Attributes:
         directory: Folder of the campaign.
-        actions: Names and units of the actions.
+        actions: Names, units and limits of the actions.
 
     Raises:
         Unsure: If there is no summary, or more was done since than told.
-        ValueError: If the folder's programs are not declared as they are written.
     """
 
     def __init__(self, folder: Path) -> None:
-        read_declared(folder)
         self.directory = folder
         try:
             with _stored(folder) as store:
                 self._known = json.loads(store.get(SUMMARY) or b"{}")
-                self._kept = [Scored(**trial) for trial in self._known["trials"]]
-                self.actions = SimpleNamespace(**self._known["labels"])
+                self._kept: list[Any] = [
+                    SimpleNamespace(**trial) for trial in self._known["trials"]
+                ]
+                self.actions = SimpleNamespace(**self._known["actions"])
                 self._num: int = self._known["lines"]
                 for number in range(self._num + 1, store.length(LOG) + 1):
                     self._take(store.json(LOG, number) or {})
@@ -99,10 +81,9 @@ class Record(Telling[Scored]):
         Raises:
             Unsure: If a trial that the belief has used is another one now.
         """
-        summary = self._known["summary"]
-        if {*summary["not_in_belief"]} & {*self._known["processed"]}:
+        if {*self._known["summary"]["not_in_belief"]} & {*self._known["processed"]}:
             raise Unsure
-        return summary
+        return self._known["summary"]
 
     @property
     def x_shape(self) -> Sequence[int]:
@@ -110,7 +91,7 @@ class Record(Telling[Scored]):
         return self._known["x_shape"]
 
     @property
-    def _trials(self) -> Sequence[Scored]:
+    def _trials(self) -> Sequence[Any]:
         return self._kept
 
     def _outcome(self, x: Any) -> Any:
@@ -119,7 +100,7 @@ class Record(Telling[Scored]):
     def _executed(self, action: Any, asked: list[float]) -> list[float]:
         if action is None:
             return asked
-        executed, limits = _single(action), self._known["limits"]
+        executed, limits = _single(action), self.actions.limits
         pairs = zip(limits, executed, strict=False)
         is_within = all(low <= a <= high for (low, high), a in pairs)
         if len(limits) != len(executed) or not is_within:
@@ -129,7 +110,7 @@ class Record(Telling[Scored]):
     def _refused(self, x: Any, error: ValueError) -> None:
         raise Unsure from error
 
-    def _record(self, event: str, facts: Facts) -> Scored:
+    def _record(self, event: str, facts: Facts) -> Any:
         line = event_of(event, facts)
         with _stored(self.directory) as store, store.writing():
             if store.append(LOG, line) != self._num + 1:  # another process was faster
@@ -140,14 +121,14 @@ class Record(Telling[Scored]):
     def _take(self, entry: Mapping[str, Any]) -> None:
         """Take a line of the log that was written after the summary."""
         self._num += 1
-        facts, waiting = facts_in(entry), self._known["summary"]["not_in_belief"]
         if entry["event"] == "refused":
             return
+        facts, summary = facts_in(entry), self._known["summary"]
         if facts is None or facts.index > len(self._kept):
             raise Unsure
-        self._kept[facts.index : facts.index + 1] = [Scored(**vars(facts))]
+        self._kept[facts.index : facts.index + 1] = [facts]
         told = [facts.index] * (facts.status != "pending")
-        self._known["summary"]["not_in_belief"] = sorted({*waiting, *told})
+        summary["not_in_belief"] = sorted({*summary["not_in_belief"], *told})
 
 
 def _stored(folder: Path) -> contextlib.closing[Store]:
@@ -167,12 +148,12 @@ def sum_up_campaign(campaign: Any) -> None:
     with contextlib.suppress(Exception):  # a belief without moments has no summary
         is_box = type(actions).__name__ == "BoxActions"
         limits = [actions.low.tolist(), actions.high.tolist()] if is_box else [[], []]
+        labels = {"names": [*actions.names], "units": [*actions.units]}
         known = {
             "summary": summary_of(campaign),
-            "trials": [vars(Scored.of(trial)) for trial in campaign.state.trials],
+            "trials": [scored(trial) for trial in campaign.state.trials],
             "x_shape": [*campaign.x_shape],
-            "labels": {"names": [*actions.names], "units": [*actions.units]},
-            "limits": [*zip(*limits, strict=True)],
+            "actions": {**labels, "limits": [*zip(*limits, strict=True)]},
             "processed": [*campaign.state.processed],
         }
         campaign._storage.sum_up(known)
@@ -186,7 +167,7 @@ def summary_of(campaign: Any) -> dict[str, Any]:
     mean, variance = belief.mean.reshape(-1), belief.variance.reshape(-1)
     names = campaign.parameter_names or [f"theta_{k + 1}" for k in range(len(mean))]
     diagnostics = getattr(belief, "diagnostics", None)
-    said = [] if diagnostics is None else [*diagnostics.warnings]
+    said = [*getattr(diagnostics, "warnings", ())]
     together = getattr(diagnostics, "combinations", None)
     return {
         "method": campaign.state.method,
@@ -195,7 +176,7 @@ def summary_of(campaign: Any) -> dict[str, Any]:
                 name: {"mean": float(m), "sd": float(v) ** 0.5}
                 for name, m, v in zip(names, mean, variance, strict=True)
             },
-            "trustworthy": None if diagnostics is None else diagnostics.trustworthy,
+            "trustworthy": getattr(diagnostics, "trustworthy", None),
             "warnings": said,
             "codes": [warning.code for warning in said],
             "combinations": str(together) if together else None,
@@ -205,20 +186,23 @@ def summary_of(campaign: Any) -> dict[str, Any]:
     }
 
 
+def scored(trial: Any) -> dict[str, Any]:
+    """Return a trial with what a campaign has found it to be, if it has yet."""
+    scores = ("information_gained", "surprise")
+    return {**vars(Facts.of(trial)), **{n: getattr(trial, n, None) for n in scores}}
+
+
 def trial_of(campaign: Any, trial: Any) -> dict[str, Any]:
     """Return a trial as JSON, but for NaN."""
-    facts = Scored.of(trial)
+    entries = scored(trial)
+    x = entries.pop("x")
     return {
-        "trial": facts.index,
-        "status": facts.status,
-        "action": _floats(facts.action),
+        "trial": entries.pop("index"),
+        **entries,
+        "action": _floats(entries["action"]),
+        "x": None if x is None else _floats(x),
         "names": [*campaign.actions.names],
         "units": [*campaign.actions.units],
-        "x": None if facts.x is None else _floats(facts.x),
-        "information_gained": facts.information_gained,
-        "surprise": facts.surprise,
-        "target": facts.target,
-        "reason": facts.reason,
     }
 
 
@@ -232,10 +216,9 @@ def answer_of(campaign: Any) -> Answer:
     data = {**summary_of(campaign), "trials": trials}
     belief = data["belief"]
     pending = sum(trial["status"] == "pending" for trial in trials)
-    waits = ", one pending" if pending else ""
-    head = f"{data['method']}, {len(trials) - pending} trials{waits}"
-    together = f"; {belief['combinations']}" if belief["combinations"] else ""
-    lines = [f"{head}, health {data['health']}{together}"]
+    head = f"{data['method']}, {len(trials) - pending} trials"
+    head += f"{', one pending' if pending else ''}, health {data['health']}"
+    lines = ["; ".join(filter(None, [head, belief["combinations"]]))]
     for trial in trials:
         gained, reason = trial["information_gained"], trial["reason"]
         gain = "" if gained is None else f"  {gained:.2f} nats"

@@ -32,17 +32,11 @@ cli.program.add_command(bank)
 
 @cli.command(
     cli.argument("task", "TASK", click.Choice(cli.TASKS)),
-    *(cli.METHOD, cli.ROUNDS, cli.SEED, cli.OF_TASK, cli.OF_CAMPAIGN),
+    *(cli.METHOD, cli.ROUNDS, cli.SEED, cli.OF_TASK, *cli.OF_CAMPAIGN),
     cli.option("--out", "folder for the results", cli.FOLDER, "DIR", required=True),
 )
 def run(
-    task: str,
-    out: Path,
-    method: str,
-    rounds: int,
-    seed: int,
-    option: list[str],
-    set: list[str],  # noqa: A002
+    task: str, out: Path, method: str, rounds: int, seed: int, option: Any, **given: Any
 ) -> None:
     """Run a campaign on a task, and save its table and figure."""
     from sbi_active import Campaign
@@ -54,10 +48,15 @@ def run(
     # Campaigns of earlier runs stay as they are.
     paths = (out / f"campaign{f'-{k}' * (k > 1)}" for k in itertools.count(1))
     folder = next(path for path in paths if not path.exists())
-    how: Any = {"options": campaign_options(set), "show_progress": sys.stderr.isatty()}
-    how |= {"method": method, "seed": seed, "directory": folder}
     real = (derive_seed(seed, "real", index) for index in itertools.count())
-    with Campaign(found.simulator, found.prior, found.actions, **how) as campaign:
+    with Campaign(
+        *(found.simulator, found.prior, found.actions),
+        method=method,
+        seed=seed,
+        options=campaign_options(given),
+        directory=folder,
+        show_progress=sys.stderr.isatty(),
+    ) as campaign:
         write_declared(folder, task=task, option=option)
         campaign.run(
             lambda action: found.real_system(action, seed=next(real)), num_rounds=rounds
@@ -88,24 +87,23 @@ def check(rows: int, rounds: int, workers: int, seed: int, **problem: Any) -> in
     """
     from sbi_active import CampaignOptions
     from sbi_active.cli.problem import problem_of
-    from sbi_active.simulation import Workers, check_simulator
+    from sbi_active.simulation import check_simulator
 
-    what = problem_of(problem)[:3]
+    model, prior, actions, _ = problem_of(problem)
     # The most that the default options allow: a round trains, designs over all actions,
     # and refines on the trials so far.
-    options, trials = CampaignOptions(workers=Workers(workers)), range(1, rounds + 1)
-    num_actions = len(getattr(what[2], "values", range(MANY_ACTIONS)))
+    options: Any = CampaignOptions(workers=workers)  # pyright: ignore
+    num_actions = len(getattr(actions, "values", range(MANY_ACTIONS)))
     most = rounds * (options.num_simulations + num_actions * options.num_samples)
-    most += sum(trials) * options.refinement.num_histories
+    most += sum(range(1, rounds + 1)) * options.refinement.num_histories
     say("running the simulator")
-    report = check_simulator(
-        *what, num_rows=rows, num_simulations=most, workers=workers, seed=seed
-    )
+    sizes: Any = {"num_rows": rows, "num_simulations": most, "workers": workers}
+    report = check_simulator(model, prior, actions, **sizes, seed=seed)
     # Where simulations take longer than this, they are what a campaign takes.
     if report.is_ready and 60 * (report.minutes or 0.0) <= LONG * rounds:
         say("timing a round")
         try:
-            seconds = time_round(*what, options, seed)
+            seconds = time_round(model, prior, actions, options, seed)
             report = replace(report, seconds_round=seconds, num_rounds=rounds)
         except Exception as error:  # whatever a campaign meets is the finding
             report = replace(report, defects=(f"a round of a campaign fails: {error}",))
@@ -131,9 +129,8 @@ def time_round(model: Any, prior: Any, actions: Any, options: Any, seed: int) ->
 
 
 @cli.command(
-    *(cli.DIR, *cli.PROBLEM, cli.SEED),
+    *(cli.DIR, *cli.PROBLEM, cli.SEED, cli.WORKERS),
     cli.option("--rows", "in all, in whole thousands", cli.COUNT, required=True),
-    cli.WORKERS,
     group=bank,
 )
 def build(folder: Path, rows: int, seed: int, workers: int, **problem: Any) -> None:
@@ -168,8 +165,7 @@ def inspect(folder: Path) -> int:
     from sbi_active import Bank
 
     made = Bank(folder)
-    problems = made.verify()
-    if problems:
+    if problems := made.verify():
         print("\n".join(["checksums: NOT ok", *problems]))
         return 1
     header = made.header

@@ -11,22 +11,17 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+
+from sbi_active.cli.declare import beside
 
 #: How the command line made the campaign: where its simulator is.
 DECLARED = "command.json"
 #: What else makes a folder a campaign's, see :mod:`sbi_active.campaign.storage`.
 MANIFESTS = ("store.db", "campaign.json")
-#: Options of ``init`` and ``run`` that are kept, and where their paths begin; and the
-#: types of their values, or of the entries of a list.
-TEXTS = ("simulator", "task", "prior", "names", "units", "folder")
-LISTS = {
-    **dict.fromkeys(("option", "actions", "effects"), str),
-    **dict.fromkeys(("theta_low", "theta_high", "noise"), float),
-}
 
 
 def in_campaign(path: Path) -> bool:
@@ -35,17 +30,9 @@ def in_campaign(path: Path) -> bool:
     return any((place / name).exists() for place in places for name in MANIFESTS)
 
 
-def names_object(specs: Sequence[str]) -> bool:
-    """Return whether --actions is MODULE:NAME, and no numbers."""
-    is_number = any(re.match(r"[-+]?\.?\d", spec) for spec in specs)
-    return len(specs) == 1 and specs[0].count(":") == 1 and not is_number
-
-
-def absolute(name: str) -> str:
-    """Return MODULE:NAME with the whole path of a file."""
-    module, colon, attribute = name.partition(":")
-    module = str(Path(module).resolve()) if module.endswith(".py") else module
-    return f"{module}{colon}{attribute}"
+def names_object(spec: str) -> bool:
+    """Return whether a part of --actions is MODULE:NAME, and no numbers."""
+    return spec.count(":") == 1 and not re.match(r"[-+]?\.?\d", spec)
 
 
 def read_declared(folder: Path) -> dict[str, Any]:
@@ -58,20 +45,19 @@ def read_declared(folder: Path) -> dict[str, Any]:
     found: Any = None
     with suppress(ValueError, RecursionError):
         found = json.loads(path.read_bytes()) if path.exists() else {}
-    if isinstance(found, dict):
-        kept = {k: found[k] for k in (*TEXTS, *LISTS) if found.get(k) is not None}
-        if all(_is_kept(name, value) for name, value in kept.items()):
-            return {"simulator": None, **kept}
+    if isinstance(found, dict) and all(map(_is_option, found.values())):
+        origin = Path(found.get("folder", ""))
+        return {name: beside(origin, value) for name, value in found.items()}
     raise ValueError(
         f"expected {path} as sbi-active writes it; got another content; remove the "
         "file, and name the simulator by --simulator"
     )
 
 
-def _is_kept(name: str, value: Any) -> bool:
-    if name in TEXTS:
-        return isinstance(value, str)
-    return isinstance(value, list) and all(type(v) is LISTS[name] for v in value)
+def _is_option(value: Any) -> bool:
+    """Return whether a value is a text, or a list of texts or of numbers."""
+    parts = value if isinstance(value, list) else [value]
+    return not isinstance(value, float) and {*map(type, parts)} in ({str}, {float})
 
 
 def write_declared(path: Path, **options: Any) -> None:
@@ -88,9 +74,7 @@ def write_declared(path: Path, **options: Any) -> None:
     _remember(path)
 
 
-def require_trust(
-    folder: Path, declared: Mapping[str, Any], *, own: str | None, trusts: bool
-) -> None:
+def require_trust(folder: Path, declared: Mapping[str, Any], *, trusts: bool) -> None:
     """Raise if nobody here said that what a folder names may be executed.
 
     A relative place, or one within a campaign, holds whatever somebody put there.
@@ -98,16 +82,15 @@ def require_trust(
     Args:
         folder: Folder of the campaign.
         declared: Options that the folder declares.
-        own: Simulator that the command line names in place of the folder's.
         trusts: Whether the command line says to import it, whoever wrote it.
     """
-    names = [] if own else [declared["simulator"]]
-    names += [declared.get("prior"), *declared.get("effects", ())]
-    names += [spec for spec in declared.get("actions", ()) if names_object([spec])]
-    origin, options = Path(declared.get("folder", "")), declared.get("option", ())
+    names = [declared.get("simulator"), declared.get("prior")]
+    names += declared.get("effects", [])
+    names += filter(names_object, declared.get("actions", []))
+    origin, options = declared.get("folder", ""), declared.get("option", ())
     modules = [name.partition(":")[0] for name in filter(None, names)]
-    places = [origin / m if m.endswith(".py") else origin for m in modules]
-    is_fixed = all(p.is_absolute() and not in_campaign(p) for p in places)
+    places = [Path(m if m.endswith(".py") else origin) for m in modules]
+    is_fixed = all(place.is_absolute() and not in_campaign(place) for place in places)
     if trusts and is_fixed:
         _remember(folder)
     # Options of a task may name files.

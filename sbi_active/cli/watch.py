@@ -10,10 +10,9 @@ import contextlib
 import sys
 import threading
 from html import escape
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from socketserver import ThreadingMixIn
 from typing import Any
-from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 from click import IntRange
 
@@ -28,7 +27,6 @@ POLICY = (
     "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
     "img-src data:; connect-src 'self'; base-uri 'none'; frame-ancestors 'none'"
 )
-HEADERS = [("Content-Security-Policy", POLICY), ("Cache-Control", "no-store")]
 #: Asks every two seconds whether there is another page, and says when nobody answers.
 SCRIPT = """<script>
 setInterval(async () => {
@@ -108,14 +106,14 @@ def watch(folder: Path, port: int, once: Path | None) -> None:
         once.write_text(text, encoding="utf-8")
         print(f"saved: {once}")
         return
-    with served(watched, port) as server:
+    with Server(watched, port) as server:
         place = f"http://{HOST}:{server.server_port}"
         print(f"{folder} is shown at {place} until Ctrl-C", flush=True)
         server.serve_forever()
 
 
-def served(watched: Watched, port: int) -> WSGIServer:
-    """Return a server of a page, for this machine alone.
+class Server(ThreadingHTTPServer):
+    """Serves a page, for this machine alone.
 
     Args:
         watched: Object that has the page.
@@ -125,31 +123,18 @@ def served(watched: Watched, port: int) -> WSGIServer:
         ValueError: If another program listens there, or only others may.
     """
 
-    def answer(asked: dict[str, Any], begin: Any) -> list[bytes]:
-        # A page from elsewhere that has its name point here asks by that name.
-        is_here = asked.get("HTTP_HOST", "").partition(":")[0] in (HOST, "localhost")
-        pages = {"/": ("html", watched.page), "/version": ("plain", watched.version)}
-        if not is_here or asked["REQUEST_METHOD"] != "GET":
-            begin("403 Forbidden", [])
-            return []
-        kind, text = pages.get(asked["PATH_INFO"], ("", None))
-        if text is None:
-            begin("404 Not Found", [])
-            return []
-        begin("200 OK", [("Content-Type", f"text/{kind}; charset=utf-8"), *HEADERS])
-        return [text().encode()]
-
-    try:
-        return make_server(HOST, port, answer, _Server, _Quiet)
-    except OSError as error:
-        raise ValueError(
-            f"expected a port that is free; got {port} ({error.strerror}); choose "
-            "another by --port, or 0 for any"
-        ) from error
-
-
-class _Server(ThreadingMixIn, WSGIServer):
-    daemon_threads = True
+    def __init__(self, watched: Watched, port: int) -> None:
+        self.texts = {
+            "/": ("html", watched.page),
+            "/version": ("plain", watched.version),
+        }
+        try:
+            super().__init__((HOST, port), _Answering)
+        except OSError as error:
+            raise ValueError(
+                f"expected a port that is free; got {port} ({error.strerror}); choose "
+                "another by --port, or 0 for any"
+            ) from error
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Say nothing of a reader that leaves, nor of what an interrupt cuts off."""
@@ -157,11 +142,26 @@ class _Server(ThreadingMixIn, WSGIServer):
             super().handle_error(request, client_address)
 
 
-class _Quiet(WSGIRequestHandler):
-    """Says nothing of each request."""
+class _Answering(BaseHTTPRequestHandler):
+    server: Server
+
+    def do_GET(self) -> None:  # noqa: N802
+        # A page from elsewhere that has its name point here asks by that name.
+        is_here = self.headers.get("Host", "").partition(":")[0] in (HOST, "localhost")
+        kind, text = self.server.texts.get(self.path, ("", None))
+        if text is None or not is_here:
+            self.send_error(404 if is_here else 403)
+            return
+        content = text().encode()
+        self.send_response(200)
+        self.send_header("Content-Type", f"text/{kind}; charset=utf-8")
+        self.send_header("Content-Security-Policy", POLICY)
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        self.wfile.write(content)
 
     def log_message(self, format: str, *_: object) -> None:
-        """Say nothing."""
+        """Say nothing of each request."""
 
 
 def _news(campaign: Any, folder: Path) -> str:
@@ -175,11 +175,8 @@ def _news(campaign: Any, folder: Path) -> str:
         doing, stage = f"trials not in the belief yet: {late}", "update"
     else:
         doing, stage = f"trial {len(campaign.history)} is to be designed", "design"
-    before = [
-        (t.index, t.seconds[stage]) for t in campaign.history if stage in t.seconds
-    ]
-    if before:
-        index, seconds = before[-1]
+    took = [(t.index, t.seconds[stage]) for t in campaign.history if stage in t.seconds]
+    for index, seconds in took[-1:]:
         doing += f" ({stage} of trial {index}: {in_words(seconds)})"
     if not is_locked(folder):
         return f"No process writes to {folder}; {doing}."

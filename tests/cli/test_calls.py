@@ -114,7 +114,7 @@ CALLS = [
             ("expected finite", "--noise nan"),
             ("expected --noise > 0", "--noise -1"),
             ("expected a Distribution", "--prior odd.py:NUMBER"),
-            ("low below high", "--theta-low 1,1"),
+            ("--theta-low below --theta-high", "--theta-low 1,1"),
             ("expected num_workers", "--set workers.num_workers=0"),
             ("is not a valid integer", "--seed 1.5"),
         )
@@ -130,7 +130,7 @@ CALLS = [
         (2, text, [*OF, name, *ASK])
         for text, name in (
             ("expected MODULE:NAME", "sled"),
-            ("under 'none' in 'sled'", "sled.py:none"),
+            ("has no attribute 'none'", "sled.py:none"),
             ("expected a function", "odd.py:NUMBER"),
             ("got ZeroDivisionError", "divides.py:f"),
             ("got SyntaxError", "halves.py:f"),

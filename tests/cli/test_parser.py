@@ -49,7 +49,7 @@ def test_nothing_heavy_is_imported(arguments, status, text):
         ("run numerica --out d", "is not one of 'numerical'"),
         ("run numerical --out d --rounds 0", "Invalid value for '--rounds': 0"),
         ("correct c 0 --reason --json", "'--reason' requires an argument"),
-        ("run numerical --out d --set sized=3", "expected a setting among"),
+        ("run numerical --out d --set sized=3", "expected a setting of a campaign"),
         ("run numerical --out d --set stop=3 seed", "expected NAME=VALUE; got 'seed'"),
     ],
 )

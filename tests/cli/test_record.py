@@ -121,7 +121,7 @@ def test_what_is_computed_or_given_up_is_summed_up_no_more(camp):
     with damaged as store, store.writing(), store.reading() as connection:
         connection.execute("UPDATE records SET body = 'x' WHERE kind = 'state'")
     Campaign.load("broken", repair=True).close()
-    with open_campaign(camp, simulates=True, trust=True) as campaign:
+    with open_campaign(camp, trust=True) as campaign:
         campaign.tell([0.2, 0.4], trial=1)
         assert record.Record(camp).summary["not_in_belief"] == [1]
         campaign.update()

@@ -69,7 +69,7 @@ def place(tmp_path_factory):
 @pytest.fixture
 def server(place):
     """A server in a thread, and the port where it listens."""
-    with watch.served(watch.Watched(place[0]), 0) as made:
+    with watch.Server(watch.Watched(place[0]), 0) as made:
         thread = threading.Thread(target=made.serve_forever, daemon=True)
         thread.start()
         yield made
@@ -123,7 +123,7 @@ def test_it_listens_on_this_machine_alone(server):
 
 
 def test_it_is_only_read_and_gives_no_file(server):
-    assert [asked(server, method=m)[0] for m in ("POST", "HEAD")] == [403, 403]
+    assert [asked(server, method=m)[0] for m in ("POST", "HEAD")] == [501, 501]
     for path in ("/store.db", "/../store.db", "/%2e%2e/store.db", "/version/.."):
         status, text, _ = asked(server, path)
         assert status == 404

@@ -25,7 +25,7 @@ BLOCK = 256
 #: Source of the random numbers of a call, see :class:`Call`.
 Draws = Literal["seeds", "blocks", "alone"]
 
-Fault = Literal["raised", "timed out", "worker died", "misused", "not loaded"]
+Fault = Literal["raised", "timed out", "worker died", "gone", "misused", "not loaded"]
 
 #: What is caught in the user's process, where an interrupt means the whole program.
 HERE = (Exception, SystemExit)

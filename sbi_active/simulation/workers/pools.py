@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, Future
+from concurrent.futures import wait as first_of
 from functools import lru_cache
 from multiprocessing import current_process
+from multiprocessing.connection import wait
 from typing import Any
 
 import cloudpickle
@@ -30,30 +33,27 @@ class Pool(ABC):
         num_slots: Number of calls at a time.
     """
 
-    #: Seconds between two looks at who is there, where no call ends; None for none.
-    LOOK: float | None = None
-    #: Exceptions of a reply that say that whoever had the call was lost.
-    LOSSES: tuple[type[Exception], ...] = ()
     num_slots = 1
 
     @abstractmethod
-    def submit(self, call: Call, time_limit: float | None) -> Future[Reply]:
-        """Return the reply to come of a call.
+    def submit(self, call: Call, time_limit: float | None) -> None:
+        """Take a call.
 
         Args:
             call: The rows.
             time_limit: Seconds after which it is given up; None waits for ever.
         """
 
-    def look(self, num_waiting: int) -> None:  # noqa: B027
-        """See who is there, while so many calls wait."""
+    @abstractmethod
+    def finished(self) -> list[tuple[Call, Reply]]:
+        """Wait for a call to end; return those that have."""
 
     def close(self) -> None:  # noqa: B027  # one has nothing to close
         """Give up what still runs."""
 
 
 class InProcess(Pool):
-    """Runs each call here, at once.
+    """Runs each call here.
 
     Args:
         simulator: Simulator of the calls.
@@ -61,12 +61,16 @@ class InProcess(Pool):
 
     def __init__(self, simulator: Callable[..., Any]) -> None:
         self._simulator = simulator
+        self._calls: list[Call] = []
 
     @override
-    def submit(self, call: Call, time_limit: float | None) -> Future[Reply]:
-        future: Future[Reply] = Future()
-        future.set_result(answer(self._simulator, call))
-        return future
+    def submit(self, call: Call, time_limit: float | None) -> None:
+        self._calls.append(call)
+
+    @override
+    def finished(self) -> list[tuple[Call, Reply]]:
+        call = self._calls.pop()
+        return [(call, answer(self._simulator, call))]
 
 
 class WorkerPool(Pool):
@@ -82,48 +86,48 @@ class WorkerPool(Pool):
     """
 
     def __init__(self, simulator: bytes, num_workers: int) -> None:
-        self.num_slots = num_workers
-        self._threads = ThreadPoolExecutor(num_workers)
-        self._simulator = simulator
+        self.num_slots, self._simulator = num_workers, simulator
         environment = tuple(sorted(os.environ.items()))
         self._waiting = waiting_workers(
             simulator, os.getpid(), os.getcwd(), tuple(sys.path), environment
         )
-        self._busy: set[Worker] = set()
-        self._is_closed = False
+        self._busy: dict[Any, Worker] = {}
 
     @override
-    def submit(self, call: Call, time_limit: float | None) -> Future[Reply]:
-        return self._threads.submit(self.ask, call, time_limit)
+    def submit(self, call: Call, time_limit: float | None) -> None:
+        try:
+            worker = self._waiting.pop()
+        except IndexError:
+            worker = Worker(self._simulator)
+        worker.begin(call, time_limit)
+        self._busy[worker.connection] = worker
 
-    def ask(self, call: Call, time_limit: float | None) -> Reply:
-        """Return the reply to a call, for which the thread waits.
-
-        Args:
-            call: The rows.
-            time_limit: Seconds after which it is given up; None waits for ever.
-        """
-        reply = None
-        while reply is None:
-            try:
-                worker = self._waiting.pop()
-            except IndexError:
-                worker = Worker(self._simulator)
-            self._busy.add(worker)
-            if self._is_closed:
-                worker.kill()
-            reply = worker.ask(call, time_limit)
-            self._busy.discard(worker)
-        if reply.fault not in ("timed out", "worker died", "not loaded"):
-            self._waiting.append(worker)
-        return reply
+    @override
+    def finished(self) -> list[tuple[Call, Reply]]:
+        done: list[tuple[Call, Reply]] = []
+        while not done:
+            until = min(worker.deadline for worker in self._busy.values())
+            left = None if math.isinf(until) else max(until - time.monotonic(), 0.0)
+            ready = wait([*self._busy], left)
+            for connection, worker in [*self._busy.items()]:
+                if connection not in ready and worker.deadline > time.monotonic():
+                    continue
+                reply = worker.reply()
+                if reply is None:  # it has begun
+                    continue
+                del self._busy[connection]
+                if reply.fault == "gone":  # while it waited, which costs no row
+                    self.submit(worker.call, worker.time_limit)
+                    continue
+                done.append((worker.call, reply))
+                if worker.end.alive:
+                    self._waiting.append(worker)
+        return done
 
     @override
     def close(self) -> None:
-        self._is_closed = True
-        self._threads.shutdown(wait=False)
-        for worker in [*self._busy]:
-            worker.kill()
+        for worker in self._busy.values():
+            worker.end()
 
 
 @lru_cache(maxsize=1)
@@ -161,11 +165,9 @@ class DaskPool(Pool):
         client: A ``distributed.Client``.
     """
 
-    LOOK = 0.5
-    LOSSES = (Exception,)
-
-    #: Seconds without any worker until that is said.
-    PATIENCE = 5.0
+    #: Seconds between two looks at who is there, and without any worker until that is
+    #: said.
+    LOOK, PATIENCE = 0.5, 5.0
 
     def __init__(self, simulator: bytes, num_workers: int, client: Any) -> None:
         num_workers = effective_n_jobs(-1) if num_workers == -1 else num_workers
@@ -175,18 +177,25 @@ class DaskPool(Pool):
         key = f"simulator-{hashlib.sha256(simulator).hexdigest()}"
         # A result, not scattered data: what a lost worker held can be made again.
         self._simulator = client.submit(bytes, simulator, key=key)
+        self._calls: dict[Future[Reply], Call] = {}
         self._last_seen: float | None = time.monotonic()  # None once it was said
 
     @override
-    def submit(self, call: Call, time_limit: float | None) -> Future[Reply]:
-        return self._executor.submit(_ask_child, self._simulator, call, time_limit)
+    def submit(self, call: Call, time_limit: float | None) -> None:
+        what = (self._simulator, call, time_limit)
+        self._calls[self._executor.submit(_ask_child, *what)] = call
+
+    @override
+    def finished(self) -> list[tuple[Call, Reply]]:
+        while not (done := first_of(self._calls, self.LOOK, FIRST_COMPLETED).done):
+            self._look()
+        return [(self._calls.pop(future), _reply_of(future)) for future in done]
 
     @override
     def close(self) -> None:
         self._executor.shutdown(wait=False)
 
-    @override
-    def look(self, num_waiting: int) -> None:
+    def _look(self) -> None:
         """Say that no worker is there, and ask for those that were given up."""
         from distributed import LocalCluster
 
@@ -197,7 +206,7 @@ class DaskPool(Pool):
             self._last_seen = None
             warn(
                 f"SA306 no workers at {self._client.scheduler.address} for "
-                f"{self.PATIENCE:g} s: {num_waiting} calls of the simulator "
+                f"{self.PATIENCE:g} s: {len(self._calls)} calls of the simulator "
                 "wait for one; start workers there, or interrupt, which keeps what is "
                 "finished",
                 stacklevel=2,
@@ -206,6 +215,13 @@ class DaskPool(Pool):
             num_wanted = len(cluster.worker_spec)
             if len(cluster.workers) < num_wanted:
                 cluster.scale(num_wanted)
+
+
+def _reply_of(future: Future[Reply]) -> Reply:
+    try:
+        return future.result()
+    except Exception as error:  # whoever had the call was lost
+        return Reply(fault="worker died", traceback=f"worker died: {error!r}")
 
 
 def _ask_child(simulator: bytes, call: Call, time_limit: float | None) -> Reply:
@@ -219,7 +235,9 @@ def _ask_child(simulator: bytes, call: Call, time_limit: float | None) -> Reply:
         # Dask's workers are daemons, to which Python allows no children; those here end
         # with their parent.
         current_process()._config.pop("daemon", None)  # pyright: ignore
-        reply = WorkerPool(simulator, 1).ask(call, time_limit)
+        pool = WorkerPool(simulator, 1)
+        pool.submit(call, time_limit)
+        [(_, reply)] = pool.finished()
         if place or reply.fault not in ("raised", "not loaded"):
             place.update({} if reply.x is None else {"is_here": False})
             return reply

@@ -8,13 +8,14 @@ there is no safe fork (Windows, macOS) each worker is spawned.
 
 from __future__ import annotations
 
-import ctypes
 import io
+import math
 import os
 import pickle
 import signal
 import sys
 import threading
+import time
 import traceback
 import weakref
 from collections import ChainMap
@@ -37,8 +38,6 @@ _FORKS = sys.platform.startswith("linux")
 
 _CONTEXT: Any = get_context("forkserver" if _FORKS else "spawn")
 
-_PR_SET_PDEATHSIG = 1  # <sys/prctl.h>
-
 #: Libraries that a simulator loads use one thread: there is a worker a core.
 _ENVIRONMENT = {
     f"{name}_NUM_THREADS": "1"
@@ -50,18 +49,30 @@ class Worker:
     """A process that has been sent a simulator and answers calls, one at a time.
 
     It has the folder, path and environment of this process at its start, and ends
-    when nobody holds this object any more.
+    when nobody holds this object any more. It says that it has loaded the simulator,
+    that it begins a call, and what came of it.
 
     Args:
         simulator: Simulator, pickled.
+
+    Attributes:
+        connection: Connection to it, which is ready when there is something to read.
+        call: Call that it has, or had last.
+        time_limit: Seconds that the call may take; None is any time.
+        deadline: Time at which to give it up, by :func:`time.monotonic`.
+        end: Function that ends it, and is alive before.
     """
 
     #: Seconds without a call after which it ends.
     PATIENCE = 60.0
 
+    call: Call
+    time_limit: float | None
+    deadline: float
+
     def __init__(self, simulator: bytes) -> None:
-        self._has_answered = False
-        self._connection, theirs = _CONTEXT.Pipe()
+        self._is_loaded = self._has_begun = False
+        self.connection, theirs = _CONTEXT.Pipe()
         environment = {**os.environ, **_ENVIRONMENT}
         self._process = _CONTEXT.Process(
             target=_work, args=(theirs, environment, self.PATIENCE)
@@ -74,57 +85,58 @@ class Worker:
         process._children.discard(self._process)  # pyright: ignore
         theirs.close()
         # Called at the latest when nobody holds this object, or this process ends.
-        self._end = weakref.finalize(
-            self, _end, self._connection, self._process, os.getpid()
+        self.end = weakref.finalize(
+            self, _end, self.connection, self._process, os.getpid()
         )
-        with suppress(OSError):
-            self._connection.send_bytes(simulator)
+        self._send(simulator)
 
-    def ask(self, call: Call, time_limit: float | None) -> Reply | None:
-        """Return the reply to a call; None if the process had died before it.
+    def begin(self, call: Call, time_limit: float | None) -> None:
+        """Give it a call, whose time counts from when it begins."""
+        self.call, self.time_limit, self.deadline = call, time_limit, math.inf
+        self.end.atexit = False  # whoever waits for it would see it end
+        if self._is_loaded:
+            self._send(pickle.dumps(call, protocol=5))
 
-        Args:
-            call: The rows.
-            time_limit: Seconds after which the process is killed, from the time when
-                it has loaded the simulator; None waits for ever.
+    def reply(self) -> Reply | None:
+        """Return the reply to its call, or None if it has only begun.
+
+        For use when the connection is ready, or the time is over, which ends it.
         """
-        has_started = False
-        self._end.atexit = False  # a thread waits, which would see it end
+        if not self.connection.poll():
+            self.end()
+            text = f"timed out: no answer within {self.time_limit:g} s"
+            return Reply(fault="timed out", traceback=text)
         try:
-            self._connection.send_bytes(pickle.dumps(call, protocol=5))
-            reply = pickle.loads(self._connection.recv_bytes())
-            has_started = reply is None
-            if has_started:
-                if not self._connection.poll(time_limit):
-                    self._end()
-                    text = f"timed out: no answer within {time_limit:g} s"
-                    return Reply(fault="timed out", traceback=text)
-                reply = pickle.loads(self._connection.recv_bytes())
+            reply = pickle.loads(self.connection.recv_bytes())
         except (EOFError, OSError):
-            code = self._end() or 0
-            how = f"was ended by signal {-code}" if code < 0 else None
-            how = how or f"ended with code {code}"
-            if has_started:
-                text = f"worker died: its process {how} during the call, without an"
-                return Reply(fault="worker died", traceback=f"{text} exception")
-            if self._has_answered:  # it died while it waited, which costs no row
-                return None
-            text = f"the process {how} while it loaded the simulator"
-            return Reply(fault="not loaded", traceback=text)
-        self._has_answered = True
-        self._end.atexit = True
+            return self._lost()
+        if reply is not None:
+            self._has_begun, self.end.atexit = False, True
+            if not self._is_loaded:
+                self.end()
+        elif self._is_loaded:
+            self._has_begun = True
+            if self.time_limit is not None:
+                self.deadline = time.monotonic() + self.time_limit
+        else:
+            self._is_loaded = True
+            self._send(pickle.dumps(self.call, protocol=5))
         return reply
 
-    def kill(self) -> None:
-        """Kill the process and what it started; whoever asks it is told."""
-        _kill(self._process)
+    def _lost(self) -> Reply:
+        code = self.end() or 0
+        how = f"was ended by signal {-code}" if code < 0 else f"ended with code {code}"
+        if self._has_begun:
+            text = f"worker died: its process {how} during the call, without an"
+            return Reply(fault="worker died", traceback=f"{text} exception")
+        if self._is_loaded:
+            return Reply(fault="gone")
+        text = f"the process {how} while it loaded the simulator"
+        return Reply(fault="not loaded", traceback=text)
 
-
-def _kill(process: Any) -> None:
-    if _FORKS:
-        with suppress(ProcessLookupError, PermissionError):
-            os.killpg(process.pid, signal.SIGKILL)
-    process.kill()
+    def _send(self, content: bytes) -> None:
+        with suppress(OSError):  # that it died is seen when it is to reply
+            self.connection.send_bytes(content)
 
 
 def _end(connection: Connection, process: Any, owner: int) -> int:
@@ -134,7 +146,10 @@ def _end(connection: Connection, process: Any, owner: int) -> int:
     connection.close()
     # One that ends by itself is given a moment, for its own code and its finalizers.
     process.join(0.02)
-    _kill(process)
+    if _FORKS:  # with what it started
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+    process.kill()
     process.join()
     return process.exitcode or 0
 
@@ -192,6 +207,7 @@ def _work(connection: Connection, environment: dict[str, str], patience: float) 
         connection.send_bytes(pickle.dumps(reply))
         return
     with suppress(EOFError, OSError):  # nobody waits for it any more
+        connection.send_bytes(pickle.dumps(None))
         while connection.poll(patience):
             call = pickle.loads(connection.recv_bytes())
             connection.send_bytes(pickle.dumps(None))
@@ -205,17 +221,16 @@ def _end_with_parent() -> None:
     """End with whoever asked for this process, and with the server that forked it."""
     os.setpgid(0, 0)  # so that what a simulator starts ends with it
     util.Finalize(None, os.killpg, (0, signal.SIGKILL), exitpriority=0)
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    threading.Thread(target=_outlive_nobody, daemon=True).start()
+    threading.Thread(target=_outlive_nobody, args=(os.getppid(),), daemon=True).start()
 
 
-def _outlive_nobody() -> None:
+def _outlive_nobody(server: int) -> None:
     parent = parent_process()
     assert parent is not None
     assert parent.pid is not None
     with suppress(OSError):  # no such process
         # A forked child of the parent may hold the other end of the sentinel open.
-        while not wait([parent.sentinel], timeout=1.0):
+        while os.getppid() == server and not wait([parent.sentinel], timeout=0.5):
             os.kill(parent.pid, 0)
     os.killpg(0, signal.SIGKILL)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, wait
 
 import numpy as np
 import torch
@@ -124,35 +123,27 @@ class Schedule:
             of_block = np.arange(len(to_come)) // BLOCK
             to_come = np.isin(of_block, of_block[to_come])
         self._to_come, self._next = np.flatnonzero(to_come), 0
-        running: dict[Future[Reply], Call] = {}
+        num_running = 0
         while True:
-            while len(running) < pool.num_slots:
-                call = self._next_call(pool.num_slots)
-                if call is None:
-                    break
-                running[pool.submit(call, self._limit(call))] = call
-            if not running:
+            while num_running < pool.num_slots and (call := self._next_call(pool)):
+                pool.submit(call, self._limit(call))
+                num_running += 1
+            if not num_running:
                 return
-            while not (done := wait(running, pool.LOOK, FIRST_COMPLETED).done):
-                pool.look(len(running))
-            future = done.pop()
-            call = running.pop(future)
-            try:
-                reply = future.result()
-            except pool.LOSSES as error:
-                reply = Reply(fault="worker died", traceback=f"worker died: {error!r}")
-            rows = self._receive(call, reply)
-            if rows is not None:
-                yield rows
+            for call, reply in pool.finished():
+                num_running -= 1
+                rows = self._receive(call, reply)
+                if rows is not None:
+                    yield rows
 
-    def _next_call(self, num_slots: int) -> Call | None:
+    def _next_call(self, pool: Pool) -> Call | None:
         while self._urgent:
             call = self._urgent.popleft()
             if call.is_probe or (self.status[call.rows] == _UNFINISHED).any():
                 return call
         if self._next == len(self._to_come):
             return None
-        size = self._size(len(self._to_come) - self._next, num_slots)
+        size = self._size(len(self._to_come) - self._next, pool.num_slots)
         rows = self._to_come[self._next : self._next + size]
         self._next += len(rows)
         return self._call(rows, "seeds" if self.has_seeds else "blocks")
