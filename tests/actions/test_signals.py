@@ -87,7 +87,6 @@ def test_recorded_signals_are_listed():
     )
     space = SignalActions(recorded(trials), amplitude=5.0)
     listed = space.listed()
-    assert listed is not None
     assert listed.tolist() == [[0.0], [2.0]]
     assert space.names == ["trial"]
     assert space.inputs(torch.tensor([2.0]))["u"].tolist() == [0.0, 2.0]

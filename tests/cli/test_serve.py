@@ -44,8 +44,6 @@ class Server:
 
     def says(self, request):
         line = request if isinstance(request, str) else json.dumps(request)
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
         self.process.stdin.write(line + "\n")
         self.process.stdin.flush()
         answer = self.process.stdout.readline()

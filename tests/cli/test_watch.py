@@ -142,7 +142,6 @@ def test_a_reader_that_leaves_is_no_error(server, capfd):
 def test_the_command_ends_by_an_interrupt(place):
     words = ["watch", str(place[0]), "--port", "0"]
     process = run(words, stdout=subprocess.PIPE)
-    assert process.stdout is not None
     said = process.stdout.readline()
     port = re.fullmatch(r".* is shown at http://127.0.0.1:(\d+) until Ctrl-C\n", said)
     assert port is not None, said

@@ -47,12 +47,9 @@ def test_a_right_model_is_left_alone():
 def test_only_recorded_inputs_are_proposed():
     trials = measured(0, {"dead zone": 0.25}, num=5)
     loop = Criticism(MODEL, PRIOR, trials, effects=LIBRARY, actions=trials.action)
-    assert loop.actions is not None
     listed = loop.actions.listed()
-    assert listed is not None
     assert listed[:, 0].tolist() == [0, 1, 2, 3, 4]
     report = loop.report(evaluate=False)
-    assert report.next_action is not None
     assert report.next_action.candidates[:, 0].tolist() == [0, 1, 2, 3, 4]
     assert all(test.is_permitted for test in report.severe_tests)
 
@@ -172,7 +169,6 @@ def test_context_is_what_was_recorded():
     TrialSimulator(model, trials).predict(
         torch.tensor([[3.0, 0.3]]), {"watcher": torch.ones(1, 1)}
     )
-    assert trials.inputs is not None
     assert torch.equal(seen["inputs"]["voltage"], trials.inputs["voltage"])
     assert torch.equal(seen["input_times"], GRID)
     assert torch.equal(seen["start"]["speed"], trials.start["speed"])

@@ -136,7 +136,6 @@ def test_the_error_falls_on_held_out_trials():
     trials = measured(1, {"cubic": -0.5}, held_out=10)
     criticism = Criticism(MODEL, PRIOR, trials, effects=LIBRARY, actions=ACTIONS)
     evaluation = criticism.evaluate()
-    assert evaluation is not None
     table = evaluation.table.set_index("metric")
     assert evaluation.scheme == "held out"
     assert table.loc["rmse", "ratio"] < 0.5
@@ -148,7 +147,6 @@ def test_the_error_falls_on_held_out_trials():
 def test_leaving_one_out_repeats_the_selection():
     trials = measured(1, {"cubic": -0.5}, num=6)
     evaluation = Criticism(MODEL, PRIOR, trials, effects=[BIAS, CUBIC]).evaluate()
-    assert evaluation is not None
     assert evaluation.scheme == "leave one out"
     assert len(evaluation.selected) == 6
     assert np.isnan(evaluation.table["low"]).all()  # below 8 trials there is none

@@ -73,7 +73,6 @@ def test_a_model_comes_as_text_path_or_spec(given, tmp_path):
     spec = mujoco.MjSpec.from_string(PENDULUM)
     source = {"text": PENDULUM, "path": file, "spec": spec}[given]
     robot = from_mjcf(source, {"hinge.damping": (0.0, 0.1)}, times=TIMES)
-    assert robot.simulator.noise is not None  # the sensor's, in the MJCF
     assert robot.simulator.noise.sd == pytest.approx(0.01)
     x = robot.simulator.mean(torch.full((1, 1), 0.05), torch.zeros(1, 1))
     assert x.shape == (1, 15)

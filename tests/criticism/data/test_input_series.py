@@ -33,8 +33,6 @@ def test_values_are_held_on_the_finest_grid():
         [[1.0, 2.0, 3.0], [5.0, 6.0, 7.0, 8.0, 9.0]],
         [[0.0, 0.5, 1.0], [0.25, 0.5, 0.75, 1.0, 1.25]],
     )
-    assert found.inputs is not None
-    assert found.input_times is not None
     assert found.input_times.tolist() == [0, 0.25, 0.5, 0.75, 1.0, 1.25]
     assert found.inputs["input"].tolist() == [[1, 1, 2, 2, 3, 3], [5, 5, 6, 7, 8, 9]]
 
@@ -54,7 +52,6 @@ def test_values_are_drawn_as_lines_where_asked():
         [[0.0, 0.5, 1.0], [0.25, 0.5, 0.75, 1.0, 1.25]],
         input_hold="linear",
     )
-    assert found.inputs is not None
     expected = [[1, 1.5, 2, 2.5, 3, 3], [5, 5, 6, 7, 8, 9]]
     assert torch.allclose(found.inputs["input"], torch.tensor(expected).double())
 
@@ -64,9 +61,7 @@ def test_inputs_may_have_clocks_of_their_own():
         {"u": [1.0, 2.0, 3.0], "v": torch.arange(5.0).expand(2, -1)},
         {"u": [0.0, 0.5, 1.0], "v": torch.linspace(0, 1, 5)},
     )
-    assert found.input_times is not None
     assert found.input_times.tolist() == [0, 0.25, 0.5, 0.75, 1]
-    assert found.inputs is not None
     assert found.inputs["u"].tolist() == [[1, 1, 2, 2, 3]] * 2
     assert found.inputs["v"].tolist() == [[0, 1, 2, 3, 4]] * 2
     with pytest.raises(ValueError, match="input_times of u; got those of v"):
@@ -78,7 +73,6 @@ def test_jitter_does_not_move_values():
     steps = np.arange(11) * 0.1
     late = steps + 1e-6 * np.array([0, 1, -1, 1, 0, -1, 1, 0, 0, 1, 0])
     found = trials(torch.arange(11.0).expand(2, -1), np.stack([steps, late]))
-    assert found.inputs is not None
     assert found.inputs["input"].tolist() == [[*range(11)]] * 2
 
 
@@ -89,9 +83,6 @@ def test_a_selection_is_not_resampled_again():
         role=["fit", "held out"],
         start=torch.tensor([[1.0, 2.0], [3.0, 4.0]]),
     )
-    assert found.held_out is not None
-    assert found.held_out.inputs is not None
-    assert found.inputs is not None
     assert torch.equal(found.held_out.inputs["input"], found.inputs["input"][1:])
     assert found.held_out.input_times is not None
     assert torch.equal(found.held_out.input_times, found.input_times)

@@ -23,7 +23,6 @@ def test_a_mask_hides_numbers():
 def test_roles_split_and_keep_indices():
     trials = Trials([1.0, 2.0, 3.0], [1.0, 2.0, 3.0], role=["fit", "held out", "fit"])
     assert trials.fit.index.tolist() == [0.0, 2.0]
-    assert trials.held_out is not None
     assert trials.held_out.action.tolist() == [[2.0]]
     assert trials[1:].role == ["held out", "fit"]
 

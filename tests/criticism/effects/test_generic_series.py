@@ -91,10 +91,8 @@ def test_several_inputs_give_their_names():
 def distorted(change):
     """Trials of a motor whose voltage is changed before it acts."""
     trials = measured(0, {}, num=5, held_out=0)
-    assert trials.inputs is not None
     real = {"voltage": change(trials.inputs["voltage"])}
     rows = len(trials)
-    assert trials.sample_times is not None
     x = speed(
         torch.tensor([[3.0, 0.3]]).double().expand(rows, -1),
         trials.action,

@@ -65,7 +65,6 @@ def test_parameters_beside_an_effect_without_a_null_are_looked_for_anew():
         summaries=0,
     )
     sensor = sensor_of(loop.rivals)
-    assert sensor is not None
     search = Search(loop.rivals, sensor, log_priors(loop.effects, ()))
     search.fit_singles()
     alone = search.found[ModelKey(("drift",))].model.rms
@@ -78,7 +77,6 @@ def test_a_set_whose_fit_was_lost_is_fitted_again_from_its_part(monkeypatch):
     """A friction that holds the machine still has no slope that leads back."""
     loop = Criticism(MODEL, PRIOR, trials(cubic=0.5), effects=OSCILLATOR, seed=0)
     sensor = sensor_of(loop.rivals)
-    assert sensor is not None
     search = Search(loop.rivals, sensor, log_priors(loop.effects, ()))
     search.fit_singles()
     part = search.found[ModelKey(("cubic",))].model

@@ -247,7 +247,6 @@ def test_a_larger_noise_is_chosen_again_without_each_trial(size, effects, verdic
     assert tracing.verdict == verdict
     assert tracing.evidences[verdict].engine == "linear"
     evaluation = loop.evaluate()
-    assert evaluation is not None
     assert evaluation.selected.count(verdict) > 12
     rows = evaluation.table.set_index("metric")
     assert rows.loc["log predictive density", "ratio"] > 1

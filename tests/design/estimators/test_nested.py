@@ -66,7 +66,6 @@ def test_six_numbers_that_four_parameters_make():
 def test_noise_that_is_not_declared_is_learned():
     rows, prior = oscillator(300, torch.tensor([6, 23]))
     assert rows.mean is not None
-    assert rows.noise is not None
     again = rows.noise.sample(rows.mean)
     pairs = CandidateSimulations(rows.theta, rows.action, rows.x, replicate=again)
     assert NestedGain().problems(pairs) == []

@@ -34,7 +34,6 @@ def surrogate_of(q: int, num: int, seed: int):
     pairs = rng.standard_normal((2, 100, q))
     noise = estimate_noise(pairs[0], pairs[1], np.ones(q))
     fit = LocalRegression.fit(whole_space(DIM), z, x, noise=noise, num_trials=1)
-    assert fit is not None
     precision = weight @ weight.T + np.diag(coordinates._scale**2)
     return Surrogate(coordinates, [fit]), precision
 

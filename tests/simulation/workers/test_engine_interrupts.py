@@ -76,7 +76,6 @@ def test_an_interrupt_in_the_default_setting_keeps_finished_rows(kind, tmp_path)
         stdout=subprocess.PIPE,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
-    assert process.stdout is not None
     assert process.stdout.readline() == b"ready\n"
     time.sleep(2.0)  # of some 40
     process.send_signal(signal.SIGINT)
