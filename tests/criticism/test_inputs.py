@@ -154,35 +154,6 @@ def test_a_simulator_may_require_times(by_model):
     assert report.verdict == "bias"
 
 
-def test_context_is_what_was_recorded():
-    seen = {}
-
-    def apply(value, phi, action, context):
-        seen.update(vars(context))
-        return value
-
-    watcher = Effect(
-        "watcher", hook="input", prior=Normal(0.0, 1.0), null=0.0, apply=apply
-    )
-    trials = measured(0, {}, num=3, held_out=0)
-    model = AugmentedSimulator(MODEL, [watcher])
-    TrialSimulator(model, trials).predict(
-        torch.tensor([[3.0, 0.3]]), {"watcher": torch.ones(1, 1)}
-    )
-    assert torch.equal(seen["inputs"]["voltage"], trials.inputs["voltage"])
-    assert torch.equal(seen["input_times"], GRID)
-    assert torch.equal(seen["start"]["speed"], trials.start["speed"])
-    wrong = Effect(
-        "wrong",
-        hook="input",
-        prior=Normal(0.0, 1.0),
-        null=0.0,
-        apply=lambda value, phi, action, context: value["voltage"],
-    )
-    with pytest.raises(ValueError, match="dict of the inputs voltage"):
-        Criticism(MODEL, PRIOR, trials, effects=[wrong])
-
-
 def test_what_was_found_can_be_simulated_on():
     trials = measured(0, {"dead zone": 0.25})
     loop = Criticism(MODEL, PRIOR, trials, effects=LIBRARY)
@@ -201,33 +172,3 @@ def test_what_was_found_can_be_simulated_on():
         torch.cat([z[:, :2], torch.zeros(len(z), 1)], 1), trials.action, **run
     )
     assert float((without - trials.x).square().mean().sqrt()) > 0.1
-
-
-def test_inputs_cover_the_model_s_own_times():
-    model = SimulatorModel(
-        lambda theta, action, *, inputs: theta * inputs["u"][:, :3],
-        noise=GaussianNoise(0.1),
-        sample_times=[0.0, 50.0, 100.0],
-    )
-    trials = Trials(
-        None,
-        torch.zeros(3, 3),
-        inputs={"u": torch.randn(3, 11)},
-        input_times=torch.linspace(0, 1, 11),
-    )
-    prior = BoxUniform(torch.zeros(1), torch.ones(1))
-    with pytest.raises(ValueError, match="its input 'u', 0 to 1; got x at 50"):
-        Criticism(model, prior, trials)
-
-
-def test_inputs_that_nobody_takes_are_noted():
-    model = SimulatorModel(lambda theta, action: theta * action, noise=0.1)
-    trials = Trials(
-        torch.tensor([1.0, 2.0, 3.0]),
-        torch.tensor([0.5, 1.0, 1.5]),
-        inputs={"u": torch.randn(3, 11)},
-        input_times=torch.linspace(0, 1, 11),
-    )
-    prior = BoxUniform(torch.zeros(1), torch.ones(1))
-    with pytest.warns(UserWarning, match="takes no argument 'inputs': they are not"):
-        Criticism(model, prior, trials)

@@ -46,16 +46,6 @@ def test_trials_that_begin_later_are_noted():
     assert len(found.input_times) == 14
 
 
-def test_values_are_drawn_as_lines_where_asked():
-    found = trials(
-        [[1.0, 2.0, 3.0], [5.0, 6.0, 7.0, 8.0, 9.0]],
-        [[0.0, 0.5, 1.0], [0.25, 0.5, 0.75, 1.0, 1.25]],
-        input_hold="linear",
-    )
-    expected = [[1, 1.5, 2, 2.5, 3, 3], [5, 5, 6, 7, 8, 9]]
-    assert torch.allclose(found.inputs["input"], torch.tensor(expected).double())
-
-
 def test_inputs_may_have_clocks_of_their_own():
     found = trials(
         {"u": [1.0, 2.0, 3.0], "v": torch.arange(5.0).expand(2, -1)},
@@ -95,13 +85,6 @@ def test_equal_inputs_make_repeats():
     assert trials(torch.randn(2, 11)).repeat_of.tolist() == [-1, -1]
     other = Trials(torch.ones(2), X, inputs=torch.randn(2, 11), input_times=FINE)
     assert other.repeat_of.tolist() == [-1, -1]
-
-
-def test_start_states_by_name_and_by_row():
-    named = trials(torch.zeros(2, 11), start={"angle": [0.1, 0.2]})
-    assert named.start["angle"].tolist() == [0.1, 0.2]
-    assert named.select([1]).start["angle"].tolist() == [0.2]
-    assert trials(torch.zeros(2, 11), start=[0.1, 0.2]).start.shape == (2, 1)
 
 
 NAN = torch.zeros(2, 11).index_put(

@@ -26,14 +26,6 @@ def test_a_file_a_trial():
     assert trials.order == "unknown"
 
 
-def test_files_of_several_trials_have_the_file_in_the_name():
-    header = f"trial,{HEADER}"
-    write("monday.csv", "1,0,1,5", "1,100,1,4", "2,0,2,5", header=header)
-    write("tuesday.csv", "1,0,1,5.5", "1,100,1,4", header=header)
-    trials = Trials.from_csv("runs")
-    assert trials.names == ("monday 1", "monday 2", "tuesday 1")
-
-
 def test_files_where_a_row_is_a_trial_go_on_from_each_other():
     write("a.csv", "1,2", "2,3", header="action_v,x_y")
     write("b.csv", "4,5", header="action_v,x_y")

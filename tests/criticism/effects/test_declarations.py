@@ -17,13 +17,12 @@ from sbi_active import Campaign, DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import (
     AugmentedSimulator,
     Criticism,
-    Effect,
     Trials,
     generic_effects,
     joint_prior,
 )
 from sbi_active.criticism.effects.declarations import require_nested
-from sbi_active.criticism.effects.table import rows_of
+from tests.effects import effect
 
 NAN = float("nan")
 PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
@@ -31,16 +30,6 @@ SPEED = torch.tensor([1.0, 2.0, 3.0, 2.0, 1.5])
 STOP = 0.7 * SPEED + 0.1 * torch.tensor([0.3, -1.2, 0.8, 0.1, -0.4])
 MODEL = SimulatorModel(lambda theta, xi: theta * xi, noise=GaussianNoise(0.1))
 ACTIONS = DiscreteActions([1.0, 1.5, 2.0, 3.0])
-
-
-def effect(name="bias", **changes):
-    parts = {
-        "hook": "observation",
-        "prior": Normal(0.0, 1.0),
-        "null": 0.0,
-        "apply": lambda value, phi, action, context: value + phi,
-    }
-    return Effect(name, **(parts | changes))
 
 
 def loop(*effects, model=MODEL):
@@ -189,42 +178,6 @@ def test_apply_may_change_what_it_gets(hook):
     assert torch.equal(*x.values())
     assert [float(v[0]) for v in given] == pytest.approx([0.5, 2.0, 1.0])
     assert float(phi["bias"][0]) == pytest.approx(0.3)
-
-
-def test_a_wrong_null_shows_where_noise_is_changed_in_place():
-    def apply(sd, phi, action, context):
-        sd *= 1.5 + phi
-        return sd
-
-    with pytest.raises(ValueError, match=r"the noise changed by up to 0\.5"):
-        loop(effect(hook="noise", prior=HalfNormal(1.0), apply=apply))
-
-
-@pytest.mark.parametrize(
-    "row",
-    [
-        "| joint | {} drag | damping | half force |",
-        "| joint | {} drag | damping | whole force | N | drag in {} |",
-        "| joint | {} drag | damping | half | N | drag in {} |",
-    ],
-)
-def test_a_malformed_row_of_a_table_is_named(row, tmp_path):
-    heading = "| of | effect | changes | prior | unit | sentence |\n|---|\n"
-    (tmp_path / "table.md").write_text(f"Effects.\n\n{heading}{row}\n")
-    with pytest.raises(
-        ValueError, match=r"expected cells of, .* in line 5 of table.md"
-    ):
-        rows_of(tmp_path / "table.md")
-
-
-def test_phi_along_the_wrong_axis_shows_where_x_has_as_many_entries_as_rows():
-    wide = SimulatorModel(
-        lambda theta, xi: theta * xi * torch.ones(16), noise=GaussianNoise(0.1)
-    )
-    trials = Trials(SPEED, STOP[:, None] * torch.ones(16))
-    wrong = effect(apply=lambda x, phi, action, context: x + phi[:, 0])
-    with pytest.raises(RuntimeError, match="must match"):
-        Criticism(wide, PRIOR, trials, effects=[wrong])
 
 
 def test_apply_may_return_a_view_of_what_it_keeps():

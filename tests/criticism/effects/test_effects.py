@@ -15,6 +15,7 @@ from sbi_active.criticism import (
     joint_prior,
 )
 from sbi_active.simulation import simulate
+from tests.effects import effect
 
 PRIOR = BoxUniform(-torch.ones(2), torch.ones(2))
 ACTIONS = DiscreteActions(torch.linspace(-2, 2, 9))
@@ -26,16 +27,6 @@ def line(theta, action, curvature=0.0):
 
 
 MODEL = SimulatorModel(line, noise=GaussianNoise(0.1), parameter_names=["a", "b"])
-
-
-def effect(name="bias", **changes):
-    parts = {
-        "hook": "observation",
-        "prior": Normal(0.0, 1.0),
-        "null": 0.0,
-        "apply": lambda x, phi, action, context: x + phi,
-    }
-    return Effect(name, **(parts | changes))
 
 
 HOOKS = {

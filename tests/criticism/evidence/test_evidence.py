@@ -10,7 +10,9 @@ from torch.distributions import Independent, Normal
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.evidence.settings import THOROUGH, settings_of
 from sbi_active.criticism.results import ModelKey
+from sbi_active.inference.engine import infer, search
 from tests.effects import on_outcomes
 
 PRIOR = Independent(Normal(torch.zeros(2), torch.tensor([2.0, 1.0])), 1)
@@ -133,3 +135,23 @@ def test_the_posterior_is_the_exact_one():
     error = 4 * sd * np.sqrt(1 / 100 + 1 / 400)
     assert np.all(np.abs(evidence.draws.mean(0) - mean) < error)
     assert np.all(np.abs(evidence.draws.std(0) - sd) < error)
+
+
+def inferred(seed=0, **given):
+    rival, rng = rivals().rival(ModelKey()), np.random.default_rng(seed)
+    found = search(rival, rng, settings=THOROUGH)
+    vars(rival).update(given)
+    return infer(rival, rng, found=found, settings=settings_of(8, is_bare=False))
+
+
+def test_the_standard_error_claims_what_repeated_runs_show():
+    found = [inferred(seed) for seed in range(20)]
+    gap = np.array([f.log_evidence for f in found]) - MODELS[()]
+    claimed = np.mean([f.standard_error for f in found])
+    assert 0.5 * claimed < np.sqrt((gap**2).mean()) < 1.7 * claimed
+
+
+def test_a_likelihood_of_zero_has_no_evidence():
+    none = inferred(log_likelihood=lambda u, floor=0.0: np.full(len(u), -np.inf))
+    assert none.log_evidence == -np.inf
+    assert none.effective_sample_size == 0

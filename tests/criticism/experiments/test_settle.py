@@ -91,15 +91,6 @@ def test_the_alias_is_withdrawn_by_the_rule_that_named_it():
     assert "failed" in str(report)
 
 
-def test_what_nothing_explains_is_looked_at_where_no_trial_was():
-    robot = Robot(lambda xi: torch.sin(3 * xi), size=1.0, seed=9)
-    report = loop(robot, robot.trials(), effects=[])
-    assert report.verdict == "unexplained"
-    assert report.stopped == "no permitted action tells more"  # all were tried
-    assert len({*robot.asked}) == 3
-    assert robot.asked[0] == -3.0  # farthest from all forward ones
-
-
 @pytest.mark.parametrize("seed", range(2))
 def test_a_clean_simulator_loses_at_most_one_trial(seed):
     robot = Robot(seed=seed)

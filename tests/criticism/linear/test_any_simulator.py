@@ -9,7 +9,6 @@ from torch.distributions import Independent, Normal, Uniform
 from sbi_active import GaussianNoise, SimulatorModel, StudentTNoise
 from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.linear.model import linearize, reweighted_at
 from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit.verdict import judge
 from sbi_active.criticism.results import ModelKey
@@ -104,15 +103,6 @@ def test_heavy_tails_have_the_bayes_factor_of_importance_sampling(bias):
     assert weight.argmin() == 4
 
 
-def test_a_trial_far_off_in_heavy_tails_moves_no_fit():
-    x = measured()
-    x[4] += 5.0
-    model = SimulatorModel(curve, noise=StudentTNoise(SD, 3.0))
-    u = verdict_of(model, x).search.model(BARE).u
-    clean = verdict_of(model, measured()).search.model(BARE).u
-    assert u == pytest.approx(clean, abs=0.15)
-
-
 def test_which_trials_have_an_outcome_tells_of_parameters_and_effects():
     """A response that ends at a height; where it should not, none has one."""
 
@@ -144,17 +134,3 @@ def test_jumps_count_as_noise_and_an_effect_beside_them_is_named():
     assert not loop.rivals.is_smooth
     assert loop.trace().verdict == "wave"
     assert loop.rivals.simulator.num_simulations < 50_000 * 12
-
-
-def test_weights_of_t_errors_at_another_point_are_those_of_a_model_there():
-    """Of a curve that is linear in its parameters, without a simulation."""
-    model = SimulatorModel(curve, noise=StudentTNoise(SD, 4.0))
-    some = RivalSet(model, PRIOR, Trials(ACTION, measured()), [], seed=0)
-    rival, unit = some.rival(BARE, df=4.0), np.full(12, SD)
-    here, there = (
-        linearize(rival, np.array(u), unit) for u in ((0.2, 0.3), (0.9, -0.5))
-    )
-    moved = reweighted_at(here, there.u, 4.0)
-    for name in ("residual", "jacobian", "scale", "offset"):
-        own, expected = getattr(moved, name), getattr(there, name)
-        np.testing.assert_allclose(own, expected, atol=1e-5, err_msg=name)

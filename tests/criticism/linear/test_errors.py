@@ -95,38 +95,6 @@ def test_the_evidence_is_that_of_the_dense_integral(ragged):
     assert found.log_sensor == pytest.approx(np.log(np.mean(np.exp(alone))))
 
 
-def test_a_parameter_that_differs_from_trial_to_trial_is_a_dense_integral_too():
-    model, plain = problem()
-    m, rows = plain.measurements, about_zero(model)
-    varying = np.stack([3 * model.jacobian[:, 0], np.zeros(len(m))], 1)
-    cells = [NoiseCell.of(m, sd=plain.unit)]
-    errors = Errors(m, plain.unit, NoiseGrid(cells), largest=2.0, varying=varying)
-    found = errors.posterior(model, errors.grams(model.rows))
-    without = plain.posterior(model, plain.grams(model.rows))
-    j = model.jacobian[:, 0] / np.sqrt(np.mean(model.jacobian[:, 0] ** 2))
-    logs = []
-    for column in (j, 0 * j):
-        k = np.outer(column, column) * (m.trial[:, None] == m.trial)
-        for size in errors.sizes[::2]:
-            for width in WIDTHS:
-                prior = np.diag(model.widened(width) ** 2)
-                design = rows[:, 1:]
-                cov = np.eye(len(m)) + size**2 * k + design @ prior @ design.T
-                off = rows[:, 0] - design @ model.center
-                logs.append(multivariate_normal(np.zeros(len(m)), cov).logpdf(off))
-    varies = np.log(np.mean(np.exp(np.array(logs) - max(logs)))) + max(logs)
-    both = np.logaddexp(without.log_process, varies) - np.log(2)
-    assert found.log_process == pytest.approx(both)
-    assert found.size == pytest.approx(without.size)  # those of the process
-    assert found.time_scale == without.time_scale
-    use = np.arange(errors.num_folds) != 3
-    part = errors.posterior(model, errors.grams(model.rows), use)
-    assert (
-        part.log_sensor
-        == plain.posterior(model, plain.grams(model.rows), use).log_sensor
-    )
-
-
 def test_a_bound_of_phi_counts_by_the_posterior_within_it():
     free, errors = problem()
     bounded, _ = problem(low=0.0)
@@ -153,14 +121,6 @@ def test_left_out_errors_are_those_of_refits():
         error = rows[~rest, 0] - rows[~rest, 1:] @ fit
         assert left.refits[k] == pytest.approx(fit)
         assert left.square[k] == pytest.approx(np.mean(error**2))
-
-
-def test_a_part_that_is_left_out_of_all_has_no_error():
-    model, errors = problem()
-    use = np.arange(errors.num_folds) != 2
-    left = leave_out(model, errors, use)
-    assert np.isnan(left.square[2])
-    assert np.isfinite(np.delete(left.square, 2)).all()
 
 
 def test_few_trials_are_left_out_in_parts():

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 import torch
 from scipy.special import logsumexp
-from scipy.stats import multivariate_normal, norm
+from scipy.stats import multivariate_normal
 
 from sbi_active import AutocorrelatedNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials, close_loop
 from sbi_active.criticism.data import Measurements
 from sbi_active.criticism.rivals.channel_noise import ChannelNoise
 from sbi_active.criticism.rivals.noise_grid import declared_noise
-from sbi_active.criticism.steps.predictive import _log_density
 
 TIMES = np.array([0.0, 0.1, 0.3, 0.6])
 SIZES = [(0.1, 3.0), (10.0, 300.0)]
@@ -149,16 +148,3 @@ def test_a_common_factor_is_summed_beside_the_sizes():
     assert wide.part(some).log_likelihood(m.x[None, some])[0] == pytest.approx(
         expected.log_likelihood(later.x[None])[0]
     )
-
-
-def test_predictions_have_the_density_of_each_channel():
-    """Of one trial given cells and sizes, as of independent numbers by channel."""
-    m = measured(1)
-    noise = AutocorrelatedNoise.unknown(sd=SIZES, correlation_time=(1e-6, 2e-6))
-    grid = declared_noise(noise, m)
-    cells, sizes = np.zeros(2, dtype=int), np.array([[1.0, 2.0], [0.5, 1.5]])
-    each = grid.by_number(sizes)
-    at = np.ones(len(m), bool)
-    got = _log_density(grid, cells, each, np.repeat(m.x[None], 2, 0), at)
-    expected = norm(0, each * grid.cells[0].sd).logpdf(m.x).sum(1)
-    np.testing.assert_allclose(got, expected, rtol=1e-9)

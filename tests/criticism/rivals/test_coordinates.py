@@ -6,24 +6,12 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import Independent, LogNormal, Normal
 
-from sbi_active.criticism import Effect
 from sbi_active.criticism.rivals.coordinates import WIDE, SearchCoordinates
-
-
-def effect(name, prior, scope="campaign"):
-    return Effect(
-        name,
-        hook="observation",
-        prior=prior,
-        null=0.0,
-        scope=scope,
-        apply=lambda x, phi, action, context: x,
-    )
-
+from tests.effects import effect
 
 BOX = BoxUniform(torch.tensor([1.0]), torch.tensor([3.0]))
-WIDE_ONE = effect("wide", LogNormal(torch.zeros(1), 2 * torch.ones(1)))
-START = effect("start", Normal(torch.zeros(2), torch.ones(2)), scope="trial")
+WIDE_ONE = effect("wide", prior=LogNormal(torch.zeros(1), 2 * torch.ones(1)))
+START = effect("start", prior=Normal(torch.zeros(2), torch.ones(2)), scope="trial")
 
 
 def coordinates(num_trials=3):
@@ -48,7 +36,7 @@ def test_only_a_positive_number_of_wide_prior_is_searched_in_logs():
     sd = np.log(WIDE) / 3.29
     for factor, is_log in ((0.9, False), (1.1, True)):
         prior = LogNormal(torch.zeros(1), torch.tensor([factor * sd]))
-        one = SearchCoordinates(BOX, [effect("one", prior)], (), 1)
+        one = SearchCoordinates(BOX, [effect("one", prior=prior)], (), 1)
         assert one.is_log[1] == is_log
 
 

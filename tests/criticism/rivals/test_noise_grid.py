@@ -14,7 +14,6 @@ from sbi_active import (
 )
 from sbi_active.criticism import Trials
 from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import (
     INDEPENDENT,
     NUM_DRAWS,
@@ -107,21 +106,6 @@ def test_errors_that_are_known_by_channel_have_their_units_along_a_trajectory():
     np.testing.assert_allclose(measurement_sds(noise, m), 0.1 * unit.numpy()[m.channel])
     assert measurement_sds(GaussianNoise(1.0), m) is None
     assert measurement_sds(AutocorrelatedNoise(1.0, 0.4, measurement_sd=0.2), m) == 0.2
-
-
-def test_correlated_noise_is_a_gaussian_of_exponential_covariance():
-    x = torch.tensor([[0.1, 0.4, torch.nan, 0.2, -0.3], [1.0, 0.9, 0.5, 0.4, 0.2]])
-    m = Measurements.of(Trials([0.0, 1.0], x, sample_times=TIMES))
-    sd = np.full(len(m), 0.7)
-    cell = NoiseCell.of(m, sd=sd, correlation_time=0.4)
-    expected = 0.0
-    for t in range(2):
-        at = m.trial == t
-        gap = np.abs(m.time[at][:, None] - m.time[at])
-        cov = 0.49 * np.exp(-gap / 0.4)
-        expected += multivariate_normal(np.zeros(at.sum()), cov).logpdf(m.x[at])
-    got = NoiseGrid([cell]).log_likelihood(m.x[None])[0]
-    assert got == pytest.approx(expected, rel=1e-9)
 
 
 def test_a_posterior_over_the_size_is_summed_out_by_draws():

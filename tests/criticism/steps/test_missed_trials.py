@@ -76,20 +76,7 @@ def test_a_trial_in_another_unit_is_named_first(drag):
     size = float((x[7] - x[7] / 100) / SENSOR)
     assert missed.size == pytest.approx(size, rel=0.01)
     assert missed.by_both
-    (warning,) = [w for w in report.warnings if "far outside" in w]
-    assert warning.startswith("held-out trial 7 is")
-    assert f"missed by {missed.size:.0f} sensor deviations" in warning
-    assert "held-out-missed" in warning
-    for page in (report.to_markdown(), report.to_html()):
-        assert page.count("held-out trial 7 is far outside") >= 2
-
-
-def test_the_level_is_that_of_all_held_out_trials(fitted):
-    some, tracing = fitted
-    trials = Trials(ACTION, measured(curve=0.5, seed=1))
-    named = evaluate_held_out(some, tracing, trials, level=12 * 0.9).missed
-    assert 6 <= len(named) <= 12
-    assert [*named] == sorted(named, key=lambda trial: -trial.size)
+    assert "SA514" in [w.code for w in report.warnings]
 
 
 def test_correlated_errors_are_no_contradiction():

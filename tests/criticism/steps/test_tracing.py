@@ -94,16 +94,6 @@ def test_estimates_are_those_of_each_effect_alone():
     assert tracing.estimates[0].name == "curve"
 
 
-def test_without_an_alarm_there_is_nothing_to_trace():
-    tracing, _ = tracing_of(measured())
-    assert tracing.verdict == "none"
-    assert tracing.chosen == ()
-    assert tracing.needed == ()
-    # No trial is suspected, and no set of several effects is looked for.
-    assert tracing.outliers == {}
-    assert not any(" + " in name for name in tracing.probabilities)
-
-
 def test_what_an_effect_leaves_over_is_unexplained_beside_it():
     x = measured(curve=2.0, further=3 * NOISE * torch.sin(1.7 * ACTION + 1))
     tracing, found = tracing_of(x)
