@@ -9,19 +9,11 @@ from scipy.stats import norm
 from torch.distributions import Independent, MultivariateNormal, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
-from sbi_active.criticism import (
-    AugmentedSimulator,
-    Criticism,
-    Trials,
-    close_loop,
-)
+from sbi_active.criticism import AugmentedSimulator, Criticism, Trials, close_loop
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.trial_simulator import NUM_REPLICATES, TrialSimulator
-from sbi_active.criticism.rivals.validity import (
-    DISAGREEMENT,
-)
-from sbi_active.criticism.steps.predictive import predict
+from sbi_active.criticism.rivals.validity import DISAGREEMENT
 from tests.effects import effect
 
 PRIOR = Independent(Normal(torch.zeros(2), torch.tensor([2.0, 1.0])), 1)
@@ -102,17 +94,6 @@ def test_a_random_simulator_gives_its_own_probability_of_an_outcome():
     assert abs(middle) < 4 / math.sqrt(0.7 * num)
 
 
-def test_masked_numbers_are_left_out():
-    def two(theta, action):
-        return line(theta, action).repeat(1, 2)
-
-    x = torch.cat([X, torch.full_like(X, torch.nan)], 1)
-    x[3] = x[3].flip(0)
-    found = rivals(two, Trials(ACTION, x)).fit().evidence
-    expected = exact(ACTION, X[:, 0])
-    assert found.log_evidence == pytest.approx(expected, abs=4 * found.standard_error)
-
-
 # Nuisances of each trial
 
 
@@ -121,21 +102,6 @@ def test_a_nuisance_of_each_trial_is_integrated_out():
     expected = exact(ACTION, X[:, 0], extra=0.8)
     assert found.standard_error < 0.2
     assert found.log_evidence == pytest.approx(expected, abs=4 * found.standard_error)
-
-
-def test_an_unseen_trial_draws_its_own_nuisance():
-    trials, new = Trials(ACTION, X), Trials([0.5, 1.5], [1.0, 5.0])
-    # Only draws in the tail of the nuisance reach the second: of 4,000, each of one of
-    # some 170 effective particles, an error of .1 to .15.
-    sample = rivals(line, trials, [START])
-    density = predict(sample, new, num_draws=4_000).log_density
-    every = [torch.cat([ACTION, a[None]]) for a in new.action.float()]
-    expected = [
-        exact(a, torch.cat([X[:, 0], y.float()]), extra=0.8)
-        - exact(ACTION, X[:, 0], extra=0.8)
-        for a, y in zip(every, new.x, strict=True)
-    ]
-    np.testing.assert_allclose(density, expected, atol=0.4)
 
 
 # Trajectories
@@ -188,18 +154,6 @@ def test_ragged_and_masked_trajectories_go_through_the_whole_loop():
     assert rmse["ratio"] < 0.5
     assert any("trial 4 gave no measurement" in w for w in report.warnings)
     assert report.simulator(report.prior.sample((3,)), torch.ones(3, 1)).shape == (3, 5)
-
-
-def test_times_beyond_those_of_the_simulator():
-    times = torch.linspace(0, 1, 5)
-    model = SimulatorModel(
-        lambda theta, action: theta[:, :1] * times.to(theta),
-        noise=GaussianNoise(0.1),
-        sample_times=times,
-    )
-    trials = Trials([1.0, 2.0], torch.ones(2, 3), sample_times=[0.0, 0.5, 1.5])
-    with pytest.raises(ValueError, match="times within those of the simulator, 0 to 1"):
-        Criticism(model, PRIOR, trials)
 
 
 def test_actions_that_are_not_permitted_are_simulated_where_they_were():

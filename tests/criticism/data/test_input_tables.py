@@ -91,45 +91,8 @@ def test_inputs_come_from_another_file_on_their_own_grid():
             "trial,time,input_u,x_y",
             "no value from 2 to 9 for input 'u' of trial a.* fill in",
         ),
-        (
-            ["a,0,1,5,0", "a,1,1,5,1"],
-            "trial,time,input_u,x_y,start_w",
-            "one value of start_w in each trial; .* value at the start in each row",
-        ),
-        (
-            ["a,0,1,5", "a,1,2,5", "b,2,1,6", "b,3,1,7"],
-            "trial,time,input_u,x_y",
-            "similar times; got trial b of 1 that begins 2 after .* from its own begin",
-        ),
     ],
 )
 def test_a_table_with_inputs_that_is_not_understood(rows, header, message):
     with pytest.raises(ValueError, match=message):
         read(rows, header)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (
-            {"inputs": OTHER[:3]},
-            "none of trial b in inputs.csv, whose trials are a; add",
-        ),
-        (
-            {"header": "trial,time,input_u"},  # ms taken for s
-            None,
-        ),
-        (
-            {"inputs": ["a,0,1", "a,1,2", "b,0,1", "b,1,2"]},
-            "x of trial a measured within the time of its input 'u', 0 to 0.001; got "
-            "x at 0.02",
-        ),
-        ({"inputs": ["a,0,1", "a,0,2"]}, "each sample once; .* rows 1 and 2 of inputs"),
-    ],
-)
-def test_another_table_that_is_not_understood(arguments, message):
-    if message is None:
-        assert beside(**arguments).input_times[-1] == 20
-        return
-    with pytest.raises(ValueError, match=message):
-        beside(**arguments)

@@ -126,21 +126,6 @@ def test_a_loop_finds_what_a_start_at_rest_would_hide():
     assert (np.abs(z) < 3.5).all()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"within": 0.05}, "0.05 of the first; got 1 .* which are 0.1 apart; pass"),
-        ({"start": {"level": 1}}, "axis from 0 to 0; got 1; number"),
-        ({"sd": 0.0}, "expected a standard deviation > 0 of the sensor; got 0.0"),
-    ],
-)
-def test_what_cannot_be_is_refused(options, message):
-    trials, *_ = lines(3)
-    options = {"start": {"level": 0}, "within": 0.5, "sd": SENSOR} | options
-    with pytest.raises(ValueError, match=message):
-        start_from_first_samples(trials, **options)
-
-
 def test_a_line_that_hides_gravity_is_said():
     times = torch.arange(10) / 30
     noise = 0.01 * torch.randn(3, 10, generator=torch.Generator().manual_seed(0))

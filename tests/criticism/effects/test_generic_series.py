@@ -5,11 +5,7 @@ import torch
 from sbi.utils import BoxUniform
 
 from sbi_active import GaussianNoise, SimulatorModel
-from sbi_active.criticism import (
-    Criticism,
-    Trials,
-    generic_effects,
-)
+from sbi_active.criticism import Criticism, Trials, generic_effects
 from sbi_active.criticism.effects.changes import delayed_input, played
 from tests.criticism.motor_world import GRID, MODEL, NOISE, PRIOR, measured, speed
 

@@ -164,26 +164,6 @@ def test_trials_that_disagree_widen_it():
     assert two - one < 0.2 * (high - low)
 
 
-def test_what_it_does_not_take():
-    trials = Trials(ACTION, recorded())
-    noisy = model(fn=lambda t, a: mean(t, a) + 0.1 * torch.randn(len(t), 120, 2))
-    with pytest.raises(ValueError, match="deterministic simulator; got a random"):
-        identify(noisy, PRIOR, trials)
-    flat = SimulatorModel(lambda t, a: t[:, :2] * a, noise=GaussianNoise(0.1))
-    with pytest.raises(ValueError, match="trajectories with sample times"):
-        identify(flat, PRIOR, Trials(ACTION, ACTION * TRUTH[:2]))
-    x = recorded()
-    x[..., 1] = torch.nan
-    with pytest.raises(ValueError, match="got none in channel 1; leave it out"):
-        identify(model(), PRIOR, Trials(ACTION, x))
-    silent = model(GaussianNoise(torch.tensor([0.02, 0.0])))
-    with pytest.raises(ValueError, match="above 0 in each channel; got 0.02, 0;"):
-        identify(silent, PRIOR, trials)
-    belief = identify(model(), PRIOR, trials)
-    with pytest.raises(ValueError, match="between 0 and 1; got 95"):
-        belief.interval(95)
-
-
 def test_a_prior_of_any_shape_counts():
     """Draws of a gain that nothing tells are those of its skewed prior."""
     own = torch.distributions.Independent(

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal, norm
+from scipy.stats import multivariate_normal
 
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.linear.errors import Errors
 from sbi_active.criticism.linear.left_out import leave_out
-from sbi_active.criticism.linear.mixture import WIDTHS, integrated
+from sbi_active.criticism.linear.mixture import WIDTHS
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.misfit.intervals import shared_process
 from sbi_active.criticism.results import ModelKey
@@ -95,18 +95,6 @@ def test_the_evidence_is_that_of_the_dense_integral(ragged):
     assert found.log_sensor == pytest.approx(np.log(np.mean(np.exp(alone))))
 
 
-def test_a_bound_of_phi_counts_by_the_posterior_within_it():
-    free, errors = problem()
-    bounded, _ = problem(low=0.0)
-    grams = errors.grams(free.rows)
-    use = np.ones(errors.num_folds, bool)
-    gram = grams.gram[-1:, use].sum(1)
-    log_z, mean, cov = (part[:, 0] for part in integrated(gram, free, [1.0]))
-    within = integrated(gram, bounded, [1.0])[0][:, 0]
-    inside = norm.logsf(0.0, mean[0, 1], np.sqrt(cov[0, 1, 1]))
-    assert within[0] - log_z[0] == pytest.approx(inside - np.log(0.5))
-
-
 def test_left_out_errors_are_those_of_refits():
     model, errors = problem()
     left = leave_out(model, errors)
@@ -121,17 +109,6 @@ def test_left_out_errors_are_those_of_refits():
         error = rows[~rest, 0] - rows[~rest, 1:] @ fit
         assert left.refits[k] == pytest.approx(fit)
         assert left.square[k] == pytest.approx(np.mean(error**2))
-
-
-def test_few_trials_are_left_out_in_parts():
-    _, errors = problem(num=3)
-    assert not errors.is_by_trial
-    assert errors.num_folds >= 8
-    m = errors.measurements
-    for k in range(errors.num_folds):
-        at = errors.fold == k
-        assert len(np.unique(m.trial[at])) == 1
-        assert np.ptp(np.flatnonzero(at)) == at.sum() - 1  # neighbors in time
 
 
 @pytest.mark.parametrize("differs", [False, True])
@@ -173,11 +150,6 @@ def test_an_error_that_trials_share_is_that_of_the_dense_integral(differs):
     off = means - p @ means
     exact = np.einsum("h,hij->ij", p, np.array(covs)) + (p[:, None] * off).T @ off
     assert cov == pytest.approx(exact, rel=1e-6)
-
-
-def test_trials_of_different_times_share_no_process():
-    model, errors = problem(ragged=True)
-    assert shared_process(model, errors, np.arange(NUM)[:, None] + 0.0) is None
 
 
 @pytest.mark.parametrize("far", [1.0, 1e6])

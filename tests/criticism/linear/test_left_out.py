@@ -12,7 +12,7 @@ from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.results import ModelKey
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_the_best_within_bounds_is_that_of_scipy(seed):
     rng = np.random.default_rng(seed)
     dim = 8
@@ -74,21 +74,6 @@ def test_a_trial_that_is_extrapolated_to_counts_in_units_of_what_is_expected(lin
         assert left.standard[j] == pytest.approx(square, rel=1e-6)
     assert left.standard[-1] < 0.3 * left.square[-1]
     assert (left.standard <= left.square).all()
-
-
-def test_weights_are_those_of_least_squares(line):
-    model, errors = line
-    weight = 1.5 + np.sin(errors.fold)
-    root = np.sqrt(weight)
-    same = replace(
-        model,
-        residual=root * model.residual,
-        jacobian=root[:, None] * model.jacobian,
-    )
-    found, plain = leave_out(model, errors, weight=weight), leave_out(same, errors)
-    assert found.standard == pytest.approx(plain.standard)
-    assert found.refits == pytest.approx(plain.refits)
-    assert found.square == pytest.approx(plain.square)
 
 
 def test_a_coordinate_at_its_bound_is_no_excuse_for_an_error(line):

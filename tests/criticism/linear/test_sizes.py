@@ -9,7 +9,7 @@ from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.steps.equivalence import MANY
 
-TIMES = torch.linspace(0, 2, 60)
+TIMES = torch.linspace(0, 2, 30)
 PRIOR = BoxUniform(torch.tensor([-2.0]), torch.tensor([2.0]))
 
 
@@ -38,10 +38,6 @@ def verdict(number, strength):
     effects = [pattern(k) for k in range(number)]
     loop = Criticism(model, PRIOR, Trials(action, x), effects=effects, seed=0)
     return loop.trace()
-
-
-def test_clean_trials_of_many_effects_say_none():
-    assert verdict(MANY + 1, 0.0).verdict == "none"
 
 
 def test_one_effect_more_does_not_change_the_verdict():

@@ -8,17 +8,9 @@ from scipy.stats import multivariate_normal
 from sbi_active.criticism import Criticism
 from sbi_active.criticism.linear.mixture import summed
 from sbi_active.criticism.linear.screening import linear_models
-from sbi_active.criticism.misfit.guesses import (
-    MARGIN,
-    guess_residual,
-)
+from sbi_active.criticism.misfit.guesses import MARGIN, guess_residual
 from sbi_active.criticism.results import ModelKey
-from tests.criticism.misfit.oscillator import (
-    EFFECTS,
-    MODEL,
-    PRIOR,
-    trials,
-)
+from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR, trials
 from tests.criticism.steps.linear_world import ACTION, measured, rivals
 
 FEW = [e for e in EFFECTS if e.name in ("friction", "bias")]
@@ -60,11 +52,6 @@ def test_a_guess_is_the_term_that_is_missing_of_numbers():
     found = guess_residual(searched(0.8 * ACTION**3))
     assert found[0][0] == "xi^3"
     assert min(gain for _, gain in found) > MARGIN
-
-
-def test_what_no_formula_is_of_numbers_has_no_guess():
-    assert guess_residual(searched(2 * torch.sin(9 * ACTION))) == ()
-    assert guess_residual(searched(0 * ACTION)) == ()
 
 
 def test_the_evidence_of_the_residual_process_is_that_of_its_covariances():

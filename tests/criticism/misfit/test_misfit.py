@@ -47,13 +47,6 @@ def test_without_the_effect_in_the_library_nothing_takes_its_place(named):
     assert found.misfit.named == ()
 
 
-def test_misfit_alone_names_nothing():
-    found = loop(trials(hidden=3 * HIDDEN), EFFECTS[2:])
-    report = found.report(evaluate=False, plan=False)
-    assert found.trace().verdict == "unexplained"
-    assert "The bare model misses the 8 trials" in " ".join(str(report).split())
-
-
 @pytest.mark.parametrize("effects", [{}, {"friction": 0.2}])
 def test_a_model_that_fits_to_the_sensor_needs_none_of_it(effects):
     found = loop(trials(**effects))

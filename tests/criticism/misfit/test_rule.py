@@ -42,22 +42,6 @@ def test_an_effect_is_named_that_halves_the_error_beyond_the_sensor():
     assert choose(faint, "ab").named == ()
 
 
-def test_what_is_named_does_not_depend_on_the_declared_sensor():
-    """Ten times finer, every error is a hundred times as many sensor variances."""
-    errors = {"none": (0.0, 1e4), "a": (30.0, 1e3), "b": (1.0, 9e3)}
-    finer = {name: (log_p, 100 * square) for name, (log_p, square) in errors.items()}
-    names = [choose(models(**own), "ab").named for own in (errors, finer)]
-    assert names == [("a",), ("a",)]
-
-
-def test_effects_that_explain_nothing_change_nothing():
-    several = models(none=(0.0, 101.0), a=(20.0, 12.0), b=(-1.0, 101.0))
-    more = several | models(c=(-1.0, 101.0), d=(-1.0, 101.0))
-    few, many = choose(several, "ab"), choose(more, "abcd")
-    assert few.named == many.named == ("a",)
-    assert few.support["a"] == many.support["a"]
-
-
 def test_formulas_in_the_place_of_an_effect_compete_with_it():
     several = models(none=(0.0, 101.0), a=(20.0, 2.0), b=(19.0, 2.1), a_b=(39.0, 1.1))
     asked = []
@@ -96,33 +80,6 @@ def test_errors_below_the_sensor_s_are_all_alike(timed):
     assert choose(several, "ab", timed=timed).key == ModelKey(("a",))
     above = models(none=(0.0, 101.0), a=(28.0, 9.9), b=(20.0, 2.5))
     assert choose(above, "ab", timed=timed).key == ModelKey(("b",))
-
-
-def test_an_effect_that_does_not_predict_better_is_dropped():
-    several = models(none=(0.0, 50.0), a=(20.0, 10.0), a_b=(25.0, 9.9), b=(0.0, 50.0))
-    uneven = 10.0 * np.array([0.8, 1.3, 0.9, 1.2, 0.7, 1.1, 1.0, 0.9])
-    several[ModelKey(("a", "b"))] = scored(25.0, uneven)
-    found = choose(several, "ab")
-    assert found.key == ModelKey(("a",))
-    assert found.inclusion["b"] > 0.9
-
-
-def test_nothing_helps_where_left_out_trials_are_predicted_alike():
-    found = choose(models(none=(0.0, 50.0), a=(-1.0, 50.0), b=(0.5, 50.0)), "ab")
-    assert found.key == ModelKey()
-    assert found.support == {}
-
-
-def test_effects_that_nothing_separates_share_their_mass():
-    several = models(none=(0.0, 101.0), a=(60.0, 11.0), b=(60.0, 11.0))
-    apart = choose(several, "ab")
-    assert apart.inclusion["a"] == pytest.approx(0.5)
-    together = choose(several, "ab", [frozenset("ab")])
-    assert len(together.key.effects) == 1
-    (name,) = together.key.effects
-    assert together.named == (name,)
-    assert together.support[name].inclusion == pytest.approx(1.0, abs=1e-6)
-    assert apart.support["a"].inclusion == pytest.approx(0.5, abs=1e-6)
 
 
 def test_what_left_out_trials_do_not_tell_apart_is_listed_in_its_place():

@@ -17,9 +17,3 @@ def test_each_part_counts_as_one_number_with_an_error_of_unknown_size():
     assert found[ONE] / found[BARE] == pytest.approx(2.0**5)
     assert [*found][-1] == BARE
     assert sum(found.values()) == pytest.approx(1.0)
-
-
-def test_prior_probabilities_count():
-    error = {BARE: np.full(10, 2.0), ONE: np.full(10, 2.0)}
-    found = weights_by_error(error, {BARE: np.log(3.0), ONE: 0.0}, seed=0)
-    assert found[BARE] == pytest.approx(0.75)

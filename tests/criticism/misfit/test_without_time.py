@@ -99,11 +99,3 @@ def test_several_effects_are_asked_what_left_out_trials_say_of_them():
     draws = tracing.evidences["quadratic"].draws  # without the step, which matters
     mean, sd = draws.mean(0), draws.std(0)
     assert (abs(mean - (*THETA, QUADRATIC)) < 2 * sd).all()
-
-
-def test_a_model_that_one_effect_refutes_has_intervals_that_know_of_it():
-    tracing = loop(trials(quadratic=QUADRATIC)).trace()
-    draws = tracing.evidences["none"].draws
-    mean, sd = draws.mean(0), draws.std(0)
-    assert abs(mean[0] - THETA[0]) > 10 * SENSOR  # the quadratic's mean is in it
-    assert (abs(mean - THETA) < 2 * sd).all()

@@ -63,21 +63,6 @@ def test_evidence_is_the_sum_over_every_combination_of_sizes(gap):
     assert posterior.sum() == pytest.approx(1.0)
 
 
-def test_with_a_settled_ratio_it_is_as_probable_where_the_ratio_is_from():
-    m = measured()
-    grid = declared_noise(noise_of(), m)
-    settled = grid.settled(lambda: m.x)
-    assert settled.log_likelihood(m.x[None])[0] == pytest.approx(
-        grid.log_likelihood(m.x[None])[0]
-    )
-    sizes = settled.sizes(np.array([1.0, 2.0]))
-    np.testing.assert_allclose(sizes[1], 2 * sizes[0])
-    cell, best = grid.likeliest(m.x)
-    np.testing.assert_allclose(
-        settled.cells[cell].sd, grid.by_number(best[None])[0] * (grid.cells[cell].sd)
-    )
-
-
 def gliding(theta, action, *, times, drag=0.0):
     """Place in m and speed in mm/s of what is pushed off, and slows down."""
     drag = torch.as_tensor(drag, dtype=theta.dtype).reshape(-1, 1)
@@ -120,31 +105,3 @@ def test_the_loop_names_an_effect_beside_errors_of_unknown_size_in_two_units(dra
     if drag:
         (phi,) = (e for e in report.tracing.estimates if e.name == "drag")
         assert abs(phi.mean - drag) < 4 * phi.sd
-
-
-def test_a_size_of_each_channel_needs_as_many_channels():
-    times = torch.arange(4.0)
-    m = Measurements.of(Trials([0.0], torch.zeros(1, 4, 3), sample_times=times))
-    with pytest.raises(ValueError, match="for each of 3 channels; got 2"):
-        declared_noise(noise_of(), m)
-
-
-def test_a_common_factor_is_summed_beside_the_sizes():
-    m = measured()
-    grid = declared_noise(noise_of(), m)
-    scales, p = np.array([1.0, 2.0, 5.0]), np.log([0.5, 0.3, 0.2])
-    wide = grid.scaled(scales, p)
-    each = [grid.log_likelihood(m.x[None] / s)[0] - len(m) * np.log(s) for s in scales]
-    assert wide.log_likelihood(m.x[None])[0] == pytest.approx(logsumexp(each + p))
-    some = m.trial > 0
-    later = Measurements.of(
-        Trials(
-            torch.arange(2.0),
-            m.x.reshape(3, 2, 4)[1:].transpose(0, 2, 1),
-            sample_times=TIMES,
-        )
-    )
-    expected = declared_noise(noise_of(), later).scaled(scales, p)
-    assert wide.part(some).log_likelihood(m.x[None, some])[0] == pytest.approx(
-        expected.log_likelihood(later.x[None])[0]
-    )

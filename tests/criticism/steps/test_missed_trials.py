@@ -14,7 +14,6 @@ from sbi_active.criticism import Effect, Trials, close_loop
 from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.results import NONE
 from sbi_active.criticism.steps.evaluation import evaluate_held_out
-from sbi_active.criticism.steps.influence import unless_refuted
 from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR
 from tests.criticism.misfit.oscillator import trials as oscillations
 from tests.criticism.steps.linear_world import (
@@ -121,23 +120,6 @@ def test_errors_under_misfit_are_compared_with_those_of_left_out_trials():
         report = close_loop(MODEL, PRIOR, trials, effects=EFFECTS, plan=False)
         assert report.tracing.misfit is not None
         assert [trial.name for trial in report.evaluation.missed] == names
-
-
-def test_what_no_model_predicts_refutes_none(fitted):
-    some, tracing = fitted
-    x = measured(curve=0.5, seed=1)
-    mean, _ = posterior(measured(curve=0.5), ("curve",))
-    x[0] += 1e4 if columns(("curve",))[0, 2] * mean[2] < 0 else -1e4  # nearer the bare
-    evaluation = evaluate_held_out(some, tracing, Trials(ACTION, x))
-    rmse = evaluation.table.set_index("metric").loc["rmse"]
-    assert rmse["after"] > rmse["before"]
-    assert [trial.position for trial in evaluation.missed if trial.by_both] == [0]
-    assert unless_refuted(tracing, evaluation).verdict == "curve"
-
-
-def test_trials_that_agree_are_not_named():
-    told = [report_of(slid(drag=d, seed=s)).evaluation for d, s in ((0, 1), (0.3, 2))]
-    assert not any(evaluation.missed for evaluation in told)
 
 
 def test_the_tail_is_that_of_the_normal_predictive(fitted):
