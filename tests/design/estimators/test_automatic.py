@@ -5,11 +5,7 @@ import torch
 from torch.distributions import Distribution
 
 from sbi_active.design import LikelihoodGain, LinearGain, PosteriorGain, RatioGain
-from sbi_active.design.estimators.automatic import (
-    choose_estimator,
-    disagreements,
-    find_estimator,
-)
+from sbi_active.design.estimators.automatic import choose_estimator, disagreements
 from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.design.estimators.contrast import ContrastiveGain, InfoNCEGain
 from sbi_active.simulation import GaussianNoise
@@ -72,13 +68,6 @@ def test_many_parameters_that_outcomes_are_linear_in_have_the_linear_estimate(
     assert (type(chosen) is LinearGain) == linear
 
 
-def test_a_ratio_beyond_the_reach_of_info_nce_is_averaged():
-    chosen, notes = choose_estimator(ExactRatio(), unusable(FAR))
-    assert type(chosen) is RatioGain
-    assert "not used: InfoNCEGain is near its largest value, log K = 4.9" in notes[-1]
-    assert "at 1 of 2 actions" in notes[-1]
-
-
 @pytest.mark.parametrize(
     ("estimator", "text"),
     [
@@ -117,8 +106,3 @@ def test_a_ratio_whose_normalization_is_off_is_noticed():
         assert len(notes) == expected
     assert "InfoNCEGain is" in notes[0]
     assert "nats below" in notes[0]
-
-
-def test_a_former_name_is_taken_for_one_version():
-    with pytest.warns(DeprecationWarning, match=r"use estimator=\"likelihood\""):
-        assert type(find_estimator("variational_nested")) is LikelihoodGain

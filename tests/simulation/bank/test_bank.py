@@ -91,14 +91,6 @@ def test_rows_by_position_slice_and_mask(bank, monkeypatch):
             bank.read(bad)
 
 
-def test_a_run_of_one_row_goes_on(bank):
-    theta, action = draw(1)
-    first = simulate(simulator, theta, action, seed=3, store=bank)
-    again = simulate(simulator, theta, action, seed=3, store=bank)
-    assert same(first, again)
-    assert len(bank) == 1
-
-
 def test_what_a_writer_that_died_left_is_removed(bank):
     simulate(simulator, *draw(4), seed=0, store=bank)
     bank.close()
@@ -163,14 +155,6 @@ def test_readers_go_on_while_another_process_writes(bank):
     assert len(bank) == 600
 
 
-def test_shapes_set_by_another_writer_hold(bank):
-    late = Bank(bank.path, simulator=simulator)
-    bank.append(Simulations(*draw(3), torch.rand(3, 3)), seed=0)
-    bank.close()
-    with late, pytest.raises(ValueError, match=r"'x': \[3\]}, as in the bank"):
-        late.append(Simulations(*draw(3), torch.rand(3, 4)), seed=1)
-
-
 def test_the_lock_goes_with_its_process(bank):
     def hold():
         own = Bank(bank.path, simulator=simulator)
@@ -216,16 +200,6 @@ def test_a_forked_child_reads_and_has_no_right_to_write(bank):
     with forked(write) as is_running:
         assert is_running.join() == 0
     assert len(reader) == len(bank) == 30
-
-
-def test_what_is_stored_is_synchronized_with_the_disk(bank):
-    bank.append(simulate(simulator, *draw(10), seed=0), seed=0)
-    with bank._store.reading() as connection:
-        found = [
-            connection.execute(f"PRAGMA {name}").fetchone()[0]
-            for name in ("synchronous", "journal_mode", "trusted_schema")
-        ]
-    assert found == [2, "wal", 0]  # 2: an fsync at each commit
 
 
 class forked:  # noqa: N801
