@@ -165,33 +165,6 @@ def test_nothing_of_the_folder_changes(place, capsys):
     assert "setInterval" not in page
 
 
-def test_a_folder_that_is_no_campaign(capsys):
-    for words in (["nowhere"], ["nowhere", "--once", "page.html"]):
-        assert main(["watch", *words]) == 2
-        assert "expected a campaign; got no nowhere" in capsys.readouterr().err
-    assert not Path("page.html").exists()
-
-
-def test_a_port_in_use(place, server, capsys):
-    port = str(server.server_port)
-    assert main(["watch", str(place[0]), "--port", port]) == 2
-    text = f"expected a port that is free; got {port} (Address already in use)"
-    assert text in capsys.readouterr().err
-    assert main(["watch", str(place[0]), "--port", "65536"]) == 2
-    assert "65536 is not in the range 0<=x<=65535" in capsys.readouterr().err
-
-
-def test_a_folder_that_goes_is_said_on_the_page(place, tmp_path):
-    folder = tmp_path / "camp"
-    folder.mkdir()
-    for file in place[0].iterdir():
-        (folder / file.name).write_bytes(file.read_bytes())
-    watched = watch.Watched(folder)
-    assert "2 trials told" in watched.page()
-    (folder / "store.db").unlink()
-    assert "expected a campaign; got no" in news(watched.page())[0]
-
-
 def test_it_reads_well_in_a_browser(place, tmp_path):
     assert_reads_well(watch.Watched(place[0]).drawn(), tmp_path)
 
