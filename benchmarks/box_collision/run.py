@@ -43,10 +43,7 @@ from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import Workers
 from sbi_active.tasks import Task, get_task
-from sbi_active.tasks.box_collision import (  # pyright: ignore
-    BoxCollisionReference,
-    exact_posterior,
-)
+from sbi_active.tasks.box_collision import BoxCollisionReference, exact_posterior  # pyright: ignore
 
 REPORTED = (3.0, 5.0, 7.0)  # m/s
 STAGES = ("simulation", "training", "design", "scoring", "update")

@@ -18,11 +18,7 @@ from torch import Tensor
 from benchmarks.criticism.problem import Problem
 from benchmarks.criticism.worlds import World
 from benchmarks.fitting import residual_sum_of_squares
-from sbi_active.criticism import (
-    Context,
-    Effect,
-    Trials,
-)
+from sbi_active.criticism import Context, Effect, Trials
 from sbi_active.criticism.data import Role
 from sbi_active.seeding import derive_seed, forked_generators, row_normals, row_seeds
 

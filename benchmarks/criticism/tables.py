@@ -199,7 +199,7 @@ def _active(world: World, rows: Sequence[Row]) -> list[str]:
     curves = Curves.of(rows)
     lines = [
         f"detectable (lambda > {DETECTABLE:g} with all random trials): "
-        f"{curves.num_cases} of {len({r['case'] for r in rows})} cases",
+        f"{curves.num_cases} of {len({r['case'] for r in rows})} cases"
     ]
     if not curves.num_cases:
         return lines

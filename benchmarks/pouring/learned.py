@@ -150,10 +150,7 @@ class ByAction:
         values = [
             [
                 own.likelihood.gain(
-                    theta,
-                    NUM_OUTER,
-                    np.random.default_rng(seed),
-                    earlier[delta, place],
+                    theta, NUM_OUTER, np.random.default_rng(seed), earlier[delta, place]
                 )
                 for place, own in enumerate(by_action)
             ]

@@ -43,9 +43,7 @@ from sbi_active.inference.emulation.likelihood import correlation_root
 from sbi_active.inference.emulation.summaries import Statistic, learned_statistic
 from sbi_active.inference.regression.outcomes import TrialOutcome
 from sbi_active.inference.regression.regions import whole_space
-from sbi_active.inference.sampling.gaussian_process import (
-    GaussianProcess,
-)
+from sbi_active.inference.sampling.gaussian_process import GaussianProcess
 
 Array = NDArray[Any]
 
@@ -163,9 +161,7 @@ class ImageLikelihood:
         return np.concatenate(means, 1), np.concatenate(errors, 1), noise
 
     def predict(
-        self,
-        theta: Array,
-        earlier: Sequence[Array] = (),
+        self, theta: Array, earlier: Sequence[Array] = ()
     ) -> tuple[Array, Array, float]:
         """Return means and deviations of statistics, both (n, q), and their freedom.
 
@@ -204,10 +200,7 @@ class ImageLikelihood:
         return self.at_each(theta, [observed], earlier)[0]
 
     def at_each(
-        self,
-        theta: Array,
-        outcomes: list[Any],
-        earlier: Sequence[Array] = (),
+        self, theta: Array, outcomes: list[Any], earlier: Sequence[Array] = ()
     ) -> Array:
         """Return w log p of outcomes at theta (n, 3), shape (outcomes, n)."""
         log_empty, log_filled = self.probability_empty(theta)

@@ -225,10 +225,7 @@ def path_of(method: str, target: str, arguments: Settings) -> Path:
 
 
 def run_missing(
-    method: str,
-    target: str,
-    learned: ByAction | ByNetwork,
-    arguments: Settings,
+    method: str, target: str, learned: ByAction | ByNetwork, arguments: Settings
 ) -> None:
     """Run the trials that are not in the file yet."""
 

@@ -10,11 +10,7 @@ from mujoco import sysid
 from sbi.utils import BoxUniform
 
 from benchmarks.robots.models import SPRING_MASS
-from sbi_active.mujoco import (
-    belief_to_parameters,
-    from_sysid,
-    randomization,
-)
+from sbi_active.mujoco import belief_to_parameters, from_sysid, randomization
 
 if not hasattr(sysid, "Parameter"):
     pytest.skip(

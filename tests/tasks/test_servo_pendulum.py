@@ -77,19 +77,6 @@ def test_a_free_pendulum_keeps_its_energy_without_friction_alone():
     assert np.array_equal(motor, free)  # no torque while the motor is off
 
 
-def test_effects_vanish_at_zero(task):
-    bare = every_trial(task)
-    assert [e.name for e in task.effects()] == [
-        "Coulomb",
-        "load-dependent",
-        "torque-dependent",
-        "viscous",
-    ]
-    for keyword in ("coulomb", "load", "torque", "viscous"):
-        assert np.array_equal(every_trial(task, **{keyword: 0.0}), bare)
-        assert np.abs(every_trial(task, **{keyword: 0.05}) - bare).max() > 0.01
-
-
 # Reading what was recorded
 
 
@@ -130,32 +117,3 @@ def test_reading_interpolates_and_finds_when_the_motor_is_off(folder):
         [100.0, 0.0],
         [100.0, 1.0],
     ]
-
-
-# The closed loop
-
-
-def edited(folder, name, change):
-    table = pd.read_csv(folder / name)
-    change(table).to_csv(folder / name, index=False)
-    return folder
-
-
-@pytest.mark.parametrize(
-    ("name", "change", "message"),
-    [
-        ("samples.csv", lambda t: t.drop(columns="goal_rad"), "got no goal_rad among"),
-        ("trials.csv", lambda t: pd.concat([t, t]), "got trial 0 more than once"),
-        ("samples.csv", lambda t: t[t["trial"] == 0], "got none of trial 1"),
-        ("samples.csv", lambda t: t[t["time_s"] < 5], "got 4.999 s in trial 0"),
-        ("samples.csv", lambda t: t[::-1], "time_s that increases; got"),
-        (
-            "samples.csv",
-            lambda t: t.assign(position_rad=t["position_rad"].where(t.index != 3)),
-            "finite position_rad; got nan in sample 3 of trial 0",
-        ),
-    ],
-)
-def test_recordings_that_do_not_fit(folder, name, change, message):
-    with pytest.raises(ValueError, match=message):
-        read_recordings(edited(folder, name, change))

@@ -233,9 +233,5 @@ def make_trajectories() -> World:
         parameter_names=block.model.parameter_names,
     )
     return replace(
-        block,
-        name="C",
-        model=model,
-        correlations=CORRELATIONS,
-        sample_times=TRAJECTORY,
+        block, name="C", model=model, correlations=CORRELATIONS, sample_times=TRAJECTORY
     )
