@@ -10,7 +10,6 @@ import torch
 
 from sbi_active.campaign.storage.codec import Absent, NotStorableError, decode, encode
 from sbi_active.design import Design
-from sbi_active.simulation import GaussianNoise
 
 
 def back(value, **known):
@@ -27,16 +26,6 @@ def test_arrays_keep_every_bit(dtype):
         assert np.array_equal(again, value)
     gap = np.array([np.nan, 1e-300, 1 / 3])
     assert np.array_equal(back(gap), gap, equal_nan=True)
-
-
-def test_an_object_that_occurs_twice_is_one():
-    noise = GaussianNoise(0.1)
-    first, second, loop = back([noise, noise, []])
-    assert first is second
-    loop_list = []
-    loop_list.append(loop_list)
-    again = back(loop_list)
-    assert again[0] is again
 
 
 def test_what_is_known_is_referred_to():

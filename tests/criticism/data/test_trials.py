@@ -12,14 +12,6 @@ def test_ragged_trajectories_are_padded_and_masked():
     assert trials.mask.sum(1).tolist() == [3, 5]
 
 
-def test_a_mask_hides_numbers():
-    x = torch.ones(2, 3)
-    mask = torch.tensor([[True, False, True], [False, False, False]])
-    trials = Trials([1.0, 2.0], x, mask=mask)
-    assert trials.valid.tolist() == [True, False]
-    assert trials.mask.tolist() == mask.tolist()
-
-
 def test_roles_split_and_keep_indices():
     trials = Trials([1.0, 2.0, 3.0], [1.0, 2.0, 3.0], role=["fit", "held out", "fit"])
     assert trials.fit.index.tolist() == [0.0, 2.0]
@@ -70,7 +62,6 @@ def test_measurements_order_channels_before_times():
     [
         (([1.0, 2.0], [1.0]), {}, "expected actions .* with as many rows"),
         (([1.0], [np.nan]), {}, "expected at least one valid trial"),
-        (([1.0, 2.0], [1.0, 2.0]), {"index": [0]}, r"expected index of shape \(2,\)"),
         (
             ([1.0, 2.0], [1.0, np.nan]),
             {"role": ["fit", "held out"]},
@@ -81,7 +72,6 @@ def test_measurements_order_channels_before_times():
             {"sample_times": [0.0, 1.0]},
             r"expected sample_times of shape \(3,\)",
         ),
-        (([1.0, 2.0], [[1.0], [[1.0, 2.0]]]), {}, "differ in their first axis alone"),
     ],
 )
 def test_bad_trials(arguments, keywords, message):

@@ -1,5 +1,4 @@
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -150,29 +149,6 @@ def test_generic_effects_vanish_and_are_scaled_by_noise_and_actions():
     assert "dead zone" in by_name
     one_way = generic_effects(MODEL, DiscreteActions([1.0, 2.0]))
     assert "dead zone" not in {e.name for e in one_way}
-
-
-def test_a_clock_offset_reads_the_trajectory_elsewhere():
-    times = torch.linspace(0, 2, 21)
-    model = SimulatorModel(
-        lambda theta, action: theta[:, :1] * times.to(theta),
-        noise=GaussianNoise(0.1),
-        sample_times=times,
-    )
-    clock = next(e for e in generic_effects(model, ACTIONS) if e.name == "clock offset")
-    x = AugmentedSimulator(model, [clock]).mean(
-        torch.tensor([[3.0, 0.05]]), torch.zeros(1, 1)
-    )
-    torch.testing.assert_close(x[0], 3 * (times + 0.05))
-
-
-def test_distinct_names():
-    with pytest.raises(ValueError, match="got bias more than once"):
-        AugmentedSimulator(MODEL, [effect(), effect()])
-    # Of "bias", "lag" and "bias + lag" two sets would print alike.
-    names = ["bias", "lag", "bias + lag"]
-    with pytest.raises(ValueError, match="got bias, lag more than once"):
-        AugmentedSimulator(MODEL, [replace(effect(), name=name) for name in names])
 
 
 def test_an_effect_through_keywords_of_the_simulator():

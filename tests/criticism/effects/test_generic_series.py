@@ -37,26 +37,6 @@ def test_a_recording_has_an_actuator_and_a_sensor():
     assert not [e for e in effects if e.hook == "action"]
 
 
-def test_several_inputs_give_their_names():
-    trials = Trials(
-        torch.tensor([1.0, 2.0]),
-        torch.zeros(2, 3),
-        sample_times=[0.0, 1.0, 2.0],
-        inputs={"voltage": torch.randn(2, 21), "flow": torch.rand(2, 21)},
-        input_times=torch.linspace(0, 2, 21),
-        input_labels=["voltage [V]", "flow"],
-        action_labels=["mass [kg]"],
-    )
-    model = SimulatorModel(
-        lambda theta, action, *, inputs: theta * inputs["flow"][:, :3], noise=0.1
-    )
-    effects = {e.name: e for e in generic_effects(model, trials)}
-    assert {"voltage gain", "flow gain", "voltage dead zone"} <= {*effects}
-    assert "flow dead zone" not in effects  # it has one sign
-    assert effects["voltage offset"].units == "V"
-    assert effects["action offset"].units == "kg"
-
-
 def distorted(change):
     """Trials of a motor whose voltage is changed before it acts."""
     trials = measured(0, {}, num=5, held_out=0)

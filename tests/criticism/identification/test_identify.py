@@ -81,15 +81,6 @@ def test_residuals_far_beyond_the_declared_error_are_told():
     assert not any("declared error" in w for w in right.diagnostics.warnings)
 
 
-def test_gaps_and_a_single_log_will_do():
-    x = recorded()[2:3]
-    x[0, 30:50, 0] = torch.nan
-    belief = identify(model(), PRIOR, Trials(ACTION[2:3], x))
-    for (low, high), truth in zip(belief.interval(0.999).values(), TRUTH, strict=True):
-        assert low < truth < high
-        assert high - low < 0.2
-
-
 @pytest.mark.parametrize(("low", "high", "side"), [(0.6, 1.0, -1), (0.0, 0.05, 1)])
 def test_an_interval_at_a_bound_is_one_sided_and_has_a_width(low, high, side):
     """Logs that ask for what is far beyond a bound say nothing of what is within.

@@ -43,16 +43,6 @@ def test_every_residual_is_drawn_at_its_action_its_trial_and_its_channel(shape):
         assert panels[0].get_ylabel().startswith(title)
 
 
-def test_a_trajectory_is_a_line_a_trial_and_channel_over_its_own_times():
-    times = np.linspace(0, 1, 20) * np.arange(1, 9)[:, None]
-    made = residuals((20, 2), times=times)
-    ax = plot_residuals(made).axes[-1]
-    drawn = [line.get_xydata() for line in ax.lines[:16]]
-    for k, trajectory in enumerate(drawn):
-        np.testing.assert_allclose(trajectory[:, 0], times[k // 2])
-        np.testing.assert_allclose(trajectory[:, 1], made.refitted[k // 2, :, k % 2])
-
-
 def test_bars_are_as_long_as_probabilities_the_most_probable_on_top():
     shares = {"drag": 0.6, "tilt": 0.33, "drag + tilt": 0.015, "none": 0.001}
     shares |= {"drag + bias": 0.004, "scatter": 0.05}

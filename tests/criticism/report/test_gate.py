@@ -1,15 +1,12 @@
 """The gate: each decision on a small case made for it."""
 
 import json
-from types import SimpleNamespace
 
 import pytest
 import torch
 from sbi.utils import BoxUniform
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
-from sbi_active.cli import criticize as command
-from sbi_active.cli.output import Answer
 from sbi_active.criticism import Trials, close_loop
 from sbi_active.criticism.report.gate import EXIT_CODES
 from tests.effects import BIAS
@@ -129,18 +126,3 @@ def test_few_trials_are_not_enough():
     gate = decided(lambda xi, fits: 0.7 * xi, fitted=3, held_out=1)
     assert gate.decision == "NOT_ENOUGH_DATA"
     assert "measure more" in gate.reason
-
-
-def test_the_command_ends_with_the_code_of_its_decision(monkeypatch, tmp_path):
-    found = {"decision": "WRONG_MODEL", "reason": "it lacks drag", "exit_code": 13}
-    seen = SimpleNamespace()
-
-    def criticize(trials, given):
-        seen.given = trials, given
-        return Answer({"gate": found}, "a report")
-
-    monkeypatch.setattr(command, "_answered", criticize)
-    answer = command.gate(tmp_path, json=True, seed=3)
-    assert seen.given == (tmp_path, {"json": True, "seed": 3})
-    assert (answer.data, answer.status) == (found, 13)
-    assert answer.text == "WRONG_MODEL: it lacks drag"
