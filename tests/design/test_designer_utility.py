@@ -98,6 +98,33 @@ def test_given_simulations_need_no_others(estimator):
     assert again.action.tolist() == [1.0]
 
 
+def test_given_simulations_in_a_box():
+    designer = InformationGainDesigner(BOX)
+    given = rows(5_000, BOX)
+    design = designer.select(ExactModel(), simulations=given, seed=0)
+    exact = information(design.candidates)
+    assert float(information(torch.tensor([[2.0]])) - exact[design.index]) < 0.1
+    distance = (design.expected_information_gain - exact).abs()
+    assert (distance < 4 * design.standard_error + 0.05).all()
+    assert (design.standard_error < 0.2).all()
+    assert design.num_simulations == 0
+    mixed = MixedActions(BOX, DiscreteActions([0.0, 1.0]))
+
+    class Second(ExactModel):
+        """The second tool does nothing."""
+
+        def log_posterior(self, theta, x, action):
+            log_q = super().log_posterior(theta, x, action[:, :1])
+            return torch.where(action[:, 1] == 1, PRIOR.log_prob(theta), log_q)
+
+    given = rows(4_000, BOX)
+    tool = (torch.arange(4_000) % 2).float()[:, None]
+    given = Simulations(given.theta, torch.cat([given.action, tool], 1), given.x)
+    design = InformationGainDesigner(mixed).select(Second(), simulations=given, seed=0)
+    assert float(design.action[1]) == 0.0
+    assert float(design.action[0]) > 1.6
+
+
 def test_random_choices_of_any_space():
     mixed = MixedActions(BOX, DiscreteActions([0.0, 1.0]))
     drawn = torch.stack(

@@ -127,3 +127,15 @@ def test_gain_against_monte_carlo(history: str, variant: str) -> None:
     posterior = posterior_of(history, variant)
     for action in (-5.0, 3.7):
         assert abs(gain_error(posterior, action)) < 4, action
+
+
+def test_gain_of_the_prior_at_the_reference_values() -> None:
+    reference = {
+        **{-5: 8.884, -4.5: 8.385, -4: 7.885, -3: 6.887, -2: 5.891, -1: 4.894},
+        **{0: 3.893, 1: 2.957, 2: 2.260, 2.5: 2.141, 3: 2.162, 4: 2.336, 5: 2.532},
+    }
+    gain = ExactPosterior([], []).expected_information_gain(list(reference))
+    assert gain.numpy() == pytest.approx(np.array(list(reference.values())), abs=6e-4)
+    sinh = ExactPosterior([], [], variant="sinh")
+    gain = sinh.expected_information_gain(torch.tensor([[-5.0], [-4.5], [-4.0]]))
+    assert gain.numpy() == pytest.approx(np.array([8.79, 8.29, 7.79]), abs=0.01)

@@ -77,6 +77,19 @@ def test_a_free_pendulum_keeps_its_energy_without_friction_alone():
     assert np.array_equal(motor, free)  # no torque while the motor is off
 
 
+def test_effects_vanish_at_zero(task):
+    bare = every_trial(task)
+    assert [e.name for e in task.effects()] == [
+        "Coulomb",
+        "load-dependent",
+        "torque-dependent",
+        "viscous",
+    ]
+    for keyword in ("coulomb", "load", "torque", "viscous"):
+        assert np.array_equal(every_trial(task, **{keyword: 0.0}), bare)
+        assert np.abs(every_trial(task, **{keyword: 0.05}) - bare).max() > 0.01
+
+
 # Reading what was recorded
 
 

@@ -10,6 +10,7 @@ from sbi_active.criticism.effects.changes import (
     lagged_input,
     lagged_samples,
     played,
+    rounded,
 )
 
 STEP = torch.tensor(0.1).double()
@@ -88,6 +89,21 @@ def test_a_sensor_s_delay_reads_between_its_samples():
     assert torch.equal(delayed_samples(x, column(0.0), times), x)
     two = delayed_samples(torch.stack([x, -x], -1), column(0.05), times)
     assert two[0, :3, 1].tolist() == pytest.approx([-1.0, -1.5, -3.5])
+
+
+def test_padding_of_a_lagged_trial_is_no_number_lost():
+    times = torch.tensor([[0.0, 0.1, 0.3, 0.3, 0.3]]).double()
+    x = torch.tensor([[1.0, 2.0, 4.0, 4.0, 4.0]]).double()
+    whole = lagged_samples(x, column(0.2), times)
+    part = lagged_samples(x[:, :3], column(0.2), times[:, :3])
+    assert torch.allclose(whole[:, :3], part)
+    assert bool(whole.isfinite().all())
+
+
+def test_a_quantum_rounds():
+    x = torch.tensor([[0.12, -0.37]]).double()
+    assert rounded(x, column(0.1))[0].tolist() == pytest.approx([0.1, -0.4])
+    assert torch.equal(rounded(x, column(0.0)), x)
 
 
 @pytest.mark.parametrize(

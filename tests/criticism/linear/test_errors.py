@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, norm
 
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.linear.errors import Errors
 from sbi_active.criticism.linear.left_out import leave_out
-from sbi_active.criticism.linear.mixture import WIDTHS
+from sbi_active.criticism.linear.mixture import WIDTHS, integrated
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.misfit.intervals import shared_process
 from sbi_active.criticism.results import ModelKey
@@ -93,6 +93,50 @@ def test_the_evidence_is_that_of_the_dense_integral(ragged):
         off = rows[:, 0] - rows[:, 1:] @ model.center
         alone.append(multivariate_normal(np.zeros(len(m)), cov).logpdf(off))
     assert found.log_sensor == pytest.approx(np.log(np.mean(np.exp(alone))))
+
+
+def test_a_parameter_that_differs_from_trial_to_trial_is_a_dense_integral_too():
+    model, plain = problem()
+    m, rows = plain.measurements, about_zero(model)
+    varying = np.stack([3 * model.jacobian[:, 0], np.zeros(len(m))], 1)
+    cells = [NoiseCell.of(m, sd=plain.unit)]
+    errors = Errors(m, plain.unit, NoiseGrid(cells), largest=2.0, varying=varying)
+    found = errors.posterior(model, errors.grams(model.rows))
+    without = plain.posterior(model, plain.grams(model.rows))
+    j = model.jacobian[:, 0] / np.sqrt(np.mean(model.jacobian[:, 0] ** 2))
+    logs = []
+    for column in (j, 0 * j):
+        k = np.outer(column, column) * (m.trial[:, None] == m.trial)
+        for size in errors.sizes[::2]:
+            for width in WIDTHS:
+                prior = np.diag(model.widened(width) ** 2)
+                design = rows[:, 1:]
+                cov = np.eye(len(m)) + size**2 * k + design @ prior @ design.T
+                off = rows[:, 0] - design @ model.center
+                logs.append(multivariate_normal(np.zeros(len(m)), cov).logpdf(off))
+    varies = np.log(np.mean(np.exp(np.array(logs) - max(logs)))) + max(logs)
+    both = np.logaddexp(without.log_process, varies) - np.log(2)
+    assert found.log_process == pytest.approx(both)
+    assert found.size == pytest.approx(without.size)  # those of the process
+    assert found.time_scale == without.time_scale
+    use = np.arange(errors.num_folds) != 3
+    part = errors.posterior(model, errors.grams(model.rows), use)
+    assert (
+        part.log_sensor
+        == plain.posterior(model, plain.grams(model.rows), use).log_sensor
+    )
+
+
+def test_a_bound_of_phi_counts_by_the_posterior_within_it():
+    free, errors = problem()
+    bounded, _ = problem(low=0.0)
+    grams = errors.grams(free.rows)
+    use = np.ones(errors.num_folds, bool)
+    gram = grams.gram[-1:, use].sum(1)
+    log_z, mean, cov = (part[:, 0] for part in integrated(gram, free, [1.0]))
+    within = integrated(gram, bounded, [1.0])[0][:, 0]
+    inside = norm.logsf(0.0, mean[0, 1], np.sqrt(cov[0, 1, 1]))
+    assert within[0] - log_z[0] == pytest.approx(inside - np.log(0.5))
 
 
 def test_left_out_errors_are_those_of_refits():

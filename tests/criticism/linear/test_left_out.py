@@ -76,6 +76,19 @@ def test_a_trial_that_is_extrapolated_to_counts_in_units_of_what_is_expected(lin
     assert (left.standard <= left.square).all()
 
 
+def test_weights_are_those_of_least_squares(line):
+    model, errors = line
+    weight = 1.5 + np.sin(errors.fold)
+    root = np.sqrt(weight)
+    same = replace(
+        model, residual=root * model.residual, jacobian=root[:, None] * model.jacobian
+    )
+    found, plain = leave_out(model, errors, weight=weight), leave_out(same, errors)
+    assert found.standard == pytest.approx(plain.standard)
+    assert found.refits == pytest.approx(plain.refits)
+    assert found.square == pytest.approx(plain.square)
+
+
 def test_a_coordinate_at_its_bound_is_no_excuse_for_an_error(line):
     """An effect that its bound keeps away leaves errors as they are without it."""
     model, errors = line

@@ -40,6 +40,10 @@ def verdict(number, strength):
     return loop.trace()
 
 
+def test_clean_trials_of_many_effects_say_none():
+    assert verdict(MANY + 1, 0.0).verdict == "none"
+
+
 def test_one_effect_more_does_not_change_the_verdict():
     few, many = (verdict(MANY + k, 0.2) for k in (0, 1))
     assert few.verdict == many.verdict == "wave 2"

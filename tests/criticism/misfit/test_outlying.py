@@ -28,3 +28,9 @@ def test_it_is_named_and_has_no_part_in_the_verdict():
     assert report.tracing.probabilities == alone.probabilities
     lines = str(report).split("Residuals by trial")[1].splitlines()
     assert next(line for line in lines if "set aside" in line).split()[0] == "3"
+
+
+def test_ordinary_misfit_sets_nothing_aside():
+    found = loop(recorded(lag=0.3, hidden=0.6))
+    assert found.misfit() is not None
+    assert found.set_aside == ()

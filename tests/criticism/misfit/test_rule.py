@@ -42,6 +42,14 @@ def test_an_effect_is_named_that_halves_the_error_beyond_the_sensor():
     assert choose(faint, "ab").named == ()
 
 
+def test_what_is_named_does_not_depend_on_the_declared_sensor():
+    """Ten times finer, every error is a hundred times as many sensor variances."""
+    errors = {"none": (0.0, 1e4), "a": (30.0, 1e3), "b": (1.0, 9e3)}
+    finer = {name: (log_p, 100 * square) for name, (log_p, square) in errors.items()}
+    names = [choose(models(**own), "ab").named for own in (errors, finer)]
+    assert names == [("a",), ("a",)]
+
+
 def test_formulas_in_the_place_of_an_effect_compete_with_it():
     several = models(none=(0.0, 101.0), a=(20.0, 2.0), b=(19.0, 2.1), a_b=(39.0, 1.1))
     asked = []
@@ -82,6 +90,12 @@ def test_errors_below_the_sensor_s_are_all_alike(timed):
     assert choose(above, "ab", timed=timed).key == ModelKey(("b",))
 
 
+def test_nothing_helps_where_left_out_trials_are_predicted_alike():
+    found = choose(models(none=(0.0, 50.0), a=(-1.0, 50.0), b=(0.5, 50.0)), "ab")
+    assert found.key == ModelKey()
+    assert found.support == {}
+
+
 def test_what_left_out_trials_do_not_tell_apart_is_listed_in_its_place():
     """A relative is less probable, and predicts as well; the third effect does not."""
     several = models(none=(0.0, 101.0), a=(0.0, 50.0), b=(0.0, 50.0), c=(0.0, 95.0))
@@ -99,6 +113,17 @@ def test_what_left_out_trials_do_not_tell_apart_is_listed_in_its_place():
     assert choose(worse, "abc").instead == {}
 
 
+def test_relatives_together_more_likely_than_the_set_without_are_in_the_top():
+    """Each is less probable than c alone, one of both is more probable than it."""
+    several = models(none=(0.0, 101.0), a=(0.0, 30.0), b=(0.0, 30.0), c=(20.2, 4.4))
+    several |= models(a_c=(19.9, 4.0), b_c=(20.0, 4.0))
+    tops = [ModelKey(("c",)), ModelKey(("b", "c"))]
+    assert starts(several, "abc") == tops
+    assert choose(several, "abc").key == ModelKey(("b", "c"))
+    apart = {**several, ModelKey(("a", "c")): scored(19.9, 4.4)}  # no relative of b
+    assert choose(apart, "abc").key == ModelKey(("c",))
+
+
 def test_a_model_that_is_far_more_probable_is_admitted_whatever_its_error():
     """Two that imitate a cause predict a few left-out trials better."""
     several = models(none=(0.0, 101.0), b=(0.0, 50.0), c=(0.0, 50.0), b_c=(20.0, 4.0))
@@ -113,6 +138,25 @@ def test_the_probability_of_a_better_prediction_is_that_of_a_t_test():
     assert predicts_better(one, other) == pytest.approx(1 - predicts_better(other, one))
     few = predicts_better(np.append(one, np.nan), np.append(other, 1.0))
     assert few == pytest.approx(predicts_better(one, other))
+
+
+def test_what_is_missed_least_is_dropped_first():
+    """Beside a useless c, b looks useless by a t test, for one trial tells of it."""
+    several = models(none=(0.0, 90.0), a=(1.0, 60.0), b=(1.0, 70.0), a_b=(20.0, 10.0))
+    even = np.full(8, 10.0)
+    uneven, one = even.copy(), 0.75 * even
+    uneven[:4] *= 1.1
+    one[0] = 200.0
+    several |= {
+        ModelKey(("c",)): scored(0.0, 88.0),
+        ModelKey(("b", "c")): scored(0.0, 66.0),
+        ModelKey(("a", "b", "c")): scored(25.0, even),
+        ModelKey(("a", "b")): scored(20.0, uneven / 1.04),
+        ModelKey(("a", "c")): scored(0.0, one),
+    }
+    better_b = predicts_better(even, one)
+    assert better_b < predicts_better(even, uneven / 1.04) < 0.8
+    assert choose(several, "abc").key == ModelKey(("a", "b"))
 
 
 def test_what_doubles_the_error_helps_whatever_a_t_test_says():

@@ -17,3 +17,17 @@ def test_each_part_counts_as_one_number_with_an_error_of_unknown_size():
     assert found[ONE] / found[BARE] == pytest.approx(2.0**5)
     assert [*found][-1] == BARE
     assert sum(found.values()) == pytest.approx(1.0)
+
+
+def test_prior_probabilities_count():
+    error = {BARE: np.full(10, 2.0), ONE: np.full(10, 2.0)}
+    found = weights_by_error(error, {BARE: np.log(3.0), ONE: 0.0}, seed=0)
+    assert found[BARE] == pytest.approx(0.75)
+
+
+def test_no_model_wins_by_one_part_alone():
+    """At the errors' mean the weight would be 1 / (1 + 1.9^-3.5) = .90."""
+    error = {BARE: np.r_[np.ones(6), 8.0], ONE: np.r_[np.full(6, 1.05), 1.0]}
+    of_the_mean = 1 / (1 + (error[ONE].mean() / error[BARE].mean()) ** 3.5)
+    found = weights_by_error(error, {BARE: 0.0, ONE: 0.0}, seed=0)
+    assert 0.5 < found[ONE] < of_the_mean - 0.05

@@ -99,3 +99,10 @@ def test_several_effects_are_asked_what_left_out_trials_say_of_them():
     draws = tracing.evidences["quadratic"].draws  # without the step, which matters
     mean, sd = draws.mean(0), draws.std(0)
     assert (abs(mean - (*THETA, QUADRATIC)) < 2 * sd).all()
+
+
+def test_a_model_that_fits_is_no_misfit():
+    found = loop(trials(quadratic=QUADRATIC))
+    assert found.trace().verdict == "quadratic"
+    assert found.misfit() is None
+    assert found.trace().misfit is None

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 from sbi.utils import BoxUniform
 from torch.distributions import Normal
@@ -43,6 +44,24 @@ def only(c, *names):
     return replace(tracing, probabilities=kept)
 
 
+def test_rivals_predict_their_posterior_predictive():
+    action = torch.tensor([1.0, 2.0, 3.0, 2.0])
+    c = criticism(action.tolist(), 0.7 * action, [BIAS], FORWARD)
+    c.trace()
+    rival = PredictedRival(c.rivals, ModelKey(), 0.5, FORWARD.values)
+    x = rival.predict(torch.tensor([2.5]), 4_000, 3)
+    assert x.shape == (4_000, 1)
+    assert torch.equal(x, rival.predict(torch.tensor([2.5]), 4_000, 3))
+    assert not torch.equal(x, rival.predict(torch.tensor([2.5]), 4_000, 4))
+    # Least squares in one parameter; errors of the mean and of the deviation.
+    fit = c.rivals.trials
+    square = float((fit.action**2).sum())
+    slope = float((fit.action * fit.x).sum()) / square
+    sd = NOISE * (1 + 2.5**2 / square) ** 0.5
+    assert float(x.mean()) == pytest.approx(2.5 * slope, abs=5 * sd / 4_000**0.5)
+    assert float(x.std()) == pytest.approx(sd, rel=5 / 8_000**0.5 + 0.02)
+
+
 def test_the_gain_is_that_of_two_known_densities():
     """Bias free against none, at two actions, beside a numerical integral."""
     c = criticism([1.0, 2.0, 3.0, 2.0], [0.7, 1.4, 2.1, 1.4], [BIAS], BOTH)
@@ -73,6 +92,16 @@ def test_pushed_one_way_the_other_way_separates_a_tilt():
     assert float(chosen.outside[0]) < 0
     assert {*chosen.outside_separates} == {"none", "tilt"}
     assert chosen.outside_gain > 0.1
+
+
+def test_where_rivals_predict_the_same_it_stops():
+    action = [1.0, 2.0, 3.0, 2.0, 1.5]
+    c = criticism(action, 0.7 * torch.tensor(action), [TILT], FORWARD, seed=2)
+    chosen = choose_action(c.rivals, only(c, "none", "tilt"), FORWARD)
+    assert chosen.action is None
+    assert chosen.information_gain.max() < 0.02
+    assert {*chosen.separates} == {"none", "tilt"}
+    assert chosen.outside is not None
 
 
 def test_pushed_both_ways_the_other_way_is_chosen():

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import torch
 from scipy.special import logsumexp
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, norm
 
 from sbi_active import AutocorrelatedNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials, close_loop
 from sbi_active.criticism.data import Measurements
 from sbi_active.criticism.rivals.channel_noise import ChannelNoise
 from sbi_active.criticism.rivals.noise_grid import declared_noise
+from sbi_active.criticism.steps.predictive import _log_density
 
 TIMES = np.array([0.0, 0.1, 0.3, 0.6])
 SIZES = [(0.1, 3.0), (10.0, 300.0)]
@@ -63,6 +64,21 @@ def test_evidence_is_the_sum_over_every_combination_of_sizes(gap):
     assert posterior.sum() == pytest.approx(1.0)
 
 
+def test_with_a_settled_ratio_it_is_as_probable_where_the_ratio_is_from():
+    m = measured()
+    grid = declared_noise(noise_of(), m)
+    settled = grid.settled(lambda: m.x)
+    assert settled.log_likelihood(m.x[None])[0] == pytest.approx(
+        grid.log_likelihood(m.x[None])[0]
+    )
+    sizes = settled.sizes(np.array([1.0, 2.0]))
+    np.testing.assert_allclose(sizes[1], 2 * sizes[0])
+    cell, best = grid.likeliest(m.x)
+    np.testing.assert_allclose(
+        settled.cells[cell].sd, grid.by_number(best[None])[0] * (grid.cells[cell].sd)
+    )
+
+
 def gliding(theta, action, *, times, drag=0.0):
     """Place in m and speed in mm/s of what is pushed off, and slows down."""
     drag = torch.as_tensor(drag, dtype=theta.dtype).reshape(-1, 1)
@@ -105,3 +121,37 @@ def test_the_loop_names_an_effect_beside_errors_of_unknown_size_in_two_units(dra
     if drag:
         (phi,) = (e for e in report.tracing.estimates if e.name == "drag")
         assert abs(phi.mean - drag) < 4 * phi.sd
+
+
+def test_a_common_factor_is_summed_beside_the_sizes():
+    m = measured()
+    grid = declared_noise(noise_of(), m)
+    scales, p = np.array([1.0, 2.0, 5.0]), np.log([0.5, 0.3, 0.2])
+    wide = grid.scaled(scales, p)
+    each = [grid.log_likelihood(m.x[None] / s)[0] - len(m) * np.log(s) for s in scales]
+    assert wide.log_likelihood(m.x[None])[0] == pytest.approx(logsumexp(each + p))
+    some = m.trial > 0
+    later = Measurements.of(
+        Trials(
+            torch.arange(2.0),
+            m.x.reshape(3, 2, 4)[1:].transpose(0, 2, 1),
+            sample_times=TIMES,
+        )
+    )
+    expected = declared_noise(noise_of(), later).scaled(scales, p)
+    assert wide.part(some).log_likelihood(m.x[None, some])[0] == pytest.approx(
+        expected.log_likelihood(later.x[None])[0]
+    )
+
+
+def test_predictions_have_the_density_of_each_channel():
+    """Of one trial given cells and sizes, as of independent numbers by channel."""
+    m = measured(1)
+    noise = AutocorrelatedNoise.unknown(sd=SIZES, correlation_time=(1e-6, 2e-6))
+    grid = declared_noise(noise, m)
+    cells, sizes = np.zeros(2, dtype=int), np.array([[1.0, 2.0], [0.5, 1.5]])
+    each = grid.by_number(sizes)
+    at = np.ones(len(m), bool)
+    got = _log_density(grid, cells, each, np.repeat(m.x[None], 2, 0), at)
+    expected = norm(0, each * grid.cells[0].sd).logpdf(m.x).sum(1)
+    np.testing.assert_allclose(got, expected, rtol=1e-9)

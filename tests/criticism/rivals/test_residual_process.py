@@ -14,6 +14,7 @@ from sbi_active.criticism.rivals.residual_process import TIME_LENGTH, ResidualPr
 
 ACTION = torch.linspace(-2, 2, 8)[:, None]
 X = torch.tensor([0.3, 1.4, -0.2, 0.8, 2.2, 1.1, 3.5, 2.9])[:, None]
+XI = ACTION[:, 0].double().numpy()
 AMPLITUDES = np.geomspace(1, 20, 10)
 
 
@@ -57,6 +58,67 @@ def test_one_process_follows_the_order_of_the_trials():
     one = Measurements.of(Trials(ACTION[:1], X[:1]))
     mean, _ = both.condition(drift[None], one, there, order=later)
     assert mean[0, 0] == pytest.approx(4 * np.sin(2 * later[-1]), abs=0.5)
+
+
+def test_the_residual_process_may_grow_with_the_prediction():
+    m = Measurements.of(Trials(ACTION, X))
+    noise = declared_noise(GaussianNoise(0.5), m)
+    action = ACTION.double().numpy() / 4
+    spread = np.exp(3 * XI)
+    process = ResidualProcess(
+        noise, m, action=action, largest=20.0, lengths=(0.3,), spread=spread
+    )
+    r = X[:, 0].double().numpy()
+    kernel = np.exp(-0.5 * ((action - action.T) / 0.3) ** 2)
+    relative = spread * np.median(0.5 / spread)
+    each = [
+        multivariate_normal(
+            np.zeros(8), a**2 * kernel * np.outer(b, b) + 0.25 * np.eye(8)
+        ).logpdf(r)
+        for a in np.geomspace(1, 20, 10)
+        for b in (np.full(8, 0.5), relative)
+    ]
+    expected = np.logaddexp.reduce(each) - np.log(20)
+    # Directions below 1e-5 of the variance are left out.
+    assert process.log_likelihood(r[None])[0] == pytest.approx(expected, abs=1e-2)
+
+
+def covariance(points, others, length):
+    """Return the kernel of two sets of places, shape (n, m)."""
+    return np.exp(-0.5 * ((points[:, None] - others) / length) ** 2)
+
+
+def test_the_best_process_is_interpolated_with_its_own_uncertainty():
+    m = Measurements.of(Trials(ACTION, X))
+    # Half of the deviation and a factor of two.
+    noise = NoiseGrid([NoiseCell.of(m, sd=np.full(8, 0.25))], scales=np.array([2.0]))
+    place = ACTION.double().numpy() / 4
+    process = ResidualProcess(noise, m, action=place, largest=20.0, lengths=(0.3,))
+    r = X[:, 0].double().numpy()
+    kernel = covariance(place[:, 0], place[:, 0], 0.3)
+
+    def total(a):
+        return 0.25 * (a**2 * kernel + np.eye(8))
+
+    likeliest = max(
+        process.amplitudes,
+        key=lambda a: multivariate_normal(np.zeros(8), total(a)).logpdf(r),
+    )
+    there = np.array([-0.45, 0.1, 0.3])
+    new = Measurements.of(Trials(4 * there[:, None], np.zeros((3, 1))))
+    everywhere = np.concatenate([place, there[:, None]])
+    mean, sd = process.condition(np.stack([r, 2 * r]), new, everywhere)
+    # The amplitude is that of the mean residual, 1.5 r.
+    best = max(
+        process.amplitudes,
+        key=lambda a: multivariate_normal(np.zeros(8), total(a)).logpdf(1.5 * r),
+    )
+    assert AMPLITUDES[0] < likeliest <= best
+    across = 0.25 * best**2 * covariance(there, place[:, 0], 0.3)
+    weight = across @ np.linalg.inv(total(best))
+    np.testing.assert_allclose(mean, np.stack([weight @ r, 2 * weight @ r]), rtol=1e-6)
+    variance = 0.25 * best**2 - np.einsum("mi,mi->m", weight, across)
+    np.testing.assert_allclose(sd**2, variance, rtol=1e-6)
 
 
 def test_trajectories_are_smooth_in_action_and_time():

@@ -122,6 +122,11 @@ def test_errors_under_misfit_are_compared_with_those_of_left_out_trials():
         assert [trial.name for trial in report.evaluation.missed] == names
 
 
+def test_trials_that_agree_are_not_named():
+    told = [report_of(slid(drag=d, seed=s)).evaluation for d, s in ((0, 1), (0.3, 2))]
+    assert not any(evaluation.missed for evaluation in told)
+
+
 def test_the_tail_is_that_of_the_normal_predictive(fitted):
     some, tracing = fitted
     x = measured(curve=0.5, seed=1)

@@ -27,3 +27,11 @@ def test_the_entropy_of_a_gaussian_of_any_units(dim, k):
     error = float(each.std()) / math.sqrt(len(x))
     assert error < 0.05
     assert float(each.mean()) == pytest.approx(exact, abs=4 * error)
+
+
+def test_outcomes_that_are_the_same_have_the_entropy_of_their_rounding():
+    x = torch.randn(200, 1, generator=torch.Generator().manual_seed(0)).double()
+    repeated = x[:20].repeat(10, 1)
+    each = nearest_neighbor_entropy(repeated, 3)
+    assert each.isfinite().all()
+    assert float(each.mean()) < -8

@@ -59,6 +59,22 @@ def test_finds_narrow_peaks(centers: list, sd: list):
     assert abs(share - 1 / len(place)).max() < 4 * error
 
 
+@pytest.mark.parametrize("dim", [12])
+def test_a_density_cut_at_many_edges(dim: int):
+    # A normal density about a corner of the box, 1 in 2^d of which is within.
+    def log_density(z: np.ndarray) -> np.ndarray:
+        log_prob = -0.5 * (((z - 1) / 0.2) ** 2).sum(1) - dim * np.log(0.2)
+        return log_prob - 0.5 * dim * np.log(np.pi / 2)
+
+    own = likelihood_of(dim, log_density)
+    found = learned_fit(own, np.random.default_rng(0), num_effective=1_000)
+    assert found is not None
+    effective = found.effective_sample_size
+    assert effective > 990
+    exact = -dim * np.log(2)
+    assert found.log_evidence == pytest.approx(exact, abs=4 / effective**0.5)
+
+
 PLATEAU = -20.0  # log likelihood where nothing is known
 DIM = 4
 

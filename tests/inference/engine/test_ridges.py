@@ -6,8 +6,10 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from sbi_active.inference.engine import infer, search
+from sbi_active.inference.engine.settings import Settings
 from tests.inference.engine.potentials import Given
 
+SETTINGS = Settings(num_effective=100, num_draws=200, share_of_plenty=0)
 X, SLOPE = 1.0, 0.4
 
 
@@ -33,6 +35,15 @@ def spread():
     weight = norm.pdf(gain) * norm.pdf(X / scale) / scale
     mean = np.average(gain, weights=weight)
     return np.sqrt(np.average((gain - mean) ** 2, weights=weight))
+
+
+def test_a_thin_ridge_has_the_right_evidence():
+    own, rng = product(), np.random.default_rng(1)
+    found = infer(own, rng, found=search(own, rng), settings=SETTINGS)
+    assert found.method == "importance"
+    assert found.effective_sample_size >= 100
+    assert found.log_evidence == pytest.approx(evidence(), abs=4 * found.standard_error)
+    assert own.num_rows < 12_000
 
 
 @pytest.mark.parametrize("seed", range(2))

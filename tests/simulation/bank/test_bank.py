@@ -202,6 +202,16 @@ def test_a_forked_child_reads_and_has_no_right_to_write(bank):
     assert len(reader) == len(bank) == 30
 
 
+def test_what_is_stored_is_synchronized_with_the_disk(bank):
+    bank.append(simulate(simulator, *draw(10), seed=0), seed=0)
+    with bank._store.reading() as connection:
+        found = [
+            connection.execute(f"PRAGMA {name}").fetchone()[0]
+            for name in ("synchronous", "journal_mode", "trusted_schema")
+        ]
+    assert found == [2, "wal", 0]  # 2: an fsync at each commit
+
+
 class forked:  # noqa: N801
     """A function in a process of its own, which needs no imports."""
 

@@ -121,6 +121,27 @@ def test_a_row_that_kills_every_worker_loses_no_good_row(client, rows):
     assert torch.equal(result.x[result.valid], theta[result.valid])
 
 
+@pytest.mark.slow
+def test_all_workers_killed_at_once_lose_nothing(client, rows, tmp_path):
+    client.wait_for_workers(2)
+    expected = simulate(seeded, *rows, seed=0).x
+
+    def kill():
+        while len([*tmp_path.iterdir()]) < 3:
+            time.sleep(1e-3)
+        for pid in client.run(os.getpid).values():
+            os.kill(pid, signal.SIGKILL)
+
+    killer = threading.Thread(target=kill, daemon=True)
+    killer.start()
+    with joblib.parallel_config(backend="dask"):
+        result = simulate(Reporting(tmp_path), *rows, seed=0, workers=2, batch_size=10)
+    killer.join(timeout=0)
+    assert not killer.is_alive()
+    assert result.tracebacks == {}
+    assert torch.equal(result.x, expected)
+
+
 def test_workers_that_the_cluster_gave_up_are_asked_for_again(rows, monkeypatch):
     monkeypatch.setattr(DaskPool, "PATIENCE", 0.0)
     theta, action = (r[:20] for r in rows)

@@ -1,0 +1,77 @@
+"""Coordinates of a search: densities against closed forms, and what is where."""
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from torch.distributions import Independent, LogNormal, Normal
+
+from sbi_active.criticism import Effect
+from sbi_active.criticism.rivals.coordinates import WIDE, SearchCoordinates
+
+
+def effect(name, prior, scope="campaign"):
+    return Effect(
+        name,
+        hook="observation",
+        prior=prior,
+        null=0.0,
+        scope=scope,
+        apply=lambda x, phi, action, context: x,
+    )
+
+
+BOX = BoxUniform(torch.tensor([1.0]), torch.tensor([3.0]))
+WIDE_ONE = effect("wide", LogNormal(torch.zeros(1), 2 * torch.ones(1)))
+START = effect("start", Normal(torch.zeros(2), torch.ones(2)), scope="trial")
+
+
+def coordinates(num_trials=3):
+    return SearchCoordinates(BOX, [WIDE_ONE], [START], num_trials)
+
+
+def test_the_density_is_the_prior_s_times_the_jacobian():
+    c = coordinates()
+    u = c.sample(50, seed=3)
+    z = torch.from_numpy(c.to_z(u))
+    expected = -np.log(2.0) + LogNormal(0.0, 2.0).log_prob(z[:, 1])
+    expected = expected + Independent(Normal(torch.zeros(6), 1.0), 1).log_prob(z[:, 2:])
+    # dz / du is b, and b z where z is searched in logs.
+    expected = expected + np.log(c.scale).sum() + z[:, 1].log()
+    assert c.log_prob(u) == pytest.approx(expected.numpy(), abs=1e-5)
+
+
+def test_only_a_positive_number_of_wide_prior_is_searched_in_logs():
+    c = coordinates()
+    assert c.is_log.tolist() == [False, True, *[False] * 6]
+    # 5 % to 95 % of a log-normal of deviation s span exp(3.29 s).
+    sd = np.log(WIDE) / 3.29
+    for factor, is_log in ((0.9, False), (1.1, True)):
+        prior = LogNormal(torch.zeros(1), torch.tensor([factor * sd]))
+        one = SearchCoordinates(BOX, [effect("one", prior)], (), 1)
+        assert one.is_log[1] == is_log
+
+
+def test_bounds_stay_bounds_and_count_as_within():
+    c = coordinates()
+    assert c.low[1:] == pytest.approx(-np.inf)
+    u = np.zeros((4, c.dim))
+    u[:, 0] = [c.low[0], c.high[0], c.low[0] - 1e-6, c.high[0] + 1e-6]
+    assert np.isfinite(c.log_prob(u)).tolist()[2:] == [False, False]
+    ends = c.to_z(u)[:2, 0]
+    assert ends == pytest.approx([1.0, 3.0])
+    assert c.from_z(c.to_z(u)) == pytest.approx(u)
+
+
+def test_a_coordinate_is_at_the_bound_where_its_draws_pile_up():
+    c, rng = coordinates(), np.random.default_rng(0)
+    for z, side in (
+        (1.0 + 0.02 * rng.random((200, 1)), -1),
+        (3.0 - 0.02 * rng.random((200, 1)), 1),
+        (2.0 + 0.02 * rng.normal(size=(200, 1)), 0),
+        (1.0 + 2.0 * rng.random((200, 1)), 0),  # the trials leave it open
+    ):
+        whole = np.concatenate([z, np.ones((200, c.dim - 1))], 1)
+        assert c.sides(c.from_z(whole)[:, :1]).tolist() == [side]
+        # Beside it are numbers without a bound, or with one.
+        assert c.sides(c.from_z(whole))[1:].tolist() == [0] * (c.dim - 1)
