@@ -117,6 +117,19 @@ def test_setup_runs_once_a_process():
     assert other(THETA, ACTION)[0, 1] != here[0, 1]
 
 
+@pytest.mark.parametrize("sd", [0.0, 1.0])
+def test_rows_that_raise_do_not_hide_whether_the_others_are_random(sd):
+    def unstable(theta, action, rng):
+        if theta[0] > 2:
+            raise FloatingPointError("unstable")
+        return theta + sd * rng.normal(size=2)
+
+    model = SimulatorModel(unstable, batched=False, noise=GaussianNoise(1.0))
+    assert model.is_deterministic(THETA, ACTION) == (sd == 0)
+    with pytest.raises(FloatingPointError, match="unstable"):
+        SimulatorModel(unstable, batched=False).is_deterministic(THETA[1:2], ACTION[:1])
+
+
 @pytest.mark.parametrize(
     ("fn", "options", "text"),
     [

@@ -26,6 +26,22 @@ def test_a_file_a_trial():
     assert trials.order == "unknown"
 
 
+def test_files_of_several_trials_have_the_file_in_the_name():
+    header = f"trial,{HEADER}"
+    write("monday.csv", "1,0,1,5", "1,100,1,4", "2,0,2,5", header=header)
+    write("tuesday.csv", "1,0,1,5.5", "1,100,1,4", header=header)
+    trials = Trials.from_csv("runs")
+    assert trials.names == ("monday 1", "monday 2", "tuesday 1")
+
+
+def test_files_where_a_row_is_a_trial_go_on_from_each_other():
+    write("a.csv", "1,2", "2,3", header="action_v,x_y")
+    write("b.csv", "4,5", header="action_v,x_y")
+    trials = Trials.from_csv("runs")
+    assert trials.action[:, 0].tolist() == [1, 2, 4]
+    assert trials.names == ("0", "1", "2")
+
+
 def test_recordings_whose_trials_stand_in_a_column_of_another_name():
     columns = {"trial": "ball", "time": "t", "x": "h", "action": "u"}
     for name, height in (("a.csv", 5), ("b.csv", 7)):
@@ -47,3 +63,16 @@ def test_what_is_wrong_is_said_with_its_file_and_row():
     (one,) = [str(note.message) for note in noted]
     assert "1 of 2 cells of column x_height[m] in runs/b.csv hold no number" in one
     assert noted[0].filename == __file__
+
+
+def test_recordings_with_other_columns_or_the_same_numbers_are_refused():
+    write("a.csv", "0,1,5", "100,1,6")
+    write("b.csv", "0,1,5", header="time_s,action_speed[m/s],x_height[m]")
+    with pytest.raises(ValueError, match=r"same columns .* time_s.* in runs/b\.csv"):
+        Trials.from_csv("runs")
+    write("b.csv", "0,1,5", "100,1,6")
+    with pytest.raises(ValueError, match="same numbers in trials a and b of runs"):
+        Trials.from_csv("runs")
+    Path("empty").mkdir()
+    with pytest.raises(ValueError, match="expected recordings in empty; got no"):
+        Trials.from_csv("empty")

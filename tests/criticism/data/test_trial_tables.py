@@ -94,7 +94,19 @@ SHORT = "trial,time,action_v,x_y"
     [
         (["1,2,3"], "trial,action_v,x_y", "got trial without time in trials.csv; add"),
         (["1,0,1,2,3"], f"{SHORT},mass", "got mass in trials.csv; rename or"),
+        (
+            ["1,0,1,2,3"],
+            "trial,time,action_v,x_y[m],x_y[cm]",
+            r"x_y\[m\] and x_y\[cm\]",
+        ),
+        (["1,0,1,5", "1,1,1,4 cm"], SHORT, r"row 2 \(trial 1\); got '4 cm' .*once, in"),
         (['1,0,1,"5,2"'], SHORT, "got '5,2' in trials.csv; write decimals with a"),
+        (["1,0,1,5", "1,,1,4"], SHORT, r"number in column time, row 2 .*an empty cell"),
+        (
+            ["1,0,1,5", "1,1,nan,4"],
+            SHORT,
+            r"column action_v, row 2 \(trial 1\); got nan",
+        ),
         (
             ["1,0,1,5", "1,1,2,4"],
             SHORT,
@@ -105,7 +117,12 @@ SHORT = "trial,time,action_v,x_y"
             SHORT,
             "= 0 s in rows 1 and 3 .* trial 1; remove",
         ),
+        (["1,0,1,5", "2,0,1,5"], SHORT, "the same numbers in trials 1 and 2 of trials"),
+        (["1,0,1,5,fit", "1,1,1,4,held out"], f"{SHORT},role", "value of role in each"),
+        (["1,0,1,5,3", "2,0,1,4,3"], f"{SHORT},index", "got index 3 in rows 1 and 2"),
         (["1\t0\t1\t5"], "trial\ttime\taction_v\tx_y", r"by commas.*sep='\\t'\)\)"),
+        (["1,0,5,1,5,2"], SHORT, "first, 4; got 6 in line 2 of trials.csv; write dec"),
+        ([], "", "names of columns and rows; got nothing in trials.csv"),
         (["1,0,1,"], SHORT, "at least one valid trial"),
     ],
 )
@@ -113,6 +130,28 @@ SHORT = "trial,time,action_v,x_y"
 def test_a_long_table_that_is_not_understood(rows, header, message):
     with pytest.raises(ValueError, match=message):
         read(rows, header)
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "latin-1"])
+def test_a_table_in_another_encoding(encoding):
+    with open("trials.csv", "w", encoding=encoding) as file:
+        file.write("action_v,x_y[°]\n1,2\n")
+    with pytest.raises(ValueError, match=r"text in UTF-8; got other bytes in trials"):
+        Trials.from_csv("trials.csv")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"columns": {"y": "x_y"}}, "columns of trial, time, .*; got y; say"),
+        ({"columns": {"x": "x_z"}}, "a column x_z for x; got .*; did you mean 'x_y'"),
+        ({"columns": {"time": ["time", "x_y"]}}, "one column for time; got time, x_y"),
+        ({"units": {"x_z": "m"}}, "got one of x_z; correct the name"),
+    ],
+)
+def test_options_that_do_not_fit_the_table(options, message):
+    with pytest.raises(ValueError, match=message):
+        read(["1,0,1,5"], SHORT, **options)
 
 
 def test_a_trial_in_another_unit_is_noted():
@@ -130,3 +169,9 @@ def test_a_trial_in_another_unit_is_noted():
     ]
     with pytest.warns(UserWarning, match="time of trials 3 .* 1000 times smaller"):
         read(fast, SHORT)
+
+
+@pytest.mark.filterwarnings("error")
+def test_trials_that_differ_little_are_not_noted():
+    rows = [f"{t},{s},{t + 1},{3.0**t + s}" for t in range(4) for s in (0, 1)]
+    assert len(read(rows, SHORT)) == 4
