@@ -172,6 +172,20 @@ def test_what_is_refused_leaves_no_trace(told, text):
     assert c.history == ()
 
 
+@pytest.mark.parametrize("make", [np.float32, torch.tensor, int, list])
+def test_what_is_told_is_a_copy(make):
+    c = campaign()
+    told = [1.0] if make is list else make(1)
+    array = np.array([0.5], dtype=np.float32)
+    trial = c.tell(told, action=array)
+    array[0] = 7.0
+    assert trial.action.tolist() == [0.5]
+    again = c.tell(array, action=[1.0])
+    array[0] = 9.0
+    assert again.x.tolist() == [7.0]
+    assert (trial.x.tolist(), trial.x.dtype) == ([1.0], torch.float32)
+
+
 def test_a_robot_that_changes_its_action_changes_no_record():
     c = campaign()
 

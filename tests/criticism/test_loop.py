@@ -208,6 +208,15 @@ def test_noise_from_repeats_is_summed_out():
     assert hidden.trace().verdict == "bias"
 
 
+def test_noise_counted_twice():
+    noisy = SimulatorModel(
+        lambda theta, action: response(theta, action) + torch.randn(len(theta), 1),
+        noise=GaussianNoise(NOISE),
+    )
+    with pytest.raises(ValueError, match="noise would count twice"):
+        Criticism(noisy, PRIOR, measured(1, {}))
+
+
 def noisy(theta, action):
     return response(theta, action) + torch.randn(len(theta), 1)
 

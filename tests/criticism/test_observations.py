@@ -14,6 +14,7 @@ from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.trial_simulator import NUM_REPLICATES, TrialSimulator
 from sbi_active.criticism.rivals.validity import DISAGREEMENT
+from sbi_active.criticism.steps.predictive import predict
 from tests.effects import effect
 
 PRIOR = Independent(Normal(torch.zeros(2), torch.tensor([2.0, 1.0])), 1)
@@ -102,6 +103,21 @@ def test_a_nuisance_of_each_trial_is_integrated_out():
     expected = exact(ACTION, X[:, 0], extra=0.8)
     assert found.standard_error < 0.2
     assert found.log_evidence == pytest.approx(expected, abs=4 * found.standard_error)
+
+
+def test_an_unseen_trial_draws_its_own_nuisance():
+    trials, new = Trials(ACTION, X), Trials([0.5, 1.5], [1.0, 5.0])
+    # Only draws in the tail of the nuisance reach the second: of 4,000, each of one of
+    # some 170 effective particles, an error of .1 to .15.
+    sample = rivals(line, trials, [START])
+    density = predict(sample, new, num_draws=4_000).log_density
+    every = [torch.cat([ACTION, a[None]]) for a in new.action.float()]
+    expected = [
+        exact(a, torch.cat([X[:, 0], y.float()]), extra=0.8)
+        - exact(ACTION, X[:, 0], extra=0.8)
+        for a, y in zip(every, new.x, strict=True)
+    ]
+    np.testing.assert_allclose(density, expected, atol=0.4)
 
 
 # Trajectories

@@ -76,6 +76,13 @@ def test_a_simulator_may_return_the_buffer_it_fills_again(kind, seeded, options)
     assert torch.equal(x, 2 * THETA)
 
 
+def test_a_mean_is_not_overwritten_by_the_next():
+    model = SimulatorModel(Buffer("torch", seeded=False), noise=GaussianNoise(1.0))
+    mean = model.mean(THETA, ACTION)
+    model.mean(5 * THETA, ACTION)
+    assert torch.equal(mean, 2 * THETA)
+
+
 def change(theta, action, seeds):
     """Change all arguments in place, torch's and through NumPy."""
     theta.mul_(2)

@@ -137,3 +137,17 @@ def test_apply_may_change_what_it_gets(hook):
     assert torch.equal(*x.values())
     assert [float(v[0]) for v in given] == pytest.approx([0.5, 2.0, 1.0])
     assert float(phi["bias"][0]) == pytest.approx(0.3)
+
+
+def test_apply_may_return_a_view_of_what_it_keeps():
+    kept = torch.zeros(100, 1)
+
+    def apply(x, phi, action, context):
+        kept[: len(x)] = x + phi
+        return kept[: len(x)]
+
+    model = AugmentedSimulator(MODEL, [effect(apply=apply)])
+    theta, action = torch.tensor([[0.5, 1.0]]), torch.ones(1, 1)
+    first = model.mean(theta, action)
+    model.mean(2 * theta, action)
+    assert float(first) == pytest.approx(1.5)

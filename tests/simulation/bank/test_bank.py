@@ -155,6 +155,14 @@ def test_readers_go_on_while_another_process_writes(bank):
     assert len(bank) == 600
 
 
+def test_shapes_set_by_another_writer_hold(bank):
+    late = Bank(bank.path, simulator=simulator)
+    bank.append(Simulations(*draw(3), torch.rand(3, 3)), seed=0)
+    bank.close()
+    with late, pytest.raises(ValueError, match=r"'x': \[3\]}, as in the bank"):
+        late.append(Simulations(*draw(3), torch.rand(3, 4)), seed=1)
+
+
 def test_the_lock_goes_with_its_process(bank):
     def hold():
         own = Bank(bank.path, simulator=simulator)

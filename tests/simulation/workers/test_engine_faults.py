@@ -108,6 +108,18 @@ def test_a_batch_that_raises_is_divided_here_too():
     assert torch.equal(some.x[some.valid], clean[some.valid])
 
 
+def test_infinite_rows_are_invalid_and_partial_ones_are_masked():
+    def simulator(theta, action, seeds):
+        x = theta.repeat(1, 2)
+        x[0] = torch.inf
+        x[1, 0] = -torch.inf
+        return x
+
+    rows = simulate(simulator, torch.rand(3, 1), torch.rand(3, 1), seed=0)
+    assert rows.status.tolist() == [Outcome.INVALID, Outcome.OK, Outcome.OK]
+    assert rows.x.isnan().tolist() == [[True, True], [True, False], [False, False]]
+
+
 @pytest.mark.parametrize("num_workers", [1, 2])
 def test_blocks_without_faults_are_what_they_would_have_been(num_workers):
     def simulator(theta, action):
