@@ -139,6 +139,16 @@ def test_apply_may_change_what_it_gets(hook):
     assert float(phi["bias"][0]) == pytest.approx(0.3)
 
 
+def test_phi_along_the_wrong_axis_shows_where_x_has_as_many_entries_as_rows():
+    wide = SimulatorModel(
+        lambda theta, xi: theta * xi * torch.ones(16), noise=GaussianNoise(0.1)
+    )
+    trials = Trials(SPEED, STOP[:, None] * torch.ones(16))
+    wrong = effect(apply=lambda x, phi, action, context: x + phi[:, 0])
+    with pytest.raises(RuntimeError, match="must match"):
+        Criticism(wide, PRIOR, trials, effects=[wrong])
+
+
 def test_apply_may_return_a_view_of_what_it_keeps():
     kept = torch.zeros(100, 1)
 

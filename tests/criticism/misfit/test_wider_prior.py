@@ -112,3 +112,10 @@ def test_a_simulator_that_refuses_what_is_beyond_is_asked_no_more():
     (only,) = found.bounds.parameters
     assert np.isnan(only.beyond)
     assert np.isnan(found.bounds.p_value)
+
+
+def test_with_a_prior_that_holds_the_truth_nothing_is_said():
+    report = criticism(0.1).report(plan=False)
+    assert report.verdict == NONE
+    assert report.tracing.bounds.parameters == ()
+    assert "bound of its prior" not in str(report)
