@@ -85,9 +85,7 @@ def active_against_random(
 
 
 def coverage_table(
-    cells: Cells,
-    rounds: Sequence[int],
-    last: tuple[str, Callable[[Rows, int], str]],
+    cells: Cells, rounds: Sequence[int], last: tuple[str, Callable[[Rows, int], str]]
 ) -> str:
     """Return how often the truth lies in regions of highest density, by round.
 

@@ -191,7 +191,7 @@ def grouped(rows: Iterable[Row], *keys: str) -> dict[tuple[Any, ...], list[Any]]
     return groups
 
 
-def short(value: object) -> object:
+def short(value: Any) -> Any:
     """Return a number with six digits."""
     return f"{float(value):.6g}" if isinstance(value, (float, Tensor)) else value
 

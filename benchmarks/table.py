@@ -1,7 +1,7 @@
 """Print a committed CSV or JSON file as a table.
 
-    python -m benchmarks table information_gain/peers.csv
-    python -m benchmarks table cost/doors.json --only "cpu_s*"
+    python -m benchmarks table information_gain/result.csv
+    python -m benchmarks table cost/network.json --only "*ratio"
     python -m benchmarks table readme    # README's; exits 1 where it misses a value
 
 A file of rows keeps its columns, or those named by ``--columns``. Of nested values each

@@ -10,9 +10,8 @@ from sbi_active import (
     DiscreteActions,
     InformationGainDesigner,
     SimulatorModel,
-    simulate,
 )
-from sbi_active.criticism import Effect, Trials, close_loop
+from sbi_active.criticism import Trials
 from sbi_active.criticism.misfit.rule import Rule
 from sbi_active.mujoco import from_mjcf
 from sbi_active.simulation.workers.settings import Workers
@@ -30,19 +29,11 @@ def slide(theta, action):
     ("call", "wrong", "meant"),
     [
         (CampaignOptions, "num_simulation", "num_simulations"),
-        (lambda **k: CampaignOptions.of(k), "num_sample", "num_samples"),
         (lambda **k: Campaign(slide, PRIOR, ACTIONS, **k), "metod", "method"),
-        (
-            lambda **k: InformationGainDesigner(ACTIONS, **k),
-            "estimators",
-            "estimator",
-        ),
+        (lambda **k: InformationGainDesigner(ACTIONS, **k), "estimators", "estimator"),
         (lambda **k: SimulatorModel(slide, **k), "noize", "noise"),
-        (lambda **k: simulate(slide, *NONE, **k), "worker", "workers"),
         (lambda **k: Trials([0.0], [0.0], **k), "sample_time", "sample_times"),
         (lambda **k: from_mjcf("", {}, **k), "sensor", "sensors"),
-        (close_loop, "warmup", "warm_up"),
-        (Effect, "prio", "prior"),
         (Rule, "chances", "chance"),
         (Workers, "num_worker", "num_workers"),
     ],

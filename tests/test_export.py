@@ -92,16 +92,6 @@ def test_arviz_reads_it(campaign, tmp_path):
     assert az.from_netcdf(path).posterior.theta.shape == (4, 50, 2)
 
 
-def test_a_belief_and_a_prior_alone(campaign):
-    data = to_inference_data(PRIOR, parameter_names=["a", "b"], num_samples=50)
-    assert {*data.groups()} == {"posterior", "sample_stats"}
-    assert [*data.posterior.parameter.values] == ["a", "b"]
-    with pytest.raises(ValueError, match="expected 2 parameter names"):
-        to_inference_data(PRIOR, parameter_names=["a"])
-    data = to_inference_data(campaign.belief, num_samples=50)
-    assert data.prior.theta.values.max() > data.posterior.theta.values.mean()
-
-
 def test_a_belief_predicts_outcomes_at_actions(campaign):
     action = torch.tensor([[1.0], [1.5]])
     x = torch.tensor([[0.5, 0.4], [0.7, 0.6]])

@@ -2,12 +2,7 @@ import numpy as np
 import torch
 from scipy import stats
 
-from sbi_active.seeding import (
-    forked_generators,
-    row_normals,
-    row_seeds,
-    row_uniforms,
-)
+from sbi_active.seeding import forked_generators, row_normals, row_seeds, row_uniforms
 
 
 def test_rows_depend_on_seed_and_index_alone():

@@ -316,11 +316,7 @@ def environment() -> dict[str, str]:
     return found | {"python": platform.python_version(), "machine": platform.machine()}
 
 
-def main(
-    *,
-    write: bool = False,
-    only: str = "",
-) -> int:
+def main(*, write: bool = False, only: str = "") -> int:
     """Run all and compare, or write.
 
     Args:

@@ -44,10 +44,7 @@ from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import Workers
 from sbi_active.tasks import Task, get_task
-from sbi_active.tasks.box_collision import (  # pyright: ignore
-    BoxCollisionReference,
-    exact_posterior,
-)
+from sbi_active.tasks.box_collision import BoxCollisionReference, exact_posterior  # pyright: ignore
 
 REPORTED = (3.0, 5.0, 7.0)  # m/s
 STAGES = ("simulation", "training", "design", "scoring", "update")
@@ -62,7 +59,6 @@ PUBLISHED = published("box collision")
 #: Mean speeds of rounds 1 and 6, and seconds a round.
 PUBLISHED_SPEEDS = published("box collision speeds")
 (PUBLISHED_TIME,) = published("box collision time")["a round"]
-COMPARED = 3  # round by which target 2 should be pushed more slowly
 
 #: Of the reference's log p, nats, above which importance sampling has failed.
 LARGEST_ERROR = 0.5
@@ -78,9 +74,7 @@ def summarize(cells: Cells) -> str:
     if not cells:
         return "no trials yet"
     parts = [errors_table(cells), rounds_table(cells), time_table(cells)]
-    return "\n\n".join(
-        [*parts, *slower_pushes(cells), *active_against_random(cells, PAIRS)]
-    )
+    return "\n\n".join([*parts, *active_against_random(cells, PAIRS)])
 
 
 def errors_table(cells: Cells) -> str:
@@ -146,29 +140,6 @@ def time_parts(rows: Rows, kind: str) -> dict[str, float]:
         part: float(sum(column(rows, f"{kind}_{s}").mean() for s in stages))
         for part, stages in PARTS.items()
     }
-
-
-def slower_pushes(cells: Cells) -> list[str]:
-    """Return how often target 2 is pushed more slowly than target 1, by method."""
-    lines = []
-    for method in dict.fromkeys(method for method, _ in cells):
-        if (method, "1") not in cells or (method, "2") not in cells:
-            continue
-        first, second = (by_seed(cells[method, t], COMPARED) for t in ("1", "2"))
-        shared = sorted(first.keys() & second.keys())
-        if shared:
-            lower = sum(second[seed] < first[seed] for seed in shared)
-            lines.append(
-                f"{method.upper()}: slower for target 2 in round {COMPARED} in {lower} "
-                f"of {len(shared)} trials ({lower / len(shared):.2f}; bar .80)"
-            )
-    return lines
-
-
-def by_seed(rows: Rows, round_: int) -> dict[int, float]:
-    """Return the speed chosen in a round, by seed."""
-    some = [r for r in rows if int(r["round"]) == round_]
-    return {int(r["seed"]): float(r["speed"]) for r in some}
 
 
 def gap(rows: Rows, round_: int) -> str:

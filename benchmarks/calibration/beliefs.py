@@ -28,10 +28,7 @@ from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation import simulate
 from sbi_active.tasks import get_task
 
-PROBLEMS: dict[str, dict[str, Any]] = {
-    "numerical": {},
-    "square": {"variant": "square"},
-}
+PROBLEMS: dict[str, dict[str, Any]] = {"numerical": {}, "square": {"variant": "square"}}
 KINDS = (
     *("right", "right, refits", "wide", "narrow", "lost mode"),
     *("always wide", "always narrow", "always one mode"),

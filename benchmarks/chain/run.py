@@ -1,9 +1,7 @@
 """Beliefs of a chain's 8 to 20 parameters beside a long tempered SMC.
 
     python -m benchmarks chain --parameters 8 12 16 20 --seeds 2300 2340
-    python -m benchmarks chain --references 2   # first seeds with a reference
-    python -m benchmarks chain --campaign      # CPU time of a round, chosen actions
-    python -m benchmarks chain --summary       # of rounds with --campaign
+    python -m benchmarks chain --summary
 
 Each seed has a truth drawn from the prior and six trials at random actions, refined
 with the defaults but for a defensive share of 1e-6, since one draw of the prior among
@@ -21,19 +19,15 @@ alone. Rows are added to results/, and those that are there are not run again.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import torch
 from scipy.stats import binom, t
 from torch import Tensor
 
-from benchmarks.rounds import played
-from benchmarks.rows import resumed
+from benchmarks.rows import benchmark, frame
 from sbi_active import RefinementOptions
 from sbi_active.display.table import Table
 from sbi_active.inference import refine
@@ -42,6 +36,7 @@ from sbi_active.tasks import get_task  # pyright: ignore
 
 RESULTS = Path(__file__).with_name("results")
 NUM_TRIALS, NUM_DRAWS, NUM_RANKED, LEVEL = 6, 20_000, 1_000, 0.9
+REFERENCES = 2302  # seeds below have a reference
 
 
 def problem(parameters: int, seed: int) -> tuple[Any, Tensor, Tensor]:
@@ -74,7 +69,7 @@ def simulator_seconds(task: Any, num: int) -> float:
     return (time.process_time() - start) * num / 1_000
 
 
-def judged(parameters: int, seed: int, *, with_reference: bool) -> dict[str, Any]:
+def judged(parameters: int, seed: int) -> dict[str, Any]:
     task, action, x = problem(parameters, seed)
     start = time.process_time()
     settings = RefinementOptions(defensive=1e-6)
@@ -102,7 +97,7 @@ def judged(parameters: int, seed: int, *, with_reference: bool) -> dict[str, Any
         "evidence_gap": np.nan,
         "reference_cpu_s": np.nan,
     }
-    if with_reference:
+    if seed < REFERENCES:
         start = time.process_time()
         one, other = (
             task.reference(action, x, seed=derive_seed(seed, "reference", i))
@@ -117,21 +112,10 @@ def judged(parameters: int, seed: int, *, with_reference: bool) -> dict[str, Any
     return row
 
 
-def rounds(parameters: int, seed: int) -> list[dict[str, Any]]:
-    """Return CPU seconds of each round of a campaign with its defaults."""
-    task, rows = problem(parameters, seed)[0], []
-    for i, (campaign, seconds) in enumerate(played(task, seed, NUM_TRIALS)):
-        parts = campaign.history[i].cpu_seconds
-        d = campaign.belief.diagnostics  # pyright: ignore
-        row = {"round": i + 1, "cpu_s": seconds, "trustworthy": bool(d.trustworthy)}
-        rows.append(row | {f"{name}_s": v for name, v in sorted(parts.items())})
-    return rows
-
-
-def summary(path: Path) -> str:
+def summary(rows: list[dict[str, Any]]) -> str:
     """Return a line for each number of parameters."""
     lines = []
-    for dim, part in pd.read_csv(path).groupby("parameters"):
+    for dim, part in frame(rows).groupby("parameters"):
         known = part.dropna(subset="kl")
         share, n = part["covered"] / int(dim), len(part)  # pyright: ignore
         off = t.ppf(0.975, n - 1) * share.std() / n**0.5 if n > 1 else np.nan
@@ -153,59 +137,14 @@ def summary(path: Path) -> str:
                 "simulator's": f"{part['simulator_s'].median():.2f}",
             }
         )
-    rows = [[str(value) for value in line.values()] for line in lines]
-    return Table([*lines[0]], rows).text()
+    cells = [[str(value) for value in line.values()] for line in lines]
+    return Table([*lines[0]], cells).text()
 
 
-def round_summary(path: Path) -> str:
-    """Return a line for each number of parameters, CPU seconds a round."""
-    lines = []
-    for dim, part in pd.read_csv(path).groupby("parameters"):
-        seconds, simulator = part["cpu_s"], part["simulation_s"]
-        line = [dim, part["seed"].nunique(), len(part), f"{seconds.median():.1f}"]
-        line += [f"{seconds.max():.1f}", f"{simulator.median():.2f}"]
-        parts = ("design_s", "training_s", "update_s")
-        line += [f"{part[name].median():.1f}" for name in parts]
-        lines.append(
-            [str(value) for value in [*line, f"{part['trustworthy'].mean():.2f}"]]
-        )
-    header = ["parameters", "campaigns", "rounds", "CPU s a round", "most"]
-    header += ["its rows' simulation", "design", "training", "update", "trustworthy"]
-    return Table(header, lines).text()
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
-
-    Args:
-        parameters: Numbers of parameters.
-        seeds: Seeds, from the first to before the second.
-        references: Number of seeds with a reference.
-        campaign: Whether to time the rounds of a campaign.
-        summary: Whether to run nothing, and print the table of the rows.
-        out: File of the results.
-    """
-
-    parameters: Sequence[int] = (8, 12, 16, 20)
-    seeds: tuple[int, int] = (2300, 2340)
-    references: int = 2
-    campaign: bool = False
-    summary: bool = False
-    out: Path = RESULTS
-
-
-def main(options: Settings) -> None:
-    """Run what is asked for and is not there yet, and print the table."""
-
-    def made(dim: int, seed: int) -> Any:
-        if options.campaign:
-            return rounds(dim, seed)
-        want = seed < options.seeds[0] + options.references
-        return judged(dim, seed, with_reference=want)
-
-    path = options.out / ("rounds.csv" if options.campaign else "beliefs.csv")
-    if not options.summary:
-        jobs = [(d, s) for s in range(*options.seeds) for d in options.parameters]
-        resumed(path, ["parameters", "seed"], jobs, made)
-    print(round_summary(path) if options.campaign else summary(path))
+main = benchmark(
+    RESULTS / "beliefs.csv",
+    judged,
+    summary,
+    seed=range(2300, 2340),
+    parameters=(8, 12, 16, 20),
+)

@@ -18,11 +18,7 @@ from torch import Tensor
 from benchmarks.criticism.problem import Problem
 from benchmarks.criticism.worlds import World
 from benchmarks.fitting import residual_sum_of_squares
-from sbi_active.criticism import (
-    Context,
-    Effect,
-    Trials,
-)
+from sbi_active.criticism import Context, Effect, Trials
 from sbi_active.criticism.data import Role
 from sbi_active.seeding import derive_seed, forked_generators, row_normals, row_seeds
 
@@ -199,7 +195,6 @@ def draw_case(
     *,
     num_trials: int = 8,
     num_held_out: int = HELD_OUT,
-    prior_scale: float = 1.0,
 ) -> Case:
     """Draw one case.
 
@@ -216,16 +211,10 @@ def draw_case(
         number: Of the case; the same number is the same truth for any number of trials.
         num_trials: Trials to fit.
         num_held_out: Further trials, held out.
-        prior_scale: By which the scales of the declared priors are wrong.
 
     Returns:
         The case.
-
-    Raises:
-        ValueError: If the kind is unknown.
     """
-    if kind not in KINDS:
-        raise ValueError(f"expected a kind among {KINDS}; got {kind!r}; choose one")
     drawn = "removed" if kind == "inexpressible" else kind
     seed = derive_seed(number, "case", world.name, drawn)
     truth = _draw_truth(world, drawn, number, seed, 64 + num_held_out)
@@ -237,7 +226,7 @@ def draw_case(
     held_out, spare = truth.action[64:], truth.action[num_trials:64]
     action = truth.action[:num_trials]
     truth = replace(truth, kind=kind, action=action)
-    library = world.library(prior_scale)
+    library = [*world.effects]
     if drawn == "removed":
         gone = world.equivalent(truth.names[0])
         library = [effect for effect in library if effect.name not in gone]

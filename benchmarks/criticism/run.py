@@ -5,15 +5,13 @@
     python -m benchmarks criticism --table open --world A --trials 12 --cases 100
     python -m benchmarks criticism --table pairs --world B --trials 12 --cases 60
     python -m benchmarks criticism --table active --world B --trials 10 --cases 40
-    python -m benchmarks criticism --table priors --world A --scale 3 --cases 100
     python -m benchmarks criticism --table loop --world D --kind library --cases 60
     python -m benchmarks criticism --table loop --world A --summary
 
 loop: false alarms, power, tracing, calibration, error before and after. open: the
 effect was removed from the library, or removed with all that could stand in for it, or
 never stood in it. pairs: two effects. active:
-actions chosen by the loop beside random ones. priors: the scales of the effects' priors
-are wrong by a factor.
+actions chosen by the loop beside random ones.
 
 Resumable: a case that stands in the CSV is not run again. One row a case, one file a
 setting, in benchmarks/criticism/results. Give each command a core of its own
@@ -40,7 +38,6 @@ TABLES: dict[str, tuple[str, ...]] = {
     "open": ("removed", "inexpressible", "outside"),
     "pairs": ("pair",),
     "active": ("library",),
-    "priors": ("clean", "library"),
 }
 
 
@@ -55,8 +52,6 @@ class Settings:
         trials: Number of trials.
         cases: Number of cases.
         first: Number of the first case.
-        scale: Scale of the declared priors.
-        independent: Whether errors are taken as independent (world C).
         summary: Whether to run nothing, and print the table of the rows.
     """
 
@@ -66,16 +61,12 @@ class Settings:
     trials: int = 8
     cases: int = 200
     first: int = 0
-    scale: float = 1.0
-    independent: bool = False
     summary: bool = False
 
 
 def paths(arguments: Settings, kind: str) -> list[Path]:
     """Return the setting's file, then those of processes with another first case."""
     name = f"{arguments.world}_{kind}_{arguments.trials}"
-    name += f"_scale_{arguments.scale:.3g}" if arguments.scale != 1 else ""
-    name += "_independent" if arguments.independent else ""
     name += "_active" if arguments.table == "active" else ""
     mine = f"{name}_from_{arguments.first}" if arguments.first else name
     others = sorted({RESULTS / f"{name}.csv", *RESULTS.glob(f"{name}_from_*.csv")})
@@ -84,8 +75,7 @@ def paths(arguments: Settings, kind: str) -> list[Path]:
 
 def run_setting(arguments: Settings, kind: str) -> None:
     """Run the cases that are in none of the files yet."""
-    options = {"assume_independent": True} if arguments.independent else {}
-    world = get_world(arguments.world, **options)
+    world = get_world(arguments.world)
     is_active = arguments.table == "active"
 
     def made(number: int) -> Any:
@@ -94,7 +84,6 @@ def run_setting(arguments: Settings, kind: str) -> None:
             kind,  # type: ignore[arg-type]  # checked by the parser
             number,
             num_trials=arguments.trials,
-            prior_scale=arguments.scale,
         )
         if is_active:
             return score_active(case, number)
@@ -121,6 +110,5 @@ def main(arguments: Settings) -> None:
         _, *files = paths(arguments, kind)
         found[kind] = [row for file in files for row in read(file)]
     world = get_world(arguments.world)
-    title = ", iid errors" if arguments.independent else ""
-    for line in tables.summary(arguments.table, world, found, title):
+    for line in tables.summary(arguments.table, world, found):
         print(line)

@@ -19,20 +19,17 @@ Row = Mapping[str, str]
 BINS = ((0.0, 10.0), (10.0, 25.0), (25.0, np.inf))
 
 
-def summary(
-    table: str, world: World, found: Mapping[str, Sequence[Row]], title: str = ""
-) -> list[str]:
+def summary(table: str, world: World, found: Mapping[str, Sequence[Row]]) -> list[str]:
     """Return the lines of a table.
 
     Args:
         table: Name of the table.
         world: World of the rows.
         found: Rows by kind.
-        title: Words behind each kind.
     """
     lines: list[str] = []
     for kind, rows in found.items():
-        lines += ["", f"## world {world.name}, {kind}{title}: {len(rows)} cases"]
+        lines += ["", f"## world {world.name}, {kind}: {len(rows)} cases"]
         failed = [r for r in rows if r["failure"]]
         lines += [f"failed {r['case']}: {r['failure']}" for r in failed]
         rows = [r for r in rows if not r["failure"]]
@@ -40,7 +37,7 @@ def summary(
             continue
         lines += SUMMARIES[table, kind](world, rows)
         lines += _cost(rows)
-    if table in ("loop", "priors") and len(found) == 2:
+    if table == "loop" and len(found) == 2:
         # As many of each, as the prior has it: "none" is right in half of the sets.
         num = min(map(len, found.values()))
         first = [
@@ -202,7 +199,7 @@ def _active(world: World, rows: Sequence[Row]) -> list[str]:
     curves = Curves.of(rows)
     lines = [
         f"detectable (lambda > {DETECTABLE:g} with all random trials): "
-        f"{curves.num_cases} of {len({r['case'] for r in rows})} cases",
+        f"{curves.num_cases} of {len({r['case'] for r in rows})} cases"
     ]
     if not curves.num_cases:
         return lines
@@ -304,8 +301,8 @@ def _range(values: np.ndarray) -> str:
 
 
 SUMMARIES: dict[tuple[str, str], Callable[[World, Sequence[Row]], list[str]]] = {
-    **{(table, "clean"): _clean for table in ("loop", "priors")},
-    **{(table, "library"): _library for table in ("loop", "priors")},
+    ("loop", "clean"): _clean,
+    ("loop", "library"): _library,
     ("open", "removed"): _removed,
     ("open", "inexpressible"): _removed,
     ("open", "outside"): _outside,

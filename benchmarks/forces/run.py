@@ -225,11 +225,7 @@ def _set(probabilities: dict[str, float]) -> list[str]:
 
 
 def _held_out(
-    own: Machine,
-    loop: Criticism,
-    names: tuple[str, ...],
-    action: Tensor,
-    clean: Tensor,
+    own: Machine, loop: Criticism, names: tuple[str, ...], action: Tensor, clean: Tensor
 ) -> float:
     """Return the rms error of the mean prediction, in sensor deviations."""
     effects = [e for e in loop.effects if e.name in names]

@@ -106,11 +106,7 @@ def measure(
     }
 
 
-def main(
-    *,
-    seeds: int = 20,
-    oscillator_seeds: int = 4,
-) -> None:
+def main(*, seeds: int = 20, oscillator_seeds: int = 4) -> None:
     """Run what is asked for and is not there yet, and print the table.
 
     Args:

@@ -37,16 +37,8 @@ from benchmarks.measured.record_stages import Bench, Settings, run_settings, wit
 from sbi_active.criticism import Effect, Trials
 from sbi_active.tasks import ball_and_hoop  # pyright: ignore
 from sbi_active.tasks.ball_and_hoop import make_effects, spin, split  # pyright: ignore
-from sbi_active.tasks.ball_and_hoop.model import (  # pyright: ignore
-    DAMPING,
-    DRIVE,
-    SENSOR_SD,
-)
-from sbi_active.tasks.ball_and_hoop.recordings import (  # pyright: ignore
-    EVERY,
-    FITTED,
-    LENGTH,
-)
+from sbi_active.tasks.ball_and_hoop.model import DAMPING, DRIVE, SENSOR_SD  # pyright: ignore
+from sbi_active.tasks.ball_and_hoop.recordings import EVERY, FITTED, LENGTH  # pyright: ignore
 from sbi_active.tasks.records import Pieces, Record, cut  # pyright: ignore
 
 RESULT = Path(__file__).parent / "results" / "ball_and_hoop.json"

@@ -24,23 +24,9 @@ from benchmarks.fitting import Fit, batched_fits, effect_bounds, fit_record, run
 from benchmarks.measured.record_stages import Bench, Settings, run_settings, with_error
 from sbi_active.criticism import Effect, Trials
 from sbi_active.tasks import cascaded_tanks  # pyright: ignore
-from sbi_active.tasks.cascaded_tanks import (  # pyright: ignore
-    FOUND_ON,
-    levels,
-    make_effects,
-    split,
-)
-from sbi_active.tasks.cascaded_tanks.model import (  # pyright: ignore
-    PRIOR_HIGH,
-    PRIOR_LOW,
-    SENSOR_SD,
-)
-from sbi_active.tasks.cascaded_tanks.recordings import (  # pyright: ignore
-    EVERY,
-    LEAD,
-    LENGTH,
-    SLOPE,
-)
+from sbi_active.tasks.cascaded_tanks import FOUND_ON, levels, make_effects, split  # pyright: ignore
+from sbi_active.tasks.cascaded_tanks.model import PRIOR_HIGH, PRIOR_LOW, SENSOR_SD  # pyright: ignore
+from sbi_active.tasks.cascaded_tanks.recordings import EVERY, LEAD, LENGTH, SLOPE  # pyright: ignore
 from sbi_active.tasks.records import Pieces, Record, cut  # pyright: ignore
 
 RESULT = Path(__file__).parent / "results" / "cascaded_tanks.json"
@@ -61,10 +47,7 @@ START_LOW, START_HIGH = (-10.0, -1.0), (10.0, 1.0)
 
 
 def run_pieces(
-    parameters: Tensor,
-    starts: Tensor,
-    pieces: Pieces,
-    effects: Sequence[Effect] = (),
+    parameters: Tensor, starts: Tensor, pieces: Pieces, effects: Sequence[Effect] = ()
 ) -> Tensor:
     """Return predictions, shape (n, t, k).
 

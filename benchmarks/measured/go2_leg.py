@@ -136,9 +136,7 @@ class Leg:
             logs: Of :meth:`log`.
         """
         noise = AutocorrelatedNoise.unknown(
-            sd=SD,
-            correlation_time=CORRELATION_TIME,
-            measurement_sd=ENCODER_SD,
+            sd=SD, correlation_time=CORRELATION_TIME, measurement_sd=ENCODER_SD
         )
         return from_mjcf(
             self.spec(), parameters, sensors=self.joints, recordings=logs, noise=noise

@@ -19,11 +19,7 @@ from benchmarks.measured.ball_and_hoop import make_bench
 from benchmarks.measured.record_stages import judge, said
 from benchmarks.rows import add, measured, stages
 from sbi_active.display.table import Table
-from sbi_active.tasks.ball_and_hoop import (  # pyright: ignore
-    DATA,
-    make_prior,
-    read_recordings,
-)
+from sbi_active.tasks.ball_and_hoop import DATA, make_prior, read_recordings  # pyright: ignore
 
 RESULT = Path(__file__).parent / "results" / "hoop_offset.json"
 SDS = (0.01, 0.02, 0.05)  # V; the first is the task's

@@ -189,11 +189,7 @@ def run_settings(
 
 
 def run_stages(
-    bench: Bench,
-    path: Path,
-    *,
-    clean: int = 10,
-    seed: int = 0,
+    bench: Bench, path: Path, *, clean: int = 10, seed: int = 0
 ) -> dict[str, Any]:
     """Run the stages that a file lacks, and return all of them.
 

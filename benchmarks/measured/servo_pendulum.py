@@ -34,15 +34,8 @@ from sbi_active.criticism import Criticism
 from sbi_active.criticism.results import NONE, SCATTER, UNEXPLAINED
 from sbi_active.display.table import Table
 from sbi_active.simulation import AutocorrelatedNoise
-from sbi_active.tasks.servo_pendulum import (  # pyright: ignore
-    Recordings,
-    ServoPendulumTask,
-)
-from sbi_active.tasks.servo_pendulum.model import (  # pyright: ignore
-    PRIOR_HIGH,
-    PRIOR_LOW,
-    angles,
-)
+from sbi_active.tasks.servo_pendulum import Recordings, ServoPendulumTask  # pyright: ignore
+from sbi_active.tasks.servo_pendulum.model import PRIOR_HIGH, PRIOR_LOW, angles  # pyright: ignore
 from sbi_active.tasks.servo_pendulum.task import DATA  # pyright: ignore
 
 Array = NDArray[Any]

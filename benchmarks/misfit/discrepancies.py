@@ -114,12 +114,7 @@ def draw_discrepancy(
 
 
 def smooth_series(
-    grid: Tensor,
-    num: int,
-    length: float,
-    *,
-    shared: float = 0.0,
-    rough: bool = False,
+    grid: Tensor, num: int, length: float, *, shared: float = 0.0, rough: bool = False
 ) -> Tensor:
     """Return draws of a Gaussian process of variance one by torch's generator.
 

@@ -182,10 +182,7 @@ def main(arguments: Settings) -> None:
     table = []
     for method in arguments.methods:
         rows = run_method(
-            arguments.setting,
-            method,
-            arguments.trials,
-            is_summary=arguments.summary,
+            arguments.setting, method, arguments.trials, is_summary=arguments.summary
         )
         table.append(summary(method, rows))
     beside = published("numerical") | exact_limits()

@@ -16,7 +16,7 @@ tells nothing. The prior is uniform on [0, 1]^d.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -134,12 +134,10 @@ class ByAction:
     Attributes:
         learned: By delta and action.
         actions: Shape (a, 3).
-        inputs: Function of parameters (n, d) and an action to what likelihoods take.
     """
 
     learned: list[list[Learned]]
     actions: Tensor
-    inputs: Callable[[np.ndarray, Tensor], np.ndarray] = lambda theta, action: theta
 
     def gains(
         self, belief: Any, earlier: Earlier, seed: int
@@ -152,14 +150,9 @@ class ByAction:
         values = [
             [
                 own.likelihood.gain(
-                    self.inputs(theta, action),
-                    NUM_OUTER,
-                    np.random.default_rng(seed),
-                    earlier[delta, place],
+                    theta, NUM_OUTER, np.random.default_rng(seed), earlier[delta, place]
                 )
-                for place, (own, action) in enumerate(
-                    zip(by_action, self.actions, strict=True)
-                )
+                for place, own in enumerate(by_action)
             ]
             for delta, by_action in enumerate(self.learned)
         ]
@@ -179,8 +172,7 @@ class ByAction:
         """
         own = self.learned[delta][place]
         seen, before = own.seen(image, delta), earlier[delta, place]
-        known = self.inputs(theta, self.actions[place])
-        found = own.likelihood.at(known, seen, before)
+        found = own.likelihood.at(theta, seen, before)
         if seen is not None and len(seen):
             before.append(seen)
         return doubted(found, own.likelihood.power)

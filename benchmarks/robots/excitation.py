@@ -236,9 +236,7 @@ def score(name: str, case: int) -> list[dict[str, object]]:
             pool = permitted_pool(name, robot, belief, derive_seed(case, k))
             if arm == "chosen":
                 designer = InformationGainDesigner(
-                    DiscreteActions(pool),
-                    num_samples=NUM_SAMPLES,
-                    estimator="linear",
+                    DiscreteActions(pool), num_samples=NUM_SAMPLES, estimator="linear"
                 )
                 pool = designer.select(
                     None,

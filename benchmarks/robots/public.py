@@ -144,11 +144,7 @@ PUBLIC = {
             "FL_calf_joint.armature": (0.0, 0.3),
         },
         read={f"FL_{joint}_joint": 0.002 for joint in LEG},
-        drive={
-            "FL_hip": (0.4, 0.0),
-            "FL_thigh": (0.4, 0.9),
-            "FL_calf": (0.6, -1.8),
-        },
+        drive={"FL_hip": (0.4, 0.0), "FL_thigh": (0.4, 0.9), "FL_calf": (0.6, -1.8)},
         start={
             "FL_hip_joint": (0.0, 0.1),
             "FL_thigh_joint": (0.9, 0.1),

@@ -105,11 +105,7 @@ def measured(models: dict[str, Any], num: int, repeats: int) -> dict[str, Any]:
 
 
 def main(
-    *,
-    rows: int = 64,
-    repeats: int = 5,
-    go2: Path | None = None,
-    out: Path = RESULT,
+    *, rows: int = 64, repeats: int = 5, go2: Path | None = None, out: Path = RESULT
 ) -> None:
     """Run from a shell.
 

@@ -40,33 +40,16 @@ TABLES = {
         "numerical.methods --summary --setting default",
     ),
     "Expected information gain": ("table information_gain/result.csv",),
-    "Beside pyro.contrib.oed": ("table information_gain/peers.csv",),
-    "Continuous and mixed actions": (
-        "search --summary",
-        "search --summary --cases mixed --first 40",
-    ),
-    "Trials for a controller": ("target --summary",),
-    "Source location finding": ("location_finding --summary",),
-    "The simulation engine": (
-        "table engine/result.json --only *overhead,*overhead,*median* "
-        "workers,*speedup*median faults,*",
-    ),
     "What an adversary found": (
         "robustness --summary",
         "robustness.exact --summary",
-        "robustness.outliers --summary",
         "robustness.health --summary",
-    ),
-    "Campaigns on disk": (
-        "table cost/directory.json --only tell* load,* *near*",
-        "table robustness/results/units.json --only [!r]*",
     ),
     "Box collision": (
         "box_collision --summary",
         "box_collision --summary --table coverage --rounds 3",
         "box_collision --summary --setting learned "
         "--methods asbi nsbi alhi nlhi --trials 10",
-        "table box_collision/speed.json",
     ),
     "The closed loop, on worlds whose truth is known": (
         *(f"criticism --summary --table loop --world {world}" for world in "ABCD"),
@@ -76,18 +59,10 @@ TABLES = {
             for world in "AB"
         ),
         "criticism --summary --table active --world A",
-        *(
-            f"criticism --summary --table priors --world A --scale {by}"
-            for by in ("3", "0.3333333")
-        ),
-        "criticism --summary --table loop --world C --kind clean --independent",
-        "criticism.campaign --summary",
-        "criticism.campaign --summary --policy check",
     ),
     "Verdicts where every model is wrong": (
         "misfit --summary",
         "misfit.metamorphic --summary",
-        "misfit.start_states --summary",
     ),
     "Trials that decide": ("experiments --summary",),
     "May it go out?": ("experiments.gate --summary",),
@@ -97,10 +72,7 @@ TABLES = {
         "robots.coverage --summary",
         "robots.excitation --summary",
     ),
-    "A chain of many parameters": (
-        "chain --summary",
-        "chain --campaign --summary",
-    ),
+    "A chain of many parameters": ("chain --summary",),
     "Bad networks and beliefs flagged": (
         "calibration.networks --summary",
         "calibration.beliefs --summary",
@@ -113,18 +85,12 @@ TABLES = {
     "The cost of a round": (
         "table cost/result.json",
         "table cost/network.json",
-        "table cost/training.json",
-        "table cost/doors.json --only cpu_s*",
-        "table cost/walls.json",
     ),
     "Robust updates": ("chain.robust --summary",),
     "sbi's own tests with the class swapped": (
         "table sbi_suite/result.json --only date sbi original* swapped*",
     ),
-    "Pouring": (
-        "pouring --summary",
-        "pouring.material --summary",
-    ),
+    "Pouring": ("pouring --summary",),
 }
 
 

@@ -1,17 +1,39 @@
-"""One small run of each closed loop, and tables of what was named."""
+"""One small run of each kind of benchmark, and what its table makes of the rows."""
 
 import json
+from pathlib import Path
 
+import numpy as np
+import pandas as pd
+import pytest
 import torch
 
 from benchmarks.__main__ import main as run
+from benchmarks.bits.run import FIGURES, figures, runs
 from benchmarks.criticism.cases import draw_case
 from benchmarks.criticism.scores import COLUMNS, score_case
 from benchmarks.criticism.worlds import get_world
+from benchmarks.experiments.run import Reality
 from benchmarks.forces.machines import machine
-from benchmarks.measured import hoop_offset
+from benchmarks.measured.cascaded_tanks import fit_tanks, score
 from benchmarks.measured.removals import removed, table
+from benchmarks.misfit import cases as misfit_cases
+from benchmarks.misfit import run as misfit_run
+from benchmarks.misfit.summary import summary
+from benchmarks.robustness.run import by_tests
+from sbi_active.tasks import cascaded_tanks
 from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR, trials
+
+TANKS = Path(cascaded_tanks.DATA).resolve()
+
+
+def test_a_last_bit_counts():
+    x = torch.tensor([1.0, 2.0])
+    other = torch.nextafter(x, torch.tensor([2.0, 2.0]))
+    assert figures([x]) == figures([x.clone()])
+    for different in ([other], [x.double()], [x, None], [x[None]]):
+        assert figures(different)["digest"] != figures([x])["digest"]
+    assert list(json.loads(FIGURES.read_text())["runs"]) == [name for name, _ in runs()]
 
 
 def test_a_strong_effect_of_world_a_is_named_and_lowers_the_error():
@@ -24,30 +46,37 @@ def test_a_strong_effect_of_world_a_is_named_and_lowers_the_error():
     assert float(row["rmse_after"]) < 0.5 * float(row["rmse_before"])
 
 
+def test_a_case_of_misfit_is_run_once_and_its_row_is_whole(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(misfit_run, "RESULTS", tmp_path)
+    for _ in range(2):
+        misfit_run.run_kind("letters", "CE", 0, 1)
+    (row,) = misfit_run.rows_of("letters", "CE")
+    assert capsys.readouterr().out.count("letters_CE_from_0 0") == 1
+    assert [*row] == misfit_run.COLUMNS
+    assert not row["failure"]
+    assert float(row["held_true"]) < float(row["held_bare"])
+    assert any("CE: right" in line for line in summary([row]))
+
+
+def test_the_truth_of_a_case_runs_the_trial_that_was_drawn():
+    case = misfit_cases.draw_case("own", "E", 330)
+    truth, reality = case.truth, Reality.of(case, 330)
+    reality.index = k = int(truth.fitted[-1])  # as if it were the next one
+    x = reality.run(truth.action[k])
+    assert torch.allclose(x, truth.measured(torch.tensor([k]))[0])
+
+
 def test_what_is_removed_is_not_named_and_aliases_are_counted():
     torch.manual_seed(0)
     row = removed(MODEL, PRIOR, trials(lag=0.3, hidden=0.6), EFFECTS)
     assert row["named"] == ["lag"]
     assert row["share_said"]
-    text = table(
-        {"servo: load-dependent": row, "balls: blue_ball": {**row, "named": []}}
-    )
+    other = {**row, "named": []}
+    text = table({"servo: load-dependent": row, "balls: blue_ball": other})
     assert "Aliases named: 1 of 1 removals; the share left said in 1." in text
     assert "Aliases named: 0 of 1 removals; the share left said in 0." in text
-
-
-def test_rows_that_stand_in_the_results_are_printed_and_not_run(tmp_path, capsys):
-    row = {"verdict": "drag", "named": ["drag"], "helps": ["lag", "drag"]}
-    row |= {"after": {"one": 0.5, "other": 0.25}, "cpu_seconds": 7.6}
-    rows = {
-        f"{sd:g} {every}": {"offset_sd": sd, "every": every, **row}
-        for sd in hoop_offset.SDS
-        for every in hoop_offset.EVERY
-    }
-    out = tmp_path / "rows.json"
-    out.write_text(json.dumps(rows))
-    run(["measured.hoop_offset", "--data", str(tmp_path), "--out", str(out)])
-    assert capsys.readouterr().out.count("| drag, lag helps | 0.500 / 0.250 |") == 9
 
 
 def test_forces_are_hidden_in_machines_that_move():
@@ -57,3 +86,59 @@ def test_forces_are_hidden_in_machines_that_move():
     x = own.model.fn(theta.expand(4, -1), action)
     assert x.shape == (4, 20)
     assert x.isfinite().all()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not TANKS.is_dir(), reason=f"needs the records in {TANKS}")
+def test_tanks_err_as_others_found():
+    """Least squares by SciPy, with other integrators, found .290."""
+    records = cascaded_tanks.read_recordings(TANKS)
+    _, scored = cascaded_tanks.split(records)
+    names = ("overflow", "linear outflow")
+    fit, effects = fit_tanks(records["estimation"], names, starts=2)
+    own = torch.from_numpy(fit.parameters[:-2])[None]
+    assert score(own, scored, effects)["validation"] == pytest.approx(0.290, rel=0.1)
+
+
+def test_intervals_of_robots_are_found_once_and_told(tmp_path, capsys):
+    sysid = pytest.importorskip("mujoco.sysid")
+    if not hasattr(sysid, "Parameter"):
+        pytest.skip("needs mujoco.sysid; run pip install 'sbi-active[sysid]'")
+    out = tmp_path / "coverage.csv"
+    command = ["robots.coverage", "--seeds", "2000", "2001", "--machine", "spring-mass"]
+    command += ["--condition", "friction 1", "--way", "sysid", "ours", "bare"]
+    for _ in range(2):
+        run([*command, "--out", str(out)])
+        rows = pd.read_csv(out)
+        assert rows.groupby("way").size().to_dict() == dict.fromkeys(
+            ("bare", "ours", "sysid"), 2
+        )
+    inside = (rows.low <= rows.truth) & (rows.truth <= rows.high)
+    assert inside[rows.way == "ours"].all()
+    assert not inside[rows.way == "sysid"].any()
+    capsys.readouterr()
+    run(["robots.coverage", "--summary", "--out", str(out)])
+    assert "| friction 1 | 0.00 | 1.00 | 1.00 | - |" in capsys.readouterr().out
+
+
+def test_an_effect_hidden_in_a_robot_shows_and_no_parameter_absorbs_it():
+    pytest.importorskip("mujoco")
+    from benchmarks.robots import hidden
+    from benchmarks.robots.public import PUBLIC
+    from sbi_active.mujoco import mjcf_effects
+
+    robot, measured = hidden.planned(PUBLIC["servo"], np.random.default_rng(3))
+    own = measured(np.zeros((hidden.NUM_TRIALS, hidden.NUM_READINGS, 1)))
+    truth, effects = hidden.Truth(robot, own), mjcf_effects(robot, trials=own)
+    theta, rng = 0.5 * (truth.low + truth.high).numpy(), np.random.default_rng(5)
+    effect, phi, excess = hidden.hidden_effect(truth, effects, theta, rng)
+    assert hidden.EXCESS[0] <= excess <= hidden.EXCESS[1]
+    # Not refitted, the bare model is farther away.
+    apart = truth.run(theta[None], effect, phi) - truth.run(theta[None])
+    assert (apart**2).sum() >= excess * 0.999
+
+
+def test_a_test_that_fails_was_not_survived():
+    rows = [*by_tests(("tests/test_seeding.py",))]
+    assert rows
+    assert all(row["survived"] and "seeding" in row["attack"] for row in rows)

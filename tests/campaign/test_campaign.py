@@ -8,12 +8,7 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import (
-    Campaign,
-    DiscreteActions,
-    GaussianNoise,
-    SimulatorModel,
-)
+from sbi_active import Campaign, DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.campaign.options import CampaignDetails
 from tests.campaign.problem import ACTIONS, OPTIONS, PRIOR, campaign, noisy
 

@@ -6,16 +6,12 @@ import pandas as pd
 import pytest
 import torch
 
-from sbi_active import (
-    Campaign,
-    DiscreteActions,
-    SimulatorModel,
-)
+from sbi_active import Campaign, DiscreteActions, SimulatorModel
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-from .storage.campaigns import MODEL, OPTIONS, PRIOR, go_on, new
+from .storage.campaigns import MODEL, OPTIONS, PRIOR, go_on
 
 
 @pytest.fixture(autouse=True)
@@ -86,19 +82,3 @@ def test_table_draws_and_names_are_the_same_without_the_simulator(folder):
     figure = loaded.plot()
     surprise = figure.axes[-2].lines[0].get_ydata()[0]
     assert surprise == pytest.approx(campaign.history[0].surprise)
-
-
-def panels(figure):
-    """Return the axes of the beliefs, and the three below."""
-    return [ax for ax in figure.axes if ax.axison][:-3], figure.axes[-3:]
-
-
-def test_empty_random_and_failed_campaigns_have_a_figure():
-    new(simulator=MODEL).plot().savefig("empty.png")
-    c = go_on(new(simulator=MODEL), 1)
-    _, (actions, _, _) = panels(c.plot(num_predicted=8))
-    assert actions.lines[0].get_ydata()[0] == float(c.history[0].action)
-    c.attach([1.0], status="invalid")
-    c.attach([1.0], [0.1, 0.2, float("nan"), 0.3])
-    c.update()
-    c.plot(num_predicted=8).savefig("failed.png")

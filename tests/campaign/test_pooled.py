@@ -93,15 +93,6 @@ def gain_forces(gain):
     return {force for force, _ in gain}
 
 
-def test_a_belief_may_keep_to_the_chosen_summary():
-    c = Campaign(Blobs(), PRIOR, choice(use="chosen"), options={"max_simulations": 300})
-    c.tell(outcome([0.7, 0.2], torch.tensor([2.0, 2.0]), 0), action=[2.0, 2.0])
-    belief = c.update()
-    assert c.history[0].summary == "nothing"
-    draws = belief.sample((2_000,))  # nothing was learned
-    assert torch.allclose(draws.std(0), torch.full((2,), 12**-0.5), atol=0.05)
-
-
 def slide(theta, action):
     return torch.cat([theta[:, :1] * action, theta[:, 1:] + action * theta[:, :1]], 1)
 

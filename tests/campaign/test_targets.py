@@ -8,7 +8,6 @@ from sbi_active import Campaign, StopRules
 from tests.campaign.learning.test_revision import (
     ACTIONS,
     BIAS,
-    LIBRARY,
     MODEL,
     OPTIONS,
     PRIOR,
@@ -27,20 +26,6 @@ def campaign(effects=(BIAS,), method="asbi", **changes):
     )
 
 
-def test_without_effects_trials_are_for_the_parameters():
-    c = campaign(effects=())
-    assert c.ask().target == "theta"
-    c.tell([1.0])
-    assert c.ask(target="slope").target == "slope"
-    c.tell([1.0])
-
-    def loss(theta):
-        return theta[:, 0] ** 2
-
-    trial = c.ask(target=loss)
-    assert (trial.target, trial.design.estimator) == ("loss", "ParameterGain")
-
-
 def test_with_effects_a_trial_is_for_what_it_tells_more_about():
     c = campaign()
     c.tell([1.0], action=[2.0])
@@ -53,15 +38,6 @@ def test_with_effects_a_trial_is_for_what_it_tells_more_about():
     assert "bias" in trial.design.notes[0]
     assert trial.num_simulations >= trial.design.num_simulations > 0
     assert "criticism" in trial.seconds
-
-
-def test_under_an_alarm_the_parameters_do_not_count():
-    c = campaign(effects=LIBRARY)
-    # At one setting twice, two biases apart: no slope explains it, a drift may.
-    tell(c, actions=(2.0, -2.0, 2.0))
-    c.update()
-    assert c.health == "alarm"
-    assert c.ask().target == "model"
 
 
 def test_where_nothing_is_open_the_trial_is_for_the_parameters():

@@ -54,7 +54,7 @@ def run(*options):
 
 def test_a_file_gives_a_report(capsys):
     measure()
-    options = [*OPTIONS, "--effects", "my_robot:effects", "--actions", "0.5:3:11"]
+    options = [*OPTIONS, "--effects", "my_robot:effects"]
     assert run("--simulator", "my_robot:distance", *options, "--out", "found") == 0
     printed = capsys.readouterr().out
     assert printed.startswith("Verdict: drag (P")

@@ -45,7 +45,6 @@ def test_nothing_heavy_is_imported(arguments, status, text):
 @pytest.mark.parametrize(
     ("line", "text"),
     [
-        ("", "Missing command."),
         ("run numerica --out d", "is not one of 'numerical'"),
         ("run numerical --out d --rounds 0", "Invalid value for '--rounds': 0"),
         ("correct c 0 --reason --json", "'--reason' requires an argument"),
@@ -83,10 +82,7 @@ def test_names_are_those_of_the_library():
 
 @pytest.mark.parametrize(
     ("line", "offered"),
-    [
-        ("sbi-active st", "status"),
-        ("sbi-active init camp --method nl", "nlhi"),
-    ],
+    [("sbi-active st", "status"), ("sbi-active init camp --method nl", "nlhi")],
 )
 def test_a_shell_completes(line, offered):
     env = {"_SBI_ACTIVE_COMPLETE": "bash_complete", "COMP_WORDS": line}

@@ -44,8 +44,6 @@ class Server:
 
     def says(self, request):
         line = request if isinstance(request, str) else json.dumps(request)
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
         self.process.stdin.write(line + "\n")
         self.process.stdin.flush()
         answer = self.process.stdout.readline()
@@ -99,16 +97,12 @@ def test_a_robot_s_loop(server):
 WRONG = [
     ("\xff", "write one JSON object a line"),
     ("[1]", "write one JSON object a line"),
-    ("[" * 99_999, "write one JSON object a line"),
     ({}, "expected a command among adopt, ask, correct"),
     ({"command": ["ask"]}, "expected a command among adopt"),
     ({"command": "init"}, "got 'init'"),
-    ({"command": "tell", "x": [0.3], "speed": 3}, "expected options among"),
-    ({"command": "tell", "x": ["fast"]}, "write them with a point"),
     ({"command": "tell", "x": [None], "action": 1}, "one of them measured"),
     ({"command": "tell", "x": 1}, "expected a pending trial; got none"),
     ({"command": "withdraw"}, "Missing argument 'TRIAL'"),
-    ({"command": "withdraw", "trial": "first"}, "'first' is not a valid integer"),
 ]
 
 

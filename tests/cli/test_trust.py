@@ -122,8 +122,7 @@ def test_trust_is_remembered_outside_of_the_folder(mine, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "content",
-    ["", "[]", '{"simulator": 3}', '{"effects": [1]}', "[" * 9999],
+    "content", ["", "[]", '{"simulator": 3}', '{"effects": [1]}', "[" * 9999]
 )
 def test_a_file_that_the_command_line_did_not_write(mine, capsys, content):
     Path("camp/command.json").write_text(content)

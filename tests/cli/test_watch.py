@@ -142,7 +142,6 @@ def test_a_reader_that_leaves_is_no_error(server, capfd):
 def test_the_command_ends_by_an_interrupt(place):
     words = ["watch", str(place[0]), "--port", "0"]
     process = run(words, stdout=subprocess.PIPE)
-    assert process.stdout is not None
     said = process.stdout.readline()
     port = re.fullmatch(r".* is shown at http://127.0.0.1:(\d+) until Ctrl-C\n", said)
     assert port is not None, said
@@ -164,33 +163,6 @@ def test_nothing_of_the_folder_changes(place, capsys):
     page = Path("page.html").read_text(encoding="utf-8")
     assert "2 trials told" in page
     assert "setInterval" not in page
-
-
-def test_a_folder_that_is_no_campaign(capsys):
-    for words in (["nowhere"], ["nowhere", "--once", "page.html"]):
-        assert main(["watch", *words]) == 2
-        assert "expected a campaign; got no nowhere" in capsys.readouterr().err
-    assert not Path("page.html").exists()
-
-
-def test_a_port_in_use(place, server, capsys):
-    port = str(server.server_port)
-    assert main(["watch", str(place[0]), "--port", port]) == 2
-    text = f"expected a port that is free; got {port} (Address already in use)"
-    assert text in capsys.readouterr().err
-    assert main(["watch", str(place[0]), "--port", "65536"]) == 2
-    assert "65536 is not in the range 0<=x<=65535" in capsys.readouterr().err
-
-
-def test_a_folder_that_goes_is_said_on_the_page(place, tmp_path):
-    folder = tmp_path / "camp"
-    folder.mkdir()
-    for file in place[0].iterdir():
-        (folder / file.name).write_bytes(file.read_bytes())
-    watched = watch.Watched(folder)
-    assert "2 trials told" in watched.page()
-    (folder / "store.db").unlink()
-    assert "expected a campaign; got no" in news(watched.page())[0]
 
 
 def test_it_reads_well_in_a_browser(place, tmp_path):

@@ -3,29 +3,18 @@
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import (
     AugmentedSimulator,
-    Context,
     Criticism,
-    Effect,
     Trials,
     close_loop,
     generic_effects,
 )
 from sbi_active.criticism.report.figures import figures
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
-from tests.criticism.motor_world import (
-    DEAD_ZONE,
-    GRID,
-    LIBRARY,
-    MODEL,
-    PRIOR,
-    measured,
-    played,
-)
+from tests.criticism.motor_world import LIBRARY, MODEL, PRIOR, measured
 from tests.effects import on_outcomes
 
 
@@ -47,28 +36,11 @@ def test_a_right_model_is_left_alone():
 def test_only_recorded_inputs_are_proposed():
     trials = measured(0, {"dead zone": 0.25}, num=5)
     loop = Criticism(MODEL, PRIOR, trials, effects=LIBRARY, actions=trials.action)
-    assert loop.actions is not None
     listed = loop.actions.listed()
-    assert listed is not None
     assert listed[:, 0].tolist() == [0, 1, 2, 3, 4]
     report = loop.report(evaluate=False)
-    assert report.next_action is not None
     assert report.next_action.candidates[:, 0].tolist() == [0, 1, 2, 3, 4]
     assert all(test.is_permitted for test in report.severe_tests)
-
-
-def test_effects_change_no_label():
-    gain = Effect(
-        "action gain",
-        hook="action",
-        prior=Normal(0.0, 1.0),
-        null=0.0,
-        apply=lambda action, phi, own, context: action * (1 + phi),
-    )
-    with pytest.raises(
-        ValueError, match="'action gain' on the action; declare hook='input'"
-    ):
-        Criticism(MODEL, PRIOR, measured(0, {}), effects=[gain])
 
 
 def summed(theta, action, *, inputs, start=0.0):
@@ -89,44 +61,6 @@ def test_equal_actions_with_other_inputs_are_other_rows():
     simulator = TrialSimulator(AugmentedSimulator(model, []), start)
     mean, _, _ = simulator.predict(torch.ones(1, 1), {})
     assert mean.tolist() == [[4.0, 9.0, 6.0]]
-
-
-def test_a_function_of_one_row_gets_its_own_inputs():
-    shapes = []
-
-    def one(theta, action, *, inputs, times, input_times, start):
-        shapes.append((inputs["u"].shape, times.shape, input_times.shape, start.shape))
-        return theta * inputs["u"].sum() + start[0]
-
-    model = SimulatorModel(one, noise=GaussianNoise(0.1), batched=False)
-    trials = Trials(
-        None,
-        torch.zeros(2, 1),
-        sample_times=[0.5],
-        inputs={"u": torch.tensor([[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]])},
-        input_times=[0.0, 0.5, 1.0],
-        start=torch.tensor([[1.0, 0.0], [2.0, 0.0]]),
-    )
-    simulator = TrialSimulator(AugmentedSimulator(model, []), trials)
-    mean, _, _ = simulator.predict(torch.ones(1, 1), {})
-    assert mean.tolist() == [[4.0, 9.0]]
-    assert {*shapes} == {((3,), (1,), (3,), (2,))}
-
-
-def test_inputs_that_are_required_and_not_there_are_asked_for():
-    model = SimulatorModel(summed, noise=GaussianNoise(0.1))
-    trials = Trials(torch.zeros(3), torch.zeros(3))
-    prior = BoxUniform(torch.zeros(1), torch.ones(1))
-    with pytest.raises(ValueError, match="requires it; got none; pass Trials.inputs"):
-        Criticism(model, prior, trials)
-    plain = SimulatorModel(lambda theta, xi: theta * xi, noise=GaussianNoise(0.1))
-    with pytest.raises(ValueError, match="no such argument; pass Trials"):
-        AugmentedSimulator(plain, [DEAD_ZONE]).evaluate(
-            torch.ones(2, 1),
-            {"dead zone": torch.ones(2, 1)},
-            torch.ones(2, 1),
-            context=Context(torch.zeros(2), None, {"voltage": played(2, 0)}, GRID),
-        )
 
 
 def falling(theta, action, *, times):  # which cannot do without them
@@ -155,83 +89,3 @@ def test_a_simulator_may_require_times(by_model):
         model, prior, trials, effects=effects, evaluate=False, plan=False
     )
     assert report.verdict == "bias"
-
-
-def test_context_is_what_was_recorded():
-    seen = {}
-
-    def apply(value, phi, action, context):
-        seen.update(vars(context))
-        return value
-
-    watcher = Effect(
-        "watcher", hook="input", prior=Normal(0.0, 1.0), null=0.0, apply=apply
-    )
-    trials = measured(0, {}, num=3, held_out=0)
-    model = AugmentedSimulator(MODEL, [watcher])
-    TrialSimulator(model, trials).predict(
-        torch.tensor([[3.0, 0.3]]), {"watcher": torch.ones(1, 1)}
-    )
-    assert trials.inputs is not None
-    assert torch.equal(seen["inputs"]["voltage"], trials.inputs["voltage"])
-    assert torch.equal(seen["input_times"], GRID)
-    assert torch.equal(seen["start"]["speed"], trials.start["speed"])
-    wrong = Effect(
-        "wrong",
-        hook="input",
-        prior=Normal(0.0, 1.0),
-        null=0.0,
-        apply=lambda value, phi, action, context: value["voltage"],
-    )
-    with pytest.raises(ValueError, match="dict of the inputs voltage"):
-        Criticism(MODEL, PRIOR, trials, effects=[wrong])
-
-
-def test_what_was_found_can_be_simulated_on():
-    trials = measured(0, {"dead zone": 0.25})
-    loop = Criticism(MODEL, PRIOR, trials, effects=LIBRARY)
-    model, prior = loop.add()
-    assert prior.event_shape == (3,)
-    run = {
-        "inputs": trials.inputs,
-        "input_times": trials.input_times,
-        "times": trials.sample_times.expand(len(trials), -1),
-        "start": trials.start,
-    }
-    z = torch.tensor([[3.0, 0.3, 0.25]]).double().expand(len(trials), -1)
-    x = model.mean(z, trials.action, **run)
-    assert float((x - trials.x).square().mean().sqrt()) < 0.06
-    without = model.mean(
-        torch.cat([z[:, :2], torch.zeros(len(z), 1)], 1), trials.action, **run
-    )
-    assert float((without - trials.x).square().mean().sqrt()) > 0.1
-
-
-def test_inputs_cover_the_model_s_own_times():
-    model = SimulatorModel(
-        lambda theta, action, *, inputs: theta * inputs["u"][:, :3],
-        noise=GaussianNoise(0.1),
-        sample_times=[0.0, 50.0, 100.0],
-    )
-    trials = Trials(
-        None,
-        torch.zeros(3, 3),
-        inputs={"u": torch.randn(3, 11)},
-        input_times=torch.linspace(0, 1, 11),
-    )
-    prior = BoxUniform(torch.zeros(1), torch.ones(1))
-    with pytest.raises(ValueError, match="its input 'u', 0 to 1; got x at 50"):
-        Criticism(model, prior, trials)
-
-
-def test_inputs_that_nobody_takes_are_noted():
-    model = SimulatorModel(lambda theta, action: theta * action, noise=0.1)
-    trials = Trials(
-        torch.tensor([1.0, 2.0, 3.0]),
-        torch.tensor([0.5, 1.0, 1.5]),
-        inputs={"u": torch.randn(3, 11)},
-        input_times=torch.linspace(0, 1, 11),
-    )
-    prior = BoxUniform(torch.zeros(1), torch.ones(1))
-    with pytest.warns(UserWarning, match="takes no argument 'inputs': they are not"):
-        Criticism(model, prior, trials)

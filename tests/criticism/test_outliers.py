@@ -5,8 +5,8 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import Independent, Normal
 
-from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, StudentTNoise
-from sbi_active.criticism import Criticism, Effect, Trials, close_loop
+from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.report.summary import suspects
 from tests.criticism.report.reports import flat, report
 
@@ -23,8 +23,7 @@ def response(theta, action, quadratic=0.0):
 
 MODEL = SimulatorModel(response, noise=GaussianNoise(1.0))
 QUADRATIC = Effect.keyword(
-    "quadratic",
-    prior=Independent(Normal(torch.zeros(1), torch.ones(1)), 1),
+    "quadratic", prior=Independent(Normal(torch.zeros(1), torch.ones(1)), 1)
 )
 
 
@@ -38,22 +37,6 @@ def measured(xi=XI, *, quadratic=0.0, seed=0):
 def criticism(x, *, xi=XI, model=MODEL, **options):
     trials = Trials(xi, x, **options)
     return Criticism(model, PRIOR, trials, effects=[QUADRATIC], actions=ACTIONS)
-
-
-def test_reports_call_trials_by_their_names():
-    x, names = measured(), [f"Drop {letter}" for letter in "abcdefgh"]
-    x[3] += 20.0
-    held_out = ["fit"] * 6 + ["held out"] * 2
-    report = criticism(x, names=names, role=held_out).report(plan=False)
-    assert str(report).startswith("Verdict: outlier")
-    assert ": trial Drop d" in str(report).splitlines()[0]
-    assert "trial Drop d does not agree with the others" in flat(report)
-    assert "held-out trial Drop g: " in flat(report)
-    assert [*report.tracing.outliers][0] == 3.0  # results go on by the index
-    lost = x.clone()
-    lost[1] = torch.nan
-    report = criticism(lost, names=names).report(plan=False, evaluate=False)
-    assert "trial Drop b gave no measurement where the model is sure" in flat(report)
 
 
 @pytest.mark.parametrize("size", [8.0, -20.0])
@@ -94,18 +77,6 @@ def test_a_slip_along_a_trajectory_is_an_outlier_and_no_process(num, wrong):
     found = Criticism(model, PRIOR, trials).trace()
     assert found.verdict == "outlier"
     assert suspects(found) == (float(wrong),)
-
-
-@pytest.mark.parametrize("wrong", [-1e30, "unit"])
-def test_what_nothing_explains_ends_no_loop(wrong):
-    x = measured()
-    x[2] = 100 * x[2] if wrong == "unit" else wrong
-    trials = Trials(XI, x)
-    made = close_loop(
-        MODEL, PRIOR, trials, effects=[QUADRATIC], evaluate=False, plan=False
-    )
-    assert made.verdict == "outlier"
-    assert suspects(made.tracing) == (2.0,)
 
 
 def test_a_true_effect_stays_named_beside_the_outlier():
@@ -149,20 +120,6 @@ def test_noise_declared_too_large_is_said():
     right = criticism(x).detect()
     assert right.lower_p_value > 0.01
     assert "SA523" not in [w.code for w in report(detection=right).warnings]
-
-
-def test_large_t_noise_and_trajectories_are_looked_at_as_well():
-    student = SimulatorModel(response, noise=StudentTNoise(100.0, 4.0))
-    assert criticism(measured(), model=student).detect().lower_p_value < 1e-4
-    times = torch.linspace(0, 1, 12)
-    noise = GaussianNoise(10.0)
-    line = SimulatorModel(
-        lambda theta, xi: theta[:, :1] * times, noise=noise, sample_times=times
-    )
-    prior = BoxUniform(-torch.ones(1), torch.ones(1))
-    x = 0.5 * times + 0.1 * torch.randn(4, 12, generator=torch.manual_seed(0))
-    trials = Trials(torch.arange(4.0), x, sample_times=times)
-    assert Criticism(line, prior, trials).detect().lower_p_value < 1e-4
 
 
 def test_held_out_trials_refute_an_alias():

@@ -58,47 +58,6 @@ def test_the_choice_and_the_report_use_separate_simulations():
     assert min(best) > exact
 
 
-def test_named_parameters_are_the_target():
-    """The first action tells about one parameter, the second about the other."""
-
-    def one_at_a_time(theta, action):
-        gain = torch.tensor([8.0, 2.0])
-        return torch.where(action > 0.5, gain * theta, gain.flip(0) * theta).gather(
-            1, (action > 0.5).long()
-        )
-
-    model = SimulatorModel(
-        one_at_a_time, noise=GaussianNoise(1.0), parameter_names=["mass", "friction"]
-    )
-    designer = InformationGainDesigner(DiscreteActions([0.0, 1.0]), num_samples=400)
-
-    def select(target):
-        return designer.select(None, model, belief=PRIOR, target=target, seed=0)
-
-    mass, friction = select("mass"), select(["friction"])
-    assert (mass.action.tolist(), friction.action.tolist()) == ([0.0], [1.0])
-    assert (mass.estimator, mass.bound) == ("ParameterGain", "lower")
-    exact = torch.tensor([0.5 * torch.log1p(torch.tensor(4.0)), 0.0]).double()
-    for design, values in ((mass, exact), (friction, exact.flip(0))):
-        error = design.standard_error
-        gain = design.expected_information_gain
-        assert (gain < values + 3 * error + 0.01).all()
-        assert (gain > values - 0.15 - 3 * error).all()
-    both = select(["mass", "friction"])
-    assert (both.expected_information_gain > exact.max() - 0.3).all()
-    with pytest.raises(
-        ValueError, match=r"names among \['mass', 'friction'\]; got 'm'"
-    ):
-        select("m")
-    with pytest.raises(ValueError, match="expected a simulator with parameter_names"):
-        designer.select(None, simulator, belief=PRIOR, target="mass")
-    nested = InformationGainDesigner(ACTIONS, estimator="nested")
-    with pytest.raises(ValueError, match="'auto' or 'linear' for target='mass'"):
-        nested.select(None, model, belief=PRIOR, target="mass")
-    with pytest.raises(ValueError, match="expected a simulator; got None"):
-        designer.select(None, belief=PRIOR)
-
-
 def six_numbers(theta, action):
     mean = action * theta
     return torch.cat([mean, 2 * mean, mean], 1) + torch.randn(len(theta), 6)
@@ -215,23 +174,3 @@ def test_regret_on_the_numerical_task(variant, trials):
         assert design.num_simulations <= 21_000
     assert sum(regret) / len(regret) <= 0.05
     assert sum(errors) / len(errors) <= 0.15
-
-
-def test_errors():
-    with pytest.raises(ValueError, match="expected num_samples >= 8"):
-        InformationGainDesigner(ACTIONS, num_samples=2)
-    designer = InformationGainDesigner(ACTIONS, num_samples=10)
-
-    class NoBelief:
-        def log_posterior(self, theta, x, action):
-            return theta[:, 0]
-
-    with pytest.raises(ValueError, match="expected belief="):
-        designer.select(NoBelief(), simulator)
-    with pytest.raises(ValueError, match="got identical x from two seeds"):
-        designer.select(ExactModel(), lambda t, a: t * a)
-
-    with pytest.raises(ValueError, match="'auto', 'entropy', 'info_nce', "):
-        InformationGainDesigner(ACTIONS, estimator="knn")
-    with pytest.raises(ValueError, match="expected a budget >= 32"):
-        designer.select(ExactModel(), simulator, budget=31)

@@ -8,10 +8,7 @@ from torch.distributions import MultivariateNormal, Normal
 
 from sbi_active.design import LikelihoodGain
 from sbi_active.design.estimators.base import CandidateSimulations
-from sbi_active.design.outcomes import (
-    conditional_gain,
-    join_outcomes,
-)
+from sbi_active.design.outcomes import conditional_gain, join_outcomes
 
 PRIOR = MultivariateNormal(torch.zeros(1), torch.eye(1))
 

@@ -91,16 +91,3 @@ def test_a_failure_or_none():
     error = float(design.standard_error[1])
     assert math.log(2) - 0.3 - 3 * error < strong < math.log(2) + 3 * error
     assert strong > 3 * error
-
-
-@pytest.mark.parametrize(
-    ("function", "text"),
-    [
-        (lambda theta: theta.mean(), r"of shape \(2000,\) or \(2000, k\)"),
-        (lambda theta: theta[:, 0].log(), r"got NaN or inf in \d+ of 2000 rows"),
-        (lambda theta: theta * torch.tensor([1.0, 0.0]), "in column 1 of 2"),
-    ],
-)
-def test_what_is_no_quantity_is_an_error(function, text):
-    with pytest.raises(ValueError, match=text):
-        select(function)

@@ -7,19 +7,10 @@ from html.parser import HTMLParser
 import pytest
 import torch
 
-from sbi_active import (
-    BoxActions,
-    Campaign,
-    DiscreteActions,
-    RandomDesigner,
-    SimulatorModel,
-)
+from sbi_active import Campaign, DiscreteActions, RandomDesigner, SimulatorModel
 from sbi_active.display.notebook import badge, card, facts, items, table
 from sbi_active.display.table import Table
-from sbi_active.inference.beliefs.belief import UnchangedBelief
-from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from tests.campaign.storage.campaigns import MODEL, OPTIONS, PRIOR, outcome
-from tests.criticism.report.reports import report
 
 EVIL = '<script>alert("&")</script>'
 VOID = {"br", "img"}
@@ -70,7 +61,7 @@ def campaign():
     model = SimulatorModel(
         MODEL.fn, noise=MODEL.noise, parameter_names=["mass", EVIL[:8]]
     )
-    actions = BoxActions([0.5], [2.0], names=[f"speed {EVIL}"], units=["m/s"])
+    actions = DiscreteActions([0.5, 2.0], names=[f"speed {EVIL}"], units=["m/s"])
     options = replace(OPTIONS, network="on demand")
     c = Campaign(model, PRIOR, actions, options=options)
     c.ask()
@@ -91,23 +82,6 @@ def test_a_campaign_has_its_health_belief_and_trials(campaign):
     assert mean in page.texts
 
 
-def test_a_long_campaign_is_small(campaign):
-    c = Campaign(MODEL, PRIOR, campaign.actions, options=OPTIONS)
-    for _ in range(40):
-        c.attach([1.0], [0.1, 0.2, 0.3, 0.4])
-    page = page_of(c)
-    assert "and 28 before" in page.texts
-    assert "39" in page.texts
-
-
-def test_a_belief_has_each_parameter_and_what_speaks_against_it():
-    belief = UnchangedBelief(PRIOR, PRIOR)
-    belief.parameter_names = ("mass", "friction")
-    belief.diagnostics = Diagnostics().warned(f"beware of {EVIL}")
-    page = page_of(belief)
-    assert {"mass", "friction", "not trustworthy", f"beware of {EVIL}"} <= {*page.texts}
-
-
 def test_looking_at_a_belief_draws_nothing_from_the_global_generator(campaign):
     before = torch.get_rng_state()
     campaign.belief._repr_html_()
@@ -122,12 +96,6 @@ def test_a_design_has_the_chosen_and_the_best_candidates(campaign):
     pairs = DiscreteActions([[0.0, 1.0], [1.0, 2.0]], names=["a", "b"])
     page = page_of(RandomDesigner(pairs).select(seed=0))
     assert {"a", "b", "chosen"} <= {*page.texts}
-
-
-def test_a_report_has_its_verdict():
-    page = page_of(report())
-    assert "Verdict" in page.text
-    assert "probability" in page.text
 
 
 def test_pieces_are_escaped():

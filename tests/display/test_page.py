@@ -1,18 +1,14 @@
 """Pages that travel: what is on them, and what a browser makes of them."""
 
 import pytest
-from matplotlib.figure import Figure
 
 from sbi_active.campaign.display.page import page as campaign_page
-from sbi_active.display import Page, Section, Table, svg
+from sbi_active.display import Page, Section, Table
 from tests.campaign.storage.campaigns import MODEL, go_on, new
 from tests.criticism.report.reports import report
 from tests.display.browser import CHROMIUM, assert_reads_well, look
 
-TABLE = Table(
-    ("name", "value"),
-    [("b", "10"), ("a", "-2.5"), ("d", ""), ("c", "1e3")],
-)
+TABLE = Table(("name", "value"), [("b", "10"), ("a", "-2.5"), ("d", ""), ("c", "1e3")])
 
 
 def test_all_text_is_escaped():
@@ -23,12 +19,6 @@ def test_all_text_is_escaped():
         assert tag not in made
         assert tag.replace("<", "&lt;").replace(">", "&gt;") in made
     assert "<td>&amp;</td>" in made
-
-
-def test_the_same_figure_is_the_same_picture():
-    figure = Figure()
-    figure.subplots().plot([1, 2])
-    assert svg(figure) == svg(figure)
 
 
 def test_tables_are_sorted_by_a_click_numbers_as_numbers(tmp_path):

@@ -30,8 +30,7 @@ DEAR = {"pyro": pytest.mark.slow}  # NUTS
 
 
 @pytest.mark.parametrize(
-    "package",
-    [pytest.param(p, marks=DEAR.get(p, ())) for p in reference.PACKAGES],
+    "package", [pytest.param(p, marks=DEAR.get(p, ())) for p in reference.PACKAGES]
 )
 def test_examples_run(package):
     setup, blocks = reference.examples(package)

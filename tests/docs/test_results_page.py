@@ -14,8 +14,6 @@ ROOT = Path(__file__).parents[2]
 def results() -> ModuleType:
     path = ROOT / "docs" / "_ext" / "results.py"
     spec = importlib.util.spec_from_file_location("results", path)
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     pytest.importorskip("sphinx")
     spec.loader.exec_module(module)

@@ -5,9 +5,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import Distribution, MultivariateNormal
 
-from sbi_active.identifiability.known import (
-    combinations_of,
-)
+from sbi_active.identifiability.known import combinations_of
 
 POSITIVE, CENTERED = (0.2, 1.0), (-1.0, 1.0)
 

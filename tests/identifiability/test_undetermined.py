@@ -108,10 +108,7 @@ DETERMINED = {
         [CENTERED, POSITIVE],
     ),
     "one far stronger": (lambda a, b, v: 1e3 * a * v + b, [CENTERED] * 2),
-    "too much stronger for float32": (
-        lambda a, b, v: 1e5 * a * v + b,
-        [CENTERED] * 2,
-    ),
+    "too much stronger for float32": (lambda a, b, v: 1e5 * a * v + b, [CENTERED] * 2),
     "weights that may vanish": (lambda a, b, v: a * b + a * v, [CENTERED] * 2),
     "only by failing": (
         lambda a, b, v: torch.where(b > 0.5, torch.nan, a * v),

@@ -27,7 +27,6 @@ def test_logs_become_trials():
     robot = from_mjcf(
         SPRING_MASS, {"cart.mass": (0.5, 2)}, recordings=frames, noise=0.01
     )
-    assert robot.trials is not None
     assert robot.trials.x.shape == (2, 100, 2)
     assert robot.trials.x.isnan().sum() == 3
     assert robot.trials.start["slide"].tolist() == [0.1, 0.1]

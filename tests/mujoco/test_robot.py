@@ -73,7 +73,6 @@ def test_a_model_comes_as_text_path_or_spec(given, tmp_path):
     spec = mujoco.MjSpec.from_string(PENDULUM)
     source = {"text": PENDULUM, "path": file, "spec": spec}[given]
     robot = from_mjcf(source, {"hinge.damping": (0.0, 0.1)}, times=TIMES)
-    assert robot.simulator.noise is not None  # the sensor's, in the MJCF
     assert robot.simulator.noise.sd == pytest.approx(0.01)
     x = robot.simulator.mean(torch.full((1, 1), 0.05), torch.zeros(1, 1))
     assert x.shape == (1, 15)
@@ -179,9 +178,7 @@ def test_a_state_that_diverges_is_invalid_and_counted():
     [
         ({"parameters": {"hinge.dampin": (0, 1)}}, "did you mean 'hinge.damping'"),
         ({"parameters": {"bob.mass": (-1, 1)}}, "'bob.mass' from 0 on; got -1 to 1"),
-        ({"times": [0.1, np.nan]}, "times that increase from 0 s on"),
         ({"times": [1.7e9, 1.7e9 + 1]}, "subtract the time at which the trial starts"),
-        ({"start": {"hinge_": 1.0}}, "did you mean 'hinge'"),
     ],
 )
 def test_what_does_not_fit_is_said(change, message):

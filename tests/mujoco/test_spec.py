@@ -50,12 +50,3 @@ def test_other_processes_find_meshes_beside_the_file(path, monkeypatch, is_spec)
     here, there = source.compile(), pickle.loads(pickle.dumps(source)).compile()
     assert here.body_mass[1] == pytest.approx(2000.0, rel=1e-6)
     np.testing.assert_array_equal(here.body_inertia, there.body_inertia)
-
-
-def test_textures_are_left_out_and_materials_keep_their_colors(path):
-    """The file of this texture is not even there."""
-    model = Source(path).compile()
-    assert model.ntex == 0
-    assert model.mat_rgba.tolist() == [[1.0, 0.0, 0.0, 1.0]]
-    with pytest.raises(ValueError, match="missing.png"):
-        mujoco.MjSpec.from_file(str(path)).compile()

@@ -103,15 +103,3 @@ def test_tendons_and_activations_move_as_in_a_bare_loop():
             rows.append(data.sensordata.copy())  # of the step's beginning
         assert x[row].numpy() == pytest.approx(np.array(rows)[50::50], abs=1e-12)
     assert float((x[0] - x[1]).abs().min()) > 1e-3
-
-
-@pytest.mark.parametrize("name", ["servo", "hinge"])
-def test_an_action_sets_one_thing_where_joint_and_actuator_share_a_name(name):
-    control = by_hand(key=True, ctrl=0.2)
-    for called in (name, f"{name} control"):
-        actions = BoxActions([0.1], [0.3], names=[called])
-        x = held(name, start="home", actions=actions)
-        assert x == pytest.approx(control, abs=1e-12)
-    actions = BoxActions([0.1], [0.3], names=["hinge position"])
-    x = held(name, start="home", actions=actions)
-    assert x == pytest.approx(by_hand(key=True, qpos=0.2), abs=1e-12)

@@ -10,11 +10,7 @@ from mujoco import sysid
 from sbi.utils import BoxUniform
 
 from benchmarks.robots.models import SPRING_MASS
-from sbi_active.mujoco import (
-    belief_to_parameters,
-    from_sysid,
-    randomization,
-)
+from sbi_active.mujoco import belief_to_parameters, from_sysid, randomization
 
 if not hasattr(sysid, "Parameter"):
     pytest.skip(
@@ -90,7 +86,6 @@ def test_outcomes_are_what_sysid_predicts():
     robot = from_sysid(groups, params, noise=0.01)
     assert robot.simulator.parameter_names == ["mass", "gear"]
     assert [p.item() for p in robot.prior.base_dist.low] == pytest.approx([0.5, 0.5])
-    assert robot.trials is not None
     assert robot.trials.names == ("bare 0", "bare 1", "payload 0", "payload 1")
     residual_fn = sysid.build_residual_fn(models_sequences=groups)
     for theta in ([1.0, 1.0], [1.4, 0.8]):
@@ -132,7 +127,6 @@ def test_a_transform_acts_on_what_is_predicted():
     found, _, measured = residual_fn(theta, params.copy())
     rows = torch.tensor(theta)[None].expand(2, -1)
     x = robot.simulator.mean(rows, robot.actions.listed().double())
-    assert robot.trials is not None
     for k in range(2):
         (series,) = measured[k]
         residual = np.asarray(found[k]).reshape(len(series.times), -1)[:, 0]

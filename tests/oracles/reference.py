@@ -217,7 +217,6 @@ def found_proposal(own: Problem, num: int, rng: np.random.Generator) -> Students
         # Distinct draws: components would close in on repeated ones.
         u = np.unique(tempered.draws(num // 2, rng), axis=0)
         proposal = Students.fitted(u, wider=1.5)
-    assert best is not None
     return best[1]
 
 

@@ -163,7 +163,6 @@ def test_a_trial_that_failed_may_come_at_any_time(order):
         belief = refine(simulator, own.prior, action[:k], x[:k], past=past, seed=3)
         assert isinstance(belief, SimulatedBelief)
         past = belief.histories
-    assert belief is not None
     torch.manual_seed(0)
     found = Found(theta=belief.sample((5_000,)).double().numpy())
     assert not judged(own, answers()["invalid"], found).faults()

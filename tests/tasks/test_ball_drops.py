@@ -5,9 +5,7 @@ import torch
 
 from sbi_active.criticism import AugmentedSimulator
 from sbi_active.tasks import get_task  # pyright: ignore
-from sbi_active.tasks.ball_drops import (  # pyright: ignore
-    fall,
-)
+from sbi_active.tasks.ball_drops import fall  # pyright: ignore
 
 G, TIMES = 9.81, torch.linspace(0, 4, 61).double()
 LEVEL = torch.zeros(1, 2).double()

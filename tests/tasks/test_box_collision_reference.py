@@ -6,9 +6,7 @@ import torch
 from sbi_active import GaussianNoise, SimulatorModel
 
 pytest.importorskip("mujoco")
-from sbi_active.tasks.box_collision import (  # noqa: E402
-    BoxCollisionReference,
-)
+from sbi_active.tasks.box_collision import BoxCollisionReference  # noqa: E402
 
 SD = 0.02
 

@@ -5,10 +5,7 @@ from torch import Tensor
 from torch.distributions import Normal
 
 from sbi_active.tasks import get_task  # pyright: ignore
-from sbi_active.tasks.location_finding.model import (  # pyright: ignore
-    NOISE_SD,
-    mean,
-)
+from sbi_active.tasks.location_finding.model import NOISE_SD, mean  # pyright: ignore
 
 
 def normal(*shape: int, seed: int) -> Tensor:

@@ -130,32 +130,3 @@ def test_reading_interpolates_and_finds_when_the_motor_is_off(folder):
         [100.0, 0.0],
         [100.0, 1.0],
     ]
-
-
-# The closed loop
-
-
-def edited(folder, name, change):
-    table = pd.read_csv(folder / name)
-    change(table).to_csv(folder / name, index=False)
-    return folder
-
-
-@pytest.mark.parametrize(
-    ("name", "change", "message"),
-    [
-        ("samples.csv", lambda t: t.drop(columns="goal_rad"), "got no goal_rad among"),
-        ("trials.csv", lambda t: pd.concat([t, t]), "got trial 0 more than once"),
-        ("samples.csv", lambda t: t[t["trial"] == 0], "got none of trial 1"),
-        ("samples.csv", lambda t: t[t["time_s"] < 5], "got 4.999 s in trial 0"),
-        ("samples.csv", lambda t: t[::-1], "time_s that increases; got"),
-        (
-            "samples.csv",
-            lambda t: t.assign(position_rad=t["position_rad"].where(t.index != 3)),
-            "finite position_rad; got nan in sample 3 of trial 0",
-        ),
-    ],
-)
-def test_recordings_that_do_not_fit(folder, name, change, message):
-    with pytest.raises(ValueError, match=message):
-        read_recordings(edited(folder, name, change))

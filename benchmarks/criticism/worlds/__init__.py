@@ -1,7 +1,5 @@
 """Worlds whose truth is known."""
 
-from typing import Any
-
 from benchmarks.criticism.worlds import box, numerical, sliding_block
 from benchmarks.criticism.worlds.world import World
 
@@ -15,14 +13,11 @@ WORLDS = {
 }
 
 
-def get_world(name: str, **options: Any) -> World:
+def get_world(name: str) -> World:
     """Return a world by its letter.
 
     Args:
         name: "A" the numerical model, "B" the sliding block, "C" its trajectories,
             "D" the box collision.
-        options: Of the world, see its ``make_world``.
     """
-    if name not in WORLDS:
-        raise ValueError(f"expected a world among {[*WORLDS]}; got {name!r}; choose")
-    return WORLDS[name](**options)
+    return WORLDS[name]()

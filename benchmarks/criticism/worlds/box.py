@@ -9,11 +9,8 @@ by millimeters. Trials that end off the table have no outcome.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from typing import Any
-
-from torch.distributions import Distribution, HalfNormal, Independent, Normal
 
 from benchmarks.criticism.worlds.world import World, noise_inflation
 from sbi_active import DiscreteActions, SimulatorModel
@@ -26,15 +23,12 @@ BESIDE = ("viscosity", "speed gain", "center of mass", "force", "time stamp")
 DECLARED = (*HIDDEN, *BESIDE)
 
 
-def library(scale: float = 1.0) -> list[Effect]:
-    """Return the declared effects of the task, the scales of their priors multiplied.
-
-    That of the restitution, which is bounded, stays.
-    """
+def library() -> list[Effect]:
+    """Return the declared effects of the task."""
     from sbi_active.tasks.box_collision import make_effects
 
     found = {effect.name: effect for effect in make_effects()}
-    return [_rescaled(found[name], scale) for name in DECLARED]
+    return [found[name] for name in DECLARED]
 
 
 def make_world() -> World:
@@ -66,15 +60,3 @@ def make_world() -> World:
         hidden=HIDDEN,
         is_rough=True,
     )
-
-
-def _rescaled(effect: Effect, scale: float) -> Effect:
-    prior = getattr(effect.prior, "base_dist", None)
-    if scale == 1.0 or not isinstance(prior, Normal | HalfNormal):
-        return effect
-    wider: Distribution = (
-        HalfNormal(prior.scale * scale)
-        if isinstance(prior, HalfNormal)
-        else Normal(prior.loc, prior.scale * scale)
-    )
-    return replace(effect, prior=Independent(wider, 1))

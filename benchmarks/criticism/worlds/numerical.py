@@ -65,21 +65,21 @@ def response(
     return (x + power * 0.2 * xi.abs() ** 1.5)[:, None]
 
 
-def library(scale: float = 1.0) -> list[Effect]:
-    """Return the declared effects, the scales of their priors multiplied."""
+def library() -> list[Effect]:
+    """Return the declared effects."""
     return [
-        effect("bias", "observation", normal(5.0 * scale), shifted),
-        effect("gain", "observation", normal(0.2 * scale), stretched),
-        Effect.keyword("quadratic", prior=normal(1.0 * scale)),
-        effect("action offset", "action", normal(0.5 * scale), shifted),
-        effect("action gain", "action", normal(0.1 * scale), stretched),
+        effect("bias", "observation", normal(5.0), shifted),
+        effect("gain", "observation", normal(0.2), stretched),
+        Effect.keyword("quadratic", prior=normal(1.0)),
+        effect("action offset", "action", normal(0.5), shifted),
+        effect("action gain", "action", normal(0.1), stretched),
         effect(
             *("saturation", "observation", uniform(*LOG_LIMIT)),
             lambda x, phi, action, context: x.clamp(-phi.exp(), phi.exp()),
             units="log",
             null=torch.inf,
         ),
-        effect("drift", "observation", normal(1.0 * scale), drifted, units="a trial"),
+        effect("drift", "observation", normal(1.0), drifted, units="a trial"),
     ]
 
 

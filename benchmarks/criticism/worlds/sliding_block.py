@@ -172,18 +172,18 @@ SPEEDS = (1.0, 1.5, 2.0, 2.5, 3.0)  # m/s
 ALIASES = {"stribeck": frozenset({"speed gain", "speed offset"})}
 
 
-def library(scale: float = 1.0) -> list[Effect]:
-    """Return the declared effects, the scales of their priors multiplied."""
+def library() -> list[Effect]:
+    """Return the declared effects."""
     return [
-        Effect.keyword("quadratic drag", prior=half_normal(0.2 * scale), units="1/m"),
-        Effect.keyword("viscous drag", prior=half_normal(0.4 * scale), units="1/s"),
-        Effect.keyword("tilt", prior=normal(math.radians(2.0) * scale), units="rad"),
-        effect("speed gain", "action", normal(0.08 * scale), stretched),
-        effect("speed offset", "action", normal(0.1 * scale), shifted, units="m/s"),
-        effect("camera bias", "observation", normal(0.02 * scale), shifted, units="m"),
-        effect("camera scale", "observation", normal(0.05 * scale), stretched),
+        Effect.keyword("quadratic drag", prior=half_normal(0.2), units="1/m"),
+        Effect.keyword("viscous drag", prior=half_normal(0.4), units="1/s"),
+        Effect.keyword("tilt", prior=normal(math.radians(2.0)), units="rad"),
+        effect("speed gain", "action", normal(0.08), stretched),
+        effect("speed offset", "action", normal(0.1), shifted, units="m/s"),
+        effect("camera bias", "observation", normal(0.02), shifted, units="m"),
+        effect("camera scale", "observation", normal(0.05), stretched),
         Effect.keyword(
-            "time offset", prior=normal(0.03 * scale), units="s", family="observation"
+            "time offset", prior=normal(0.03), units="s", family="observation"
         ),
     ]
 
@@ -198,14 +198,9 @@ def outside() -> list[Effect]:
     ]
 
 
-def make_world(*, one_way: bool = False) -> World:
-    """Return world B.
-
-    Args:
-        one_way: Permit pushes in the positive direction only. A tilt is then a change
-            of both frictions, and nothing shows it.
-    """
-    speeds = SPEEDS if one_way else (*(-v for v in reversed(SPEEDS)), *SPEEDS)
+def make_world() -> World:
+    """Return world B."""
+    speeds = (*(-v for v in reversed(SPEEDS)), *SPEEDS)
     return World(
         name="B",
         model=SimulatorModel(
@@ -220,7 +215,6 @@ def make_world(*, one_way: bool = False) -> World:
         library=library,
         scatter=noise_inflation(2.0),
         outside=outside(),
-        equivalences=[frozenset({"none", "tilt"})] if one_way else [],
         aliases=ALIASES,
         formulas={"camera bias": frozenset({"1"}), "camera scale": frozenset({"x"})},
     )
@@ -230,13 +224,8 @@ TRAJECTORY = tuple(np.round(np.linspace(0.04, 2.0, 50), 2).tolist())  # s
 CORRELATIONS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98)
 
 
-def make_trajectories(*, assume_independent: bool = False) -> World:
-    """Return world C.
-
-    Args:
-        assume_independent: Tell the loop nothing of the time axis, so that it takes
-            the declared noise as independent.
-    """
+def make_trajectories() -> World:
+    """Return world C."""
     block = make_world()
     model = SimulatorModel(
         partial(slide, times=TRAJECTORY),
@@ -244,9 +233,5 @@ def make_trajectories(*, assume_independent: bool = False) -> World:
         parameter_names=block.model.parameter_names,
     )
     return replace(
-        block,
-        name="C",
-        model=model,
-        correlations=CORRELATIONS,
-        sample_times=() if assume_independent else TRAJECTORY,
+        block, name="C", model=model, correlations=CORRELATIONS, sample_times=TRAJECTORY
     )

@@ -34,8 +34,7 @@ class World:
         prior: Of theta.
         actions: The permitted ones.
         noise_sd: Of the real system, in the units of x.
-        library: ``library(scale)`` gives the effects declared to the loop, the scales
-            of their priors multiplied. Priors of bounded support stay as they are.
+        library: Function of the effects declared to the loop.
         scatter: Noise inflation, which is not an effect of the library.
         outside: Effects that the library lacks; their priors are the distributions of
             their strengths.
@@ -58,7 +57,7 @@ class World:
     prior: BoxUniform
     actions: DiscreteActions
     noise_sd: float
-    library: Callable[[float], list[Effect]]
+    library: Callable[[], list[Effect]]
     scatter: Effect
     outside: Sequence[Effect]
     equivalences: Sequence[frozenset[str]] = ()
@@ -72,7 +71,7 @@ class World:
     @property
     def effects(self) -> list[Effect]:
         """The declared library with the priors that the truth is drawn from."""
-        return self.library(1.0)
+        return self.library()
 
     def equivalent(self, name: str) -> frozenset[str]:
         """Return the names that count as one with a name, itself included."""

@@ -24,10 +24,7 @@ from benchmarks.misfit.machines.tanks import make_tanks
 #: Where the undeclared forms vanish, and their names for tuning and judging seeds.
 FORMS = {"A": (("sine", "bump"), ("step", "power"))}
 FORMS |= dict.fromkeys("BC", (("magnet",), ("stribeck", "edge_shift")))
-SPEED = {
-    "A": ("action offset", "saturation"),
-    "B": ("time offset", "speed offset"),
-}
+SPEED = {"A": ("action offset", "saturation"), "B": ("time offset", "speed offset")}
 SLOW = {"A": ("drift", "quadratic"), "B": ("quadratic drag", "tilt")}
 
 
@@ -43,11 +40,7 @@ def make_letter(letter: str, num_trials: int) -> Machine:
     forms, unseen = FORMS[letter]
 
     def fn(
-        theta: Tensor,
-        action: Tensor,
-        *,
-        hidden: Hidden | None = None,
-        **effects: Any,
+        theta: Tensor, action: Tensor, *, hidden: Hidden | None = None, **effects: Any
     ) -> Tensor:
         theta = theta.clone()
         for name, value in (hidden or {}).items():

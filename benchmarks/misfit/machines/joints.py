@@ -26,12 +26,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.misfit.machines.joint import Declared, Joint, row
-from benchmarks.misfit.machines.machine import (
-    Hidden,
-    Machine,
-    box,
-    uniform_rows,
-)
+from benchmarks.misfit.machines.machine import Hidden, Machine, box, uniform_rows
 
 GRAVITY = 9.81  # m/s^2
 NOISE_SD = 0.01  # rad, or m

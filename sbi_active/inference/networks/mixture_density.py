@@ -34,7 +34,7 @@ class MixtureDensity:
     Attributes:
         hidden_features: Width of each hidden layer.
         num_components: Number of Gaussian components K. Half loses .03 nats on 40
-            outcomes of an oscillator (the score of ``benchmarks cost.training``).
+            outcomes of an oscillator.
         num_iterations: Number of steps of gradient descent. Half loses .6 nats there,
             twice gains .3.
         batch_size: Number of rows a step. Half loses .2 nats there, twice gains .1.

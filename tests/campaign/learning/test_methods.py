@@ -6,18 +6,14 @@ import cloudpickle
 import pytest
 import torch
 
-from benchmarks.numerical.methods import faithful_options
-from sbi_active import CampaignOptions, MixtureDensity
+from sbi_active import MixtureDensity
 from sbi_active.campaign.learning.methods import METHODS
 from sbi_active.inference import LFIRE
 from tests.campaign.problem import OPTIONS, RATIOS, campaign, noisy
 from tests.campaign.sizes import REFINEMENT
 
 DENSITY = MixtureDensity(hidden_features=(16,), num_components=2, num_iterations=150)
-TRAINED = {
-    **dict.fromkeys(("asbi", "nsbi", "alhi", "nlhi"), DENSITY),
-    "seqbed": RATIOS,
-}
+TRAINED = {**dict.fromkeys(("asbi", "nsbi", "alhi", "nlhi"), DENSITY), "seqbed": RATIOS}
 QUICK = {**dict.fromkeys(TRAINED, OPTIONS.density_estimator), "seqbed": RATIOS}
 GAINS = {"asbi": "posterior", "alhi": "likelihood", "seqbed": "ratio"}
 
@@ -86,21 +82,3 @@ def test_faithful_seqbed_is_lfire():
     assert c.history[0].design.estimator == "RatioGain"
     assert c.history[0].action.tolist() == [3.0]
     assert abs(float(c.belief.mean) - 0.7) < 0.15
-
-
-def test_faithful_options():
-    options = CampaignOptions.faithful()
-    network = options.density_estimator
-    assert (network.num_iterations, network.batch_size) == (2_000, 50)
-    assert (network.hidden_features, network.num_components) == ((128, 128), 5)
-    assert options.num_samples // 2 == 1_000  # one half chooses: the paper's M
-    assert not options.refine
-    assert faithful_options("nsbi") == options
-    alhi = faithful_options("alhi")
-    assert alhi.estimator == "likelihood"
-    assert alhi.details.posterior == "kde"
-    assert alhi.density_estimator == MixtureDensity.faithful()
-    seqbed = faithful_options("seqbed")
-    assert isinstance(seqbed.density_estimator, LFIRE)
-    total = [o.num_simulations + 21 * o.num_samples for o in (alhi, seqbed)]
-    assert total == [52_000, 52_000]

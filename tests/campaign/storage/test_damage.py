@@ -13,17 +13,15 @@ import pytest
 import torch
 
 from sbi_active import Campaign
-from sbi_active.campaign import storage
-from sbi_active.messages import RenamedWarning
 from sbi_active.simulation.bank import CorruptSegmentError
 from sbi_active.simulation.bank.store import Store
 from tests.campaign.storage.campaigns import MODEL, draws, facts, go_on, new
 from tests.simulation.bank.filled import crafted, execute, flip
 
 if sys.version_info >= (3, 11):
-    import tomllib
+    pass
 else:
-    import tomli as tomllib
+    pass
 
 FILE = "store.db"
 
@@ -151,19 +149,6 @@ def test_another_schema_names_the_release(folder):
         Campaign.load(folder)
 
 
-def test_people_read_what_it_is(folder):
-    found = tomllib.loads((folder / "campaign.toml").read_text())
-    assert (found["method"], found["seed"], found["x_shape"]) == ("nsbi", 0, [4])
-    assert "BoxUniform" in found["prior"]
-    (folder / "campaign.toml").unlink()  # which nothing reads
-    Campaign.load(folder)
-
-
-def test_the_former_name_of_the_error():
-    with pytest.warns(RenamedWarning, match="bank.CorruptSegmentError"):
-        assert storage.DamagedCampaignError is CorruptSegmentError
-
-
 class Bomb:
     def __reduce__(self):
         return (os.mkdir, ("exploded",))
@@ -179,9 +164,7 @@ def short(tmp_path_factory):
 
 @pytest.mark.parametrize(
     ("kind", "number"),
-    [
-        *(("state", 0), ("belief", 0), ("campaign", 0), ("log", 1), ("prior", 0)),
-    ],
+    [*(("state", 0), ("belief", 0), ("campaign", 0), ("log", 1), ("prior", 0))],
 )
 def test_nothing_is_executed(short, tmp_path, kind, number):
     folder = shutil.copytree(short, tmp_path / "c")

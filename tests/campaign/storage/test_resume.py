@@ -1,15 +1,12 @@
 """Campaigns that go on from their directory, as if they had never been left."""
 
-import dataclasses
 import pickle
-import warnings
 from dataclasses import replace
 
 import pytest
 import torch
 
 from sbi_active import BoxActions, Campaign
-from sbi_active.messages import RenamedWarning
 from sbi_active.simulation.bank import Bank, LockedError
 from tests.campaign.storage.campaigns import (
     MODEL,
@@ -33,10 +30,7 @@ def counted(theta, action):
     return drawn(theta, action)
 
 
-@pytest.mark.parametrize(
-    ("method", "simulator"),
-    [("asbi", MODEL), ("nlhi", drawn)],
-)
+@pytest.mark.parametrize(("method", "simulator"), [("asbi", MODEL), ("nlhi", drawn)])
 def test_left_after_every_step(tmp_path, method, simulator):
     given = {"method": method, "simulator": simulator, "actions": [0.5, 1.0, 2.0]}
     whole = go_on(new(**given), 3)
@@ -196,35 +190,6 @@ def test_another_simulator_is_refused_or_not_forgotten_by_a_kill(tmp_path, told_
     assert torch.equal(draws(again), draws(anew))
 
 
-def test_options_and_actions_are_taken_as_by_the_constructor(tmp_path):
-    listed = [0.5, 1.0, 2.0]
-    whole = go_on(new(tmp_path / "c", actions=listed), 1)
-    whole.close()
-    fields = {f.name: getattr(OPTIONS, f.name) for f in dataclasses.fields(OPTIONS)}
-    again = Campaign.load(
-        tmp_path / "c", simulator=MODEL, options=fields, actions=listed
-    )
-    assert again.state.options == whole.state.options
-    assert again.actions.listed()[:, 0].tolist() == listed
-    assert torch.equal(draws(again), draws(whole))
-    with pytest.raises(TypeError, match="expected keywords of CampaignOptions among"):
-        Campaign.load(tmp_path / "c", simulator=MODEL, options={"rows": 3})
-    with pytest.raises(TypeError, match="expected an action space or a list"):
-        Campaign.load(tmp_path / "c", simulator=MODEL, actions="fast")
-
-
-def test_options_of_a_load_are_said_to_hold_for_one_process(tmp_path):
-    new(tmp_path / "c").close()
-    own = Campaign.load(tmp_path / "c").state.options
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        Campaign.load(tmp_path / "c", simulator=MODEL, options=own)
-    other = replace(own, num_samples=own.num_samples + 1)
-    with pytest.warns(UserWarning, match="hold for this process"):
-        Campaign.load(tmp_path / "c", simulator=MODEL, options=other)
-    assert Campaign.load(tmp_path / "c").state.options == own
-
-
 def price(action):
     return 1 + action[:, 0]
 
@@ -270,7 +235,9 @@ def test_adopted_effects_come_back(tmp_path):
     assert again.state.version.effects == ("bias",)
     assert torch.equal(draws(again), draws(campaign))
     assert draws(again).shape[1] == 3
-    go_on(again, 7)
+    again.attach([1.0], outcome(torch.tensor([1.0]), 7) + 1)
+    again.update()
+    assert again.history[-1].version == 1
 
 
 def test_a_bank_that_campaigns_share(tmp_path, caplog):
@@ -312,20 +279,3 @@ def test_a_pickled_copy_lives_in_memory(tmp_path):
     copy.tell([0.1] * 4, action=[1.0])
     assert len(campaign.history) == 1
     assert len(Campaign.load(tmp_path / "c").history) == 1
-
-
-def test_called_back_in_order(tmp_path):
-    seen = []
-    with pytest.warns(RenamedWarning, match="set .on_trial"):
-        campaign = new(
-            tmp_path / "c",
-            on_trial=lambda t: seen.append(("told", t.index, t.surprise)),
-        )
-    campaign.on_update = lambda t: seen.append(("updated", t.index, t.surprise is None))
-    go_on(campaign, 2)
-    assert seen == [
-        ("told", 0, None),
-        ("updated", 0, False),
-        ("told", 1, None),
-        ("updated", 1, False),
-    ]

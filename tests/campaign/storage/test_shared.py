@@ -12,12 +12,7 @@ from sbi_active.campaign.storage.codec import decode, encode
 from sbi_active.campaign.storage.directory import LogChangedError
 from sbi_active.simulation.bank import CorruptSegmentError, store
 from sbi_active.simulation.bank.store import Store
-from tests.campaign.storage.campaigns import (
-    facts,
-    go_on,
-    mean,
-    new,
-)
+from tests.campaign.storage.campaigns import facts, go_on, mean, new
 from tests.simulation.bank.filled import crafted, execute
 
 FILE = "store.db"

@@ -33,30 +33,8 @@ def test_values_are_held_on_the_finest_grid():
         [[1.0, 2.0, 3.0], [5.0, 6.0, 7.0, 8.0, 9.0]],
         [[0.0, 0.5, 1.0], [0.25, 0.5, 0.75, 1.0, 1.25]],
     )
-    assert found.inputs is not None
-    assert found.input_times is not None
     assert found.input_times.tolist() == [0, 0.25, 0.5, 0.75, 1.0, 1.25]
     assert found.inputs["input"].tolist() == [[1, 1, 2, 2, 3, 3], [5, 5, 6, 7, 8, 9]]
-
-
-def test_trials_that_begin_later_are_noted():
-    late = torch.stack([FINE, FINE + 0.3])
-    with pytest.warns(UserWarning, match="trials 1 begin up to 0.3 after the") as noted:
-        found = trials(torch.randn(2, 11), late, sample_times=late[:, [0, 5, 10]])
-    assert noted[0].filename == __file__
-    assert found.input_times is not None
-    assert len(found.input_times) == 14
-
-
-def test_values_are_drawn_as_lines_where_asked():
-    found = trials(
-        [[1.0, 2.0, 3.0], [5.0, 6.0, 7.0, 8.0, 9.0]],
-        [[0.0, 0.5, 1.0], [0.25, 0.5, 0.75, 1.0, 1.25]],
-        input_hold="linear",
-    )
-    assert found.inputs is not None
-    expected = [[1, 1.5, 2, 2.5, 3, 3], [5, 5, 6, 7, 8, 9]]
-    assert torch.allclose(found.inputs["input"], torch.tensor(expected).double())
 
 
 def test_inputs_may_have_clocks_of_their_own():
@@ -64,9 +42,7 @@ def test_inputs_may_have_clocks_of_their_own():
         {"u": [1.0, 2.0, 3.0], "v": torch.arange(5.0).expand(2, -1)},
         {"u": [0.0, 0.5, 1.0], "v": torch.linspace(0, 1, 5)},
     )
-    assert found.input_times is not None
     assert found.input_times.tolist() == [0, 0.25, 0.5, 0.75, 1]
-    assert found.inputs is not None
     assert found.inputs["u"].tolist() == [[1, 1, 2, 2, 3]] * 2
     assert found.inputs["v"].tolist() == [[0, 1, 2, 3, 4]] * 2
     with pytest.raises(ValueError, match="input_times of u; got those of v"):
@@ -78,24 +54,7 @@ def test_jitter_does_not_move_values():
     steps = np.arange(11) * 0.1
     late = steps + 1e-6 * np.array([0, 1, -1, 1, 0, -1, 1, 0, 0, 1, 0])
     found = trials(torch.arange(11.0).expand(2, -1), np.stack([steps, late]))
-    assert found.inputs is not None
     assert found.inputs["input"].tolist() == [[*range(11)]] * 2
-
-
-def test_a_selection_is_not_resampled_again():
-    found = trials(
-        [[1.0, 2.0, 3.0], [5.0, 6.0, 7.0, 8.0, 9.0]],
-        [[0.0, 0.5, 1.0], [0.25, 0.5, 0.75, 1.0, 1.25]],
-        role=["fit", "held out"],
-        start=torch.tensor([[1.0, 2.0], [3.0, 4.0]]),
-    )
-    assert found.held_out is not None
-    assert found.held_out.inputs is not None
-    assert found.inputs is not None
-    assert torch.equal(found.held_out.inputs["input"], found.inputs["input"][1:])
-    assert found.held_out.input_times is not None
-    assert torch.equal(found.held_out.input_times, found.input_times)
-    assert found.held_out.start.tolist() == [[3.0, 4.0]]
 
 
 def test_equal_inputs_make_repeats():
@@ -104,13 +63,6 @@ def test_equal_inputs_make_repeats():
     assert trials(torch.randn(2, 11)).repeat_of.tolist() == [-1, -1]
     other = Trials(torch.ones(2), X, inputs=torch.randn(2, 11), input_times=FINE)
     assert other.repeat_of.tolist() == [-1, -1]
-
-
-def test_start_states_by_name_and_by_row():
-    named = trials(torch.zeros(2, 11), start={"angle": [0.1, 0.2]})
-    assert named.start["angle"].tolist() == [0.1, 0.2]
-    assert named.select([1]).start["angle"].tolist() == [0.2]
-    assert trials(torch.zeros(2, 11), start=[0.1, 0.2]).start.shape == (2, 1)
 
 
 NAN = torch.zeros(2, 11).index_put(
@@ -132,27 +84,9 @@ BACK = FINE.clone().index_put((torch.tensor(3),), torch.tensor(0.1))
             {"inputs": torch.zeros(2, 11), "input_times": FINE / 1000},
             "x of trial 0 measured within the time of its input 'input', 0 to 0.001",
         ),
-        (
-            {
-                "inputs": torch.zeros(2, 11),
-                "input_times": torch.stack([FINE, 5000 + FINE]),
-                "sample_times": torch.stack([TIMES, 5000 + TIMES]),
-            },
-            "begin at similar times; got trial 1 of 1 .* 5000 after .* its own begin",
-        ),
-        ({"inputs": torch.zeros(2, 11), "start": [1.0]}, "start states of shape"),
-        (
-            {"inputs": torch.zeros(2, 11), "start": {"w": [1.0, torch.nan]}},
-            "'w' without a number in trials .1.",
-        ),
     ],
 )
 def test_bad_inputs(arguments, message):
-    keywords = {
-        "action": None,
-        "input_times": FINE,
-        "sample_times": TIMES,
-        **arguments,
-    }
+    keywords = {"action": None, "input_times": FINE, "sample_times": TIMES, **arguments}
     with pytest.raises(ValueError, match=message):
         Trials(x=X, **keywords)

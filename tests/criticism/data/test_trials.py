@@ -12,18 +12,9 @@ def test_ragged_trajectories_are_padded_and_masked():
     assert trials.mask.sum(1).tolist() == [3, 5]
 
 
-def test_a_mask_hides_numbers():
-    x = torch.ones(2, 3)
-    mask = torch.tensor([[True, False, True], [False, False, False]])
-    trials = Trials([1.0, 2.0], x, mask=mask)
-    assert trials.valid.tolist() == [True, False]
-    assert trials.mask.tolist() == mask.tolist()
-
-
 def test_roles_split_and_keep_indices():
     trials = Trials([1.0, 2.0, 3.0], [1.0, 2.0, 3.0], role=["fit", "held out", "fit"])
     assert trials.fit.index.tolist() == [0.0, 2.0]
-    assert trials.held_out is not None
     assert trials.held_out.action.tolist() == [[2.0]]
     assert trials[1:].role == ["held out", "fit"]
 
@@ -57,32 +48,6 @@ def test_names_are_one_each(names):
         Trials([1.0, 2.0], [1.0, 2.0], names=names)
 
 
-def test_messages_call_trials_by_their_names():
-    with pytest.warns(UserWarning, match="x is inf in trial late: taken"):
-        Trials([1.0, 2.0], [1.0, np.inf], names=["early", "late"])
-    with pytest.raises(ValueError, match="got NaN in trial late; hold out other"):
-        Trials(
-            *([1.0, 2.0], [1.0, np.nan]),
-            names=["early", "late"],
-            role=["fit", "held out"],
-        )
-    with pytest.raises(ValueError, match="in trial late; sort its samples by time"):
-        Trials(
-            *([1.0, 2.0], [[1.0, 2.0], [3.0, 4.0]]),
-            sample_times=[[0.0, 1.0], [1.0, 0.0]],
-            names=["early", "late"],
-        )
-
-
-def test_measurements_skip_gaps_within_a_trajectory_alone():
-    x = torch.tensor([[1.0, torch.nan, 3.0], [4.0, 5.0, 6.0]])
-    trials = Trials([0.0, 1.0], x, sample_times=[0.0, 0.5, 2.0])
-    m = Measurements.of(trials)
-    assert m.x.tolist() == [1, 3, 4, 5, 6]
-    assert m.gap.tolist() == [np.inf, 2.0, np.inf, 0.5, 1.5]
-    assert m.trial.tolist() == [0, 0, 1, 1, 1]
-
-
 def test_measurements_order_channels_before_times():
     x = torch.arange(12.0).reshape(2, 3, 2)  # trial, time, channel
     m = Measurements.of(Trials([0.0, 1.0], x, sample_times=[0.0, 1.0, 2.0]))
@@ -97,7 +62,6 @@ def test_measurements_order_channels_before_times():
     [
         (([1.0, 2.0], [1.0]), {}, "expected actions .* with as many rows"),
         (([1.0], [np.nan]), {}, "expected at least one valid trial"),
-        (([1.0, 2.0], [1.0, 2.0]), {"index": [0]}, r"expected index of shape \(2,\)"),
         (
             ([1.0, 2.0], [1.0, np.nan]),
             {"role": ["fit", "held out"]},
@@ -108,7 +72,6 @@ def test_measurements_order_channels_before_times():
             {"sample_times": [0.0, 1.0]},
             r"expected sample_times of shape \(3,\)",
         ),
-        (([1.0, 2.0], [[1.0], [[1.0, 2.0]]]), {}, "differ in their first axis alone"),
     ],
 )
 def test_bad_trials(arguments, keywords, message):

@@ -48,8 +48,6 @@ def test_numbers_of_a_table_become_si(where):
     frame = pd.DataFrame(ROWS, columns=names).assign(trial=1)
     with pytest.warns(ChangedWarning, match="action_v.* to rad/s, x_y.* to m, input_u"):
         trials = Trials.from_dataframe(frame, units=units)
-    assert trials.sample_times is not None
-    assert trials.inputs is not None
     assert trials.sample_times.flatten().tolist() == [0, pytest.approx(0.02)]
     assert trials.action.item() == pytest.approx(np.pi)
     assert trials.x.flatten().tolist() == pytest.approx([0.005, -0.002])

@@ -1,10 +1,9 @@
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import HalfNormal, Independent, Normal
+from torch.distributions import HalfNormal, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import (
@@ -15,6 +14,7 @@ from sbi_active.criticism import (
     joint_prior,
 )
 from sbi_active.simulation import simulate
+from tests.effects import effect
 
 PRIOR = BoxUniform(-torch.ones(2), torch.ones(2))
 ACTIONS = DiscreteActions(torch.linspace(-2, 2, 9))
@@ -26,16 +26,6 @@ def line(theta, action, curvature=0.0):
 
 
 MODEL = SimulatorModel(line, noise=GaussianNoise(0.1), parameter_names=["a", "b"])
-
-
-def effect(name="bias", **changes):
-    parts = {
-        "hook": "observation",
-        "prior": Normal(0.0, 1.0),
-        "null": 0.0,
-        "apply": lambda x, phi, action, context: x + phi,
-    }
-    return Effect(name, **(parts | changes))
 
 
 HOOKS = {
@@ -84,14 +74,6 @@ def test_at_the_null_it_is_the_simulator(hook):
     )
 
 
-def test_noise_effects_stretch_the_noise():
-    model = AugmentedSimulator(MODEL, [HOOKS["noise"]])
-    theta = torch.tensor([0.0, 0.0, 2.0]).repeat(4_000, 1)
-    x = model(theta, torch.zeros(4_000, 1), seeds=torch.arange(4_000))
-    # Standard error of a standard deviation of 0.3 from 4,000 draws: 0.3 / sqrt(8000).
-    assert float(x.std()) == pytest.approx(0.3, abs=4 * 0.3 / math.sqrt(8_000))
-
-
 @pytest.mark.parametrize(
     ("wrong", "size"),
     [
@@ -103,23 +85,6 @@ def test_an_effect_that_does_not_vanish_is_named_with_its_size(wrong, size):
     check = PRIOR.sample((16,)), ACTIONS.sample((16,), seed=0)
     with pytest.raises(ValueError, match=f"effect 'bias' to vanish.*up to {size}"):
         AugmentedSimulator(MODEL, [wrong], check=check)
-
-
-def test_without_actions_the_first_call_compares():
-    model = AugmentedSimulator(MODEL, [effect(null=0.5)])
-    with pytest.raises(ValueError, match="vanish at its null"):
-        model.mean(torch.zeros(3, 3), torch.ones(3, 1))
-
-
-def test_a_null_at_infinity():
-    saturation = effect(
-        "saturation",
-        null=torch.inf,
-        prior=Independent(HalfNormal(torch.ones(1)), 1),
-        apply=lambda x, phi, a, c: phi * torch.tanh(x / phi),
-    )
-    check = PRIOR.sample((16,)), ACTIONS.sample((16,), seed=0)
-    AugmentedSimulator(MODEL, [saturation], check=check)  # inf * tanh(0) is NaN
 
 
 def test_augmenting_twice_is_augmenting_with_both():
@@ -184,34 +149,6 @@ def test_generic_effects_vanish_and_are_scaled_by_noise_and_actions():
     assert "dead zone" in by_name
     one_way = generic_effects(MODEL, DiscreteActions([1.0, 2.0]))
     assert "dead zone" not in {e.name for e in one_way}
-
-
-def test_a_clock_offset_reads_the_trajectory_elsewhere():
-    times = torch.linspace(0, 2, 21)
-    model = SimulatorModel(
-        lambda theta, action: theta[:, :1] * times.to(theta),
-        noise=GaussianNoise(0.1),
-        sample_times=times,
-    )
-    clock = next(e for e in generic_effects(model, ACTIONS) if e.name == "clock offset")
-    x = AugmentedSimulator(model, [clock]).mean(
-        torch.tensor([[3.0, 0.05]]), torch.zeros(1, 1)
-    )
-    torch.testing.assert_close(x[0], 3 * (times + 0.05))
-
-
-def test_distinct_names():
-    with pytest.raises(ValueError, match="got bias more than once"):
-        AugmentedSimulator(MODEL, [effect(), effect()])
-    # Of "bias", "lag" and "bias + lag" two sets would print alike.
-    names = ["bias", "lag", "bias + lag"]
-    with pytest.raises(ValueError, match="got bias, lag more than once"):
-        AugmentedSimulator(MODEL, [replace(effect(), name=name) for name in names])
-
-
-def test_generic_effects_need_a_size():
-    with pytest.raises(ValueError, match="expected a simulator with declared noise"):
-        generic_effects(SimulatorModel(line), ACTIONS)
 
 
 def test_an_effect_through_keywords_of_the_simulator():

@@ -69,17 +69,6 @@ def test_a_second_derivative_and_channels_of_their_own_errors():
     assert ratio.tolist() == pytest.approx([1, 10])
 
 
-def test_phi_is_added_to_the_start_that_the_simulator_is_told():
-    trials, *_ = lines(3)
-    _, nuisance = start_from_first_samples(trials, {"place": 0}, within=0.5, sd=1.0)
-    told = {"start": {"place": torch.zeros(2), "load": torch.ones(2)}}
-    phi, context = torch.tensor([[0.5], [-1.0]]), Context(torch.zeros(2))
-    changed = nuisance.apply(told, phi, torch.zeros(2, 1), context)["start"]
-    assert changed["place"].tolist() == [0.5, -1.0]
-    assert changed["load"].tolist() == [1, 1]
-    assert nuisance.apply({}, phi, torch.zeros(2, 1), context) == {}
-
-
 def test_zeros_are_taken_from_x_and_are_left_by_the_sensor_alone():
     rng = np.random.default_rng(0)
     zero = torch.from_numpy(rng.normal(0, 50, (300, 1, 1)))
@@ -135,30 +124,6 @@ def test_a_loop_finds_what_a_start_at_rest_would_hide():
     draws = tracing.evidences["drag"].draws
     z = (draws.mean(0) - [2.3, 0.6]) / draws.std(0)
     assert (np.abs(z) < 3.5).all()
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"within": 0.05}, "0.05 of the first; got 1 .* which are 0.1 apart; pass"),
-        ({"start": {"level": 1}}, "axis from 0 to 0; got 1; number"),
-        ({"sd": 0.0}, "expected a standard deviation > 0 of the sensor; got 0.0"),
-    ],
-)
-def test_what_cannot_be_is_refused(options, message):
-    trials, *_ = lines(3)
-    options = {"start": {"level": 0}, "within": 0.5, "sd": SENSOR} | options
-    with pytest.raises(ValueError, match=message):
-        start_from_first_samples(trials, **options)
-
-
-def test_trials_without_times_or_names_are_refused():
-    alone = Trials([1.0, 2.0], torch.zeros(2, 3))
-    with pytest.raises(ValueError, match="expected trials with sample times"):
-        zero_from_first_samples(alone, within=1.0, sd=1.0)
-    named = Trials([1.0], torch.zeros(1, 20), sample_times=TIMES, start=[[1.0]])
-    with pytest.raises(ValueError, match="expected measured start states by name"):
-        start_from_first_samples(named, {"place": 0}, within=0.5, sd=1.0)
 
 
 def test_a_line_that_hides_gravity_is_said():

@@ -7,12 +7,7 @@ import torch
 from sbi.utils import BoxUniform
 
 from sbi_active import GaussianNoise, SimulatorModel
-from sbi_active.criticism import (
-    Context,
-    Criticism,
-    Trials,
-    generic_effects,
-)
+from sbi_active.criticism import Context, Criticism, Trials, generic_effects
 from sbi_active.criticism.effects.changes import delayed_input, played
 from tests.criticism.motor_world import GRID, MODEL, NOISE, PRIOR, measured, speed
 
@@ -44,19 +39,6 @@ def test_a_recording_has_an_actuator_and_a_sensor():
     assert not [e for e in effects if e.hook == "action"]
 
 
-def test_a_row_whose_size_is_not_known_is_left_out():
-    """A command that rests tells nothing of time, one of one sign of no dead zone."""
-    trials = measured(0, {})
-    trials.inputs = {"voltage": torch.ones(len(trials), len(GRID)).double()}
-    effects = generic_effects(MODEL, trials)
-    assert {e.name for e in effects if e.hook == "input"} == {
-        "input gain",
-        "input offset",
-        "input saturation",
-    }
-    assert "sensor saturation" not in {e.name for e in effects}
-
-
 def test_effects_travel_to_other_processes():
     x = torch.rand(4, 19).double()
     times = torch.linspace(0, 1, 19).double()
@@ -68,33 +50,11 @@ def test_effects_travel_to_other_processes():
             assert torch.equal(there.apply(*rows), effect.apply(*rows))
 
 
-def test_several_inputs_give_their_names():
-    trials = Trials(
-        torch.tensor([1.0, 2.0]),
-        torch.zeros(2, 3),
-        sample_times=[0.0, 1.0, 2.0],
-        inputs={"voltage": torch.randn(2, 21), "flow": torch.rand(2, 21)},
-        input_times=torch.linspace(0, 2, 21),
-        input_labels=["voltage [V]", "flow"],
-        action_labels=["mass [kg]"],
-    )
-    model = SimulatorModel(
-        lambda theta, action, *, inputs: theta * inputs["flow"][:, :3], noise=0.1
-    )
-    effects = {e.name: e for e in generic_effects(model, trials)}
-    assert {"voltage gain", "flow gain", "voltage dead zone"} <= {*effects}
-    assert "flow dead zone" not in effects  # it has one sign
-    assert effects["voltage offset"].units == "V"
-    assert effects["action offset"].units == "kg"
-
-
 def distorted(change):
     """Trials of a motor whose voltage is changed before it acts."""
     trials = measured(0, {}, num=5, held_out=0)
-    assert trials.inputs is not None
     real = {"voltage": change(trials.inputs["voltage"])}
     rows = len(trials)
-    assert trials.sample_times is not None
     x = speed(
         torch.tensor([[3.0, 0.3]]).double().expand(rows, -1),
         trials.action,

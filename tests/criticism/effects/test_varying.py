@@ -27,9 +27,7 @@ def trials_of(friction):
     torch.manual_seed(0)
     x = stopping(torch.stack([friction, torch.full((8,), 0.1)], 1), SPEED[:, None])
     return Trials(
-        SPEED,
-        x + 0.003 * torch.randn(x.shape),
-        action_labels=["speed [m/s]"],
+        SPEED, x + 0.003 * torch.randn(x.shape), action_labels=["speed [m/s]"]
     )
 
 
@@ -60,15 +58,3 @@ def test_parameters_stay_within_their_prior():
     torch.testing.assert_close(moved, expected)
     kept = effect.apply(theta.clone(), 0 * phi, action, None)
     assert torch.equal(kept, theta)
-
-
-def test_labels_constants_and_an_unknown_order_vary_nothing():
-    x = torch.zeros(4, 2)
-    constant = Trials(torch.ones(4), x, order="unknown")
-    assert varying_parameters(MODEL, PRIOR, constant) == []
-    two = Trials(torch.tensor([[1.0, 2.0], [2.0, 2.0]]), x[:2])
-    names = [e.name for e in varying_parameters(MODEL, PRIOR, two)]
-    assert names == [
-        *("friction by action 1", "friction by trial"),
-        *("delay by action 1", "delay by trial"),
-    ]

@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 import torch
-from sbi.utils import BoxUniform
 from scipy.stats import multivariate_normal
 from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.evidence.settings import THOROUGH, settings_of
 from sbi_active.criticism.results import ModelKey
+from sbi_active.inference.engine import infer, search
 from tests.effects import on_outcomes
 
 PRIOR = Independent(Normal(torch.zeros(2), torch.tensor([2.0, 1.0])), 1)
@@ -61,17 +62,6 @@ def test_importance_sampling_gives_the_evidence(names):
     )
 
 
-def test_no_parameters_are_simulated_twice():
-    sets = rivals()
-    rival, scattered = sets.rival(ModelKey()), sets.rival(ModelKey(error="scatter"))
-    u = rival.coordinates.sample(7, seed=3)
-    before = sets.simulator.num_simulations
-    first = rival.residual(u)[0]
-    again = scattered.residual(np.concatenate([u[::-1], u[:2]]))[0]
-    assert sets.simulator.num_simulations == before + 7 * len(X)
-    np.testing.assert_array_equal(again, first[[6, 5, 4, 3, 2, 1, 0, 0, 1]])
-
-
 def test_scatter_sums_out_the_inflation():
     evidence = rivals().fit(ModelKey(error="scatter")).evidence
     factors = 1 + 2.5 * np.abs(np.random.default_rng(0).normal(size=4_000))
@@ -109,19 +99,6 @@ def test_a_curved_ridge_has_the_right_evidence():
     )
 
 
-def test_the_order_of_a_few_trials_is_no_structure():
-    def order(num, kind="known"):
-        line = SimulatorModel(lambda theta, xi: theta * xi, noise=GaussianNoise(0.5))
-        prior = BoxUniform(-torch.ones(1), torch.ones(1))
-        return RivalSet(
-            line, prior, Trials(ACTION[:num], X[:num], order=kind), []
-        ).scaled_order()
-
-    assert order(4) is None
-    assert order(5, "unknown") is None
-    np.testing.assert_allclose(order(5), [0, 0.25, 0.5, 0.75, 1])
-
-
 def test_the_posterior_is_the_exact_one():
     evidence = rivals().fit().evidence
     design = np.stack([XI**0, XI], 1)
@@ -133,3 +110,17 @@ def test_the_posterior_is_the_exact_one():
     error = 4 * sd * np.sqrt(1 / 100 + 1 / 400)
     assert np.all(np.abs(evidence.draws.mean(0) - mean) < error)
     assert np.all(np.abs(evidence.draws.std(0) - sd) < error)
+
+
+def inferred(seed=0, **given):
+    rival, rng = rivals().rival(ModelKey()), np.random.default_rng(seed)
+    found = search(rival, rng, settings=THOROUGH)
+    vars(rival).update(given)
+    return infer(rival, rng, found=found, settings=settings_of(8, is_bare=False))
+
+
+def test_the_standard_error_claims_what_repeated_runs_show():
+    found = [inferred(seed) for seed in range(20)]
+    gap = np.array([f.log_evidence for f in found]) - MODELS[()]
+    claimed = np.mean([f.standard_error for f in found])
+    assert 0.5 * claimed < np.sqrt((gap**2).mean()) < 1.7 * claimed

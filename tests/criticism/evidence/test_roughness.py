@@ -124,3 +124,20 @@ def test_a_random_simulator_is_not_merged():
     theta = torch.zeros(64, 2)
     x = model.evaluate(theta, {}, torch.ones(64, 1), merge=True)
     assert len(x.unique()) > 32
+
+
+def test_jumps_far_from_the_fit_are_none_there():
+    def curve(theta, action):
+        rough = torch.round(20 * theta) / 20
+        return torch.where(theta.abs() > 0.5, rough, theta) * action
+
+    prior = Independent(Normal(torch.zeros(1), 2 * torch.ones(1)), 1)
+    model = SimulatorModel(curve, noise=GaussianNoise(0.01))
+    action = torch.linspace(1, 2, 8)[:, None]
+    some = RivalSet(model, prior, Trials(action, 0.1 * action), [])
+    assert some.is_smooth
+    assert not some.roughness.any()
+    assert some.step <= 1e-3
+    # The same where the fit is among the jumps.
+    other = RivalSet(model, prior, Trials(action, 1.523 * action), [])
+    assert not other.is_smooth

@@ -81,15 +81,6 @@ def test_residuals_far_beyond_the_declared_error_are_told():
     assert not any("declared error" in w for w in right.diagnostics.warnings)
 
 
-def test_gaps_and_a_single_log_will_do():
-    x = recorded()[2:3]
-    x[0, 30:50, 0] = torch.nan
-    belief = identify(model(), PRIOR, Trials(ACTION[2:3], x))
-    for (low, high), truth in zip(belief.interval(0.999).values(), TRUTH, strict=True):
-        assert low < truth < high
-        assert high - low < 0.2
-
-
 @pytest.mark.parametrize(("low", "high", "side"), [(0.6, 1.0, -1), (0.0, 0.05, 1)])
 def test_an_interval_at_a_bound_is_one_sided_and_has_a_width(low, high, side):
     """Logs that ask for what is far beyond a bound say nothing of what is within.
@@ -162,26 +153,6 @@ def test_trials_that_disagree_widen_it():
     alike = identify(model(), PRIOR, trials, settings=IdentifySettings(wider=0.0))
     one, two = alike.interval()["frequency"]
     assert two - one < 0.2 * (high - low)
-
-
-def test_what_it_does_not_take():
-    trials = Trials(ACTION, recorded())
-    noisy = model(fn=lambda t, a: mean(t, a) + 0.1 * torch.randn(len(t), 120, 2))
-    with pytest.raises(ValueError, match="deterministic simulator; got a random"):
-        identify(noisy, PRIOR, trials)
-    flat = SimulatorModel(lambda t, a: t[:, :2] * a, noise=GaussianNoise(0.1))
-    with pytest.raises(ValueError, match="trajectories with sample times"):
-        identify(flat, PRIOR, Trials(ACTION, ACTION * TRUTH[:2]))
-    x = recorded()
-    x[..., 1] = torch.nan
-    with pytest.raises(ValueError, match="got none in channel 1; leave it out"):
-        identify(model(), PRIOR, Trials(ACTION, x))
-    silent = model(GaussianNoise(torch.tensor([0.02, 0.0])))
-    with pytest.raises(ValueError, match="above 0 in each channel; got 0.02, 0;"):
-        identify(silent, PRIOR, trials)
-    belief = identify(model(), PRIOR, trials)
-    with pytest.raises(ValueError, match="between 0 and 1; got 95"):
-        belief.interval(95)
 
 
 def test_a_prior_of_any_shape_counts():

@@ -8,13 +8,10 @@ from torch.distributions import Independent, Normal, Uniform
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
-from sbi_active.criticism.linear.fits import along_secants
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.sensor import sensor_of
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.tracing import log_priors
-from tests.criticism.misfit.oscillator import EFFECTS as OSCILLATOR
-from tests.criticism.misfit.oscillator import MODEL, PRIOR, trials
 
 SENSOR, NUM_TRIALS, LIMIT, SLOPE = 0.5, 14, 14.0, 2.0
 
@@ -65,42 +62,9 @@ def test_parameters_beside_an_effect_without_a_null_are_looked_for_anew():
         summaries=0,
     )
     sensor = sensor_of(loop.rivals)
-    assert sensor is not None
     search = Search(loop.rivals, sensor, log_priors(loop.effects, ()))
     search.fit_singles()
     alone = search.found[ModelKey(("drift",))].model.rms
     both = search.fit_set(ModelKey(("limit", "drift"))).model.rms
     assert alone > 5
     assert both < 1 + 3 / np.sqrt(2 * NUM_TRIALS)
-
-
-def test_a_set_whose_fit_was_lost_is_fitted_again_from_its_part(monkeypatch):
-    """A friction that holds the machine still has no slope that leads back."""
-    loop = Criticism(MODEL, PRIOR, trials(cubic=0.5), effects=OSCILLATOR, seed=0)
-    sensor = sensor_of(loop.rivals)
-    assert sensor is not None
-    search = Search(loop.rivals, sensor, log_priors(loop.effects, ()))
-    search.fit_singles()
-    part = search.found[ModelKey(("cubic",))].model
-    faint, again = search._faint, []
-
-    def lost(rival, u, *arguments, **options):
-        if again:
-            return along_secants(rival, u, *arguments, **options)
-        u = u.copy()
-        u[:, rival.columns()["friction"]] = 20.0
-        return u, (rival.residual(u)[0] ** 2).sum(1)
-
-    def from_its_part(key, parent):
-        again.append(parent)
-        u = faint(key, parent)
-        assert (u[search.columns(key, parent)] == part.u).all()
-        return u
-
-    for module in ("search", "fits"):
-        name = f"sbi_active.criticism.linear.{module}.along_secants"
-        monkeypatch.setattr(name, lost)
-    monkeypatch.setattr(search, "_faint", from_its_part)
-    both = search.fit_set(ModelKey(("cubic", "friction"))).model
-    assert again == [ModelKey(("cubic",))]
-    assert both.rms <= part.rms * (1 + 1e-6)

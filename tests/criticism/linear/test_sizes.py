@@ -9,7 +9,7 @@ from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.steps.equivalence import MANY
 
-TIMES = torch.linspace(0, 2, 60)
+TIMES = torch.linspace(0, 2, 30)
 PRIOR = BoxUniform(torch.tensor([-2.0]), torch.tensor([2.0]))
 
 

@@ -36,11 +36,6 @@ def test_effects_closer_than_the_noise_are_nearly_the_same():
     assert near_aliases(rivals(X, twin(0.3)), ACTIONS) == (PAIR,)
 
 
-def test_what_is_listed_already_is_left_out():
-    group = frozenset({*PAIR, "kink"})
-    assert near_aliases(rivals(X, twin(0.3)), ACTIONS, [group]) == ()
-
-
 def test_effects_apart_by_more_over_the_permitted_actions_are_not():
     # Between the trials at hand they hardly differ; beyond them they do.
     other = on_outcomes(

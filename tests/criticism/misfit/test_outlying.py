@@ -10,7 +10,7 @@ SLIP = 1.0
 
 
 def loop(own):
-    return Criticism(MODEL, PRIOR, own, effects=EFFECTS, seed=0)
+    return Criticism(MODEL, PRIOR, own, effects=EFFECTS[2:], seed=0)
 
 
 def test_it_is_named_and_has_no_part_in_the_verdict():

@@ -10,7 +10,7 @@ from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.predictive import predict
 
-SENSOR, NUM, SAMPLES = 0.01, 12, 30
+SENSOR, NUM, NUM_HELD, SAMPLES = 0.01, 12, 4, 30
 TIMES = torch.linspace(0.1, 3.0, SAMPLES, dtype=torch.float64)
 PRIOR = Normal(torch.tensor([2.0]), torch.tensor([0.7]))
 PRIOR = torch.distributions.Independent(PRIOR, 1)
@@ -39,15 +39,15 @@ MODEL = SimulatorModel(
 )
 
 
-def trials(num_held=4, **effects):
+def trials(**effects):
     rng = np.random.default_rng(1)
-    num = NUM + num_held
+    num = NUM + NUM_HELD
     action = torch.from_numpy(rng.uniform(1, 4, (num, 1)))
     start = torch.from_numpy(rng.normal(0, 0.5, num))
     theta = torch.full((num, 1), 2.3, dtype=torch.float64)
     x = level(theta, action, start=start, **effects)
     x = x + SENSOR * torch.from_numpy(rng.normal(size=x.shape))
-    role = ["fit"] * NUM + ["held out"] * num_held
+    role = ["fit"] * NUM + ["held out"] * NUM_HELD
     return Trials(action, x, sample_times=TIMES, role=role), start
 
 
@@ -72,70 +72,11 @@ def test_the_cause_is_found_beside_start_states(found):
 def test_a_held_out_trial_tells_of_its_start_by_its_first_samples(found):
     criticism, own, start = found
     tracing, held = criticism.trace(), own.held_out
-    report = criticism.report(plan=False)
-    assert "draw start from the prior" not in str(report)
     error = tracing.misfit.of(tracing.model).held_out[0]
     blind = loop(own)
     far = blind.trace().misfit.of(blind.trace().model).held_out[0]
     assert error < 0.5 * far
-    text = " ".join(str(blind.report(plan=False)).split())
-    assert "trials that were not fitted draw start from the prior" in text
     # What was used to find the start is not scored.
     p = predict(criticism.rivals, held, key=ModelKey(("drag",)))
     assert len(p.position) == 4 * (SAMPLES - 6)
     assert {int(i) % SAMPLES for i in p.position} == {*range(6, SAMPLES)}
-
-
-def test_start_states_are_those_of_least_squares(found):
-    """Drawn given the first samples, against a search over the start alone."""
-    from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
-    from sbi_active.criticism.steps.nuisances import conditioned
-
-    criticism, own, start = found
-    criticism.trace()
-    rivals = criticism.rivals
-    fit = rivals.fit(ModelKey(("drag",)))
-    u = fit.sample.u[:40]
-    simulator = TrialSimulator(rivals.simulator.model, own.held_out)
-    rng = np.random.default_rng(0)
-    theta, phi = conditioned(rivals, fit, u, simulator, rng)
-    drawn = phi["start"][..., 0].numpy()
-    grid = torch.linspace(-2, 2, 2001, dtype=torch.float64)
-    middle, drag = float(theta.mean()), float(phi["drag"].mean())
-    for t in range(4):
-        action = own.held_out.action[t].expand(len(grid), -1)
-        x = level(
-            torch.full((len(grid), 1), middle).double(), action, start=grid, drag=drag
-        )
-        square = ((x - own.held_out.x[t])[:, :6] ** 2).sum(1)
-        best = float(grid[int(square.argmin())])
-        assert drawn[:, t].mean() == pytest.approx(
-            best, abs=4 * drawn[:, t].std() + 0.01
-        )
-        assert drawn[:, t].std() < 0.1
-
-
-def test_left_out_trials_tell_of_their_starts_too(found):
-    criticism, *_ = found
-    table = criticism.trace().misfit
-    assert table.of("drag").left_out[0] < 0.5 * table.of("none").left_out[0]
-    own, _ = trials(num_held=0, drag=1.2, hidden=HIDDEN)
-    rmse = loop(own, warm_up=0.55).evaluate().table.set_index("metric").loc["rmse"]
-    assert rmse["after"] == pytest.approx(table.of("drag").left_out[0], rel=0.3)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"warm_up": -1.0}, "expected warm_up >= 0; got -1"),
-        ({"warm_up": 3.0}, "expected trials longer than warm_up = 3; got 2.9"),
-    ],
-)
-def test_a_warm_up_that_cannot_be(options, message):
-    with pytest.raises(ValueError, match=message):
-        loop(trials()[0], **options)
-
-
-def test_a_warm_up_needs_nuisances():
-    with pytest.raises(ValueError, match="effects of scope 'trial' with warm_up = 0.5"):
-        Criticism(MODEL, PRIOR, trials()[0], effects=[DRAG], warm_up=0.5)

@@ -6,19 +6,14 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import HalfNormal, Normal
+from torch.distributions import HalfNormal
 
-from sbi_active import BoxActions, GaussianNoise, SimulatorModel
+from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces import force_effects
-from sbi_active.criticism.linear.search import Search
-from sbi_active.criticism.linear.sensor import sensor_of
-from sbi_active.criticism.misfit.record import traced
-from sbi_active.criticism.misfit.verdict import judge
-from sbi_active.criticism.results import OUTLIER, SCATTER, UNEXPLAINED, ModelKey
+from sbi_active.criticism.results import SCATTER, UNEXPLAINED, ModelKey
 from sbi_active.criticism.steps.detection import REFUTED
-from sbi_active.criticism.steps.tracing import log_priors
 from tests.criticism.forces.test_forces import MODEL, PRIOR, SD, measured
 from tests.criticism.misfit.oscillator import EFFECTS
 from tests.criticism.misfit.oscillator import MODEL as OSCILLATOR
@@ -26,26 +21,10 @@ from tests.criticism.misfit.oscillator import PRIOR as RATES
 from tests.criticism.misfit.oscillator import trials as oscillations
 from tests.effects import BIAS
 
-SOME = ("sin 2q*", "q^3*", "v|v|*", "cos 6 pi t*")
-
-
-def few_of(trials, effects):
-    rivals = RivalSet(MODEL, PRIOR, trials, effects, seed=0)
-    sensor = sensor_of(rivals)
-    return Search(rivals, sensor, log_priors(rivals.library, ()))
-
 
 @pytest.fixture(scope="module")
 def hidden():
     return measured("sin 2q", 0.5, seed=1)
-
-
-@pytest.fixture(scope="module")
-def few(hidden):
-    effects = force_effects(MODEL, PRIOR, hidden, joints=["hinge"], include=SOME)
-    found = few_of(hidden, effects)
-    found.fit_singles()
-    return found
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +35,10 @@ def loop(hidden):
 
 def test_a_verdict_takes_a_few_thousand_simulated_trials(loop):
     tracing = loop.trace()
-    assert tracing.verdict.endswith("of hinge")
+    assert len(tracing.chosen) == 1
+    in_q = {e.name for e in loop.effects if e.family == "force in q of hinge"}
+    assert tracing.verdict in in_q
+    assert sum(p for k, p in tracing.probabilities.items() if k in in_q) > 0.9
     assert loop.rivals.simulator.num_simulations < 10_000
     assert tracing.evidences[tracing.verdict].engine == "linear"
     assert tracing.p_value > 0.01
@@ -82,28 +64,6 @@ def test_one_that_does_not_lower_the_error_is_withdrawn(loop):
     assert loop.judged(evaluation).chosen == loop.trace().chosen
 
 
-def test_a_stand_in_is_called_one(loop):
-    loop.trace()
-    evaluation = replace(loop.evaluate(), p_value=1e-4)
-    assert loop.judged(evaluation).stand_in == (
-        "that of held-out trials has p = 0.0001",
-    )
-    assert loop.judged(replace(evaluation, p_value=0.5)).stand_in == ()
-
-
-def test_a_gross_error_of_one_trial_is_found_without_simulations(few):
-    trials = measured(seed=4)
-    x = trials.x.clone()
-    x[3] += 0.05
-    wrong = few_of(
-        Trials(trials.action, x, sample_times=trials.sample_times),
-        list(few.rivals.effects.values()),
-    )
-    tracing = traced(judge(wrong), None)
-    assert tracing.verdict == OUTLIER
-    assert next(iter(tracing.outliers)) == 3.0
-
-
 @pytest.fixture(scope="module")
 def biased():
     """A small library with an effect on the noise, and a missing bias."""
@@ -127,24 +87,6 @@ def test_linear_evidence_is_that_of_samples(biased):
     linear = [tracing.evidences[k].log_evidence for k in ("none", "bias")]
     # The bare model, hundreds of nats behind, is linear no more: hence the share.
     assert np.diff(linear) == pytest.approx(np.diff(sampled), abs=1.0, rel=0.01)
-
-
-def test_an_effect_on_the_noise_has_an_evidence_beside_the_others(biased):
-    found = biased.trace()
-    assert found.inclusion["louder"] < 0.05
-    assert "louder" in [e.name for e in found.estimates]
-
-
-@pytest.mark.slow
-def test_the_next_action_is_told_within_the_range_tried_and_beyond_it(hidden):
-    effects = force_effects(MODEL, PRIOR, hidden, joints=["hinge"])
-    actions = BoxActions([-2.4, 0.0], [2.4, 3.0])
-    loop = Criticism(MODEL, PRIOR, hidden, effects=effects, actions=actions, seed=0)
-    found = loop.next_action()
-    assert len(found.separates) > 1  # several forms of a force in q
-    tried = hidden.action[:, 0].abs().max()
-    assert abs(found.within[0]) <= tried < abs(found.beyond[0])
-    assert found.beyond_gain > found.within_gain  # forms part far from rest
 
 
 def test_what_is_asked_first_does_not_matter():
@@ -206,33 +148,6 @@ LOUDER = Effect(
 )
 
 
-def test_outcomes_are_told_however_large_the_library():
-    """A ball that flies too far is not seen, without a time axis."""
-
-    def seen(theta, action):
-        x = theta * action
-        return x.where(x.abs() < 3, torch.nan)
-
-    def turned(k):
-        return Effect(
-            f"turned {k}",
-            hook="action",
-            prior=Normal(0.0, 0.5),
-            null=0.0,
-            apply=lambda a, phi, action, context: a + phi * torch.cos(k * a),
-        )
-
-    action = torch.linspace(-2, 2, 20, dtype=torch.float64)[:, None]
-    error = torch.randn(20, 1, generator=torch.manual_seed(0)).double()
-    trials = Trials(action, seen(2.0, action + 0.4 * torch.cos(3 * action)) + error / 9)
-    model = SimulatorModel(seen, noise=GaussianNoise(1 / 9))
-    prior = BoxUniform(torch.zeros(1), 5 * torch.ones(1))
-    loop = Criticism(model, prior, trials, effects=[turned(k) for k in range(25)])
-    tracing = loop.trace()
-    assert loop.rivals.can_fail
-    assert tracing.verdict == "turned 3"
-
-
 @pytest.mark.parametrize(
     ("size", "effects", "verdict"),
     [
@@ -247,7 +162,6 @@ def test_a_larger_noise_is_chosen_again_without_each_trial(size, effects, verdic
     assert tracing.verdict == verdict
     assert tracing.evidences[verdict].engine == "linear"
     evaluation = loop.evaluate()
-    assert evaluation is not None
     assert evaluation.selected.count(verdict) > 12
     rows = evaluation.table.set_index("metric")
     assert rows.loc["log predictive density", "ratio"] > 1

@@ -5,14 +5,14 @@ from dataclasses import replace
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import Independent, Normal
+from torch.distributions import Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
-from sbi_active.criticism import Criticism, Effect, Trials
-from sbi_active.criticism.next_trial.candidates import simulated
+from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.next_trial.next_action import PredictedRival, choose_action
 from sbi_active.criticism.results import ModelKey
 from sbi_active.design.estimators.model_index import ModelIndexGain, RivalSampler
+from tests.effects import on_outcomes
 
 NOISE = 0.1
 PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
@@ -23,18 +23,10 @@ MODEL = SimulatorModel(
 )
 
 
-def normal(sd):
-    return Independent(Normal(torch.zeros(1), torch.full((1,), sd)), 1)
-
-
-def effect(name, apply):
-    return Effect(name, hook="observation", prior=normal(1.0), null=0.0, apply=apply)
-
-
 #: Forward, a slope by distance is a slope.
-TILT = effect("tilt", lambda x, phi, action, context: x + phi * action.abs())
-BIAS = effect("bias", lambda x, phi, action, context: x + phi)
-GAIN = effect("gain", lambda x, phi, action, context: x * (1 + phi))
+TILT = on_outcomes("tilt", lambda x, phi, action, context: x + phi * action.abs())
+BIAS = on_outcomes("bias", lambda x, phi, action, context: x + phi)
+GAIN = on_outcomes("gain", lambda x, phi, action, context: x * (1 + phi))
 
 
 def criticism(action, x, effects, actions, seed=0):
@@ -97,7 +89,6 @@ def test_pushed_one_way_the_other_way_separates_a_tilt():
     c = criticism(action, 0.7 * torch.tensor(action), [TILT], FORWARD)
     chosen = c.next_action()
     assert frozenset({"none", "tilt"}) in chosen.inseparable
-    assert chosen.outside is not None
     assert float(chosen.outside[0]) < 0
     assert {*chosen.outside_separates} == {"none", "tilt"}
     assert chosen.outside_gain > 0.1
@@ -117,7 +108,6 @@ def test_pushed_both_ways_the_other_way_is_chosen():
     action = [1.0, 2.0, 3.0, 2.0, 1.5]
     c = criticism(action, 0.7 * torch.tensor(action), [TILT], BOTH)
     chosen = c.next_action()
-    assert chosen.action is not None
     assert float(chosen.action[0]) < 0
     assert chosen.inseparable == ()
     assert chosen.outside is None
@@ -147,14 +137,3 @@ def test_a_simulator_that_fails_outside_its_range_names_nothing():
     chosen = c.next_action()
     assert chosen.action is None
     assert chosen.outside is None or float(chosen.outside[0]) > 0
-
-
-def test_there_is_nothing_beyond_labels():
-    one = torch.ones(3)
-    own = Trials(None, 0.7 * one, start={"place": one})
-    model = SimulatorModel(
-        lambda theta, xi, *, start: theta * start["place"][:, None],
-        noise=GaussianNoise(NOISE),
-    )
-    c = Criticism(model, PRIOR, own, effects=[BIAS])
-    assert len(simulated(c.rivals, torch.tensor([[3.5]]))) == 0

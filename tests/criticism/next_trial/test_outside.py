@@ -23,8 +23,3 @@ def test_extrapolated_actions_keep_their_sign_where_there_is_one(values, farthes
         assert float(found.min()) >= 0
     if max(values) <= 0:
         assert float(found.max()) <= 0
-
-
-def test_a_single_action_has_nothing_beyond():
-    actions = DiscreteActions([2.0])
-    assert len(extrapolated(actions, actions.values, limit=4)) == 0

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import Independent, Normal
 
-from sbi_active import BoxActions, DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism import Criticism, Trials, generic_effects
 from sbi_active.criticism.next_trial.candidates import extrapolated
@@ -61,35 +60,15 @@ def aliased():
     return pushed()
 
 
-@pytest.mark.slow
-def test_left_out_trials_are_less_sure_of_an_alias():
-    tracing = pushed().trace()
-    assert tracing.verdict == "action gain + sensor gain"
-    assert tracing.misfit is not None
-    ends = tracing.evidences[tracing.verdict]
-    at = ends.names.index("length")
-    mean, sd = ends.draws[:, at].mean(), ends.draws[:, at].std()
-    # Left-out trials know nothing of what both gains hide: twice as wide as by evidence
-    # alone, which is 10 deviations off and more, and still about a wrong length.
-    assert 5 * sd < abs(mean - 1.0) < 10 * sd
-
-
 def test_a_confident_alias_is_told_as_what_it_is(aliased):
     report = aliased.report(evaluate=False)
     assert report.verdict == "action gain + sensor gain"
     assert report.probabilities[report.verdict] > 0.84  # the most that two can have
     length = report.parameters.set_index("parameter").loc["length"]
     assert abs(length["after"] - 1.0) > 5 * length["after_sd"]  # confident, and wrong
-    text = " ".join(str(report).split())
-    assert "stop" not in str(report).lower()
-    assert "P holds among the declared effects alone" in text
-    shift = length["after"] - length["before"]
-    far = abs(shift) / length["before_sd"]
-    moved = f"length by {shift:+.3g} to {length['after']:.3g} ({far:.2g} of its"
-    assert (moved in text) == (far >= 1)  # else it is no move to speak of
-    assert "No other action was tried than these 8: angle from 0.2 to 1.2 rad" in text
-    assert "put to the test most at angle = 1.2 rad" in text
-    assert "beyond the permitted range at angle = 1.7 rad" in text
+    assert "P holds among the declared effects alone" in " ".join(str(report).split())
+    tested = [float(t.action[0]) for t in report.severe_tests]
+    assert tested == pytest.approx([1.2, 1.7])  # the second is not permitted
 
 
 def test_the_verdict_fails_most_where_it_is_put_to_the_test(aliased):
@@ -114,10 +93,6 @@ def _missed(criticism, action):
     return float(
         np.sqrt(((truth(action[None].double())[0].numpy() - mean) ** 2).mean())
     )
-
-
-def normal(sd):
-    return Independent(Normal(torch.zeros(1), torch.full((1,), sd)), 1)
 
 
 SPEEDS = DiscreteActions([1.0, 1.5, 2.0, 2.5, 3.0])
@@ -167,22 +142,3 @@ def test_a_simulator_that_fails_beyond_its_range_is_tested_within():
     c = line(1.0, forward)
     [only] = severe_tests(c.rivals, c.trace(), SPEEDS)
     assert only.is_permitted
-
-
-def test_a_box_of_actions_is_tested_within_and_beyond():
-    box = BoxActions(torch.tensor([1.0]), torch.tensor([3.0]))
-    c = line(1.0, actions=box)
-    inside, beyond = severe_tests(c.rivals, c.trace(), box)
-    assert 1 <= inside.action[0] <= 3
-    assert not 1 <= beyond.action[0] <= 3
-
-
-def test_without_permitted_actions_or_a_plan_no_action_is_named():
-    for made in (
-        line(1.0, actions=None).report(evaluate=False),
-        line(1.0).report(evaluate=False, plan=False),
-    ):
-        assert made.severe_tests == ()
-        text = " ".join(str(made).split())
-        assert "P holds among the declared effects alone" in text
-        assert "put to the test" not in text

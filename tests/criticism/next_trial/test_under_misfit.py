@@ -43,23 +43,6 @@ def test_trials_unlike_those_at_hand_tell_most(missed):
     assert gain[-2:].max() > 0.2
 
 
-def test_the_report_says_how_they_count(missed):
-    text = " ".join(str(missed.report(evaluate=False)).split())
-    assert "Every model misses, so that probabilities among them are too sure" in text
-    assert "count by their errors on left-out trials: none 0." in text
-
-
-def test_where_one_model_predicts_alone_the_report_says_so(missed):
-    tracing = missed.trace()
-    misfit = replace(tracing.misfit, weights={"none": 0.99})
-    missed._tracing = replace(tracing, misfit=misfit)
-    report = missed.report(evaluate=False)
-    missed._tracing = tracing
-    assert report.next_action.action is None
-    text = " ".join(str(report).split())
-    assert "Of the declared models only none predicts left-out trials so well." in text
-
-
 def test_an_action_that_some_draws_alone_chose_is_chosen_again(missed, monkeypatch):
     """Its report is of other draws, and there it may tell nothing."""
     select, calls = next_action._select, []

@@ -20,6 +20,7 @@ from sbi_active.criticism.results import (
     Residuals,
     Tracing,
 )
+from sbi_active.criticism.under_misfit import Misfit, ModelError, Support
 from tests.effects import on_outcomes
 
 DRAG = on_outcomes("drag", lambda x, phi, action, context: x - phi)
@@ -76,6 +77,30 @@ def tracing(verdict: str = "drag", **changes) -> Tracing:
         robust=True,
     )
     return replace(made, **changes)
+
+
+def misfit(left_out, held_out=(None, None), *, named=(), sensor=(0.005,)) -> Misfit:
+    """Return models that miss, by errors of the bare one and of that with drag."""
+    models = tuple(
+        ModelError(
+            name=name,
+            probability=float(name == "drag"),
+            left_out=np.atleast_1d(left),
+            held_out=None if held is None else np.atleast_1d(held),
+            remains=0.9,
+        )
+        for name, left, held in zip(("none", "drag"), left_out, held_out, strict=True)
+    )
+    return Misfit(
+        models=models,
+        helps=("drag",),
+        named=named,
+        support={"drag": Support(inclusion=0.9, better=0.9, gained=9.0, remains=0.9)},
+        sensor=np.array(sensor),
+        passes=False,
+        size=40.0,
+        time_scale=1.0,
+    )
 
 
 def residuals(shape=(6,), *, size: float = 1.0, num: int = 8, times=None) -> Residuals:

@@ -7,11 +7,10 @@ from matplotlib.colors import to_hex
 from sbi_active.criticism.report.figures import (
     AFTER,
     BEFORE,
-    plot_before_after,
     plot_probabilities,
     plot_residuals,
 )
-from tests.criticism.report.reports import evaluation, residuals, tracing
+from tests.criticism.report.reports import residuals, tracing
 
 
 def points(ax):
@@ -44,31 +43,6 @@ def test_every_residual_is_drawn_at_its_action_its_trial_and_its_channel(shape):
         assert panels[0].get_ylabel().startswith(title)
 
 
-def test_a_trajectory_is_a_line_a_trial_and_channel_over_its_own_times():
-    times = np.linspace(0, 1, 20) * np.arange(1, 9)[:, None]
-    made = residuals((20, 2), times=times)
-    ax = plot_residuals(made).axes[-1]
-    drawn = [line.get_xydata() for line in ax.lines[:16]]
-    for k, trajectory in enumerate(drawn):
-        np.testing.assert_allclose(trajectory[:, 0], times[k // 2])
-        np.testing.assert_allclose(trajectory[:, 1], made.refitted[k // 2, :, k % 2])
-
-
-@pytest.mark.parametrize(("size", "scale"), [(1.0, "linear"), (40.0, "symlog")])
-def test_the_band_is_two_deviations_and_all_points_are_in_view(size, scale):
-    made = residuals(size=size)
-    for ax in plot_residuals(made).axes:
-        (band,) = ax.patches
-        assert band.get_extents().height > 0
-        low, high = band.get_y(), band.get_y() + band.get_height()
-        assert (low, high) == (-2, 2)
-        assert ax.get_yscale() == scale
-        low, high = ax.get_ylim()
-        assert low == -high
-        largest = np.abs(made.refitted).max()
-        assert largest < high < 2 * max(largest, 3.5)
-
-
 def test_bars_are_as_long_as_probabilities_the_most_probable_on_top():
     shares = {"drag": 0.6, "tilt": 0.33, "drag + tilt": 0.015, "none": 0.001}
     shares |= {"drag + bias": 0.004, "scatter": 0.05}
@@ -87,21 +61,3 @@ def test_bars_are_as_long_as_probabilities_the_most_probable_on_top():
 
 def is_filled(bar):
     return to_hex(bar.get_facecolor()) == AFTER
-
-
-def test_every_score_is_drawn_before_and_after_with_its_total():
-    made = evaluation()
-    figure = plot_before_after(made)
-    assert len(figure.axes) == len(made.before)
-    for ax, name in zip(figure.axes, made.before, strict=True):
-        pairs = np.stack([made.before[name], made.after[name]], 1)
-        drawn = [line.get_ydata() for line in ax.lines[: len(pairs)]]
-        np.testing.assert_allclose(drawn, pairs)
-        (row,) = made.table[made.table["metric"] == name].to_dict("records")
-        totals = [line for line in ax.lines if line.get_marker() == "_"]
-        assert [float(line.get_ydata()[0]) for line in totals] == [
-            row["before"],
-            row["after"],
-        ]
-        ticks = [label.get_text() for label in ax.get_xticklabels()]
-        assert ticks == ["before", "after"]

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials, close_loop, joint_prior
@@ -24,6 +23,7 @@ from tests.criticism.report.reports import (
     tracing,
     trials,
 )
+from tests.effects import normal
 
 SURE = report().detection
 HELD = evaluation()
@@ -187,10 +187,6 @@ def test_a_report_of_a_right_model_has_none():
     assert "Warnings" not in str(right())
 
 
-def normal(sd):
-    return Independent(Normal(torch.zeros(1), torch.full((1,), sd)), 1)
-
-
 def on_x(name, change, sd):
     return Effect(
         name,
@@ -223,7 +219,6 @@ def measured(missing, **options):
 
 BIAS = on_x("bias", lambda phi, action, context: phi, 0.5)
 DRIFT = on_x("drift", lambda phi, action, context: phi * context.index[:, None], 0.1)
-QUADRATIC = Effect.keyword("quadratic", prior=normal(1.0))
 
 
 def test_trials_of_unknown_order_drift_nowhere():
@@ -231,12 +226,3 @@ def test_trials_of_unknown_order_drift_nowhere():
     assert "SA526" in [w.code for w in made.warnings]
     assert "drift" not in made.probabilities
     assert made.verdict == "bias"
-
-
-def test_the_edge_is_that_of_phi_among_all_effects_that_were_added():
-    # Noise is not declared, so that left-out trials are not asked first.
-    made = measured(lambda xi: 0.5 + 1.7 * xi**2, effects=[BIAS, QUADRATIC], noise=None)
-    alone = {e.name: e.mean[0] for e in made.tracing.estimates}
-    assert made.verdict == "bias + quadratic"
-    assert alone["bias"] > 0.5 * 2.58  # where it must do the work of both
-    assert "SA515" not in [w.code for w in made.warnings]

@@ -123,13 +123,6 @@ def test_the_loop_names_an_effect_beside_errors_of_unknown_size_in_two_units(dra
         assert abs(phi.mean - drag) < 4 * phi.sd
 
 
-def test_a_size_of_each_channel_needs_as_many_channels():
-    times = torch.arange(4.0)
-    m = Measurements.of(Trials([0.0], torch.zeros(1, 4, 3), sample_times=times))
-    with pytest.raises(ValueError, match="for each of 3 channels; got 2"):
-        declared_noise(noise_of(), m)
-
-
 def test_a_common_factor_is_summed_beside_the_sizes():
     m = measured()
     grid = declared_noise(noise_of(), m)

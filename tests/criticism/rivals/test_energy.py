@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import Independent, Normal
 
 from sbi_active import GaussianNoise, SimulatorModel
-from sbi_active.criticism import Criticism, Effect, Trials
+from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.forces import force_effects, total_force
 from sbi_active.criticism.rivals.coordinates import dissipative_bounds
 
@@ -76,16 +75,6 @@ def test_quadratic_damping_that_feeds_energy_is_never_adopted(pushed, forces):
         if "v|v| of hinge" in evidence.names:
             at = evidence.names.index("v|v| of hinge")
             assert (evidence.draws[:, at] <= 1e-9).all()
-
-
-def test_what_is_no_force_has_no_bounds():
-    prior = Independent(Normal(torch.zeros(2), torch.ones(2)), 1)
-    effect = Effect(
-        "keywords", hook="dynamics", prior=prior, null=0.0, apply=lambda v, *rest: v
-    )
-    low, high = dissipative_bounds(effect)
-    assert low.tolist() == [-np.inf] * 2
-    assert high.tolist() == [np.inf] * 2
 
 
 @pytest.mark.slow

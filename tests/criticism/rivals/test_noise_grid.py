@@ -6,15 +6,9 @@ import torch
 from scipy import stats
 from scipy.stats import multivariate_normal
 
-from sbi_active import (
-    AutocorrelatedNoise,
-    GaussianNoise,
-    StudentTNoise,
-    estimate_noise,
-)
+from sbi_active import AutocorrelatedNoise, GaussianNoise, StudentTNoise, estimate_noise
 from sbi_active.criticism import Trials
 from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import (
     INDEPENDENT,
     NUM_DRAWS,
@@ -23,12 +17,6 @@ from sbi_active.criticism.rivals.noise_grid import (
 )
 
 TIMES = np.array([0.0, 0.1, 0.3, 0.6, 1.0])
-
-
-def test_noise_without_size_is_refused():
-    m = Measurements.of(Trials([0.0, 1.0], [0.0, 1.0]))
-    with pytest.raises(ValueError, match="expected measurement noise with a standard"):
-        declared_noise(GaussianNoise(0.0), m)
 
 
 def trajectories():
@@ -109,21 +97,6 @@ def test_errors_that_are_known_by_channel_have_their_units_along_a_trajectory():
     assert measurement_sds(AutocorrelatedNoise(1.0, 0.4, measurement_sd=0.2), m) == 0.2
 
 
-def test_correlated_noise_is_a_gaussian_of_exponential_covariance():
-    x = torch.tensor([[0.1, 0.4, torch.nan, 0.2, -0.3], [1.0, 0.9, 0.5, 0.4, 0.2]])
-    m = Measurements.of(Trials([0.0, 1.0], x, sample_times=TIMES))
-    sd = np.full(len(m), 0.7)
-    cell = NoiseCell.of(m, sd=sd, correlation_time=0.4)
-    expected = 0.0
-    for t in range(2):
-        at = m.trial == t
-        gap = np.abs(m.time[at][:, None] - m.time[at])
-        cov = 0.49 * np.exp(-gap / 0.4)
-        expected += multivariate_normal(np.zeros(at.sum()), cov).logpdf(m.x[at])
-    got = NoiseGrid([cell]).log_likelihood(m.x[None])[0]
-    assert got == pytest.approx(expected, rel=1e-9)
-
-
 def test_a_posterior_over_the_size_is_summed_out_by_draws():
     repeats = 0.3 * torch.randn(60, 1, generator=torch.Generator().manual_seed(0))
     m = Measurements.of(Trials([0.0, 1.0, 2.0], [0.3, -0.4, 0.5]))
@@ -134,12 +107,3 @@ def test_a_posterior_over_the_size_is_summed_out_by_draws():
     expected = stats.multivariate_t(np.zeros(3), scale, df=59).logpdf(m.x)
     # A size known to 9 % has a density known to .16 nats a draw, here.
     assert grid.log_likelihood(m.x[None])[0] == pytest.approx(expected, abs=0.15)
-
-
-def test_a_posterior_over_one_size_may_be_of_single_numbers():
-    """Its draws have no axis of parameters."""
-    m = Measurements.of(Trials([0.0, 1.0, 2.0], [0.3, -0.4, 0.5]))
-    size = torch.distributions.LogNormal(np.log(0.3), 0.1)
-    grid = declared_noise(GaussianNoise(0.3, posterior=size), m)
-    assert len(grid.cells) == NUM_DRAWS
-    assert all(cell.sd.shape == (3,) for cell in grid.cells)

@@ -10,10 +10,7 @@ from sbi_active.criticism import Trials
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import declared_noise
-from sbi_active.criticism.rivals.residual_process import (
-    TIME_LENGTH,
-    ResidualProcess,
-)
+from sbi_active.criticism.rivals.residual_process import TIME_LENGTH, ResidualProcess
 
 ACTION = torch.linspace(-2, 2, 8)[:, None]
 X = torch.tensor([0.3, 1.4, -0.2, 0.8, 2.2, 1.1, 3.5, 2.9])[:, None]

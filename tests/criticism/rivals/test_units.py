@@ -3,27 +3,16 @@
 import numpy as np
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import HalfNormal, Independent, Normal
+from torch.distributions import HalfNormal, Independent
 
-from sbi_active.criticism import Effect
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
+from tests.effects import effect, normal
 
 PRIOR = BoxUniform(torch.zeros(2), torch.tensor([1.0, 3.0]))
 
 
-def effect(name, prior):
-    return Effect(
-        name=name,
-        hook="observation",
-        family=name,
-        prior=Independent(prior, 1),
-        null=0.0,
-        apply=lambda x, phi, action, context: x + phi,
-    )
-
-
-WIDE = effect("friction", HalfNormal(torch.tensor([45.0])))
-OTHERS = [effect(f"other {k}", Normal(torch.zeros(1), torch.ones(1))) for k in range(3)]
+WIDE = effect("friction", prior=Independent(HalfNormal(torch.tensor([45.0])), 1))
+OTHERS = [effect(f"other {k}") for k in range(3)]
 
 
 def test_an_effect_has_the_same_units_in_every_rival():
@@ -40,7 +29,7 @@ def test_an_effect_has_the_same_units_in_every_rival():
 
 
 def test_so_do_nuisances_of_each_trial():
-    offset = effect("offset", Normal(torch.zeros(1), 3 * torch.ones(1)))
+    offset = effect("offset", prior=normal(3.0))
     alone = SearchCoordinates(PRIOR, [], [offset], 4)
     beside = SearchCoordinates(PRIOR, [WIDE], [offset], 4)
     np.testing.assert_array_equal(alone.shift[2:], beside.shift[3:])

@@ -33,12 +33,6 @@ LATE = {
     "lag": Independent(HalfNormal(SCALE), 1),
     "clock": normal(SCALE),
 }
-#: Late, and with a second strength that shows nowhere.
-TWO = Effect.keyword(
-    "two",
-    *("delay", "unused"),
-    prior=Independent(HalfNormal(torch.tensor([0.2, 1.0])), 1),
-)
 
 
 def groups(*names):
@@ -64,12 +58,3 @@ def test_a_delay_is_a_lag_near_zero_and_not_beyond():
 def test_a_delay_is_a_clock_of_another_scale_at_any_size():
     """1 - exp(-t) takes the place of a delay t."""
     assert groups("delay", "clock") == (frozenset({"delay", "clock"}),)
-
-
-def test_of_three_the_two_are_left_that_are_alike_everywhere():
-    assert groups("lag", "delay", "clock") == (frozenset({"delay", "clock"}),)
-
-
-def test_effects_may_have_strengths_of_other_numbers():
-    assert groups(TWO, "clock") == (frozenset({"two", "clock"}),)
-    assert groups("lag", TWO) == ()

@@ -14,12 +14,7 @@ from sbi_active.design.estimators.base import CandidateSimulations, standard_err
 from sbi_active.design.estimators.contrast import InfoNCEGain
 from tests.design.fragile import PRIOR as FRAGILE_PRIOR
 from tests.design.fragile import Fragile, log_normal
-from tests.linear_gaussian import (
-    PRIOR,
-    ExactLikelihood,
-    ExactRatio,
-    information,
-)
+from tests.linear_gaussian import PRIOR, ExactLikelihood, ExactRatio, information
 
 ACTIONS = torch.tensor([[0.0], [0.5], [1.0], [2.0]])
 EXACT = information(ACTIONS)
@@ -117,11 +112,7 @@ class FragileLikelihood:
 
 @pytest.mark.parametrize("luck", [0.0, 0.4])
 @pytest.mark.parametrize(
-    "estimator",
-    [
-        LikelihoodGain(num_contrastive=500),
-        InfoNCEGain(num_contrastive=511),
-    ],
+    "estimator", [LikelihoodGain(num_contrastive=500), InfoNCEGain(num_contrastive=511)]
 )
 def test_outcomes_without_a_measurement_are_information(estimator, luck):
     model = FragileLikelihood(luck)

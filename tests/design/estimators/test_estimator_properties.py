@@ -13,15 +13,10 @@ from sbi_active.design import (
     PosteriorGain,
     RatioGain,
 )
-from sbi_active.design.estimators.automatic import ESTIMATORS as NAMES
 from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.design.estimators.contrast import InfoNCEGain
 from sbi_active.simulation import GaussianNoise
-from tests.linear_gaussian import (
-    PRIOR,
-    ExactLikelihoodAndPosterior,
-    ExactRatio,
-)
+from tests.linear_gaussian import PRIOR, ExactLikelihoodAndPosterior, ExactRatio
 
 ACTIONS = torch.tensor([[0.0], [0.5], [2.0]])
 
@@ -53,11 +48,6 @@ def rows():
     mean = ACTIONS[:, None] * theta
     x = mean + torch.randn_like(theta)
     return CandidateSimulations(theta, ACTIONS, x, mean, GaussianNoise(1.0))
-
-
-def test_all_estimators_are_here():
-    assert set(ESTIMATORS) == set(NAMES)
-    assert all(type(e) is NAMES[name] for name, e in ESTIMATORS.items())
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
@@ -103,15 +93,3 @@ def test_missing_rows_are_left_out(name, rows):
     gain = ESTIMATORS[name](Everything(), replace(rows, x=x, missing=missing), PRIOR)
     assert gain[1].isnan().all()
     assert gain[2].isfinite().all()
-
-
-@pytest.mark.parametrize("name", sorted(set(FROM_MODELS) - {"posterior"}))
-def test_a_model_that_cannot_say_is_an_error(name, rows):
-    """A loss that the model does not know is refused, not dropped."""
-    x = rows.x.clone()
-    x[1, 3] = torch.nan
-    with pytest.raises(ValueError, match="outcome without a measurement is, x = NaN"):
-        ESTIMATORS[name](Everything(), replace(rows, x=x), PRIOR)
-    model = object()
-    with pytest.raises(ValueError, match=r"expected a model with log_\w+ for \w+Gain"):
-        ESTIMATORS[name](model, rows, PRIOR)

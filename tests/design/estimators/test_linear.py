@@ -4,9 +4,7 @@ import pytest
 import torch
 from torch.distributions import MultivariateNormal
 
-from sbi_active import (
-    GaussianNoise,
-)
+from sbi_active import GaussianNoise
 from sbi_active.design import LinearGain
 from sbi_active.design.estimators.base import CandidateSimulations
 from sbi_active.simulation import AutocorrelatedNoise

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import pytest
 import torch
 
-from sbi_active import DiscreteActions, InformationGainDesigner
 from sbi_active.design import ModelIndexGain
 from sbi_active.design.estimators.model_index import RivalSampler
 
@@ -111,22 +110,6 @@ def test_a_difference_hidden_in_a_long_trajectory():
     exact = torch.tensor(exact)
     assert (gain.mean(1) <= exact + 3 * error).all()
     assert (gain.mean(1) > exact - 0.1 - 3 * error).all()
-
-
-def test_the_designer_chooses_by_it():
-    designer = InformationGainDesigner(DiscreteActions(ACTIONS), num_samples=400)
-    design = designer.select(LOSSY, target="model", seed=0)
-    assert design.action.tolist() == [2.0]
-    assert design.estimator == "ModelIndexGain"
-    assert design.bound == "lower"
-    distance = (design.expected_information_gain - information(LOSSY)).abs()
-    assert (distance < 3 * design.standard_error + 0.02).all()
-    assert ((design.probability_valid - 0.75).abs() < 0.1).all()  # of both alike
-    assert design.num_simulations <= 1_600
-    again = designer.select(LOSSY, target="model", seed=0)
-    assert torch.equal(
-        design.expected_information_gain, again.expected_information_gain
-    )
 
 
 @dataclass

@@ -2,8 +2,6 @@
 
 import json
 
-import pytest
-
 from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 
 KNOWN = Diagnostics(
@@ -22,12 +20,3 @@ def test_as_plain_data():
     assert plain["assumptions"] == {"settled": {"holds": False, "figure": 0.3}}
     assert plain["bandwidth"] == 0.1
     assert "effective_sample_size" not in plain  # not known
-
-
-def test_entries_by_name_go_in_the_next_version():
-    with pytest.warns(DeprecationWarning, match=r"use an attribute, or to_dict"):
-        assert KNOWN["trustworthy"]
-    with pytest.warns(DeprecationWarning, match=r"get\('bandwidth'\) is deprecated"):
-        assert KNOWN.get("bandwidth") == 0.1
-    with pytest.warns(DeprecationWarning, match="deprecated"):
-        assert "width" not in KNOWN

@@ -49,10 +49,7 @@ def exact():
 
 @pytest.mark.parametrize(
     "simulator",
-    [
-        SimulatorModel(line, noise=GaussianNoise(SD)),
-        drawn,
-    ],
+    [SimulatorModel(line, noise=GaussianNoise(SD)), drawn],
     ids=["declared", "drawn"],
 )
 def test_values_get_their_probabilities(simulator):

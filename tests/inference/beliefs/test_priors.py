@@ -11,10 +11,8 @@ from torch.distributions import (
     Dirichlet,
     Distribution,
     Independent,
-    LKJCholesky,
     MixtureSameFamily,
     Normal,
-    OneHotCategorical,
     Poisson,
     TransformedDistribution,
     Uniform,
@@ -38,10 +36,8 @@ def independent(prior: Distribution) -> Independent:
     [
         (independent(Poisson(3 * TWO)), "continuous parameters; got a discrete one"),
         (independent(Bernoulli(0.5 * TWO)), "declare the choice as an Effect"),
-        (OneHotCategorical(TWO), "got a discrete one, OneHotCategorical"),
         (Dirichlet(TWO), "may vary one by one; got Dirichlet"),
         (Normal(0.0, 1.0), r"event shape \(theta_dim,\); got Normal"),
-        (LKJCholesky(2, 1.0), "may vary one by one; got LKJCholesky"),
     ],
 )
 def test_what_is_discrete_or_tied_is_refused(prior, message):
@@ -97,12 +93,7 @@ NETWORKS = {True: "each round", False: "on demand"}
         ),
         independent(VonMises(0 * TWO, TWO)),
     ],
-    ids=[
-        "Cauchy",
-        "shifted log-normal",
-        "mixture of bounds",
-        "angle",
-    ],
+    ids=["Cauchy", "shifted log-normal", "mixture of bounds", "angle"],
 )
 def test_heavy_tails_and_mixtures_give_the_right_posterior(prior):
     set_validate_args(prior, True)  # as after an import of pyro, which says so for all

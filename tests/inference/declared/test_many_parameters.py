@@ -11,10 +11,7 @@ from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.inference import refine
 from sbi_active.inference.declared.refining import SimulatedBelief
 from sbi_active.inference.engine import SimulatedPotential, search
-from sbi_active.inference.engine.potential import (
-    MeanTable,
-    SimulatedLikelihood,
-)
+from sbi_active.inference.engine.potential import MeanTable, SimulatedLikelihood
 from sbi_active.inference.sampling.coordinates import (
     NormalCoordinates,
     PriorCoordinates,

@@ -47,7 +47,6 @@ def test_finds_narrow_peaks(centers: list, sd: list):
     rng = np.random.default_rng(0)
     place, width = np.array(centers), np.array(sd)
     found = learned_fit(likelihood_of(2, peaks(place, width)), rng)
-    assert found is not None
     effective = found.effective_sample_size
     assert effective > 2_900
     assert found.efficiency > 0.2
@@ -96,7 +95,6 @@ def test_a_peak_on_a_plateau_is_not_lost(is_known: bool, width: float):
     own = likelihood_of(DIM, log_likelihood)
     near = known if is_known else own.coordinates.sample_prior(400, rng)
     found = learned_fit(own, rng, near=near)
-    assert found is not None
     assert found.log_evidence == pytest.approx(-DIM * np.log(2), abs=0.1)
     draws = found.draws(500, rng)
     assert draws.mean(0) == pytest.approx(center, abs=0.3 * width)

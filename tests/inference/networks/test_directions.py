@@ -13,9 +13,9 @@ from sbi_active.inference.sampling.adam import Adam
 from sbi_active.seeding import forked_generators
 
 NUM, SD = 300, 2.0
+ALL_ROWS = {"scaling": "action", "whiten": True, "baseline": "best"}
 TIMES = torch.linspace(0.1, 1.0, NUM)
 BASIS = torch.stack([TIMES, torch.sin(8 * TIMES)])
-ALL_ROWS = {"scaling": "action", "whiten": True, "baseline": "best"}
 
 
 def rows(num: int, seed: int):

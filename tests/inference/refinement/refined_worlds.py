@@ -8,9 +8,7 @@ from collections.abc import Callable
 import torch
 from sbi.utils import BoxUniform
 from torch import Tensor
-from torch.distributions import (
-    Distribution,
-)
+from torch.distributions import Distribution
 
 from sbi_active.seeding import forked_generators
 

@@ -25,20 +25,6 @@ def test_a_constant_channel_does_no_harm():
     assert belief.diagnostics.trustworthy, belief.diagnostics.warnings
 
 
-@pytest.mark.parametrize(
-    ("action", "x", "match"),
-    [
-        (torch.zeros(2), torch.zeros(2, 1), r"expected action \(t, action_dim\)"),
-        (torch.zeros(2, 1), torch.zeros(3, 1), "as many trials"),
-        (torch.zeros(0, 1), torch.zeros(0, 1), "at least one"),
-        (torch.zeros(1, 1), torch.zeros(1, 3), "expected simulated x of shape"),
-    ],
-)
-def test_bad_trials_are_refused(action: Tensor, x: Tensor, match: str):
-    with pytest.raises(ValueError, match=match):
-        refine(numerical(), BOX, action, x, seed=0)
-
-
 def test_deterministic_simulator_is_refused():
     with pytest.raises(ValueError, match="expected a simulator with noise"):
         refine(
@@ -48,13 +34,3 @@ def test_deterministic_simulator_is_refused():
             torch.ones(1, 1),
             seed=0,
         )
-
-
-def test_a_lack_of_memory_is_said(monkeypatch):
-    def lacking(*_):
-        raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried")
-
-    monkeypatch.setattr("sbi_active.inference.refinement.refining._learned", lacking)
-    one = torch.ones(1, 1)
-    with pytest.raises(MemoryError, match="belief of 2 parameters; got none left"):
-        refine(numerical().__call__, BOX, one, one, seed=0)

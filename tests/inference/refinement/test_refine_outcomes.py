@@ -90,8 +90,7 @@ def scored(world: World, num: int, seed: int, *, all_invalid: bool = False):
 
 
 @pytest.mark.parametrize(
-    ("name", "all_invalid"),
-    [("edge", False), ("rare", False), ("dropout", True)],
+    ("name", "all_invalid"), [("edge", False), ("rare", False), ("dropout", True)]
 )
 def test_close_to_the_exact_posterior(name: str, all_invalid: bool):
     runs = [scored(WORLDS[name], 4, seed, all_invalid=all_invalid) for seed in range(2)]

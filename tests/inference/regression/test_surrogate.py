@@ -21,7 +21,6 @@ def regress(curve, *, noise: float = 0.1, q: int = 3, num_trials: int = 1):
     fit = LocalRegression.fit(
         whole_space(2), z, x, noise=estimate, num_trials=num_trials
     )
-    assert fit is not None
     return fit, weight
 
 

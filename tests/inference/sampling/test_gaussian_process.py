@@ -2,9 +2,7 @@
 
 import numpy as np
 
-from sbi_active.inference.sampling.gaussian_process import (
-    GaussianProcess,
-)
+from sbi_active.inference.sampling.gaussian_process import GaussianProcess
 
 
 def test_a_trend_of_ten_thousand_deviations_is_known_to_one():

@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_t
 
-from sbi_active.inference.sampling.mixtures import (
-    StudentMixture,
-    lower_factors,
-)
+from sbi_active.inference.sampling.mixtures import StudentMixture, lower_factors
 
 MEANS = np.array([[-3.0, 0.0], [3.0, 1.0]])
 FACTORS = np.array([[[1.0, 0.0], [0.8, 0.5]], [[0.3, 0.0], [-0.1, 0.2]]])

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sbi_active.inference.sampling.weights import (
-    systematic,
-)
+from sbi_active.inference.sampling.weights import systematic
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.3, 0.5, np.nextafter(1, 0)])

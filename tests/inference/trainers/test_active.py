@@ -43,10 +43,7 @@ def round_of(inference):
 @pytest.mark.filterwarnings("ignore:.*Maximum number of epochs")
 @pytest.mark.parametrize(
     ("trainer", "estimator"),
-    [
-        *[(ASBI, "maf"), (ALHI, None)],
-        *[(SeqBED, None), (SeqBED_B, "mlp")],
-    ],
+    [*[(ASBI, "maf"), (ALHI, None)], *[(SeqBED, None), (SeqBED_B, "mlp")]],
 )
 def test_a_pickled_trainer_goes_on(trainer, estimator):
     whole = round_of(trainer(PRIOR, estimator, show_progress_bars=False))

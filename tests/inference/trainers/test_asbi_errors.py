@@ -27,30 +27,6 @@ def raises(text, error=ValueError):
     return pytest.raises(error, match=re.escape(text))
 
 
-OUTSIDE = torch.tensor([[0.0, 3.0]]).expand(50, -1)
-
-
-@pytest.mark.parametrize(
-    ("text", "changes"),
-    [
-        ("expected action of shape (50, 1) or (1,)", {"action": torch.rand(50, 2)}),
-        ("earlier rounds of this trainer have actions", {"action": None}),
-        ("theta within the prior's support; got 50 of 50 rows", {"theta": OUTSIDE}),
-        (
-            "at least one simulation with a measurement",
-            {"x": torch.full((50, 2), torch.nan)},
-        ),
-        ("expected theta (n, 2) and x (n, ...)", {"theta": torch.zeros(50, 1)}),
-        ("expected x of shape (2,) or (n, 2)", {"x": torch.rand(50, 3)}),
-    ],
-)
-def test_rows_that_do_not_fit(text, changes):
-    theta, x, action = rows()
-    given = {"theta": theta, "x": x, "action": action} | changes
-    with raises(text):
-        with_round().append_simulations(**given)
-
-
 def test_rounds_with_and_without_action_do_not_mix():
     theta, x, action = rows()
     with raises("expected action=, since belief= was given"):

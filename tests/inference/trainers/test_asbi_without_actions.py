@@ -3,9 +3,7 @@
 import pytest
 import torch
 from sbi.inference import NPE_C, DirectPosterior
-from sbi.simulators.linear_gaussian import (
-    linear_gaussian,
-)
+from sbi.simulators.linear_gaussian import linear_gaussian
 from torch.distributions import MultivariateNormal
 
 from sbi_active import ASBI

@@ -20,9 +20,9 @@ def prior():
     return torch.distributions.MultivariateNormal(torch.zeros(2), torch.eye(2))
 
 
-def fill(bank, seeds=(0, 1, 2, 3)):
+def fill(bank, seeds=(0, 1, 2, 3), num=5):
     for seed in seeds:
-        theta = torch.full((5, 2), float(seed))
+        theta = torch.full((num, 2), float(seed))
         rows = Simulations(theta, theta[:, :1], theta)
         bank.append(rows, seed=seed, proposal=prior(), label="prior")
 

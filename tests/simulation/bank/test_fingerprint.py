@@ -69,8 +69,6 @@ def sled(tmp_path, monkeypatch):
     ("name", "value"),
     [
         ("G", 9.8),
-        ("SIZES", {"mass": 1.3, "wheels": (1, 2)}),
-        ("LIMIT", 2.0),
         ("SECOND", 1.5),  # of a function that a function calls
         ("STIFFNESS", 5.0),  # of another module, by name
         ("drag", lambda v, power=2: 0.0),

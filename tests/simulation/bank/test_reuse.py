@@ -2,7 +2,6 @@ import warnings
 
 import pytest
 import torch
-from sbi.utils import BoxUniform
 from torch.distributions import Independent, Normal
 
 from sbi_active import Bank, simulate
@@ -109,27 +108,3 @@ def test_few_effective_rows_are_told(bank):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         reuse(bank, TARGET, proposals=PROPOSALS)
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ({"proposals": {"prior": PRIOR}}, r"got none for \['round 1'\]; give them"),
-        (
-            {"proposals": {"prior": ROUND, "round 1": ROUND}},
-            r"expected proposals\['prior'\] to be what its rows were drawn from",
-        ),
-    ],
-)
-def test_bad_arguments(bank, options, text):
-    with pytest.raises(ValueError, match=text):
-        reuse(bank, TARGET, **options)
-
-
-def test_a_target_elsewhere(bank):
-    far = BoxUniform(torch.tensor([50.0]), torch.tensor([51.0]))
-    with pytest.raises(ValueError, match="got 4000 rows, all of density 0; simulate"):
-        reuse(bank, far)
-    empty = Bank(bank.path.parent / "empty", simulator=simulator)
-    with pytest.raises(ValueError, match=r"expected rows in .*; got none"):
-        reuse(empty, TARGET)

@@ -120,29 +120,6 @@ def test_any_posterior_is_averaged_over_fixed_draws(kind):
     assert ratio.unique().numel() == 4  # each row has a draw of its own
 
 
-@pytest.mark.parametrize(
-    ("make", "text"),
-    [
-        (lambda: GaussianNoise(torch.ones(2, 2)), "a number or one a channel; got"),
-        (
-            lambda: GaussianNoise(SD).sample(torch.ones(3, 4)),
-            "one standard deviation a",
-        ),
-        (
-            lambda: AutocorrelatedNoise(SD, 1).sample(torch.ones(3, 2)),
-            "time before channels",
-        ),
-        (
-            lambda: GaussianNoise(0).log_prob(torch.ones(3, 2), torch.ones(3, 2)),
-            "expected a standard deviation > 0 for a density",
-        ),
-    ],
-)
-def test_errors(make, text):
-    with pytest.raises(ValueError, match=text):
-        make()
-
-
 def test_sizes_that_are_unknown_by_channel_are_summed_channel_by_channel():
     bounds = [(0.1, 1.0), (20.0, 400.0)]
     noise = AutocorrelatedNoise.unknown(

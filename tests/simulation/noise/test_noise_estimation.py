@@ -5,12 +5,7 @@ import pytest
 import torch
 from scipy import stats
 
-from sbi_active import (
-    AutocorrelatedNoise,
-    GaussianNoise,
-    StudentTNoise,
-    estimate_noise,
-)
+from sbi_active import AutocorrelatedNoise, GaussianNoise, StudentTNoise, estimate_noise
 from sbi_active.seeding import row_seeds
 
 SETS = 150
@@ -126,20 +121,3 @@ def test_posterior_density_is_that_of_its_draws(kind):
     density = posterior.log_prob(grid.exp()) + grid.sum(1)  # over logarithms
     mass = density.exp().mean().item() * (high - low).prod().item()
     assert abs(mass - inside) < 4 * math.sqrt(0.25 / 40_000) + 0.005
-
-
-@pytest.mark.parametrize(
-    ("repeats", "options", "text"),
-    [
-        (torch.ones(1, 3), {}, "expected at least 2 repeats of one action; got 1"),
-        (torch.ones(3, 2), {}, r"expected repeats that differ; got identical ones in "),
-        (
-            [torch.rand(3, 2), torch.rand(3, 3)],
-            {},
-            r"expected repeats of shape \(k, \*x_shape\), or groups of such; got",
-        ),
-    ],
-)
-def test_errors(repeats, options, text):
-    with pytest.raises(ValueError, match=text):
-        estimate_noise(repeats, **options)

@@ -115,26 +115,6 @@ def test_setup_is_no_part_of_the_time_limit():
     assert torch.equal(x, theta * 2)
 
 
-def test_a_simulator_known_to_draw_nothing_needs_no_blocks(rows):
-    theta, action = rows
-    sizes = []
-
-    def fn(theta, action):
-        sizes.append(len(theta))
-        return theta * action
-
-    noisy = SimulatorModel(fn, noise=GaussianNoise(1.0))
-    assert noisy.is_deterministic(theta, action)
-    bare = noisy.without_noise()
-    sizes.clear()
-    x = simulate(bare, theta, action, seed=0, batch_size=64).x
-    assert torch.equal(x, theta * action)
-    assert sizes == [64] * 10 + [60]
-    sizes.clear()
-    simulate(noisy, theta, action, seed=0, batch_size=64)
-    assert max(sizes) == 256
-
-
 def test_a_store_is_read_before_anything_is_simulated(rows):
     for simulator in (seeded, global_torch):
         expected = simulate(simulator, *rows, seed=3).x

@@ -152,7 +152,6 @@ def test_workers_die_with_their_parent_and_silently(way, tmp_path):
             stderr=errors,
             start_new_session=True,
         )
-        assert parent.stdout is not None
         pids = {int(parent.stdout.readline()) for _ in range(2)}
         stats = [Path(f"/proc/{pid}/stat").read_text().split() for pid in pids]
         nests = {int(stat[3]) for stat in stats}
