@@ -81,6 +81,7 @@ class RowPosterior(DirectPosterior):
         assert isinstance(made, cls)
         return made, index
 
+    @torch.no_grad()
     def sample_batched(  # pyright: ignore[reportIncompatibleMethodOverride]
         self,
         sample_shape: Any,

@@ -190,11 +190,15 @@ def refine_declared(
         before = None
         coordinates = NormalCoordinates(PriorCoordinates(prior, rng), rng)
         table = MeanTable(simulator, settings.workers)
+    own = Settings(
+        num_effective=settings.effective_of(coordinates.dim),
+        num_simulations=3 * settings.num_histories * len(action),
+        num_draws=settings.num_draws or max(settings.num_histories // 6, 100),
+    )
     spent = table.num_simulations, table.num_missing
     declared = SimulatedLikelihood(table, action, x)
     potential = SimulatedPotential(declared, coordinates)
     contradiction, fit = None, None
-    own = _engine_settings(settings, len(action), coordinates.dim)
     if before is not None:
         fit = _gone_on(before.pool, potential, own, rng)
     if fit is None:
@@ -206,31 +210,15 @@ def refine_declared(
     if not len(fit.u):
         raise UnexplainedOutcomeError(NOTHING_EXPLAINS)
     belief = SimulatedBelief(prior, potential, fit, defensive=settings.defensive)
-    known = diagnose_fit(fit, potential, declared, seed)
-    if contradiction is not None:
+    known, pool = diagnose_fit(fit, potential, declared, seed), fit.pool
+    if contradiction is not None:  # the likelihood of the draws is of another noise
         known = contradiction.noted(known)
-    num_simulations = table.num_simulations - spent[0]
-    num_missing = table.num_missing - spent[1]
-    belief.diagnostics = known.extended(
-        num_simulations=num_simulations, num_missing=num_missing
-    )
-    pool = fit.pool
-    if contradiction is not None:  # its likelihood is of another noise
         pool = Pool.empty(potential.dim, len(action))
+    num, missing = table.num_simulations - spent[0], table.num_missing - spent[1]
+    belief.diagnostics = known.extended(num_simulations=num, num_missing=missing)
     belief.histories = DeclaredRecord((action, x), coordinates, table, pool)
-    warn_missing(num_missing, num_simulations, "their draws", stacklevel=5)
+    warn_missing(missing, num, "their draws", stacklevel=5)
     return belief
-
-
-def _engine_settings(
-    settings: RefinementOptions, num_trials: int, dim: int
-) -> Settings:
-    num_draws = settings.num_draws or max(settings.num_histories // 6, 100)
-    return Settings(
-        num_effective=settings.effective_of(dim),
-        num_simulations=3 * settings.num_histories * num_trials,
-        num_draws=num_draws,
-    )
 
 
 def _near(
@@ -241,8 +229,8 @@ def _near(
     num: int = 250,
 ) -> Array | None:
     """Return draws of all hints, shape (n, d), those first that stand for each."""
-    places = coordinates.base.drawn_from(hints[:2], num, seed=seed)
-    drawn = [coordinates.from_z(z) for z in places]
+    drawn = coordinates.base.drawn_from(hints[:2], num, seed=seed)
+    drawn = [coordinates.from_z(z) for z in drawn]
     if not drawn:
         return None
     return np.concatenate([*[u[:1] for u in drawn], *[u[1:] for u in drawn]])
@@ -265,9 +253,8 @@ def _gone_on(
     if found is not None and share_cut(potential, found) > own.hopeless:
         return None
     fit = infer(potential, rng, past=pool, found=found, settings=own)
-    if fit.effective_sample_size < own.num_effective:
-        return None
-    if fit.tail_shape > own.largest_shape:
+    is_heavy = fit.tail_shape > own.largest_shape
+    if fit.effective_sample_size < own.num_effective or is_heavy:
         return None
     best = fit.u[[fit.log_likelihood.argmax()]]
     contradicted = find_contradiction(

@@ -139,10 +139,10 @@ class Processes(Stages):
         errors = [trial.error(draws) for trial in surrogate.trials]
         return 0.0, np.ones(1), float(sum(errors))
 
-    def tails(self, stage: Stage) -> tuple[list[float], float]:
-        """Return tail probabilities of the trials and of all together."""
+    def tails(self, stage: Stage) -> list[float]:
+        """Return tail probabilities of the trials and, last, of all together."""
         tails = [trial.tail(stage.draws) for trial in stage.surrogate.trials]
-        return tails, min(1.0, len(tails) * min(tails))
+        return [*tails, min(1.0, len(tails) * min(tails))]
 
     def best_summary(self, trial: PooledTrial) -> str:
         """Return the summary by which a trial is expected to tell most."""

@@ -322,12 +322,13 @@ class _Modes:
         """
         own, n = self.settings, len(moved.u)
         equal = np.full(n, 1 / n)
-        proposal = fitted(moved.u, equal, own.num_components, own, self.rng)
+        fit = fitted(moved.u, equal, own.num_components, own, self.rng)
+        proposals: list[tuple[int, Proposal]] = [(n, fit)]
         log_prior = self.potential.log_prior(moved.u)
         log_own = log_prior + moved.log_likelihood - moved.log_evidence
         pool = Pool(
             *(moved.u, log_prior, moved.log_likelihood, log_own + np.log(n), log_own),
-            *(np.ones(n, dtype=bool), n, [(n, proposal)], self.potential.num_trials),
+            *(np.ones(n, dtype=bool), n, proposals, self.potential.num_trials),
             np.zeros(n),
         )
         return Fit(

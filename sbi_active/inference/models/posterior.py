@@ -214,7 +214,7 @@ class ActionPosterior:
     def _condition(self, x: Tensor | None, action: Tensor | None) -> Tensor:
         if x is None or action is None:
             given = "x without action" if action is None else "action without x"
-            given = "neither" if x is None and action is None else given
+            given = "neither" if x is action else given
             raise ValueError(
                 f"expected x= and action= together; got {given}; pass both, or "
                 "posterior.at(action) to something that only knows x"

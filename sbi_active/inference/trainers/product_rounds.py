@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import Self
 
+from sbi_active.expected import require
 from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.beliefs.weighted import KernelBelief
@@ -71,11 +72,9 @@ class ProductRounds(ActionRounds):
     _factor: ClassVar[type[ActionFactor]]
 
     def __init__(self, *args: Any, posterior: str, **kwargs: Any) -> None:
-        if posterior not in SAMPLERS:
-            raise ValueError(
-                f"expected posterior among {', '.join(map(repr, SAMPLERS))}; got "
-                f"{posterior!r}; choose one of these"
-            )
+        known = ", ".join(map(repr, SAMPLERS))
+        advice = f"posterior among {known}", repr(posterior), "choose one of these"
+        require(posterior in SAMPLERS, *advice)
         super().__init__(*args, **kwargs)
         self._sampler = posterior
 
@@ -143,7 +142,7 @@ class ProductRounds(ActionRounds):
         require_whole(torch.stack([trial.x for trial in trials]))
         seed = told.seed()
         if told.simulator is None:
-            self._require_belief_network()
+            self._require_trained()
         belief: Belief | None = None
         if self._may_ask_network(told) and self._trained_round is not None:
             belief = self._product(trials, settings, seed)
@@ -244,13 +243,8 @@ class ProductRounds(ActionRounds):
         learned = self._model(deepcopy(self._neural_net))
         used = trials[-1:] if chained else trials
         counted = [t for t in used if _says_something(learned, t, prior)]
-        product = Product(
-            coordinates,
-            learned,
-            counted,
-            region,
-            previous if chained and previous is not prior else None,
-        )
+        before = previous if chained and previous is not prior else None
+        product = Product(coordinates, learned, counted, region, before)
         belief = sample_product(
             prior,
             product,

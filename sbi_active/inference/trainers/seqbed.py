@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import Self
 
+from sbi_active.expected import require
 from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.beliefs.weighted import KernelBelief
@@ -91,10 +92,8 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
     ) -> None:
         self._prior = require_support(prior)
         self._settings = LFIRE() if settings is None else settings
-        if num_particles is not None and num_particles < 2:
-            raise ValueError(
-                f"expected num_particles >= 2; got {num_particles}; use about 50"
-            )
+        given = 2 if num_particles is None else num_particles
+        require(given >= 2, "num_particles >= 2", given, "use about 50")
         self._num_particles = num_particles
         self._rows: list[Simulations] = []
         self._model: LFIREModel | None = None
@@ -118,13 +117,14 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         share = len(theta) // len(candidates)
         num = self._num_particles or math.isqrt(share)
         repeats = share // max(num, 1)
-        if repeats < 2 * self._settings.num_folds:
-            raise ValueError(
-                f"expected at least {2 * self._settings.num_folds} simulations of each "
-                f"particle at each action; got {repeats}, of {len(theta)} in all at "
-                f"{len(candidates)} different actions and {num} particles; allow "
-                "more simulations, or fewer actions"
-            )
+        fewest = 2 * self._settings.num_folds
+        require(
+            repeats >= fewest,
+            f"at least {fewest} simulations of each particle at each action",
+            f"{repeats}, of {len(theta)} in all at {len(candidates)} different actions "
+            f"and {num} particles",
+            "allow more simulations, or fewer actions",
+        )
         particles = theta[:num]
         return (
             particles.repeat_interleave(repeats, 0).repeat(len(candidates), 1),
@@ -212,15 +212,17 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         if not told.afresh:
             assert self.belief is not None
             return self._simulated(self.belief, trials[-1], simulator, settings, seed)
-        spent = {"num_simulations": 0, "num_missing": 0}
-        current: Distribution = self._prior
+        beliefs: list[Any] = [self._prior]
         for k, trial in enumerate(trials):
             own = derive_seed(seed, "trial", k)
-            belief = self._simulated(current, trial, simulator, settings, own)
-            found, current = belief.diagnostics, belief
-            spent = {name: n + getattr(found, name) for name, n in spent.items()}
-        belief.diagnostics = belief.diagnostics.extended(**spent)
-        return belief
+            last = self._simulated(beliefs[-1], trial, simulator, settings, own)
+            beliefs.append(last)
+        known = [belief.diagnostics for belief in beliefs[1:]]
+        beliefs[-1].diagnostics = known[-1].extended(
+            num_simulations=sum(d.num_simulations for d in known),
+            num_missing=sum(d.num_missing for d in known),
+        )
+        return beliefs[-1]
 
     def _simulated(
         self,

@@ -2,7 +2,6 @@ import torch
 
 from sbi_active.inference import MixtureDensity
 from sbi_active.inference.networks.mixture_density import (
-    TrainingBudget,
     train_mixture_density,
 )
 from sbi_active.inference.sampling.adam import Adam
@@ -34,7 +33,8 @@ def test_faithful_settings_condition_on_nothing_but_z_scores():
             condition,
             train_rows=torch.arange(180),
             held_out_rows=torch.arange(180, 200),
-            budget=TrainingBudget(num_iterations=20, batch_size=50),
+            num_iterations=20,
+            batch_size=50,
         )
         assert net.conditioning is None
         assert net.baseline_kind == "none"

@@ -41,7 +41,7 @@ def test_lfire_meets_the_closed_form():
     psi = [settings.summaries(x, *scaling).numpy() for x in (own, marginal)]
     ratio = settings.fit(*psi, seed=0)
     x = torch.linspace(-1.5, 2.5, 9)[:, None]
-    found = ratio(settings.summaries(x, *scaling).numpy())
+    found = settings.summaries(x, *scaling).numpy() @ ratio[:-1] + ratio[-1]
     exact = log_ratio(torch.tensor([[theta]]), x, torch.ones(1, 1))
     # A coefficient of 8,000 rows is known to about .05.
     assert np.abs(found - exact.numpy()).max() < 0.2
