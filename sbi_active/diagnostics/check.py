@@ -29,7 +29,7 @@ from sbi_active.diagnostics.log_score import (
 from sbi_active.diagnostics.rows import RowPosterior, stratified_actions
 from sbi_active.expected import require, suggests
 from sbi_active.inference.engine.potential import declares_noise
-from sbi_active.inference.models.posterior import ActionPosterior
+from sbi_active.inference.models.posterior import ActionPosterior, at_conditions
 from sbi_active.inference.rounds.condition import outcome_rows, pack
 from sbi_active.seeding import derive_seed, forked_generators, kept_generators
 from sbi_active.simulation import SimulatorModel, simulate
@@ -125,7 +125,7 @@ def check_calibration(
             "expected a simulator and actions, which only a campaign brings; got none; "
             "pass simulator and actions="
         )
-    given = [*inference] if isinstance(inference, list | tuple) else [inference]
+    given = inference if isinstance(inference, list | tuple) else [inference]
     posteriors, space = [amortized(one) for one in given], action_space(actions)
     with single_thread(), kept_generators(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Number of .* samples should be")
@@ -246,7 +246,7 @@ def _check_round(
     if not hasattr(direct.posterior_estimator, "knows"):
         kept &= condition.isfinite().all(1)  # sbi's networks take no NaN
     rows, condition = rows.at(kept), condition[kept]
-    at_rows, index = RowPosterior.of(direct, condition)
+    at_rows, index = at_conditions(direct, condition, RowPosterior)
     network: Any = at_rows.posterior_estimator
 
     def log_density(values: Tensor, row: Tensor) -> Tensor:

@@ -88,9 +88,9 @@ def from_pyro(
             )
         if _base(d.support).event_dim or len(_shape(d)) > 1:
             raise ValueError(
-                f"expected vectors of parameters with bounds of their own; got {name!r} "
-                f"of shape {tuple(_shape(d))} on {d.support}; write it as a function "
-                "of free ones"
+                "expected vectors of parameters with bounds of their own; got "
+                f"{name!r} of shape {tuple(_shape(d))} on {d.support}; write it as a "
+                "function of free ones"
             )
         if any(name not in other or not _same(d, other[name]) for other in sites):
             raise ValueError(
@@ -106,8 +106,10 @@ def from_pyro(
     ]
     # Each site as a vector, one number as a vector of one.
     vectors = [d if _shape(d) else d.expand((1,)) for d in first.values()]
-    parts = [Independent(d, 1) if sum(d.batch_shape) > 1 else d for d in vectors]
-    prior = MultipleIndependent(parts, validate_args=False)
+    parts = [Independent(d, 1) if d.batch_shape else d for d in vectors]
+    prior = parts[0]
+    if len(parts) > 1:
+        prior = MultipleIndependent(parts, validate_args=False)
     noise = _noise([_node(trace, outcome)["fn"] for trace in traces])
     function = _Row(model, first, [*sizes.values()], outcome, noise is not None)
     simulator = SimulatorModel(
@@ -116,19 +118,15 @@ def from_pyro(
     return PyroProblem(simulator, prior, names)
 
 
+@dataclass(frozen=True)
 class _Row:
     """A row of the simulator: the model, conditioned on parameters."""
 
-    def __init__(
-        self,
-        model: Callable[[Tensor], Any],
-        sites: dict[str, Distribution],
-        sizes: list[int],
-        outcome: str,
-        is_mean: bool,
-    ) -> None:
-        self.model, self.outcome, self.is_mean = model, outcome, is_mean
-        self.sites, self.sizes = sites, sizes
+    model: Callable[[Tensor], Any]
+    sites: dict[str, Distribution]
+    sizes: list[int]
+    outcome: str
+    is_mean: bool
 
     def __call__(self, theta: Any, action: Any, rng: np.random.Generator) -> Any:
         parts = torch.as_tensor(theta).split(self.sizes)

@@ -202,28 +202,23 @@ def filled_simulator(simulator: Any, enumeration: Enumeration, k: int) -> Any:
 
 
 def enumerated(
-    refine: Callable[..., Any],
+    refine: Callable[[Any, Distribution, int], Any],
     simulator: Callable[..., Any],
     prior: Distribution,
     enumeration: Enumeration,
-    action: Tensor,
-    x: Tensor,
     seed: int,
-    **options: Any,
 ) -> EnumeratedBelief:
     """Return the belief over all parameters: one of the others for each combination.
 
     Each is computed afresh; what was simulated for earlier trials is not kept.
 
     Args:
-        refine: Computes the belief of a simulator of continuous parameters.
+        refine: From a simulator of continuous parameters, their prior and a seed to
+            their belief.
         simulator: Simulator of all parameters.
         prior: Original prior.
         enumeration: The prior as a mixture.
-        action: Executed actions, shape (t, action_dim).
-        x: Their outcomes, shape (t, *x_shape).
         seed: Seed of everything random.
-        options: Further arguments of refine.
 
     Raises:
         UnexplainedOutcomeError: If no combination explains the outcomes.
@@ -232,9 +227,8 @@ def enumerated(
     log_mass, kept, fault = [], [], None
     for k in range(len(enumeration.values)):
         own = filled_simulator(simulator, enumeration, k)
-        values = derive_seed(seed, "values", k)
         try:
-            part = refine(own, enumeration.rest, action, x, seed=values, **options)
+            part = refine(own, enumeration.rest, derive_seed(seed, "values", k))
         except UnexplainedOutcomeError as error:
             fault = error
             continue

@@ -50,6 +50,29 @@ from sbi_active.seeding import derive_seed, forked_generators
 
 
 @dataclass(frozen=True)
+class Problem:
+    """The posterior that is asked for.
+
+    Attributes:
+        simulator: ``simulator(theta, action)``.
+        prior: The original prior.
+        action: Executed actions, shape (t, action_dim).
+        x: Outcomes of the actions, shape (t, *x_shape).
+        hints: Distributions that say where else to look first.
+        settings: Settings of the belief.
+        seed: Seed of everything random.
+    """
+
+    simulator: Callable[..., Any]
+    prior: Distribution
+    action: Tensor
+    x: Tensor
+    hints: Sequence[Distribution]
+    settings: RefinementOptions
+    seed: int
+
+
+@dataclass(frozen=True)
 class DeclaredRecord:
     """The record that a belief goes on from when a further trial is known.
 
@@ -147,29 +170,13 @@ class SimulatedBelief(WeightedBelief):
         return theta
 
 
-def refine_declared(
-    simulator: Callable[..., Any],
-    prior: Distribution,
-    action: Tensor,
-    x: Tensor,
-    *,
-    hints: Sequence[Distribution],
-    past: object,
-    settings: RefinementOptions,
-    seed: int,
-) -> SimulatedBelief | None:
+def refine_declared(problem: Problem, past: object) -> SimulatedBelief | None:
     """Return the posterior, if its likelihood can be simulated.
 
     Args:
-        simulator: Deterministic beside a declared noise.
-        prior: The original prior.
-        action: Executed actions, shape (t, action_dim).
-        x: Outcomes of the actions, shape (t, *x_shape).
-        hints: Distributions that say where else to look first.
+        problem: Problem, whose simulator is deterministic beside a declared noise.
         past: State of an earlier call: draws to go on from, and what needs no
             simulation.
-        settings: Budget.
-        seed: Seed of everything random.
 
     Returns:
         None for another simulator.
@@ -177,6 +184,8 @@ def refine_declared(
     Raises:
         UnexplainedOutcomeError: If no parameters have a likelihood.
     """
+    simulator, prior, settings = problem.simulator, problem.prior, problem.settings
+    action, x, seed = problem.action, problem.x, problem.seed
     with forked_generators(derive_seed(seed, "few")):
         few = prior.sample(torch.Size([4])).float()
     if not declares_noise(simulator, few, action[:1].expand(len(few), -1)):
@@ -202,7 +211,7 @@ def refine_declared(
     if before is not None:
         fit = _gone_on(before.pool, potential, own, rng)
     if fit is None:
-        near = _near(hints, coordinates, seed)
+        near = _near(problem.hints, coordinates, seed)
         potential, found, contradiction = _searched(
             potential, near, own, settings.max_inflations, rng
         )

@@ -69,14 +69,9 @@ def infer(
         _begin(pool, potential, rng, modes, near, settings)
     elif modes is not None:
         modes.go_on(pool)
+    num_modes = 0 if found is None else len(found.modes)
     sampling = ImportanceSampling(
-        pool,
-        potential,
-        rng,
-        num_components=max(
-            settings.num_components, len(modes.found.modes) if modes else 0
-        ),
-        settings=settings,
+        *(pool, potential, rng, max(settings.num_components, num_modes), settings),
         # After a further trial the modes are not all, and the draws may know others.
         found=found if past is None else None,
     )

@@ -192,6 +192,7 @@ def _around(z: Array, rng: np.random.Generator) -> StudentMixture:
     return fitted_normals(z[:2_000], 6, rng)
 
 
+@dataclass(frozen=True)
 class Product:
     r"""The learned likelihood of all trials, where it was learned.
 
@@ -201,7 +202,7 @@ class Product:
     with R the region of the training rows, which were drawn from a belief that holds
     the posterior. The factors are exact products; only q is learned.
 
-    Args:
+    Attributes:
         coordinates: Coordinates of the prior.
         model: q, up to factors without theta.
         trials: The history.
@@ -209,17 +210,11 @@ class Product:
         previous: Belief that takes the prior's place, where beliefs are chained.
     """
 
-    def __init__(
-        self,
-        coordinates: PriorCoordinates,
-        model: ActionFactor,
-        trials: Sequence[Observation],
-        region: TrainedRegion | None = None,
-        previous: Distribution | None = None,
-    ) -> None:
-        self.coordinates, self.model, self.region = coordinates, model, region
-        self._previous = previous
-        self.trials = [*trials]
+    coordinates: PriorCoordinates
+    model: ActionFactor
+    trials: Sequence[Observation]
+    region: TrainedRegion | None = None
+    previous: Distribution | None = None
 
     def log_factors(self, theta: Tensor) -> Tensor:
         r"""Return :math:`\sum_k \log q(x_k | \theta, \xi_k)`, (n, d) -> (n,), float64.
@@ -249,10 +244,10 @@ class Product:
 
     def _evaluate(self, theta: Tensor) -> Tensor:
         total = self.log_factors(theta)
-        if self._previous is not None:
-            ratio = self._previous.log_prob(theta)
-            total = total + (ratio - self.coordinates.prior.log_prob(theta)).double()
-        return total
+        if self.previous is None:
+            return total
+        ratio = self.previous.log_prob(theta) - self.coordinates.prior.log_prob(theta)
+        return total + ratio.double()
 
 
 def sample_product(

@@ -106,7 +106,7 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         first = [int((columns == k).nonzero()[0]) for k in range(masks.shape[1])]
         masked = lost[first].tolist()
 
-        how = settings.scaling, settings.whiten, settings.baseline
+        how: Any = settings.scaling, settings.whiten, settings.baseline
         if settings.embedding_net is not None:
             how = "global", settings.whiten, "none"
         embedding = settings.embedding_net or nn.Identity()

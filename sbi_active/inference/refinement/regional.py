@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
-from torch.distributions import Distribution
 
 from sbi_active.arrays import Array
 from sbi_active.inference.declared.contradiction import Contradiction, compared
 from sbi_active.inference.declared.diagnosing import Doubt
-from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.declared.refining import Problem
 from sbi_active.inference.engine.learned import LearnedBelief
 from sbi_active.inference.refinement.checks import (
     Fresh,
@@ -37,15 +34,9 @@ class Regions(Stages):
     """Histories in regions, and a polynomial in each.
 
     Args:
-        simulator: ``simulator(theta, action)``.
-        prior: The original prior.
-        action: Executed actions, shape (t, action_dim).
-        outcome: Their outcomes, shape (t, *x_shape).
-        hints: Distributions to look at first.
-        past: Histories of the first of these trials.
-        settings: Settings of the belief.
+        problem: The posterior that is asked for.
         own: Settings of the stages.
-        seed: Seed of everything random here.
+        past: Histories of the first of its trials.
         further_noise: Standard deviations of noise to add, shape (t, q).
 
     Attributes:
@@ -56,30 +47,25 @@ class Regions(Stages):
 
     def __init__(
         self,
-        simulator: Callable[..., Any],
-        prior: Distribution,
-        action: Tensor,
-        outcome: Tensor,
+        problem: Problem,
+        own: StageSettings,
         *,
-        hints: Sequence[Distribution] = (),
         past: HistoryRecord | None = None,
-        settings: RefinementOptions,
-        own: StageSettings = StageSettings(),  # noqa: B008  (frozen)
-        seed: int,
         further_noise: Array | None = None,
     ) -> None:
+        prior, settings, seed = problem.prior, problem.settings, problem.seed
         rng = np.random.default_rng(derive_seed(seed, "refine"))
         coordinates = PriorCoordinates(prior, rng)
         super().__init__(
             *(prior, settings, own, settings.num_histories, rng, coordinates)
         )
-        self.action, self.outcome = action, outcome
+        self.action, self.outcome = problem.action, problem.x
         self.histories = Histories(
-            *(simulator, action, outcome.numpy().reshape(len(action), -1)),
+            *(problem.simulator, self.action, self.outcome.flatten(1).numpy()),
             *(coordinates, seed, past, settings.workers),
             further_noise=further_noise,
         )
-        near = coordinates.drawn_from(hints, 1_000, seed=seed)
+        near = coordinates.drawn_from(problem.hints, 1_000, seed=seed)
         self.regions = [whole_space(coordinates.dim), *map(around, near)]
         self.near = np.concatenate(near) if near else None
         self.shape_change = 0.0

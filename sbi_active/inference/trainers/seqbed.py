@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +16,6 @@ from sbi_active.expected import require
 from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.beliefs.weighted import KernelBelief
-from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.models.lfire import LFIRE, LFIREModel, fit_log_ratios
 from sbi_active.inference.rounds.rows import (
     Observation,
@@ -204,19 +202,17 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         self._model, self._rows = None, []
 
     def _infer(self, told: Told) -> Belief:
-        trials, simulator, settings = told.trials, told.simulator, told.settings
+        trials, seed = told.trials, told.seed()
         require_whole(torch.stack([trial.x for trial in trials]))
-        seed = told.seed()
-        if simulator is None:
+        if told.simulator is None:
             return self._weighted(self.build_posterior(), trials[-1], {})
         if not told.afresh:
             assert self.belief is not None
-            return self._simulated(self.belief, trials[-1], simulator, settings, seed)
+            return self._simulated(told, self.belief, trials[-1], seed)
         beliefs: list[Any] = [self._prior]
         for k, trial in enumerate(trials):
             own = derive_seed(seed, "trial", k)
-            last = self._simulated(beliefs[-1], trial, simulator, settings, own)
-            beliefs.append(last)
+            beliefs.append(self._simulated(told, beliefs[-1], trial, own))
         known = [belief.diagnostics for belief in beliefs[1:]]
         beliefs[-1].diagnostics = known[-1].extended(
             num_simulations=sum(d.num_simulations for d in known),
@@ -225,19 +221,15 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         return beliefs[-1]
 
     def _simulated(
-        self,
-        belief: Distribution,
-        trial: Observation,
-        simulator: Callable[..., Any],
-        settings: RefinementOptions,
-        seed: int,
+        self, told: Told, belief: Distribution, trial: Observation, seed: int
     ) -> Belief:
         """Weigh new particles of a belief, simulated at the executed action."""
-        n = settings.num_histories
+        n = told.settings.num_histories
         with forked_generators(seed, "theta"):
             drawn = belief.sample(torch.Size([n]))
         theta, action = self.arrange(drawn, trial.action.expand(n, -1))
-        workers = settings.workers
+        simulator, workers = told.simulator, told.settings.workers
+        assert simulator is not None
         rows = rows_of(simulator, theta, action, derive_seed(seed, "x"), workers)
         assert rows is not None
         folds = derive_seed(seed, "folds")
