@@ -169,12 +169,12 @@ def check_belief(
     assert belief is not None
     action = torch.stack([t.action for t in trials])
     x = torch.stack([t.x for t in trials])
-    if infer is None:
-        model, settings = simulator, refinement
+    model, settings = simulator, refinement
 
-        def infer(action: Tensor, x: Tensor, seed: int) -> Distribution:
-            return refine(model, prior, action, x, settings=settings, seed=seed)
+    def refined(action: Tensor, x: Tensor, seed: int) -> Distribution:
+        return refine(model, prior, action, x, settings=settings, seed=seed)
 
+    infer = refined if infer is None else infer
     refits = [
         _compare(belief, infer(action, x, derive_seed(seed, "refit", r)), seed)
         for r in range(num_refits)

@@ -204,7 +204,7 @@ def judge(
     coverage = {c: num / n for c, num in inside.items()}
     intervals = {c: clopper_pearson(num, n, each) for c, num in inside.items()}
     columns = uniform[:, :dim].T.numpy()
-    distance = [float(kstest(c, "uniform", mode="asymp").statistic) for c in columns]
+    distance = [float(kstest(c, "uniform", method="asymp").statistic) for c in columns]
     margin = math.sqrt(math.log(2 / each) / (2 * n))
     ranged = [(max(v - margin, 0.0), min(v + margin, 1.0)) for v in distance]
     p_value = check_uniformity_frequentist(ranks[:, :dim], num_posterior_samples)
