@@ -33,7 +33,7 @@ from torch.distributions import Distribution
 from sbi_active.diagnostics.calibration import Verdict, worst
 from sbi_active.diagnostics.check import is_campaign
 from sbi_active.diagnostics.log_score import smooth
-from sbi_active.expected import suggests
+from sbi_active.expected import require, suggests
 from sbi_active.inference.beliefs.belief import names_of
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.refinement.refining import refine
@@ -90,12 +90,12 @@ class BeliefCheck:
             pairs = zip(self.beyond, self.within, strict=True)
             texts = [f"{a:.2f} and {b:.2f}" for a, b in pairs]
             lines.append(f"  refits differ by {'; '.join(texts)} nats")
+        figures = self.spread, self.spread_interval, self.shift, self.p_value
         names = (*self.parameter_names, "density")
-        for k in range(len(self.spread)):
-            low, high = self.spread_interval[k]
+        for name, spread, (low, high), shift, p in zip(names, *figures, strict=False):
             lines.append(
-                f"  {names[k]}: scores spread {self.spread[k]:.2f} ({low:.2f} to "
-                f"{high:.2f}), shift {self.shift[k]:.2f}, p = {self.p_value[k]:.2g}"
+                f"  {name}: scores spread {spread:.2f} ({low:.2f} to {high:.2f}), "
+                f"shift {shift:.2f}, p = {p:.2g}"
             )
         return "\n".join(lines)
 
@@ -139,18 +139,26 @@ def check_belief(
     Raises:
         ValueError: If there is no trial, no simulator, or sizes are too small.
     """
-    if num_repeats and (num_repeats < 10 or num_copies < 1):
-        raise ValueError(
-            f"expected num_repeats 0 or at least 10, num_copies at least 1; got "
-            f"{num_repeats} and {num_copies}; use 40 and 6"
-        )
-    if num_repeats == 0 and num_refits < 1:
-        raise ValueError("expected repeats or refits; got neither; pass num_refits=2")
-    prior, trials = _given(inference)
+    require(
+        not num_repeats or (num_repeats >= 10 and num_copies >= 1),
+        "num_repeats 0 or at least 10, num_copies at least 1",
+        f"{num_repeats} and {num_copies}",
+        "use 40 and 6",
+    )
+    asked = num_repeats or num_refits
+    require(asked > 0, "repeats or refits", "neither", "pass num_refits=2")
     if is_campaign(inference):
+        prior, trials = inference.prior, inference.state.explained
         simulator = inference.simulator if simulator is None else simulator
         own = inference.state.options.refinement
         refinement = own if refinement is None else refinement
+    elif hasattr(inference, "trials"):
+        prior, trials = inference._prior, inference.trials
+    else:
+        raise TypeError(
+            f"expected a trainer or a campaign; got {type(inference).__name__}; pass "
+            "inference, whose update gave the belief"
+        )
     if simulator is None or not trials:
         raise ValueError(
             "expected a simulator and at least one trial; got "
@@ -181,18 +189,6 @@ def check_belief(
     names = getattr(simulator, "parameter_names", None)
     names = names_of(belief, belief.event_shape[0]) if names is None else names
     return _judge((*names,), refits, scores, level, len(x) * num_copies * num_repeats)
-
-
-def _given(inference: Any) -> tuple[Distribution, Sequence[Any]]:
-    """Return the prior and the trials behind a belief."""
-    if is_campaign(inference):
-        return inference.prior, inference.state.explained
-    if not hasattr(inference, "trials"):
-        raise TypeError(
-            f"expected a trainer or a campaign; got {type(inference).__name__}; pass "
-            "inference, whose update gave the belief"
-        )
-    return inference._prior, inference.trials
 
 
 def _compare(
@@ -240,17 +236,12 @@ def _scores(
     new = action.repeat(copies, 1)
     scores = []
     for k, theta in enumerate(truths):
-        rows = simulate(
-            simulator,
-            theta.expand(len(new), -1),
-            new,
-            seed=derive_seed(seed, "new", k),
-        ).without_missing()
-        after = infer(
-            torch.cat([action, rows.action.to(action)]),
-            torch.cat([x, rows.x.to(x)]),
-            derive_seed(seed, "repeat", k),
-        )
+        own = derive_seed(seed, "new", k)
+        rows = simulate(simulator, theta.expand(len(new), -1), new, seed=own)
+        rows = rows.without_missing()
+        every = torch.cat([action, rows.action.to(action)])
+        seen = torch.cat([x, rows.x.to(x)])
+        after = infer(every, seen, derive_seed(seed, "repeat", k))
         with forked_generators(derive_seed(seed, "rank", k)):
             draws = after.sample(torch.Size([num_draws])).float()
             ties = np.random.random(len(theta) + 1)
@@ -261,80 +252,70 @@ def _scores(
     return np.stack(scores)
 
 
-def _judge_refits(
-    refits: Sequence[tuple[float, float]],
-    dim: int,
-    *,
-    different: float = 0.3,
-    excluded: float = 0.6,
-) -> list[tuple[Verdict, str]]:
-    """Return what refits say of a belief.
-
-    Args:
-        refits: Nats beyond and within it, of each refit.
-        dim: Number of parameters.
-        different: Nats a parameter at which two beliefs differ; twice the width is .8
-            or .3 by the direction.
-        excluded: Nats a parameter of refits that the belief does not hold.
-    """
-    if not refits:
-        return []
-    a, b = min(refits, key=max)
-    text = f"inferred again it is another: {a:.2f} nats are beyond it, {b:.2f} in it"
-    if a > excluded * dim:
-        return [("stop", f"{text}; it is too narrow or lost a mode")]
-    if max(a, b) > different * dim:
-        return [("refine", f"{text}; raise num_histories")]
-    if max(map(max, refits)) > 2 * different * dim:
-        text = "two inferences of the same trials differ; raise num_histories"
-        return [("refine", text)]
-    return []
-
-
 def _judge(
     names: tuple[str, ...],
     refits: Sequence[tuple[float, float]],
     scores: np.ndarray,
     level: float,
     num_simulations: int,
+    *,
+    different: float = 0.3,
+    excluded: float = 0.6,
 ) -> BeliefCheck:
-    dim, found = len(names), _judge_refits(refits, len(names))
-    beyond = tuple(a for a, _ in refits)
-    within = tuple(b for _, b in refits)
-    n, is_other = len(scores), bool(found)
-    spread, shift, p_value, ends = [], [], [], []
+    """Return what refits and ranks say of a belief.
+
+    Args:
+        names: Names of the parameters.
+        refits: Nats beyond and within it, of each refit.
+        scores: Normal scores of the ranks, shape (n, d + 1), or (0, 0).
+        level: Probability that ranks alone flag a right belief.
+        num_simulations: Rows of new outcomes.
+        different: Nats a parameter at which two beliefs differ; twice the width is .8
+            or .3 by the direction.
+        excluded: Nats a parameter of refits that the belief does not hold.
+    """
+    dim, n = len(names), len(scores)
+    found: list[tuple[Verdict, str]] = []
+    if refits:
+        a, b = min(refits, key=max)
+        text = (
+            f"inferred again it is another: {a:.2f} nats are beyond it, {b:.2f} in it"
+        )
+        if a > excluded * dim:
+            found.append(("stop", f"{text}; it is too narrow or lost a mode"))
+        elif max(a, b) > different * dim:
+            found.append(("refine", f"{text}; raise num_histories"))
+        elif max(map(max, refits)) > 2 * different * dim:
+            text = "two inferences of the same trials differ; raise num_histories"
+            found.append(("refine", text))
+    is_other = bool(found)
+    z = np.ascontiguousarray(scores.T)
+    total, shift = (z**2).sum(1), z.sum(1) / max(n, 1)
+    tail = np.minimum(2 * np.minimum(chi2.sf(total, n), chi2.cdf(total, n)), 1.0)
+    side = 2 * norm.sf(np.abs(shift) * n**0.5)
+    p_value = np.minimum(2 * np.minimum(tail, side), 1.0)
+    spread = (total / max(n, 1)) ** 0.5
+    ends = (total[:, None] / chi2.ppf([0.975, 0.025], max(n, 1))) ** 0.5
     labels = (*names, "the density")
-    for k in range(scores.shape[1] if n else 0):
-        z = scores[:, k]
-        total = float((z**2).sum())
-        tail = min(2 * min(chi2.sf(total, n), chi2.cdf(total, n)), 1.0)
-        side = 2 * float(norm.sf(abs(z.mean()) * n**0.5))
-        spread.append(float((total / n) ** 0.5))
-        shift.append(float(z.mean()))
-        p_value.append(float(min(2 * min(tail, side), 1.0)))
-        quantiles = chi2.ppf([0.975, 0.025], n)
-        ends.append(tuple(float((total / q) ** 0.5) for q in quantiles))
-        if p_value[k] < level / (dim + 1):
-            text = f"ranks of {labels[k]} in repeats are not uniform (p = "
-            text += f"{p_value[k]:.1g})"
-            # The truth of a wide belief lies where the density is high.
-            wide = shift[k] > 0 if k == dim else spread[k] < 1
-            if is_other:  # of the belief and the repeats, which is wrong?
-                found.append(("refine", text))
-            else:
-                word = "wide" if wide else "narrow"
-                text += f": beliefs are too {word} or misplaced"
-                found.append(("refine" if wide else "stop", text))
+    for k in np.flatnonzero(p_value < level / (dim + 1)):
+        text = f"ranks of {labels[k]} in repeats are not uniform (p = {p_value[k]:.1g})"
+        # The truth of a wide belief lies where the density is high.
+        is_wide = shift[k] > 0 if k == dim else spread[k] < 1
+        if is_other:  # of the belief and the repeats, which is wrong?
+            found.append(("refine", text))
+        else:
+            text += f": beliefs are too {'wide' if is_wide else 'narrow'} or misplaced"
+            found.append(("refine" if is_wide else "stop", text))
     return BeliefCheck(
         verdict=worst([v for v, _ in found]),
         reasons=(*(text for _, text in found),),
         parameter_names=names,
-        beyond=beyond,
-        within=within,
-        spread=(*spread,),
-        spread_interval=(*ends,),
-        shift=(*shift,),
-        p_value=(*p_value,),
+        beyond=(*(a for a, _ in refits),),
+        within=(*(b for _, b in refits),),
+        spread=(*spread.tolist(),),
+        spread_interval=(*map(tuple, ends.tolist()),),
+        shift=(*shift.tolist(),),
+        p_value=(*p_value.tolist(),),
         num_repeats=n,
         num_simulations=num_simulations,
     )

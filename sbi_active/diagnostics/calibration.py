@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import torch
 from sbi.diagnostics.sbc import check_uniformity_frequentist
-from scipy.stats import beta, norm
+from scipy.stats import beta, kstest, norm
 from torch import Tensor
 
 if TYPE_CHECKING:
@@ -87,7 +87,6 @@ class Calibration:
         tarp: Expected coverage and credibility by distances to random points (Lemos et
             al. 2023), of all rows.
         tarp_area: Area between these from .5 up; negative for too narrow a posterior.
-        local: p-values that the posterior is right at given outcomes, where asked for.
     """
 
     verdict: Verdict
@@ -103,7 +102,6 @@ class Calibration:
     label: Tensor = field(repr=False)
     tarp: tuple[Tensor, Tensor] = field(repr=False)
     tarp_area: float
-    local: tuple[float, ...] = ()
 
     @property
     def flagged(self) -> list[str]:
@@ -199,15 +197,14 @@ def judge(
     """
     n, dim = len(ranks), ranks.shape[1] - 1
     each = level / (num_kinds + dim)
+    uniform = (ranks.double() + 0.5) / (num_posterior_samples + 1)
     # The smallest region that holds the truth has the draws of a higher density.
-    credible = 1 - (ranks[:, -1].double() + 0.5) / (num_posterior_samples + 1)
-    coverage, intervals = {}, {}
-    for c in levels:
-        inside = int((credible <= c).sum())
-        coverage[c] = inside / n
-        intervals[c] = clopper_pearson(inside, n, each)
-    uniform = (ranks[:, :dim].double() + 0.5) / (num_posterior_samples + 1)
-    distance = [ks_distance(uniform[:, k].numpy()) for k in range(dim)]
+    credible = 1 - uniform[:, -1]
+    inside = {c: int((credible <= c).sum()) for c in levels}
+    coverage = {c: num / n for c, num in inside.items()}
+    intervals = {c: clopper_pearson(num, n, each) for c, num in inside.items()}
+    columns = uniform[:, :dim].T.numpy()
+    distance = [float(kstest(c, "uniform", method="asymp").statistic) for c in columns]
     margin = math.sqrt(math.log(2 / each) / (2 * n))
     ranged = [(max(v - margin, 0.0), min(v + margin, 1.0)) for v in distance]
     p_value = check_uniformity_frequentist(ranks[:, :dim], num_posterior_samples)
@@ -216,21 +213,14 @@ def judge(
     excess = gap - tolerance.lost * (gap + gained).clamp_min(-20)
     reasons: list[tuple[Verdict, str]] = []
     low, high = intervals[0.9]
+    text = f"90 % regions hold {coverage[0.9]:.0%} of the truths, at"
     if high < 0.9 - tolerance.excluded:
-        text = (
-            f"90 % regions hold {coverage[0.9]:.0%} of the truths, at most {high:.0%}"
-        )
-        reasons.append(("stop", f"{text}: it excludes the truth too often"))
+        word = f"most {high:.0%}: it excludes the truth too often"
+        reasons.append(("stop", f"{text} {word}"))
     elif high < 0.9 - tolerance.coverage:
-        text = (
-            f"90 % regions hold {coverage[0.9]:.0%} of the truths, at most {high:.0%}"
-        )
-        reasons.append(("refine", f"{text}: it is too sure"))
+        reasons.append(("refine", f"{text} most {high:.0%}: it is too sure"))
     elif low > 0.9 + tolerance.coverage:
-        text = (
-            f"90 % regions hold {coverage[0.9]:.0%} of the truths, at least {low:.0%}"
-        )
-        reasons.append(("refine", f"{text}: it is too wide"))
+        reasons.append(("refine", f"{text} least {low:.0%}: it is too wide"))
     for k, (least, _) in enumerate(ranged):
         if least > tolerance.rank_distance:
             text = f"ranks of {names[k]} are {distance[k]:.2f} from uniform"
@@ -267,13 +257,6 @@ def clopper_pearson(successes: int, n: int, level: float) -> Interval:
     return low, high
 
 
-def ks_distance(values: np.ndarray) -> float:
-    """Return the largest distance of a sample's distribution from uniform."""
-    ordered = np.sort(values)
-    steps = np.arange(len(ordered) + 1) / len(ordered)
-    return float(max((steps[1:] - ordered).max(), (ordered - steps[:-1]).max()))
-
-
 def _interval(values: Tensor, level: float) -> Interval:
     """Return the normal interval of a mean, without the farthest of terms.
 
@@ -296,42 +279,41 @@ def _plotted(found: Calibration) -> Figure:
 
     figure, axes = plt.subplots(2, 2, figsize=(11, 8), layout="constrained")
     figure.suptitle(f"calibration: {found.verdict}")
-    for k in range(len(found.parameter_names)):
+    (ranks, tarp), (shares, gaps) = axes
+    for k, name in enumerate(found.parameter_names):
         sbc_rank_plot(
             found.ranks[:, k : k + 1],
             found.num_posterior_samples,
             plot_type="cdf",
-            ranks_labels=[found.parameter_names[k]],
+            ranks_labels=[name],
             colors=[f"C{k}"],
             fig=figure,
-            ax=axes[0, 0],
+            ax=ranks,
         )
-    axes[0, 0].set_title("ranks of the truth")
+    ranks.set_title("ranks of the truth")
     coverage, credibility = found.tarp
-    axes[0, 1].plot(credibility, coverage, color="blue", label="TARP")
-    levels = [*found.overall.coverage]
-    middle = [found.overall.coverage[c] for c in levels]
-    ends = np.array([found.overall.coverage_interval[c] for c in levels]).T
-    axes[0, 1].errorbar(
-        levels, middle, abs(ends - middle), fmt="o", label="smallest regions"
-    )
-    axes[0, 1].plot([0, 1], [0, 1], "k--", label="ideal")
-    axes[0, 1].set(xlabel="credibility level", ylabel="expected coverage")
-    axes[0, 1].legend()
-    place = np.arange(len(found.strata))
+    tarp.plot(credibility, coverage, color="blue", label="TARP")
+    levels, middle = [*found.overall.coverage], [*found.overall.coverage.values()]
+    ends = np.array([*found.overall.coverage_interval.values()]).T
+    error = abs(ends - middle)
+    tarp.errorbar(levels, middle, error, fmt="o", label="smallest regions")
+    tarp.plot([0, 1], [0, 1], "k--", label="ideal")
+    tarp.set(xlabel="credibility level", ylabel="expected coverage")
+    tarp.legend()
     color = {"trust": "C2", "refine": "C1", "stop": "C3"}
-    for i, s in zip(place, found.strata, strict=True):
+    for i, s in enumerate(found.strata):
         for ax, value, (low, high) in (
-            (axes[1, 0], s.coverage[0.9], s.coverage_interval[0.9]),
-            (axes[1, 1], s.gap, s.gap_interval),
+            (shares, s.coverage[0.9], s.coverage_interval[0.9]),
+            (gaps, s.gap, s.gap_interval),
         ):
             error = [[max(value - low, 0)], [max(high - value, 0)]]
             ax.errorbar(i, value, error, fmt="o", color=color[s.verdict])
-    axes[1, 0].axhline(0.9, color="k", ls="--")
-    axes[1, 0].set_ylabel("coverage of 90 % regions")
-    axes[1, 1].axhline(0.0, color="k", ls="--")
-    axes[1, 1].set_ylabel("log-score gap [nats]")
-    for ax in axes[1]:
-        names = [s.name for s in found.strata]
-        ax.set_xticks(place, names, rotation=90, fontsize=7)
+    names = [s.name for s in found.strata]
+    for ax, ideal, label in (
+        (shares, 0.9, "coverage of 90 % regions"),
+        (gaps, 0.0, "log-score gap [nats]"),
+    ):
+        ax.axhline(ideal, color="k", ls="--")
+        ax.set_ylabel(label)
+        ax.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
     return figure

@@ -31,7 +31,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation import SimulatorModel, simulate
+from sbi_active.simulation import Simulations, SimulatorModel, simulate
 from sbi_active.support import within_support
 
 
@@ -46,13 +46,11 @@ def smooth(belief: Distribution, theta: Tensor) -> Tensor:
 def gap_by_likelihood(
     simulator: SimulatorModel,
     belief: Distribution,
-    theta: Tensor,
-    action: Tensor,
-    x: Tensor,
+    simulated: Simulations,
     log_q: Callable[[Tensor], Tensor],
     draws: Tensor,
     *,
-    num_contrastive: int,
+    num_contrastive: int = 64,
     seed: int,
 ) -> Tensor:
     r"""Return :math:`\log p(\theta|x,\xi) - \log q`, on average a lower bound.
@@ -60,9 +58,7 @@ def gap_by_likelihood(
     Args:
         simulator: Simulator with declared noise.
         belief: Belief over theta before x.
-        theta: Truths, shape (n, d).
-        action: Actions, shape (n, action_dim).
-        x: Outcomes, shape (n, *x_shape).
+        simulated: Rows of truths, n of them.
         log_q: Log density of rows of draws, (m, n, d) -> (m, n).
         draws: Draws of q, shape (m, n, d).
         num_contrastive: Draws of q and of the belief, as many of each.
@@ -71,33 +67,32 @@ def gap_by_likelihood(
     Returns:
         Shape (n,), nats.
     """
-    n, m = len(theta), num_contrastive
+    n, m = len(simulated), num_contrastive
     with forked_generators(derive_seed(seed, "contrast")):
         other = belief.sample(torch.Size([m * n])).reshape(m, n, -1).float()
-    rows = torch.cat([theta[None], draws[:m], other])
+    rows = torch.cat([simulated.theta[None], draws[:m], other])
     with torch.no_grad():
         q = log_q(rows).double()
     b = smooth(belief, rows)
     finite = b.isfinite()
+
+    def repeated(part: Tensor) -> Tensor:
+        return part.expand(len(rows), *part.shape)[finite]
+
+    bare, x = simulator.without_noise(), repeated(simulated.x).double()
+    action, own = repeated(simulated.action), derive_seed(seed, "mean")
+    mean = simulate(bare, rows[finite], action, seed=own).x.double()
+    assert simulator.noise is not None
+    value = simulator.noise.log_prob(x, mean.nan_to_num(0.0)).double()
+    # Where one alone is NaN it is impossible.
+    agrees = (x.isnan() == mean.isnan()).flatten(1).all(1)
+    value = torch.where(x.isnan().flatten(1).all(1), 0.0, value)
     likelihood = torch.full(b.shape, -torch.inf, dtype=torch.float64)
-    pairs = rows[finite], action.expand(len(rows), *action.shape)[finite]
-    seen = x.expand(len(rows), *x.shape)[finite]
-    bare = simulator.without_noise()
-    mean = simulate(bare, *pairs, seed=derive_seed(seed, "mean")).x.double()
-    likelihood[finite] = noise_log_prob(simulator, seen.double(), mean)
+    likelihood[finite] = torch.where(agrees, value, -torch.inf)
     proposal = torch.logaddexp(q, b) - math.log(2)
     log_weight = (likelihood + b - proposal).nan_to_num(nan=-torch.inf)
     log_z = log_weight.logsumexp(0) - math.log(len(rows))
     return likelihood[0] + b[0] - q[0] - log_z
-
-
-def noise_log_prob(simulator: SimulatorModel, x: Tensor, mean: Tensor) -> Tensor:
-    """Return log p(x | mean), shape (n,); where one alone is NaN it is impossible."""
-    assert simulator.noise is not None
-    value = simulator.noise.log_prob(x, mean.nan_to_num(0.0)).double()
-    agrees = (x.isnan() == mean.isnan()).flatten(1).all(1)
-    nothing = x.isnan().flatten(1).all(1)
-    return torch.where(agrees, torch.where(nothing, 0.0, value), -torch.inf)
 
 
 def gap_by_classifier(
@@ -132,16 +127,12 @@ def gap_by_classifier(
     true, false = features(theta), [features(d) for d in draws[:2]]
     half = np.random.default_rng(derive_seed(seed, "half")).permutation(len(theta)) % 2
     terms = np.zeros(len(theta))
+    options: Any = {"early_stopping": True, "max_iter": 60, "max_depth": 4}
     for k in (0, 1):
         on, off = half != k, half == k
-        options: Any = {"early_stopping": True}
-        model = HistGradientBoostingClassifier(
-            max_iter=60, max_depth=4, random_state=k, **options
-        )
-        model.fit(
-            np.concatenate([true[on], false[0][on]]),
-            np.repeat([1, 0], int(on.sum())),
-        )
+        model = HistGradientBoostingClassifier(random_state=k, **options)
+        rows = np.concatenate([true[on], false[0][on]])
+        model.fit(rows, np.repeat([1, 0], int(on.sum())))
         p, *q = (_log_ratio(model, f[off]) for f in (true, *false))
         terms[off] = p - np.mean([np.exp(v) for v in q], 0) + 1
     return torch.from_numpy(terms)

@@ -13,7 +13,6 @@ from sklearn.cluster import KMeans
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace
-from sbi_active.inference.models.posterior import at_conditions
 from sbi_active.seeding import derive_seed
 from sbi_active.support import within_support
 
@@ -71,16 +70,7 @@ class RowPosterior(DirectPosterior):
     is what a check meets. Such a row keeps its draws outside, where they are wrong.
     """
 
-    @classmethod
-    def of(
-        cls, direct: DirectPosterior, condition: Tensor
-    ) -> tuple[RowPosterior, Tensor]:
-        """Return the posterior over rows of packed conditions, and their numbers."""
-        made, index = at_conditions(direct, condition)
-        made.__class__ = cls
-        assert isinstance(made, cls)
-        return made, index
-
+    @torch.no_grad()
     def sample_batched(  # pyright: ignore[reportIncompatibleMethodOverride]
         self,
         sample_shape: Any,

@@ -122,10 +122,10 @@ class Coordinates:
         reach: float = 6.0,
         num_knots: int = 1_201,
     ) -> None:
-        self._reach = reach
-        highest = 10 * float(target.abs().max()) + 100
+        self._reach, self._fit, self._target = reach, fit, target
+        highest = float(np.log(10 * float(target.abs().max()) + 100))
         self._low = float(np.log(lowest))
-        self._step = (float(np.log(highest)) - self._low) / (num_grid - 1)
+        self._step = (highest - self._low) / (num_grid - 1)
         grid = self._low + self._step * torch.arange(num_grid, dtype=target.dtype)
         log_prior = error_model.log_deviation(grid).numpy()
         log_alone = fit.log_alone(target, grid.exp()[:, None].expand(-1, len(target)))
@@ -155,6 +155,12 @@ class Coordinates:
     def log_gain(self, log_sd: Tensor) -> Tensor:
         """Return the log density behind y over the prior's, (..., q) to (..., q)."""
         return _between(self._gain, (log_sd - self._low) / self._step)
+
+    def potential(self, sites: dict[str, Tensor]) -> Tensor:
+        """Return minus the log density of coordinates, the site "y"."""
+        y, log_sd = sites["y"], self(sites["y"])
+        joint = self._fit.log_joint(self._target, log_sd.exp()).logsumexp(-1)
+        return 0.5 * y.square().sum(-1) - joint + self.log_gain(log_sd).sum(-1)
 
 
 def _between(table: Tensor, place: Tensor) -> Tensor:
@@ -318,38 +324,34 @@ def denoise(
         else:
             own, rng = fit.marginal(seen), np.random.default_rng(seed)
             coordinates = Coordinates(own, target, error_model, rng)
-            y, log_sd, divergences = _nuts(own, target, coordinates, num_draws)
-            x = fit.given(target, log_sd.exp(), seen)
+            y, divergences = _nuts(coordinates, torch.full_like(target, 0.7), num_draws)
+            x = fit.given(target, coordinates(y).exp(), seen)
             probability[seen] = error_model.misspecified(x[:, seen], target).mean(0)
-            r_hat, ess = _figures(torch.cat([x[:, seen], y], 1))
+            chains = torch.cat([x[:, seen], y], 1).reshape(2, num_draws, -1)
+            r_hat = float(split_gelman_rubin(chains, chain_dim=0, sample_dim=1).max())
+            ess = effective_sample_size(chains, chain_dim=0, sample_dim=1)
+            ess = float(ess.min())
     return Denoised(x * scale + center, probability, r_hat, ess, divergences)
 
 
 def _nuts(
-    fit: Predictive,
-    target: Tensor,
     coordinates: Coordinates,
+    start: Tensor,
     num_draws: int,
     *,
     depth: int = 5,
     accepted: float = 0.65,
-    starts: tuple[float, ...] = (-0.7, 0.7),
     num_warmup: int = 40,
-) -> tuple[Tensor, Tensor, int]:
-    """Return coordinates and log deviations, both (n, q), and divergences."""
+) -> tuple[Tensor, int]:
+    """Return coordinates (n, q) of two chains, from a start and its mirror image.
 
-    def potential(sites: dict[str, Tensor]) -> Tensor:
-        y = sites["y"]
-        log_sd = coordinates(y)
-        joint = fit.log_joint(target, log_sd.exp()).logsumexp(-1)
-        gain = coordinates.log_gain(log_sd).sum(-1)
-        return 0.5 * y.square().sum(-1) - joint + gain
-
+    And the number of their divergences.
+    """
     draws, divergences = [], 0
-    for start in starts:
+    for y in (-start, start):
         # Coordinates are about standard normal: no masses are to be learned.
         kernel = NUTS(
-            potential_fn=potential,
+            potential_fn=coordinates.potential,
             step_size=1.0,  # pyright: ignore
             adapt_mass_matrix=False,
             target_accept_prob=accepted,
@@ -359,20 +361,11 @@ def _nuts(
             kernel,
             num_draws,
             warmup_steps=num_warmup,
-            initial_params={"y": torch.full_like(target, start)},
+            initial_params={"y": y},
             disable_progbar=True,
         )
         run.run()
         notes: dict[str, Any] = run.diagnostics()
         divergences += sum(len(rows) for rows in notes.get("divergences", {}).values())
         draws.append(run.get_samples()["y"])
-    y = torch.cat(draws)
-    return y, coordinates(y), divergences
-
-
-def _figures(draws: Tensor) -> tuple[float, float]:
-    """Return the largest r_hat and the smallest effective number of draws."""
-    chains = draws.reshape(2, -1, draws.shape[-1])
-    r_hat = split_gelman_rubin(chains, chain_dim=0, sample_dim=1)
-    ess = effective_sample_size(chains, chain_dim=0, sample_dim=1)
-    return float(r_hat.max()), float(ess.min())
+    return torch.cat(draws), divergences

@@ -11,54 +11,12 @@ import pyro
 import torch
 from pyro import poutine
 from pyro.poutine.subsample_messenger import _Subsample
+from sbi.utils import MultipleIndependent
 from torch import Tensor
-from torch.distributions import Distribution, Normal, StudentT, constraints
+from torch.distributions import Distribution, Independent, Normal, StudentT
 
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel, StudentTNoise
-
-
-class SitesPrior(Distribution):
-    """The joint prior of a Pyro model's latent sites, end to end.
-
-    Args:
-        sites: Distribution of each, by name; independent of one another.
-    """
-
-    arg_constraints = {}  # pyright: ignore
-
-    def __init__(self, sites: dict[str, Distribution]) -> None:
-        self.sites = sites
-        self.sizes = [int(np.prod(_shape(d))) for d in sites.values()]
-        super().__init__(
-            torch.Size(), torch.Size([sum(self.sizes)]), validate_args=False
-        )
-
-    @property
-    def support(self) -> Any:
-        """Bounds of every entry, those of its site."""
-        parts = [_base(d.support) for d in self.sites.values()]
-        whole = constraints.cat(parts, dim=-1, lengths=self.sizes)
-        return constraints.independent(whole, 1)
-
-    def sample(self, sample_shape: Any = ()) -> Tensor:
-        """Return draws, shape (*sample_shape, d), float32."""
-        shape = torch.Size(sample_shape)
-        pairs = zip(self.sites.values(), self.sizes, strict=True)
-        parts = [d.sample(shape).reshape(*shape, size) for d, size in pairs]
-        return torch.cat(parts, -1).float()
-
-    def log_prob(self, value: Tensor) -> Tensor:
-        """Return the log density, (..., d) -> (...)."""
-        inside = self.support.check(value)
-        total = torch.zeros(value.shape[:-1], dtype=value.dtype)
-        safe = torch.where(inside[..., None], value, self.sample().to(value))
-        for d, part in zip(
-            self.sites.values(), safe.split(self.sizes, -1), strict=True
-        ):
-            log_p = d.log_prob(part.reshape(*value.shape[:-1], *_shape(d)))
-            total = total + log_p.reshape(*value.shape[:-1], -1).sum(-1)
-        return torch.where(inside, total, -torch.inf)
 
 
 @dataclass(frozen=True)
@@ -72,7 +30,7 @@ class PyroProblem:
     """
 
     simulator: SimulatorModel
-    prior: SitesPrior
+    prior: Distribution
     parameter_names: list[str]
 
 
@@ -128,10 +86,11 @@ def from_pyro(
                 f"expected continuous parameters; got {name!r}, which is discrete; sum "
                 "it out in the model"
             )
-        if _base(d.support).event_dim:
+        if _base(d.support).event_dim or len(_shape(d)) > 1:
             raise ValueError(
-                f"expected parameters with bounds of their own; got {name!r} on "
-                f"{d.support}; write it as a function of free ones"
+                "expected vectors of parameters with bounds of their own; got "
+                f"{name!r} of shape {tuple(_shape(d))} on {d.support}; write it as a "
+                "function of free ones"
             )
         if any(name not in other or not _same(d, other[name]) for other in sites):
             raise ValueError(
@@ -139,33 +98,35 @@ def from_pyro(
                 "changes from run to run; write it as a location and a scale times a "
                 "site of its own"
             )
-    prior = SitesPrior(first)
+    sizes = {name: _shape(d).numel() for name, d in first.items()}
     names = [
         name if size == 1 else f"{name}_{i + 1}"
-        for name, size in zip(first, prior.sizes, strict=True)
+        for name, size in sizes.items()
         for i in range(size)
     ]
+    # Each site as a vector, one number as a vector of one.
+    vectors = [d if _shape(d) else d.expand((1,)) for d in first.values()]
+    parts = [Independent(d, 1) if d.batch_shape else d for d in vectors]
+    prior = parts[0]
+    if len(parts) > 1:
+        prior = MultipleIndependent(parts, validate_args=False)
     noise = _noise([_node(trace, outcome)["fn"] for trace in traces])
-    function = _Row(model, first, prior.sizes, outcome, noise is not None)
+    function = _Row(model, first, [*sizes.values()], outcome, noise is not None)
     simulator = SimulatorModel(
         function, noise=noise, batched=False, parameter_names=names
     )
     return PyroProblem(simulator, prior, names)
 
 
+@dataclass(frozen=True)
 class _Row:
     """A row of the simulator: the model, conditioned on parameters."""
 
-    def __init__(
-        self,
-        model: Callable[[Tensor], Any],
-        sites: dict[str, Distribution],
-        sizes: list[int],
-        outcome: str,
-        is_mean: bool,
-    ) -> None:
-        self.model, self.outcome, self.is_mean = model, outcome, is_mean
-        self.sites, self.sizes = sites, sizes
+    model: Callable[[Tensor], Any]
+    sites: dict[str, Distribution]
+    sizes: list[int]
+    outcome: str
+    is_mean: bool
 
     def __call__(self, theta: Any, action: Any, rng: np.random.Generator) -> Any:
         parts = torch.as_tensor(theta).split(self.sizes)

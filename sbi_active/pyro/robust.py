@@ -134,12 +134,11 @@ class RobustASBI(ASBI):
         if simulator is None or refinement is not None:
             raise ValueError(
                 "expected a simulator, whose predictive tells what an outcome may be, "
-                "and no refinement; got "
-                f"simulator={simulator}, refinement={refinement}; pass the simulator "
-                "alone"
+                f"and no refinement; got simulator={simulator}, refinement="
+                f"{refinement}; pass the simulator alone"
             )
         trial = self._observation(x_o, action)
-        self._require_belief_network()
+        self._require_trained()
         network, previous = self._neural_net, self.belief
         assert network is not None
         assert previous is not None
@@ -150,7 +149,9 @@ class RobustASBI(ASBI):
         rows = simulate(simulator, theta, actions, seed=derive_seed(seed, "rows"))
         flat, x_o = rows.x.reshape(len(rows.x), -1), trial.x.reshape(-1)
         missing = x_o.isnan()
-        known = bool(missing.any()) and _knows(network, trial.x, trial.action)
+        known = False
+        if bool(missing.any()) and isinstance(network, MixtureDensityNetwork):
+            known = network.knows(pack(trial.x[None], trial.action[None]))
         # A number that simulations lack too is information; else its sensor failed.
         lacking = missing if known else torch.zeros_like(missing)
         rows_alike = (flat.isnan() == lacking).all(1) & ~flat.isinf().any(1)
@@ -167,10 +168,3 @@ class RobustASBI(ASBI):
         self.denoised.append(denoised)
         self._forget_round()
         return belief
-
-
-def _knows(network: Any, x: Tensor, action: Tensor) -> bool:
-    """Return whether a network was trained on outcomes that lack the same numbers."""
-    if not isinstance(network, MixtureDensityNetwork):
-        return False  # sbi's networks take no NaN
-    return network.knows(pack(x[None], action[None]))

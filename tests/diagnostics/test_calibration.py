@@ -110,14 +110,14 @@ def test_a_blunt_network_passes_ranks_and_not_the_gap(trained):
         assert low < 0.9 < high
 
 
-def test_a_result_says_itself_and_leaves_the_generators_alone(trained):
+@pytest.mark.parametrize("gap", ["likelihood", "classifier"])
+def test_a_result_says_itself_and_leaves_the_generators_alone(trained, gap):
     before = torch.random.get_rng_state()
+    options = {"num_simulations": 150, "parameter_names": ["k"], "gap": gap}
     found, again = (
-        check_calibration(
-            trained, MODEL, actions=ACTIONS, num_simulations=150, parameter_names=["k"]
-        )
-        for _ in range(2)
+        check_calibration(trained, MODEL, actions=ACTIONS, **options) for _ in range(2)
     )
+    assert found.gap_method == gap
     assert (torch.random.get_rng_state() == before).all()
     assert (found.ranks == again.ranks).all()
     assert again.to_dict() == found.to_dict()

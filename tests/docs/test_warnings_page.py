@@ -75,6 +75,8 @@ def test_codes_are_those_of_the_registry():
         and isinstance(node.value, str)
         and re.match(r"SA\d{3}\b", node.value)
     }
+    doubts = importlib.import_module("sbi_active.inference.declared.diagnosing")
+    said |= {text[:5] for text in doubts.texts().values()}
     assert said == {*explanations()}
     headings = re.findall("^### .*", (LIBRARY / "messages.md").read_text(), re.M)
     assert len(headings) == len(said)

@@ -373,19 +373,14 @@ def compare(
     score = float(chained_log_prob.clamp_min(refined_score + floor).mean())
     entropy = -float(chained.log_prob(chained_draws).double().mean())
     loss, bluntness = refined_score - score, entropy + refined_score
+    kind = f"overconfident or misplaced, {loss:.1f} nats behind the refined belief"
+    if bluntness > 0.5 * loss:
+        kind = f"under-confident, {bluntness:.1f} nats blunter than the refined belief"
+    text = f"SA122 the amortized network is {kind}"
     refined.diagnostics = refined.diagnostics.extended(
         refined_log_score=refined_score,
         chained_log_score=score,
         chained_loss=loss,
         chained_bluntness=bluntness,
-    )
-    if loss <= tolerance:
-        return
-    kind = (
-        f"under-confident, {bluntness:.1f} nats blunter than the refined belief"
-        if bluntness > 0.5 * loss
-        else f"overconfident or misplaced, {loss:.1f} nats behind the refined belief"
-    )
-    refined.diagnostics = refined.diagnostics.extended(
-        network_warnings=((f"SA122 the amortized network is {kind}"),)
+        network_warnings=(text,) if loss > tolerance else (),
     )

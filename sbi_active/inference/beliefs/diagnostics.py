@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from types import MappingProxyType
 from typing import Any
 
 from sbi_active.display.notebook import badge, card, facts, items
@@ -17,7 +16,6 @@ VERDICTS = {
     False: ("bad", "not trustworthy"),
     None: ("plain", "not checked"),
 }
-_NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ class Diagnostics:
     trustworthy: bool | None = None
     warnings: tuple[str, ...] = ()
     network_warnings: tuple[str, ...] = ()
-    assumptions: Mapping[str, Assumption] = field(default_factory=lambda: _NOTHING)
+    assumptions: Mapping[str, Assumption] = field(default_factory=dict)
     num_simulations: int = 0
     num_missing: int = 0
     effective_sample_size: float | None = None
@@ -70,7 +68,7 @@ class Diagnostics:
     tail_probability: float | None = None
     tail_probability_of_trial: tuple[float, ...] = ()
     combinations: Combinations = Combinations()
-    figures: Mapping[str, Any] = field(default_factory=lambda: _NOTHING)
+    figures: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("warnings", "network_warnings"):
@@ -103,8 +101,12 @@ class Diagnostics:
             known[name] = [*known[name]]
         known["combinations"] = self.combinations.to_dict()
         known |= self.figures
-        empty = (None, (), [], {})
-        return {name: v for name, v in known.items() if not _is_any_of(v, empty)}
+        containers = (tuple, list, dict)
+        return {
+            name: value
+            for name, value in known.items()
+            if value is not None and not (isinstance(value, containers) and not value)
+        }
 
     def __str__(self) -> str:
         texts = (*self.warnings, *self.network_warnings)
@@ -147,11 +149,6 @@ class Diagnostics:
             raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
         return figures[name]
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        parts = {f.name: getattr(self, f.name) for f in fields(self)}
-        plain = ("assumptions", "figures")  # a view of a dict does not pickle
-        return _restored, (parts | {name: dict(parts[name]) for name in plain},)
-
     def __getitem__(self, name: str) -> Any:
         known = self._as_dict(f"[{name!r}]")
         # A list without entries is left out of a dict, and is no unknown name.
@@ -170,11 +167,3 @@ class Diagnostics:
             stacklevel=3,
         )
         return self.to_dict()
-
-
-def _is_any_of(value: Any, others: tuple[Any, ...]) -> bool:
-    return any(type(value) is type(other) and value == other for other in others)
-
-
-def _restored(parts: dict[str, Any]) -> Diagnostics:
-    return Diagnostics(**parts)

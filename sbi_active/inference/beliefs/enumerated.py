@@ -53,36 +53,35 @@ class Enumeration:
         """
         if not isinstance(prior, MultipleIndependent):
             return None
-        parts = [*prior.dists]
         sizes = [int(size) for size in prior.dims_per_dist]
         columns = torch.arange(sum(sizes)).split(sizes)
-        is_discrete = [_values(part) is not None for part in parts]
-        if not any(is_discrete) or all(is_discrete):
+        values = [_values(part) for part in prior.dists]
+        known = [(v, n) for v, n in zip(values, sizes, strict=True) if v is not None]
+        if math.prod(len(v) ** n for v, n in known) > Enumeration.most_values:
             return None
-        chosen: list[tuple[Tensor, Tensor]] = []
-        for part, size in zip(parts, sizes, strict=True):
-            values = _values(part)
-            if values is not None:
-                rows = torch.tensor([*product(values.tolist(), repeat=size)])
-                chosen.append((rows, part.log_prob(rows).reshape(len(rows), -1).sum(1)))
-        if math.prod(len(rows) for rows, _ in chosen) > Enumeration.most_values:
+        rest, others, chosen, places = [], [], [], []
+        for part, size, at, own in zip(
+            prior.dists, sizes, columns, values, strict=True
+        ):
+            if own is None:
+                rest.append(part)
+                others.append(at)
+            else:
+                rows = torch.tensor([*product(own.tolist(), repeat=size)])
+                log_p = part.log_prob(rows).reshape(len(rows), -1).sum(1)
+                chosen.append([*zip(rows, log_p, strict=True)])
+                places.append(at)
+        if not chosen or not rest:
             return None
-        pairs = [*product(*(zip(*both, strict=True) for both in chosen))]
-        values = torch.stack([torch.cat([row for row, _ in own]) for own in pairs])
+        pairs = [*product(*chosen)]
+        combined = torch.stack([torch.cat([row for row, _ in own]) for own in pairs])
         log_p = torch.stack([torch.stack([p for _, p in own]).sum() for own in pairs])
         possible = log_p > -torch.inf
-        of = [*zip(parts, columns, is_discrete, strict=True)]
-        continuous = [part for part, _, discrete in of if not discrete]
-        rest = continuous[0]
-        if len(continuous) > 1:
-            rest = MultipleIndependent(continuous, validate_args=False)
-        return Enumeration(
-            torch.cat([c for _, c, discrete in of if discrete]),
-            values[possible],
-            log_p[possible],
-            torch.cat([c for _, c, discrete in of if not discrete]),
-            rest,
-        )
+        joint = rest[0]
+        if len(rest) > 1:
+            joint = MultipleIndependent(rest, validate_args=False)
+        places, others = torch.cat(places), torch.cat(others)
+        return Enumeration(places, combined[possible], log_p[possible], others, joint)
 
     def filled(self, k: int, theta: Tensor) -> Tensor:
         """Return parameters (..., d) of continuous ones (..., d - m), combination k."""
@@ -140,15 +139,13 @@ class EnumeratedBelief(Belief):
         return drawn
 
     def _log_prob(self, theta: Tensor) -> Tensor:
-        return self._density(theta, lambda part, rows: part.log_prob(rows))
+        return self._density(theta, Belief.log_prob)
 
     @override
     def _smooth_log_prob(self, theta: Tensor) -> Tensor:
-        return self._density(theta, lambda part, rows: part.smooth_log_prob(rows))
+        return self._density(theta, Belief.smooth_log_prob)
 
-    def _density(
-        self, theta: Tensor, log_prob: Callable[[Belief, Tensor], Tensor]
-    ) -> Tensor:
+    def _density(self, theta: Tensor, log_prob: Callable[..., Tensor]) -> Tensor:
         which, own = self._enumeration.combination(theta), self._enumeration.others
         density = torch.full((len(theta),), -torch.inf, dtype=torch.float64)
         for k, part in enumerate(self.parts):
@@ -205,28 +202,23 @@ def filled_simulator(simulator: Any, enumeration: Enumeration, k: int) -> Any:
 
 
 def enumerated(
-    refine: Callable[..., Any],
+    refine: Callable[[Any, Distribution, int], Any],
     simulator: Callable[..., Any],
     prior: Distribution,
     enumeration: Enumeration,
-    action: Tensor,
-    x: Tensor,
     seed: int,
-    **options: Any,
 ) -> EnumeratedBelief:
     """Return the belief over all parameters: one of the others for each combination.
 
     Each is computed afresh; what was simulated for earlier trials is not kept.
 
     Args:
-        refine: Computes the belief of a simulator of continuous parameters.
+        refine: From a simulator of continuous parameters, their prior and a seed to
+            their belief.
         simulator: Simulator of all parameters.
         prior: Original prior.
         enumeration: The prior as a mixture.
-        action: Executed actions, shape (t, action_dim).
-        x: Their outcomes, shape (t, *x_shape).
         seed: Seed of everything random.
-        options: Further arguments of refine.
 
     Raises:
         UnexplainedOutcomeError: If no combination explains the outcomes.
@@ -235,30 +227,25 @@ def enumerated(
     log_mass, kept, fault = [], [], None
     for k in range(len(enumeration.values)):
         own = filled_simulator(simulator, enumeration, k)
-        values = derive_seed(seed, "values", k)
         try:
-            part = refine(own, enumeration.rest, action, x, seed=values, **options)
+            part = refine(own, enumeration.rest, derive_seed(seed, "values", k))
         except UnexplainedOutcomeError as error:
             fault = error
             continue
         kept.append(k)
         parts.append(part)
         log_mass.append(float(enumeration.log_prob[k]) + part.log_evidence)
-    if not parts:
-        assert fault is not None
+    if fault is not None and not parts:
         raise fault
     mass = torch.tensor(log_mass, dtype=torch.float64)
-    # Trials contradict each other where the noise was inflated.
     known = [part.diagnostics.figures for part in parts]
     is_inflated = torch.tensor(["noise_inflation" in figures for figures in known])
     if not bool(is_inflated.all()):
-        # Evidence under wider noise is not comparable: trials rule these values out.
+        # Trials contradict each other where the noise was inflated. Evidence under
+        # wider noise is not comparable: trials rule these values out.
         mass[is_inflated] = -torch.inf
-    some = replace(
-        enumeration,
-        values=enumeration.values[kept],
-        log_prob=enumeration.log_prob[kept],
-    )
+    values, log_prob = enumeration.values[kept], enumeration.log_prob[kept]
+    some = replace(enumeration, values=values, log_prob=log_prob)
     belief = EnumeratedBelief(prior, some, parts, mass.softmax(0))
     belief.diagnostics = _diagnosed(belief, float(mass.logsumexp(0)))
     return belief
@@ -269,13 +256,13 @@ def _diagnosed(
 ) -> Diagnostics:
     """Return what is known of a mixture: the worst of the parts that count."""
     known = [part.diagnostics for part in belief.parts]
-    counts = belief.probability > negligible
-    some = [d for d, is_seen in zip(known, counts, strict=True) if is_seen]
+    counts = (belief.probability > negligible).nonzero()[:, 0].tolist()
+    some = [known[k] for k in counts]
     effective = [d.effective_sample_size for d in some]
     texts = [
-        f"where the discrete parameters are {values.tolist()}: {text}"
-        for values, d, is_seen in zip(belief.values, known, counts, strict=True)
-        for text in (d.warnings if is_seen else ())
+        f"where the discrete parameters are {belief.values[k].tolist()}: {text}"
+        for k in counts
+        for text in known[k].warnings
     ]
     found = Diagnostics(
         trustworthy=all(d.trustworthy is not False for d in some),

@@ -7,9 +7,9 @@ from typing import Any
 
 import torch
 from sbi.utils.torchutils import set_validate_args
-from torch import Tensor
 from torch.distributions import Distribution, MixtureSameFamily, constraints
 
+from sbi_active.expected import require
 from sbi_active.inference.beliefs.enumerated import Enumeration
 from sbi_active.seeding import forked_generators
 from sbi_active.support import parts_of, within_support
@@ -29,7 +29,15 @@ def require_support(
             implemented, or its parameters are discrete or tied to one another; if
             torch's defaults are such that no belief can be computed.
     """
-    _require_defaults()
+    dtype, device = torch.get_default_dtype(), torch.get_default_device()
+    require(
+        dtype in (torch.float32, torch.float64) and device.type != "meta",
+        "torch to make tensors of float32 or float64 that hold numbers",
+        f"default dtype {dtype} and device {device}",
+        "call torch.set_default_dtype(torch.float32) and "
+        "torch.set_default_device('cpu')",
+    )
+    name = type(prior).__name__
     if prior is None:
         raise ValueError(
             "expected a prior, since a belief starts from it; got None; pass one "
@@ -39,34 +47,35 @@ def require_support(
         support = prior.support
     except (NotImplementedError, AttributeError):
         support = None
-    if support is None:
-        raise ValueError(
-            "expected a prior with a support, which every belief keeps; got "
-            f"{type(prior).__name__} without one; use sbi.utils.BoxUniform, a torch "
-            "distribution, or sbi.utils.process_prior with lower_bound and upper_bound"
-        )
+    require(
+        support is not None,
+        "a prior with a support, which every belief keeps",
+        f"{name} without one",
+        "use sbi.utils.BoxUniform, a torch distribution, or sbi.utils.process_prior "
+        "with lower_bound and upper_bound",
+    )
     may_be = enumerates and Enumeration.of(prior) is not None
-    if any(map(is_discrete, parts_of(support))) and not may_be:
-        raise ValueError(
-            "expected a prior of continuous parameters; got a discrete one, "
-            f"{_shown_prior(prior)}; put parameters of up to "
-            f"{Enumeration.most_values} combined values beside continuous ones with "
-            "sbi's MultipleIndependent and the method asbi or nsbi, or declare the "
-            "choice as an Effect"
-        )
+    require(
+        may_be or not any(map(is_discrete, parts_of(support))),
+        "a prior of continuous parameters",
+        f"a discrete one, {_shown_prior(prior)}",
+        f"put parameters of up to {Enumeration.most_values} combined values beside "
+        "continuous ones with sbi's MultipleIndependent and the method asbi or nsbi, "
+        "or declare the choice as an Effect",
+    )
     tied = tuple(map(type, (constraints.simplex, constraints.corr_cholesky)))
-    if any(isinstance(part, tied) for part in parts_of(support)):
-        raise ValueError(
-            "expected a prior whose parameters may vary one by one; got "
-            f"{_shown_prior(prior)}, which ties them to one another; use parameters "
-            "that are free, such as the logarithms of ratios"
-        )
-    if len(prior.event_shape) != 1 and not prior.batch_shape:
-        raise ValueError(
-            "expected a prior over parameter sets, event shape (theta_dim,); got "
-            f"{_shown_prior(prior)} of event shape {tuple(prior.event_shape)}; pass "
-            "torch.distributions.Independent(distribution of shape (theta_dim,), 1)"
-        )
+    require(
+        not any(isinstance(part, tied) for part in parts_of(support)),
+        "a prior whose parameters may vary one by one",
+        f"{_shown_prior(prior)}, which ties them to one another",
+        "use parameters that are free, such as the logarithms of ratios",
+    )
+    require(
+        len(prior.event_shape) == 1 or bool(prior.batch_shape),
+        "a prior over parameter sets, event shape (theta_dim,)",
+        f"{_shown_prior(prior)} of event shape {tuple(prior.event_shape)}",
+        "pass torch.distributions.Independent(distribution of shape (theta_dim,), 1)",
+    )
     if any(isinstance(part, MixtureSameFamily) for part in _nested(prior)):
         # torch asks that a value lies within the bounds of every component, and raises
         # for draws of its own; whether it does so at all depends on what was imported.
@@ -74,25 +83,13 @@ def require_support(
     if prior.batch_shape:
         with forked_generators(0):
             draws = prior.sample(torch.Size([2]))
-        if prior.log_prob(draws).shape != (2,):
-            name = type(prior).__name__
-            raise ValueError(
-                "expected a prior of one density a parameter set; got a batch of "
-                f"{tuple(prior.batch_shape)} densities, {name}; pass "
-                f"torch.distributions.Independent({name}(...), 1)"
-            )
-    return prior
-
-
-def _require_defaults() -> None:
-    """Raise if torch makes tensors that no belief can be computed with."""
-    dtype, device = torch.get_default_dtype(), torch.get_default_device()
-    if dtype not in (torch.float32, torch.float64) or device.type == "meta":
-        raise ValueError(
-            "expected torch to make tensors of float32 or float64 that hold numbers; "
-            f"got default dtype {dtype} and device {device}; call "
-            "torch.set_default_dtype(torch.float32) and torch.set_default_device('cpu')"
+        require(
+            prior.log_prob(draws).shape == (2,),
+            "a prior of one density a parameter set",
+            f"a batch of {tuple(prior.batch_shape)} densities, {name}",
+            f"pass torch.distributions.Independent({name}(...), 1)",
         )
+    return prior
 
 
 def is_discrete(part: Any) -> bool:
@@ -139,36 +136,28 @@ def require_width(
         return
     with forked_generators(seed):
         draws = prior.sample(torch.Size([256])).reshape(256, -1).float()
-    inside = within_support(prior, draws)
-    if not bool(inside.any()):
-        raise ValueError(
-            f"expected a prior with draws in its support; got {draws[0].tolist()} "
-            "outside; pass finite bounds, the lower one below the upper one"
-        )
+    require(
+        bool(within_support(prior, draws).any()),
+        "a prior with draws in its support",
+        f"{draws[0].tolist()} outside",
+        "pass finite bounds, the lower one below the upper one",
+    )
     draws = draws.double()
     size = draws.abs().amax(0).clamp_min(torch.finfo(torch.float32).tiny)
     steps = draws.std(0) / (size * torch.finfo(torch.float32).eps)
-    narrow = (steps < fewest).nonzero()[:, 0].tolist()
-    if not narrow:
-        _require_no_atoms(draws, names)
-        return
-    k = narrow[0]
-    name = f"parameter {k}" if names is None else names[k]
-    raise ValueError(
-        f"expected a prior in which parameters vary; got {name} "
-        f"within [{draws[:, k].min():.9g}, {draws[:, k].max():.9g}], fewer than "
-        f"{fewest} steps of float32 wide; fix the parameter in the simulator, or "
-        "shift it to deviations from its value"
-    )
-
-
-def _require_no_atoms(draws: Tensor, names: Sequence[str] | None) -> None:
-    """Raise if half of the draws of a parameter, shape (n, d), repeat others."""
-    few = [len(column.unique()) < len(draws) / 2 for column in draws.T]
-    if any(few):
-        k = few.index(True)
+    for k, column in enumerate(draws.T):
         name = f"parameter {k}" if names is None else names[k]
-        raise ValueError(
-            f"expected a prior of continuous parameters; got {name}, of which draws "
-            "repeat; fix it in the simulator, or declare a choice as an Effect"
+        require(
+            bool(steps[k] >= fewest),
+            "a prior in which parameters vary",
+            f"{name} within [{column.min():.9g}, {column.max():.9g}], fewer than "
+            f"{fewest} steps of float32 wide",
+            "fix the parameter in the simulator, or shift it to deviations from its "
+            "value",
+        )
+        require(
+            len(column.unique()) >= len(draws) / 2,
+            "a prior of continuous parameters",
+            f"{name}, of which draws repeat",
+            "fix it in the simulator, or declare a choice as an Effect",
         )

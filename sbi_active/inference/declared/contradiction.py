@@ -91,15 +91,12 @@ def find_contradiction(
         informed_above: Derivative below which no trial informs a parameter.
     """
     t = len(likelihood)
-    seen = likelihood.x.isfinite().flatten(1).numpy()
     squares = (residual.reshape(t, -1) ** 2).sum(1)
     informed = theta.shape[1]
     if jacobian is not None:
         informed = int((np.abs(jacobian).max(0) > informed_above).sum())
     found = compared(
-        likelihood.action,
-        likelihood.x,
-        lambda gap: whitened(likelihood.noise, gap),
+        *(likelihood.action, likelihood.x, lambda gap: whitened(likelihood.noise, gap)),
         squares,
         num_fitted=informed,
     )
@@ -110,7 +107,7 @@ def find_contradiction(
     d = jacobian.shape[1]
     precision = jacobian.T @ jacobian + np.eye(d)
     parts = residual.reshape(t, -1), jacobian.reshape(t, -1, d)
-    measured: Any = seen.any(1)
+    measured: Any = likelihood.x.isfinite().flatten(1).any(1).numpy()
     gradient = np.einsum("kn,knd->kd", *parts) * measured[:, None]
     spread = np.linalg.eigvals(np.linalg.solve(precision, gradient.T @ gradient))
     by_trial = t / (t - 1) * float(spread.real.max())
@@ -146,13 +143,16 @@ def compared(
     probability = float(chi2.sf(squares.sum(), freedom))
     if probability >= level:
         return None
-    each = chi2.sf(squares, np.maximum(count, 1))
-    return Contradiction(
-        float(np.sqrt(squares.sum() / freedom)),
-        probability,
-        tuple(float(p) for p in each),
-        _repeats(action, x, whiten, level) or _worst(squares, count),
-    )
+    trials = _repeats(action, x, whiten, level)
+    if not trials:
+        size = np.sqrt(squares / np.maximum(count, 1))
+        worst = _listed([f"trial {k} by {size[k]:.3g}" for k in np.argsort(-size)])
+        trials = (
+            f"the best fit misses {worst} deviations of the noise (root mean square)"
+        )
+    each = chi2.sf(squares, np.maximum(count, 1)).tolist()
+    inflation = float(np.sqrt(squares.sum() / freedom))
+    return Contradiction(inflation, probability, (*each,), trials)
 
 
 def _beyond_noise(
@@ -202,22 +202,13 @@ def _repeats(
         worst = float(tails.min())
         odd = same[int(tails.argmin())]
         others = [k for k in same if k != odd]
+        listed = _listed([*map(str, others)], " and {} more")
         text = (
-            f"trial {odd} gave {_shown(x[odd])}, and {_trials(others)} of the same "
-            f"action {_shown(own)} gave {_shown(x[others].nanmedian(0).values)}"
+            f"trial {odd} gave {_shown(x[odd])}, and trial{'s' * (len(others) > 1)} "
+            f"{listed} of the same action {_shown(own)} gave "
+            f"{_shown(x[others].nanmedian(0).values)}"
         )
     return text
-
-
-def _worst(squares: Array, count: Array) -> str:
-    size = np.sqrt(squares / np.maximum(count, 1))
-    listed = _listed([f"trial {k} by {size[k]:.3g}" for k in np.argsort(-size)])
-    return f"the best fit misses {listed} deviations of the noise (root mean square)"
-
-
-def _trials(numbers: list[int]) -> str:
-    listed = _listed([*map(str, numbers)], " and {} more")
-    return f"trial{'s' * (len(numbers) > 1)} {listed}"
 
 
 def _shown(values: Tensor) -> str:

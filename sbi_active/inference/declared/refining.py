@@ -50,6 +50,29 @@ from sbi_active.seeding import derive_seed, forked_generators
 
 
 @dataclass(frozen=True)
+class Problem:
+    """The posterior that is asked for.
+
+    Attributes:
+        simulator: ``simulator(theta, action)``.
+        prior: The original prior.
+        action: Executed actions, shape (t, action_dim).
+        x: Outcomes of the actions, shape (t, *x_shape).
+        hints: Distributions that say where else to look first.
+        settings: Settings of the belief.
+        seed: Seed of everything random.
+    """
+
+    simulator: Callable[..., Any]
+    prior: Distribution
+    action: Tensor
+    x: Tensor
+    hints: Sequence[Distribution]
+    settings: RefinementOptions
+    seed: int
+
+
+@dataclass(frozen=True)
 class DeclaredRecord:
     """The record that a belief goes on from when a further trial is known.
 
@@ -147,29 +170,13 @@ class SimulatedBelief(WeightedBelief):
         return theta
 
 
-def refine_declared(
-    simulator: Callable[..., Any],
-    prior: Distribution,
-    action: Tensor,
-    x: Tensor,
-    *,
-    hints: Sequence[Distribution],
-    past: object,
-    settings: RefinementOptions,
-    seed: int,
-) -> SimulatedBelief | None:
+def refine_declared(problem: Problem, past: object) -> SimulatedBelief | None:
     """Return the posterior, if its likelihood can be simulated.
 
     Args:
-        simulator: Deterministic beside a declared noise.
-        prior: The original prior.
-        action: Executed actions, shape (t, action_dim).
-        x: Outcomes of the actions, shape (t, *x_shape).
-        hints: Distributions that say where else to look first.
+        problem: Problem, whose simulator is deterministic beside a declared noise.
         past: State of an earlier call: draws to go on from, and what needs no
             simulation.
-        settings: Budget.
-        seed: Seed of everything random.
 
     Returns:
         None for another simulator.
@@ -177,6 +184,8 @@ def refine_declared(
     Raises:
         UnexplainedOutcomeError: If no parameters have a likelihood.
     """
+    simulator, prior, settings = problem.simulator, problem.prior, problem.settings
+    action, x, seed = problem.action, problem.x, problem.seed
     with forked_generators(derive_seed(seed, "few")):
         few = prior.sample(torch.Size([4])).float()
     if not declares_noise(simulator, few, action[:1].expand(len(few), -1)):
@@ -190,15 +199,19 @@ def refine_declared(
         before = None
         coordinates = NormalCoordinates(PriorCoordinates(prior, rng), rng)
         table = MeanTable(simulator, settings.workers)
+    own = Settings(
+        num_effective=settings.effective_of(coordinates.dim),
+        num_simulations=3 * settings.num_histories * len(action),
+        num_draws=settings.num_draws or max(settings.num_histories // 6, 100),
+    )
     spent = table.num_simulations, table.num_missing
     declared = SimulatedLikelihood(table, action, x)
     potential = SimulatedPotential(declared, coordinates)
     contradiction, fit = None, None
-    own = _engine_settings(settings, len(action), coordinates.dim)
     if before is not None:
         fit = _gone_on(before.pool, potential, own, rng)
     if fit is None:
-        near = _near(hints, coordinates, seed)
+        near = _near(problem.hints, coordinates, seed)
         potential, found, contradiction = _searched(
             potential, near, own, settings.max_inflations, rng
         )
@@ -206,31 +219,15 @@ def refine_declared(
     if not len(fit.u):
         raise UnexplainedOutcomeError(NOTHING_EXPLAINS)
     belief = SimulatedBelief(prior, potential, fit, defensive=settings.defensive)
-    known = diagnose_fit(fit, potential, declared, seed)
-    if contradiction is not None:
+    known, pool = diagnose_fit(fit, potential, declared, seed), fit.pool
+    if contradiction is not None:  # the likelihood of the draws is of another noise
         known = contradiction.noted(known)
-    num_simulations = table.num_simulations - spent[0]
-    num_missing = table.num_missing - spent[1]
-    belief.diagnostics = known.extended(
-        num_simulations=num_simulations, num_missing=num_missing
-    )
-    pool = fit.pool
-    if contradiction is not None:  # its likelihood is of another noise
         pool = Pool.empty(potential.dim, len(action))
+    num, missing = table.num_simulations - spent[0], table.num_missing - spent[1]
+    belief.diagnostics = known.extended(num_simulations=num, num_missing=missing)
     belief.histories = DeclaredRecord((action, x), coordinates, table, pool)
-    warn_missing(num_missing, num_simulations, "their draws", stacklevel=5)
+    warn_missing(missing, num, "their draws", stacklevel=5)
     return belief
-
-
-def _engine_settings(
-    settings: RefinementOptions, num_trials: int, dim: int
-) -> Settings:
-    num_draws = settings.num_draws or max(settings.num_histories // 6, 100)
-    return Settings(
-        num_effective=settings.effective_of(dim),
-        num_simulations=3 * settings.num_histories * num_trials,
-        num_draws=num_draws,
-    )
 
 
 def _near(
@@ -241,8 +238,8 @@ def _near(
     num: int = 250,
 ) -> Array | None:
     """Return draws of all hints, shape (n, d), those first that stand for each."""
-    places = coordinates.base.drawn_from(hints[:2], num, seed=seed)
-    drawn = [coordinates.from_z(z) for z in places]
+    drawn = coordinates.base.drawn_from(hints[:2], num, seed=seed)
+    drawn = [coordinates.from_z(z) for z in drawn]
     if not drawn:
         return None
     return np.concatenate([*[u[:1] for u in drawn], *[u[1:] for u in drawn]])
@@ -265,9 +262,8 @@ def _gone_on(
     if found is not None and share_cut(potential, found) > own.hopeless:
         return None
     fit = infer(potential, rng, past=pool, found=found, settings=own)
-    if fit.effective_sample_size < own.num_effective:
-        return None
-    if fit.tail_shape > own.largest_shape:
+    is_heavy = fit.tail_shape > own.largest_shape
+    if fit.effective_sample_size < own.num_effective or is_heavy:
         return None
     best = fit.u[[fit.log_likelihood.argmax()]]
     contradicted = find_contradiction(

@@ -29,6 +29,7 @@ from sbi_active.inference.emulation.pool import Pool
 from sbi_active.inference.emulation.processes import nearest
 from sbi_active.inference.emulation.summaries import Summary, is_short
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.inference.sampling.gaussian_process import GaussianProcess
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation.noise.base import NoiseModel
 
@@ -73,62 +74,61 @@ def candidate_gains(
     near = np.sort(near)
     rng = np.random.default_rng(derive_seed(seed, "outcomes"))
     draws = reference[rng.integers(len(reference), size=num_outer + num_inner)]
+    draws, z, action = region.scaled(draws), z[near], action[near]
     places = candidates.double().numpy()
     center, scale = places.mean(0), places.std(0)
     varied = scale > 0
-    inputs = np.concatenate(
-        [
-            region.scaled(z[near]),
-            ((action[near] - center) / (scale + ~varied))[:, varied],
-        ],
-        1,
+    place, unit = (
+        ((own - center) / (scale + ~varied))[:, varied] for own in (action, places)
     )
-    unit = ((places - center) / (scale + ~varied))[:, varied]
-    same = np.abs(action[near][:, None] - places).max(2) < 1e-5
-    gains = []
+    inputs = np.concatenate([region.scaled(z), place], 1)
+    same = np.abs(action[:, None] - places).max(2) < 1e-5
     raw = rows.x[torch.from_numpy(near)]
     measured = raw.flatten(1).isfinite().any(1).numpy()
-    valid = _share(measured, same)
-    for summary in summaries:
-        numbers = summary(raw)
-        full = np.isfinite(numbers).all(1)
-        gains.append(
-            _gains(
-                *(inputs[full], z[near][full], numbers[full], same[full]),
-                *(region.scaled(draws), unit, noise, tuple(raw.shape[1:])),
-                num_outer=num_outer,
-                rng=np.random.default_rng(derive_seed(seed, "noise")),
-                seed=seed,
-            )
-        )
-    return np.stack(gains, 1) * valid[:, None, None], valid
-
-
-def _share(measured: NDArray[np.bool_], same: NDArray[np.bool_]) -> Array:
-    """Return the share of rows with a measurement at each action, shape (a,)."""
     count, found = same.sum(0), (same & measured[:, None]).sum(0)
-    overall = measured.mean()
-    return (found + overall) / (count + 1)
+    valid = (found + measured.mean()) / (count + 1)
+    gains = np.zeros((len(places), len(summaries), num_outer))
+    for k, summary in enumerate(summaries):
+        numbers, rng = summary(raw), np.random.default_rng(derive_seed(seed, "noise"))
+        full = np.isfinite(numbers).all(1)
+        if full.sum() < z.shape[1] + 4:
+            continue
+        processes, roots = _learned(
+            inputs[full],
+            z[full],
+            numbers[full],
+            same[full],
+            noise,
+            raw.shape[1:],
+            rng,
+            seed,
+        )
+        normal = rng.standard_normal((num_outer, len(roots[0])))
+        for a, own in enumerate(unit):
+            tiled = np.broadcast_to(own, (len(draws), len(own)))
+            at = np.concatenate([draws, tiled], 1)
+            parts = [process.predict(at) for process in processes]
+            mean, variance = (np.concatenate(p, 1) for p in zip(*parts, strict=True))
+            gains[a, k] = mixture_gain(mean, variance, roots[a], normal, num_outer)
+    return gains * valid[:, None, None], valid
 
 
-def _gains(
+def _learned(
     inputs: Array,
     z: Array,
     numbers: Array,
     same: NDArray[np.bool_],
-    draws: Array,
-    unit: Array,
     noise: NoiseModel | None,
-    x_shape: tuple[int, ...],
-    *,
-    num_outer: int,
+    x_shape: Sequence[int],
     rng: np.random.Generator,
     seed: int,
+    *,
     own_rows: float = 8.0,
-) -> Array:
-    """Return contributions of one summary at each action, shape (a, m)."""
-    if len(inputs) < z.shape[1] + 4:
-        return np.zeros((len(unit), num_outer))
+) -> tuple[tuple[GaussianProcess, ...], list[Array]]:
+    """Return processes of numbers (n, q) and a factor of each action's noise.
+
+    Actions share the noise of ``own_rows`` rows beside those of their own.
+    """
     if noise is not None:
         processes = (declared_process(inputs, numbers, ("rough",)),)
         zeros = torch.zeros(max(400, 4 * numbers.shape[1]), *x_shape).double()
@@ -136,25 +136,14 @@ def _gains(
         sampled = noise.sample(zeros, seeds).reshape(len(zeros), -1).numpy()
         covariance = np.atleast_2d(np.cov(sampled.T))
         root = np.linalg.cholesky(covariance + 1e-9 * np.diag(np.diag(covariance)))
-        roots = [root] * len(unit)
-    else:
-        dim, features = z.shape[1], numbers
-        if not is_short(numbers.shape[1], dim) and inputs.shape[1] > dim:
-            crossed = [numbers * inputs[:, [j]] for j in range(dim, inputs.shape[1])]
-            features = np.concatenate([numbers, *crossed, inputs[:, dim:]], 1)
-        _, processes, left_out = learned_processes(inputs, features, z, seed=seed)
-        common = np.concatenate([p.noise_sd for p in processes]) ** 2
-        total = own_rows * common + same.T.astype(float) @ left_out**2
-        sd = np.sqrt(total / (own_rows + same.sum(0))[:, None])
-        root = correlation_root(left_out)
-        roots = [s[:, None] * root for s in sd]
-    normal = rng.standard_normal((num_outer, len(roots[0])))
-    result = np.zeros((len(unit), num_outer))
-    for k, place in enumerate(unit):
-        at = np.concatenate(
-            [draws, np.broadcast_to(place, (len(draws), len(place)))], 1
-        )
-        parts = [process.predict(at) for process in processes]
-        mean, variance = (np.concatenate(p, 1) for p in zip(*parts, strict=True))
-        result[k] = mixture_gain(mean, variance, roots[k], normal, num_outer)
-    return result
+        return processes, [root] * same.shape[1]
+    dim, features = z.shape[1], numbers
+    if not is_short(numbers.shape[1], dim) and inputs.shape[1] > dim:
+        crossed = [numbers * inputs[:, [j]] for j in range(dim, inputs.shape[1])]
+        features = np.concatenate([numbers, *crossed, inputs[:, dim:]], 1)
+    _, processes, left_out = learned_processes(inputs, features, z, seed=seed)
+    common = np.concatenate([p.noise_sd for p in processes]) ** 2
+    total = own_rows * common + same.T.astype(float) @ left_out**2
+    sd = np.sqrt(total / (own_rows + same.sum(0))[:, None])
+    root = correlation_root(left_out)
+    return processes, [s[:, None] * root for s in sd]

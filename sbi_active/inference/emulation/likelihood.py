@@ -57,8 +57,6 @@ class TrialLikelihood:
         root: Cholesky factor of the correlation of the noise, shape (q, q).
         freedom: Degrees of freedom of learned noise.
         outcome: Probability of a measurement, or of none; None where simulations agree.
-        label: Label of the summary.
-        num_rows: Simulations behind it.
     """
 
     region: Region
@@ -70,8 +68,6 @@ class TrialLikelihood:
     root: Array
     freedom: float
     outcome: TrialOutcome | None
-    label: str
-    num_rows: int
 
     def log_likelihood(self, z: Array) -> Array:
         """Return log densities, (n, d) -> (n,)."""

@@ -139,10 +139,10 @@ class Processes(Stages):
         errors = [trial.error(draws) for trial in surrogate.trials]
         return 0.0, np.ones(1), float(sum(errors))
 
-    def tails(self, stage: Stage) -> tuple[list[float], float]:
-        """Return tail probabilities of the trials and of all together."""
+    def tails(self, stage: Stage) -> list[float]:
+        """Return tail probabilities of the trials and, last, of all together."""
         tails = [trial.tail(stage.draws) for trial in stage.surrogate.trials]
-        return tails, min(1.0, len(tails) * min(tails))
+        return [*tails, min(1.0, len(tails) * min(tails))]
 
     def best_summary(self, trial: PooledTrial) -> str:
         """Return the summary by which a trial is expected to tell most."""
@@ -186,8 +186,12 @@ class Processes(Stages):
         valid: NDArray[np.bool_] = np.asarray(
             np.isfinite(numbers[:, used]).all(1) & used.any()
         )
-        outcome = self._outcome(z, numbers, used)
-        region = Region(np.zeros(z.shape[1]), np.eye(z.shape[1]), 1.0)
+        kind = np.isfinite(numbers)
+        agrees = np.asarray(kind[:, used].all(1) if used.any() else ~kind.any(1))
+        outcome, region = None, whole_space(z.shape[1])
+        if not (agrees.all() and len(agrees)):  # as it had, or none
+            none = np.zeros((0, 2), dtype=bool)
+            outcome = TrialOutcome.fit(region, 0, z, agrees, none)
         processes: tuple[GaussianProcess, ...] = ()
         root, freedom, seen = np.eye(used.sum()), np.inf, observed[used]
         needed = z.shape[1] + 4
@@ -220,22 +224,7 @@ class Processes(Stages):
             root=root,
             freedom=freedom,
             outcome=outcome,
-            label=label,
-            num_rows=len(rows),
         )
-
-    def _outcome(
-        self, z: Array, numbers: Array, used: NDArray[np.bool_]
-    ) -> TrialOutcome | None:
-        """Return the probability that a trial has a measurement, as it had, or none."""
-        if used.any():
-            agrees = np.asarray(np.isfinite(numbers[:, used]).all(1))
-        else:
-            agrees = np.asarray(~np.isfinite(numbers).any(1))
-        if agrees.all() and len(agrees):
-            return None
-        pairs = np.zeros((0, 2), dtype=bool)
-        return TrialOutcome.fit(whole_space(z.shape[1]), 0, z, agrees, pairs)
 
     def simulate(self, size: int, *, share_of_prior: float = 0.1) -> None:
         """Add rows at the trials that know least."""

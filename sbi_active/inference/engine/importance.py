@@ -49,19 +49,12 @@ from sbi_active.inference.sampling.weights import (
 )
 
 
-def importance_sample(
-    pool: Pool,
-    potential: Density,
-    rng: np.random.Generator,
-    *,
-    num_components: int,
-    settings: Settings,
-    found: Found | None = None,
-) -> bool:
-    """Add draws to a pool until enough are effective; return whether it is rough.
+@dataclass
+class ImportanceSampling:
+    """Adds draws to a pool, of proposals that are fitted to it, until enough count.
 
-    A likelihood is rough where it had to be tempered often. The posterior rests on the
-    draws of one proposal, which was fitted to none of them: its evidence has no bias.
+    The posterior rests on the draws of one proposal, which was fitted to none of them:
+    its evidence has no bias.
 
     Args:
         pool: Draws to begin with.
@@ -70,63 +63,9 @@ def importance_sample(
         num_components: Number of components of a proposal at most.
         settings: Numbers of draws.
         found: Modes, to propose along ridges from; None if there are none.
-    """
-    own, start = settings, potential.num_simulations
-    budget = own.budget(potential.dim)
-    fits = _Fits(pool, potential, found, num_components, own, rng)
-    proposal = pool.proposals[-1][1] if pool.num_final else None
-    best, latched, heavy = 0.0, 0.0, 0
-    kept: Proposal | None = None  # the best
-    for _ in range(own.max_rounds):
-        spent = potential.num_simulations - start
-        power = fits.power()
-        effective = pool.effective_sample_size
-        is_cheap = spent < own.share_of_plenty * budget and not fits.is_rough
-        wanted = own.asked(potential.dim, is_cheap=is_cheap)
-        if not len(pool.u) or spent >= budget:
-            break
-        is_heavy = False
-        if power == 1 and effective >= wanted:
-            is_heavy = pareto_shape(pool.log_weight[pool.is_final]) > own.largest_shape
-            if not is_heavy or heavy == own.max_heavy:
-                break
-            heavy += 1  # draws that outweigh others show where to draw more
-        efficiency = effective / max(pool.num_final, 1)
-        is_good = power == 1 and efficiency >= own.efficient
-        is_good |= own.affords(effective, pool.num_final, wanted)
-        # It no longer gets better by being fitted again.
-        is_good |= fits.num_full >= own.max_fits and efficiency >= 0.5 * best
-        is_good |= efficiency >= 0.5 * latched > 0  # what was drawn is not lost
-        size = own.draws_of_fit(potential.dim)
-        if proposal is not None and is_good and efficiency > 0 and not is_heavy:
-            rows = (own.num_effective - effective) / efficiency * pool.num_trials
-            if pool.num_past and rows > budget - spent:
-                break  # modes serve better than draws of fewer trials
-            latched = latched or efficiency
-            lacking = 1.1 * (wanted - effective) / efficiency
-            size = int(np.clip(lacking, 0.2 * own.num_draws, 4 * own.num_draws))
-        elif kept is not None and fits.num_full >= own.max_fits:
-            pool.restart()  # what was fitted since is worse
-            proposal, latched, kept = kept, best, None
-        else:
-            if efficiency > best and effective >= own.seen:
-                kept = proposal
-            if pool.num_past and kept is None and fits.num_full > own.max_fits:
-                break  # modes are found again, and particles led from there
-            best, latched = max(best, efficiency), 0.0
-            pool.restart()
-            proposal = fits.again(power, efficiency)
-        floor = float(pool.log_likelihood.max()) - own.negligible / power
-        pool.add(proposal, proposal.sample(size, rng), potential, floor)
-    return fits.is_rough
-
-
-@dataclass
-class _Fits:
-    """Proposals that are fitted to a pool, one after another.
 
     Attributes:
-        num_full: Number of those to the whole likelihood.
+        num_full: Number of proposals fitted to the whole likelihood.
         num_tempered: Number of those to a power of it.
         ridge: Places along ridges, of the last proposal there.
         is_along: Whether the last proposal was along ridges; None before any.
@@ -136,10 +75,10 @@ class _Fits:
 
     pool: Pool
     potential: Density
-    found: Found | None
+    rng: np.random.Generator
     num_components: int
     settings: Settings
-    rng: np.random.Generator
+    found: Found | None = None
     num_full: int = 0
     num_tempered: int = 0
     ridge: Ridge | None = None
@@ -147,39 +86,89 @@ class _Fits:
     efficiency: dict[bool, float] = field(default_factory=dict)
 
     @property
-    def num(self) -> int:
-        """Number of fits."""
-        return self.num_full + self.num_tempered
-
-    @property
     def is_rough(self) -> bool:
         """Whether the likelihood had to be tempered often."""
         return self.num_tempered > self.settings.few_tempered
 
-    def power(self) -> float:
-        """Return the largest power of the new likelihood that leaves enough draws."""
-        return _largest_power(*self._logs(), self.settings.fewest)
+    def run(self) -> None:
+        """Draw until enough are effective, or the budget is spent."""
+        pool, potential, own = self.pool, self.potential, self.settings
+        budget, start = own.budget(potential.dim), potential.num_simulations
+        proposal = pool.proposals[-1][1] if pool.num_final else None
+        best, latched, heavy = 0.0, 0.0, 0
+        kept: Proposal | None = None  # the best
+        for _ in range(own.max_rounds):
+            spent = potential.num_simulations - start
+            power = _largest_power(*self._logs(), own.fewest)
+            effective = pool.effective_sample_size
+            is_cheap = spent < own.share_of_plenty * budget and not self.is_rough
+            wanted = own.asked(potential.dim, is_cheap=is_cheap)
+            if not len(pool.u) or spent >= budget:
+                break
+            is_heavy = False
+            if power == 1 and effective >= wanted:
+                shape = pareto_shape(pool.log_weight[pool.is_final])
+                is_heavy = shape > own.largest_shape
+                if not is_heavy or heavy == own.max_heavy:
+                    break
+                heavy += 1  # draws that outweigh others show where to draw more
+            efficiency = effective / max(pool.num_final, 1)
+            is_good = power == 1 and efficiency >= own.efficient
+            is_good |= own.affords(effective, pool.num_final, wanted)
+            # It no longer gets better by being fitted again.
+            is_good |= self.num_full >= own.max_fits and efficiency >= 0.5 * best
+            is_good |= efficiency >= 0.5 * latched > 0  # what was drawn is not lost
+            size = own.draws_of_fit(potential.dim)
+            if proposal is not None and is_good and efficiency > 0 and not is_heavy:
+                rows = (own.num_effective - effective) / efficiency * pool.num_trials
+                if pool.num_past and rows > budget - spent:
+                    break  # modes serve better than draws of fewer trials
+                latched = latched or efficiency
+                lacking = 1.1 * (wanted - effective) / efficiency
+                size = int(np.clip(lacking, 0.2 * own.num_draws, 4 * own.num_draws))
+            elif kept is not None and self.num_full >= own.max_fits:
+                pool.restart()  # what was fitted since is worse
+                proposal, latched, kept = kept, best, None
+            else:
+                if efficiency > best and effective >= own.seen:
+                    kept = proposal
+                if pool.num_past and kept is None and self.num_full > own.max_fits:
+                    break  # modes are found again, and particles led from there
+                best, latched = max(best, efficiency), 0.0
+                pool.restart()
+                proposal = self._fitted(power, efficiency)
+            floor = float(pool.log_likelihood.max()) - own.negligible / power
+            pool.add(proposal, proposal.sample(size, self.rng), potential, floor)
 
-    def again(self, power: float, efficiency: float) -> Proposal:
+    def _fitted(self, power: float, efficiency: float) -> Proposal:
         """Return a proposal for a power of the likelihood, fitted to all draws.
+
+        A mixture that is dense around the draws alone misses tails, and the peaks of a
+        rough likelihood between those that were found: it has a share of a wider one.
 
         Args:
             power: Power of the likelihood.
             efficiency: Share of the last proposal's draws that were effective.
         """
-        pool, own, rng, is_rough = self.pool, self.settings, self.rng, self.is_rough
+        pool, own, rng = self.pool, self.settings, self.rng
+        share = own.share_if_rough if self.is_rough else own.share_of_wide
         self.num_full += power == 1
         self.num_tempered += power < 1
         log_rest, log_new = self._logs()
         weight = normalized(log_rest + power * log_new)
-        share = own.share_if_rough if is_rough else own.share_of_wide
-        proposal = defended(pool, weight, self.num_components, share, own, rng)
+        main = fitted(pool.u, weight, self.num_components, own, rng)
+        log_rest = pool.log_prior - pool.log_mixture
+        flat = _largest_power(log_rest, pool.log_likelihood, own.broad)
+        weight = normalized(log_rest + flat * pool.log_likelihood)
+        wide = fitted(pool.u, weight, 2, own, rng)
         if self.is_along is not None:
             self.efficiency[self.is_along] = efficiency
         self.is_along = False
         # Where few draws count, they may lie across a ridge.
-        is_first = self.num <= own.num_ridged
-        if self.found is not None and (is_first or self._is_better_along):
+        is_first = self.num_full + self.num_tempered <= own.num_ridged
+        known = self.efficiency
+        is_better = known.get(True, 0.0) > known.get(False, np.inf)
+        if self.found is not None and (is_first or is_better):
             full = normalized(pool.log_mixture_weight)
             if self.ridge is not None:
                 self.ridge = self.ridge.grown(pool.u, full, rng)
@@ -191,36 +180,13 @@ class _Fits:
             if self.ridge is not None:
                 self.is_along = True
                 return self.ridge.mixture
-        return proposal
-
-    @property
-    def _is_better_along(self) -> bool:
-        known = self.efficiency
-        return known.get(True, 0.0) > known.get(False, np.inf)
+        return Defended(main, wide, share)
 
     def _logs(self) -> tuple[Array, Array]:
         """Return log weights without the new likelihood, and that, shapes (n,)."""
         pool = self.pool
         log_new = pool.log_likelihood - pool.log_past
         return pool.log_prior + pool.log_past - pool.log_mixture, log_new
-
-
-def defended(
-    pool: Pool,
-    weight: Array,
-    num_components: int,
-    share: float,
-    settings: Settings,
-    rng: np.random.Generator,
-) -> Defended:
-    """Return a mixture fitted to weighted draws, with a share of a wider one.
-
-    A mixture that is dense around the draws alone misses tails, and the peaks of a
-    rough likelihood between those that were found.
-    """
-    main = fitted(pool.u, weight, num_components, settings, rng)
-    wide = fitted(pool.u, _flattened(pool, settings), 2, settings, rng)
-    return Defended(main, wide, share)
 
 
 def fitted(
@@ -289,13 +255,6 @@ def pareto_shape(log_weight: Array) -> float:
     b_mean = float(normalized(log_likelihood) @ b)
     shape = float(np.log1p(-b_mean * x).mean())
     return (num * shape + 10 * 0.5) / (num + 10)
-
-
-def _flattened(pool: Pool, settings: Settings) -> Array:
-    """Return weights of a power of the likelihood that leaves many draws."""
-    log_rest = pool.log_prior - pool.log_mixture
-    power = _largest_power(log_rest, pool.log_likelihood, settings.broad)
-    return normalized(log_rest + power * pool.log_likelihood)
 
 
 def _largest_power(

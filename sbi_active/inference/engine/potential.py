@@ -38,9 +38,8 @@ def declares_noise(
     """
     if not isinstance(simulator, SimulatorModel) or simulator.noise is None:
         return False
-    if not simulator.draws_by_noise_alone:
-        return False
-    if not bool((simulator.noise.parameters > 0).all()):
+    is_noisy = bool((simulator.noise.parameters > 0).all())
+    if not simulator.draws_by_noise_alone or not is_noisy:
         return False
     return simulator.is_deterministic(theta, action)
 

@@ -127,26 +127,6 @@ class ActionRatio(ActionFactor):
     log_factor = log_ratio  # its marginal knows no theta
 
 
-@dataclass(frozen=True, kw_only=True)
-class RegionSettings:
-    """Settings of the region where a network is trained and trusted.
-
-    Attributes:
-        num_components: Number of components of the mixture whose level set is a
-            region: enough for a few modes.
-        num_fitted: Number of rows that a region is fitted to.
-        lost: Share of the rows that may lie outside.
-        margin: Nats below the density of the last row inside.
-        spread: Deviations of rows to learn from, in those of a component.
-    """
-
-    num_components: int = 6
-    num_fitted: int = 2_000
-    lost: float = 2e-3
-    margin: float = 3.0
-    spread: float = 2.0
-
-
 @dataclass(frozen=True)
 class TrainedRegion:
     """Region where a network was trained; its values elsewhere mean nothing.
@@ -161,12 +141,18 @@ class TrainedRegion:
 
     @staticmethod
     def of(
-        z: Array, rng: np.random.Generator, own: RegionSettings = RegionSettings()
+        z: Array, rng: np.random.Generator, *, lost: float = 2e-3, margin: float = 3.0
     ) -> TrainedRegion:
-        """Return the region of rows, coordinates of shape (n, d)."""
-        some = rng.permutation(z)[: own.num_fitted]
-        mixture = fitted_normals(some, own.num_components, rng)
-        floor = np.quantile(mixture.log_prob(z), own.lost) - own.margin
+        """Return the region of rows, coordinates of shape (n, d).
+
+        Args:
+            z: The rows.
+            rng: Source of the choice of some.
+            lost: Share of the rows that may lie outside.
+            margin: Nats below the density of the last row inside.
+        """
+        mixture = _around(rng.permutation(z), rng)
+        floor = np.quantile(mixture.log_prob(z), lost) - margin
         return TrainedRegion(mixture, float(floor))
 
     def contains(self, z: Array) -> NDArray[np.bool_]:
@@ -179,7 +165,8 @@ def widened(
     num_samples: int,
     coordinates: PriorCoordinates,
     rng: np.random.Generator,
-    own: RegionSettings = RegionSettings(),
+    *,
+    spread: float = 2.0,
 ) -> Array:
     """Return draws spread up to twice as wide as those of a belief, within the support.
 
@@ -187,19 +174,25 @@ def widened(
     parameters of any distribution. Each component of a Gaussian mixture of z, shape (n,
     d), is doubled, so that modes stay apart.
     """
-    mixture = fitted_normals(z[: own.num_fitted], own.num_components, rng)
+    mixture = _around(z, rng)
     factor = mixture.factors[mixture.log_parts(z).argmax(0)]
     kept, missing = [], num_samples
     while missing > 0:
         i = rng.integers(len(z), size=2 * num_samples)
         normal = rng.standard_normal((len(i), z.shape[1]))
-        step = np.sqrt(own.spread**2 - 1) * np.einsum("nij,nj->ni", factor[i], normal)
+        step = np.sqrt(spread**2 - 1) * np.einsum("nij,nj->ni", factor[i], normal)
         drawn = z[i] + step
         kept.append(drawn[coordinates.inside(drawn)][:missing])
         missing -= len(kept[-1])
     return np.concatenate(kept)
 
 
+def _around(z: Array, rng: np.random.Generator) -> StudentMixture:
+    """Return a mixture fitted to rows (n, d), of components enough for a few modes."""
+    return fitted_normals(z[:2_000], 6, rng)
+
+
+@dataclass(frozen=True)
 class Product:
     r"""The learned likelihood of all trials, where it was learned.
 
@@ -209,7 +202,7 @@ class Product:
     with R the region of the training rows, which were drawn from a belief that holds
     the posterior. The factors are exact products; only q is learned.
 
-    Args:
+    Attributes:
         coordinates: Coordinates of the prior.
         model: q, up to factors without theta.
         trials: The history.
@@ -217,17 +210,11 @@ class Product:
         previous: Belief that takes the prior's place, where beliefs are chained.
     """
 
-    def __init__(
-        self,
-        coordinates: PriorCoordinates,
-        model: ActionFactor,
-        trials: Sequence[Observation],
-        region: TrainedRegion | None = None,
-        previous: Distribution | None = None,
-    ) -> None:
-        self.coordinates, self.model, self.region = coordinates, model, region
-        self._previous = previous
-        self.trials = [*trials]
+    coordinates: PriorCoordinates
+    model: ActionFactor
+    trials: Sequence[Observation]
+    region: TrainedRegion | None = None
+    previous: Distribution | None = None
 
     def log_factors(self, theta: Tensor) -> Tensor:
         r"""Return :math:`\sum_k \log q(x_k | \theta, \xi_k)`, (n, d) -> (n,), float64.
@@ -247,6 +234,8 @@ class Product:
         inside = np.ones(len(z), dtype=bool)
         if self.region is not None:
             inside = self.region.contains(z)
+        if not inside.any():  # constraints of some priors cannot reshape no rows
+            return total
         theta = self.coordinates.to_theta(z[inside])
         with torch.no_grad(), single_thread():
             parts = [self._evaluate(part) for part in theta.split(batch_size)]
@@ -255,10 +244,10 @@ class Product:
 
     def _evaluate(self, theta: Tensor) -> Tensor:
         total = self.log_factors(theta)
-        if self._previous is not None:
-            ratio = self._previous.log_prob(theta)
-            total = total + (ratio - self.coordinates.prior.log_prob(theta)).double()
-        return total
+        if self.previous is None:
+            return total
+        ratio = self.previous.log_prob(theta) - self.coordinates.prior.log_prob(theta)
+        return total + ratio.double()
 
 
 def sample_product(

@@ -13,26 +13,9 @@ from sklearn.linear_model import LogisticRegressionCV
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.expected import require_least
+from sbi_active.expected import require, require_least
 from sbi_active.inference.beliefs.belief import ParticleDraws
 from sbi_active.simulation.outcomes import Simulations
-
-
-@dataclass(frozen=True)
-class LogRatio:
-    r"""The log ratio :math:`\beta^\top \psi(x) + \beta_0` at one parameter set.
-
-    Attributes:
-        weight: :math:`\beta`, shape (q,).
-        intercept: :math:`\beta_0`.
-    """
-
-    weight: NDArray[np.float64]
-    intercept: float
-
-    def __call__(self, summary: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return log ratios, shape (n,), of summaries, shape (n, q)."""
-        return summary @ self.weight + self.intercept
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,8 +76,8 @@ class LFIRE:
         seed: int,
         *,
         fewest_rows: int = 2,
-    ) -> LogRatio:
-        """Return the log ratio at one parameter set.
+    ) -> NDArray[np.float64]:
+        r"""Return :math:`\beta` and, last, :math:`\beta_0` at a parameter set, (q + 1).
 
         Args:
             own: Summaries of its outcomes, shape (n, q).
@@ -103,12 +86,12 @@ class LFIRE:
             fewest_rows: Rows of each kind a fold at least.
         """
         fewest = fewest_rows * self.num_folds
-        if min(len(own), len(marginal)) < fewest:
-            raise ValueError(
-                f"expected at least {fewest} outcomes of a parameter set and of the "
-                f"marginal; got {len(own)} and {len(marginal)}; simulate each "
-                "parameter set several times, as SeqBED_LFIRE.arrange() does"
-            )
+        require(
+            min(len(own), len(marginal)) >= fewest,
+            f"at least {fewest} outcomes of a parameter set and of the marginal",
+            f"{len(own)} and {len(marginal)}",
+            "simulate each parameter set several times, as SeqBED_LFIRE.arrange() does",
+        )
         features = np.concatenate([own, marginal])
         label = np.repeat([1, 0], [len(own), len(marginal)])
         order = np.random.default_rng(seed).permutation(len(label))
@@ -122,7 +105,7 @@ class LFIRE:
         with warnings.catch_warnings():  # of arguments whose defaults will change
             warnings.simplefilter("ignore")
             model.fit(features[order], label[order])
-        return LogRatio(model.coef_[0], float(model.intercept_[0]))
+        return np.append(model.coef_[0], model.intercept_[0])
 
 
 @dataclass(frozen=True)
@@ -135,7 +118,7 @@ class LFIREModel:
         action: Actions, shape (a, action_dim).
         center: Center of the outcomes of each action, shape (a, x_dim).
         scale: Scale of the outcomes of each action, shape (a, x_dim).
-        log_ratios: A row an action, an entry a particle.
+        weight: Weights of the summaries and, last, intercepts, (a, p, q + 1).
     """
 
     settings: LFIRE
@@ -143,7 +126,7 @@ class LFIREModel:
     action: Tensor
     center: Tensor
     scale: Tensor
-    log_ratios: Sequence[Sequence[LogRatio]]
+    weight: NDArray[np.float64]
 
     @property
     def belief(self) -> Distribution:
@@ -164,11 +147,9 @@ class LFIREModel:
         for a in place.unique().tolist():
             rows = torch.nonzero(place == a)[:, 0]
             psi = self.settings.summaries(x[rows], self.center[a], self.scale[a])
-            ratios = self.log_ratios[a]
-            own = particle[rows]
-            weight = np.stack([r.weight for r in ratios])[own]
-            intercept = np.array([r.intercept for r in ratios])[own]
-            total[rows] = torch.from_numpy((psi.numpy() * weight).sum(1) + intercept)
+            own = self.weight[a][particle[rows]]
+            log_ratio = (psi.numpy() * own[:, :-1]).sum(1) + own[:, -1]
+            total[rows] = torch.from_numpy(log_ratio)
         return total
 
     def nearest_action(self, action: Tensor) -> Tensor:
@@ -192,7 +173,7 @@ def fit_log_ratios(
     particles, particle = theta.unique(dim=0, return_inverse=True)
     actions, place = action.unique(dim=0, return_inverse=True)
     rng = np.random.default_rng(seed)
-    centers, scales, log_ratios = [], [], []
+    centers, scales, weights = [], [], []
     for a in range(len(actions)):
         rows = torch.nonzero(place == a)[:, 0]
         flat = x[rows].double().flatten(1)
@@ -204,24 +185,13 @@ def fit_log_ratios(
         centers.append(center)
         scales.append(scale)
         own = particle[rows].numpy()
-        log_ratios.append(
-            [
-                settings.fit(
-                    psi[own == i],
-                    psi[rng.permutation(len(psi))[: settings.num_marginal]],
-                    int(rng.integers(2**31)),
-                )
-                for i in range(len(particles))
-            ]
-        )
-    return LFIREModel(
-        settings,
-        particles,
-        actions,
-        torch.stack(centers),
-        torch.stack(scales),
-        log_ratios,
-    )
+        for i in range(len(particles)):
+            marginal = psi[rng.permutation(len(psi))[: settings.num_marginal]]
+            seed = int(rng.integers(2**31))
+            weights.append(settings.fit(psi[own == i], marginal, seed))
+    scaling = torch.stack(centers), torch.stack(scales)
+    weight = np.stack(weights).reshape(len(actions), len(particles), -1)
+    return LFIREModel(settings, particles, actions, *scaling, weight)
 
 
 def _places(rows: Tensor, known: Tensor, name: str, what: str) -> Tensor:

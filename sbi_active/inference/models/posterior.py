@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import deepcopy
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from sbi.inference.posteriors.base_posterior import NeuralPosterior
@@ -214,7 +214,7 @@ class ActionPosterior:
     def _condition(self, x: Tensor | None, action: Tensor | None) -> Tensor:
         if x is None or action is None:
             given = "x without action" if action is None else "action without x"
-            given = "neither" if x is None and action is None else given
+            given = "neither" if x is action else given
             raise ValueError(
                 f"expected x= and action= together; got {given}; pass both, or "
                 "posterior.at(action) to something that only knows x"
@@ -223,9 +223,14 @@ class ActionPosterior:
         return pack(rows, action_rows(action, self.action_dim, num_rows=len(rows)))
 
 
+Direct = TypeVar("Direct", bound=DirectPosterior)
+
+
 def at_conditions(
-    direct: DirectPosterior, condition: Tensor
-) -> tuple[DirectPosterior, Tensor]:
+    direct: DirectPosterior,
+    condition: Tensor,
+    kind: type[Direct] = DirectPosterior,
+) -> tuple[Direct, Tensor]:
     """Return a posterior given the number of a row, and these numbers.
 
     sbi refuses NaN in a condition, and its diagnostics drop such rows; the number of a
@@ -234,11 +239,12 @@ def at_conditions(
     Args:
         direct: Estimator over packed conditions.
         condition: Packed conditions, shape (n, c).
+        kind: Class of the posterior.
 
     Returns:
         The posterior, and numbers of shape (n, 1).
     """
-    posterior = DirectPosterior(
+    posterior = kind(
         _Rewritten(direct.posterior_estimator, torch.Size([1]), condition, _row_of),
         direct.prior,
         max_sampling_batch_size=direct.max_sampling_batch_size,

@@ -154,10 +154,10 @@ class Conditioning(nn.Module):
         theta: Tensor,
         condition: Tensor,
         action_dim: int,
-        *,
         scaling: Literal["action", "global"],
         whiten: bool,
         baseline: Literal["best", "none", "linear", "curved"],
+        *,
         most_numbers: float = 200,
         num_directions: int = 32,
         margin: float = 0.25,
@@ -198,9 +198,7 @@ class Conditioning(nn.Module):
 
     def _summarized(self, x: Tensor) -> Tensor:
         """Return outcomes as they are, or a few directions of them, (n, k)."""
-        own = getattr(
-            self, "directions", None
-        )  # networks of earlier versions have none
+        own = getattr(self, "directions", None)  # none in networks of earlier versions
         return x.double() if own is None else own(x)
 
     def _choose(

@@ -17,7 +17,6 @@ from sbi_active.expected import require, require_least, require_one_of, suggests
 from sbi_active.inference.networks.mixture_network import (
     ACTIVATIONS,
     MixtureDensityNetwork,
-    PreparedLoss,
 )
 from sbi_active.inference.sampling.adam import Adam
 
@@ -119,38 +118,7 @@ class MixtureDensity:
 
         Theta (n, theta_dim) and packed (x, action), shape (n, x_dim + action_dim).
         """
-        return MixtureDensityNetwork(
-            theta,
-            condition,
-            action_dim,
-            scaling=self.scaling,
-            whiten=self.whiten,
-            baseline=self.baseline,
-            activation=self.activation,
-            hidden_features=self.hidden_features,
-            num_components=self.num_components,
-            embedding_net=self.embedding_net,
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrainingBudget:
-    """Length and settings of the training.
-
-    Attributes:
-        num_iterations: Steps of gradient descent.
-        batch_size: Rows a step.
-        clip_max_norm: Bound of the gradient's norm; None does not clip.
-        anneal: Whether the learning rate falls to zero along a cosine.
-        patience: Epochs without improvement on held-out rows after which training
-            stops and the best weights return; None spends the whole budget.
-    """
-
-    num_iterations: int
-    batch_size: int
-    clip_max_norm: float | None = 5.0
-    anneal: bool = False
-    patience: int | None = None
+        return MixtureDensityNetwork(theta, condition, action_dim, self)
 
 
 @dataclass
@@ -170,7 +138,11 @@ def train_mixture_density(
     *,
     train_rows: Tensor,
     held_out_rows: Tensor,
-    budget: TrainingBudget,
+    num_iterations: int,
+    batch_size: int,
+    clip_max_norm: float | None = 5.0,
+    anneal: bool = False,
+    patience: int | None = None,
     calibration_kernel: Callable[[Tensor], Tensor] | None = None,
 ) -> TrainingRecord:
     r"""Minimize :math:`-\sum_n K(c_n) \log q(\theta_n | c_n)` over the training rows.
@@ -186,7 +158,12 @@ def train_mixture_density(
         condition: Conditions, shape (n, condition_dim).
         train_rows: Indices of rows to train on.
         held_out_rows: Indices of rows to validate on; may be empty.
-        budget: Budget of the training.
+        num_iterations: Steps of gradient descent.
+        batch_size: Rows a step.
+        clip_max_norm: Bound of the gradient's norm; None does not clip.
+        anneal: Whether the learning rate falls to zero along a cosine.
+        patience: Epochs without improvement on held-out rows after which training
+            stops and the best weights return; None spends the whole budget.
         calibration_kernel: Weight K of a row; None is 1.
 
     Returns:
@@ -195,31 +172,30 @@ def train_mixture_density(
     Raises:
         RuntimeError: If the loss is not finite.
     """
-    trained: MixtureDensityNetwork | PreparedLoss = network
-    patience = budget.patience
+    row_loss: Callable[[Tensor, Tensor], Tensor] = network.loss
     if network.conditioning is not None and patience is None:
-        patience = budget.num_iterations  # never runs out
+        patience = num_iterations  # never runs out
     if network.can_prepare and calibration_kernel is None:
         theta, condition = network.prepare(theta, condition)
-        trained = PreparedLoss(network)
+        row_loss = network.prepared_loss
 
     def loss_of(theta: Tensor, condition: Tensor) -> Tensor:
-        loss = trained.loss(theta, condition)
+        loss = row_loss(theta, condition)
         if calibration_kernel is not None:
             loss = calibration_kernel(condition) * loss
         return loss.mean()
 
     def height(step: int) -> float:
-        return 1 + math.cos(math.pi * step / budget.num_iterations)
+        return 1 + math.cos(math.pi * step / num_iterations)
 
     optimizer.rate = optimizer.initial_rate  # resumed: an annealed one starts again
-    size = min(budget.batch_size, len(train_rows))
+    size = min(batch_size, len(train_rows))
     steps_an_epoch = len(train_rows) // size
     record, best, best_state, fruitless, done = TrainingRecord(), torch.inf, None, 0, 0
-    while done < budget.num_iterations and fruitless != patience:
+    while done < num_iterations and fruitless != patience:
         start, total = time.time(), theta.new_zeros(())
         network.train()
-        num_steps = min(steps_an_epoch, budget.num_iterations - done)
+        num_steps = min(steps_an_epoch, num_iterations - done)
         order = train_rows[torch.randperm(len(train_rows))][: num_steps * size]
         # One gather an epoch: indexing rows at every step costs a tenth of the step.
         batches = zip(
@@ -229,11 +205,11 @@ def train_mixture_density(
             optimizer.forget_gradients()
             loss = loss_of(*batch)
             loss.backward()
-            if budget.clip_max_norm is not None:
-                clip_grad_norm_(optimizer.parameters, budget.clip_max_norm)
+            if clip_max_norm is not None:
+                clip_grad_norm_(optimizer.parameters, clip_max_norm)
             optimizer.step()
             done += 1
-            if budget.anneal:
+            if anneal:
                 optimizer.rate *= height(done) / height(done - 1)
             total += loss.detach()
 

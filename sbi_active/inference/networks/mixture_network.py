@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Literal
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from sbi.neural_nets.estimators.base import ConditionalDensityEstimator
@@ -70,16 +70,9 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         theta: Training parameters, shape (n, theta_dim).
         condition: Training conditions, shape (n, condition_dim).
         action_dim: Numbers of the action at the end of a condition; None leaves them
-            unknown, and the next three arguments without effect.
-        scaling: Scaling of the condition, as in :class:`.MixtureDensity`; so are all
-            that follow.
-        whiten: Whether theta is whitened.
-        baseline: Gaussian posterior that the network corrects.
-        activation: Name of the function between layers.
-        hidden_features: Width of each hidden layer.
-        num_components: Gaussian components K.
-        embedding_net: Embedding network of the condition, which is then scaled over all
-            rows, without a baseline.
+            unknown, and scaling, whitening and baseline without effect.
+        settings: Settings, a :class:`.MixtureDensity`. With an embedding network the
+            condition is scaled over all rows, without a baseline.
         global_logit: Logit of a component of the global frame at the start, where
             others are of local frames: a twentieth of the weight of each.
         few: Number of parameters beyond which correlations of a component are the same
@@ -97,19 +90,13 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         self,
         theta: Tensor,
         condition: Tensor,
-        action_dim: int | None = None,
+        action_dim: int | None,
+        settings: Any,
         *,
-        scaling: Literal["action", "global"] = "action",
-        whiten: bool = True,
-        baseline: Literal["best", "none", "linear", "curved"] = "best",
-        activation: Literal["silu", "relu"] = "silu",
-        hidden_features: Sequence[int] = (128, 128),
-        num_components: int = 5,
-        embedding_net: nn.Module | None = None,
         global_logit: float = -3.0,
         few: int = 12,
     ) -> None:
-        dim, num = theta.shape[1], num_components
+        dim, num = theta.shape[1], settings.num_components
         missing = ~finite(condition)
         ever_missing = missing.any(0)
         # Columns that go missing together need one mask between them.
@@ -119,21 +106,16 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         first = [int((columns == k).nonzero()[0]) for k in range(masks.shape[1])]
         masked = lost[first].tolist()
 
-        if embedding_net is not None:
-            scaling, baseline = "global", "none"
+        how: Any = settings.scaling, settings.whiten, settings.baseline
+        if settings.embedding_net is not None:
+            how = "global", settings.whiten, "none"
+        embedding = settings.embedding_net or nn.Identity()
         conditioning = None
-        plain = (scaling, whiten, baseline) == ("global", False, "none")
-        if action_dim is not None and not plain:
+        if action_dim is not None and how != ("global", False, "none"):
+            most = 200 if settings.embedding_net is None else math.inf
             conditioning = Conditioning(
-                theta,
-                condition,
-                action_dim,
-                scaling=scaling,
-                whiten=whiten,
-                baseline=baseline,
-                most_numbers=200 if embedding_net is None else math.inf,
+                *(theta, condition, action_dim, *how), most_numbers=most
             )
-        embedding = embedding_net or nn.Identity()
         with torch.no_grad():
             if conditioning is None:
                 seen = torch.zeros(2, condition.shape[1])
@@ -141,8 +123,8 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
                 seen = conditioning(condition[:2])[0].float()
             width = embedding(seen).shape[1] + len(masked)
         layers: list[nn.Module] = []
-        for hidden in hidden_features:
-            layers += [nn.Linear(width, hidden), ACTIVATIONS[activation]()]
+        for hidden in settings.hidden_features:
+            layers += [nn.Linear(width, hidden), ACTIVATIONS[settings.activation]()]
             width = hidden
         num_upper = dim * dim if dim <= few else 0
         last = nn.Linear(width, num * (1 + 2 * dim + num_upper))
@@ -248,7 +230,7 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
     def prepare(
         self, theta: Tensor, condition: Tensor, *, most_factors: int = 10_000_000
     ) -> tuple[Tensor, Tensor]:
-        """Return rows for :class:`PreparedLoss`: all that no weight changes."""
+        """Return rows for :meth:`prepared_loss`: all that no weight changes."""
         most = max(1, most_factors // (self.num_frames * self._dim**2))
         prepared, inputs = [], []
         with torch.no_grad():
@@ -260,6 +242,15 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
                 prepared.append(torch.cat([v.flatten(1), log_det], 1))
                 inputs.append(seen)
         return torch.cat(prepared), torch.cat(inputs)
+
+    def prepared_loss(self, prepared: Tensor, seen: Tensor) -> Tensor:
+        """Return -log q, shape (n,), for rows that went through the conditioning once.
+
+        Training visits a row several times, and only the layers change between visits.
+        """
+        v, log_det = prepared.tensor_split([-self._num_components], 1)
+        v = v.reshape(len(v), self._num_components, -1)
+        return -self._log_local_density(v, log_det, seen)
 
     def _log_density(self, theta: Tensor, condition: Tensor) -> Tensor:
         seen, frames = self._see(condition)
@@ -330,25 +321,6 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
             log_diagonal.reshape(shape).clamp(*log_precision),
             upper * self.strict_upper,
         )
-
-
-class PreparedLoss(nn.Module):
-    """The loss of a network on rows that went through its conditioning once.
-
-    Training visits a row several times, and only the layers change between visits. The
-    network has a conditioning and no embedding net.
-    """
-
-    def __init__(self, network: MixtureDensityNetwork) -> None:
-        super().__init__()
-        self.network = network
-
-    def loss(self, input: Tensor, condition: Tensor, **kwargs: object) -> Tensor:
-        """Return -log q, shape (n,), for rows of ``network.prepare``."""
-        num = self.network._num_components
-        v, log_det = input[:, :-num], input[:, -num:]
-        v = v.reshape(len(v), num, -1)
-        return -self.network._log_local_density(v, log_det, condition)
 
 
 def _frame_of_components(num_components: int, num_frames: int) -> list[int]:

@@ -177,14 +177,14 @@ class Fresh:
     """What simulations that no regression was fitted to say of it.
 
     Attributes:
-        tails: Tail probability of each trial, and of all.
+        tails: Tail probability of each trial and, last, of all.
         shift: Largest error of a mean, in standard deviations of the belief.
         limit: Largest shift of a belief that is to be trusted.
         correlation: Correlation of their errors across trials.
         least: Squares of the observed trials at the draw that explains them best, (t,).
     """
 
-    tails: tuple[list[float], float]
+    tails: list[float]
     shift: float
     limit: float
     correlation: float
@@ -224,7 +224,7 @@ def compared_with_fresh(
     d, sds = z.shape[1], z.std(0) + 1e-300
     label = surrogate.assign(z)
     if (label >= 0).sum() <= 10:
-        tails = [1.0] * num_trials, 1.0
+        tails = [1.0] * (num_trials + 1)
         return Fresh(tails, np.inf, own.largest_shift, 0.0, np.zeros(num_trials))
     real, known, errors, moves = [], [], [], []
     for k in np.unique(label[label >= 0]):
@@ -249,7 +249,7 @@ def compared_with_fresh(
     worst = int(np.abs(move.mean(0)).argmax())
     deviation = float(move[:, worst].std() / np.sqrt(len(move)))
     return Fresh(
-        (tail[:-1], tail[-1]),
+        tail,
         float(np.abs(move.mean(0))[worst]),
         max(own.largest_shift, own.chance * deviation),
         _across(error, num_trials),

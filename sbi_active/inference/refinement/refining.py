@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.expected import require
 from sbi_active.inference.beliefs.enumerated import (
     EnumeratedBelief,
     Enumeration,
@@ -20,6 +20,7 @@ from sbi_active.inference.beliefs.enumerated import (
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.declared.refining import (
     DeclaredRecord,
+    Problem,
     SimulatedBelief,
     refine_declared,
 )
@@ -104,65 +105,48 @@ def refine(
     action, outcome = _trials(action, x)
     enumeration = Enumeration.of(prior)
     if enumeration is not None:
-        return enumerated(
-            *(refine, simulator, prior, enumeration, action, outcome, seed),
-            settings=settings,
-            stages=stages,
-        )
+        own: Any = {"settings": settings, "stages": stages}
+
+        def of_others(simulator: Any, prior: Distribution, seed: int) -> Any:
+            return refine(simulator, prior, action, outcome, seed=seed, **own)
+
+        return enumerated(of_others, simulator, prior, enumeration, seed)
     hints = [] if start is None else start
     hints = [hints] if isinstance(hints, Distribution) else [*hints]
+    problem = Problem(simulator, prior, action, outcome, hints, settings, seed)
     with single_thread():
-        belief = refine_declared(
-            *(simulator, prior, action, outcome),
-            hints=hints,
-            past=past,
-            settings=settings,
-            seed=seed,
-        )
-        if belief is None:
-            known = past if isinstance(past, HistoryRecord) else None
-            learned = partial(
-                Regions,
-                *(simulator, prior, action, outcome),
-                hints=hints,
-                settings=settings,
-                own=StageSettings() if stages is None else stages,
-            )
-            belief = _within_memory(learned, known, seed)
-    return belief
-
-
-def _within_memory(
-    learned: partial[Regions], past: HistoryRecord | None, seed: int
-) -> LearnedBelief:
-    try:
-        return _learned(learned, past, seed)
-    except RuntimeError as error:
-        if "allocate memory" not in str(error):
-            raise
-        dim = parameter_dim(learned.args[1])
-        raise MemoryError(
-            f"expected memory for a belief of {dim} parameters; got none left; fix the "
-            "parameters that no trial informs, or lower num_histories"
-        ) from error
+        belief = refine_declared(problem, past)
+        if belief is not None:
+            return belief
+        known = past if isinstance(past, HistoryRecord) else None
+        own = StageSettings() if stages is None else stages
+        try:
+            return _learned(problem, own, known)
+        except RuntimeError as error:
+            if "allocate memory" not in str(error):
+                raise
+            raise MemoryError(
+                f"expected memory for a belief of {parameter_dim(prior)} parameters; "
+                "got none left; fix the parameters that no trial informs, or lower "
+                "num_histories"
+            ) from error
 
 
 def _learned(
-    learned: partial[Regions], past: HistoryRecord | None, seed: int
+    problem: Problem, own: StageSettings, past: HistoryRecord | None
 ) -> LearnedBelief:
     """Return the belief of a regression, of as wide a noise as the trials scatter."""
-    regions = learned(past=past, seed=seed)
+    regions = Regions(problem, own, past=past)
     belief, first = regions.run(), regions.contradiction()
     if first is None:
         return belief
     histories, sds = belief.histories, regions.histories.noise_sds
     now, inflation = first, 1.0
-    for number in range(regions.settings.max_inflations):
+    for number in range(problem.settings.max_inflations):
         inflation *= now.inflation
-        wider = learned(
-            seed=derive_seed(seed, "inflated", number),
-            further_noise=np.sqrt(max(inflation**2 - 1, 0.0)) * sds,
-        )
+        further_noise = np.sqrt(max(inflation**2 - 1, 0.0)) * sds
+        again = replace(problem, seed=derive_seed(problem.seed, "inflated", number))
+        wider = Regions(again, own, further_noise=further_noise)
         belief, further = wider.run(), wider.contradiction()
         if further is None:
             break
@@ -174,12 +158,12 @@ def _learned(
 
 def _trials(action: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
     action, x = torch.as_tensor(action), torch.as_tensor(x)
-    if action.ndim != 2 or x.ndim < 1 or len(action) != len(x) or len(action) == 0:
-        raise ValueError(
-            "expected action (t, action_dim) and x (t, *x_shape) with as many trials, "
-            f"at least one; got {tuple(action.shape)} and {tuple(x.shape)}; stack "
-            "the trials along axis 0"
-        )
+    require(
+        action.ndim == 2 and x.ndim > 0 and len(action) == len(x) > 0,
+        "action (t, action_dim) and x (t, *x_shape) with as many trials, at least one",
+        f"{tuple(action.shape)} and {tuple(x.shape)}",
+        "stack the trials along axis 0",
+    )
     # Copies: a record keeps them, whatever becomes of the caller's.
     x = x.double().cpu().clone().reshape(len(x), *x.shape[1:] or (1,))
     return action.float().cpu().clone(), x

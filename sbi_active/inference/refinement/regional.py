@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
-from torch.distributions import Distribution
 
 from sbi_active.arrays import Array
 from sbi_active.inference.declared.contradiction import Contradiction, compared
 from sbi_active.inference.declared.diagnosing import Doubt
-from sbi_active.inference.declared.settings import RefinementOptions
+from sbi_active.inference.declared.refining import Problem
 from sbi_active.inference.engine.learned import LearnedBelief
 from sbi_active.inference.refinement.checks import (
     Fresh,
@@ -37,15 +34,9 @@ class Regions(Stages):
     """Histories in regions, and a polynomial in each.
 
     Args:
-        simulator: ``simulator(theta, action)``.
-        prior: The original prior.
-        action: Executed actions, shape (t, action_dim).
-        outcome: Their outcomes, shape (t, *x_shape).
-        hints: Distributions to look at first.
-        past: Histories of the first of these trials.
-        settings: Settings of the belief.
+        problem: The posterior that is asked for.
         own: Settings of the stages.
-        seed: Seed of everything random here.
+        past: Histories of the first of its trials.
         further_noise: Standard deviations of noise to add, shape (t, q).
 
     Attributes:
@@ -56,30 +47,25 @@ class Regions(Stages):
 
     def __init__(
         self,
-        simulator: Callable[..., Any],
-        prior: Distribution,
-        action: Tensor,
-        outcome: Tensor,
+        problem: Problem,
+        own: StageSettings,
         *,
-        hints: Sequence[Distribution] = (),
         past: HistoryRecord | None = None,
-        settings: RefinementOptions,
-        own: StageSettings = StageSettings(),  # noqa: B008  (frozen)
-        seed: int,
         further_noise: Array | None = None,
     ) -> None:
+        prior, settings, seed = problem.prior, problem.settings, problem.seed
         rng = np.random.default_rng(derive_seed(seed, "refine"))
         coordinates = PriorCoordinates(prior, rng)
         super().__init__(
             *(prior, settings, own, settings.num_histories, rng, coordinates)
         )
-        self.action, self.outcome = action, outcome
+        self.action, self.outcome = problem.action, problem.x
         self.histories = Histories(
-            *(simulator, action, outcome.numpy().reshape(len(action), -1)),
+            *(problem.simulator, self.action, self.outcome.flatten(1).numpy()),
             *(coordinates, seed, past, settings.workers),
             further_noise=further_noise,
         )
-        near = coordinates.drawn_from(hints, 1_000, seed=seed)
+        near = coordinates.drawn_from(problem.hints, 1_000, seed=seed)
         self.regions = [whole_space(coordinates.dim), *map(around, near)]
         self.near = np.concatenate(near) if near else None
         self.shape_change = 0.0
@@ -195,7 +181,7 @@ class Regions(Stages):
             other, error=error, change=stage.change, shrinkage=stage.shrinkage
         )
 
-    def tails(self, stage: Stage) -> tuple[list[float], float]:
+    def tails(self, stage: Stage) -> list[float]:
         """Return tail probabilities, by fresh simulations at draws of the belief."""
         c, own = self.coordinates, self.own
         num = max(own.least_checked, int(own.checked_share * self.budget))
@@ -207,13 +193,12 @@ class Regions(Stages):
         )
         return self.fresh.tails
 
-    def doubts(self) -> dict[str, Doubt]:
-        """Return what the regressions take for granted."""
+    def doubts(self) -> tuple[dict[str, Doubt], dict[str, Any]]:
+        """Return what the regressions take for granted, and the trials that are odd."""
         last, fresh, own = self.stages[-1], self.fresh, self.own
         fits, dim = last.surrogate.regressions, self.coordinates.dim
-        live = [
-            f.ratio for f, mass in zip(fits, last.mass, strict=True) if mass > own.live
-        ]
+        pairs = zip(fits, last.mass, strict=True)
+        ratio = max((f.ratio for f, mass in pairs if mass > own.live), default=np.inf)
         roughness = self.stages[0].surrogate.regressions[0].roughness
         tails, has_edges = noise_tails(self.stages, own)
         known = 0.0
@@ -226,63 +211,18 @@ class Regions(Stages):
         share, blur = outcomes_at(last.surrogate, last.draws, self.histories, own)
         self.probability_of_outcome = share
         rare = ", ".join(str(k) for k, p in enumerate(share) if p < own.rare)
-        return {
-            "confirmed": (
-                fresh.shift <= fresh.limit,
-                fresh.shift,
-                "SA101 fresh simulations do not confirm the belief: its mean is off by "
-                "{:.2g} standard deviations; raise num_histories",
-            ),
-            "gaussian_noise": (
-                not has_edges,
-                tails,
-                "SA110 the noise has hard edges (its excess kurtosis is {:.2g}), which "
-                "the belief does not follow, so that it may be too wide or too narrow; "
-                "check against a belief of a trained network",
-            ),
-            "noise_known": (
-                known <= 1,
-                known,
-                "SA110 the noise is not Gaussian, and the simulations are too few to "
-                "tell what it is ({:.2g} times the error that is allowed for); raise "
-                "num_histories",
-            ),
-            "smooth_response": (
-                roughness <= own.rough,
-                roughness,
-                "SA111 over the prior the outcomes have more turns than a cubic, which "
-                "misses {:.0%} of their variance, so that four or more narrow modes "
-                "are possible and one may be lost; check against another seed or a "
-                "narrower prior",
-            ),
-            "no_misfit": (
-                last.excess <= own.misfit,
-                max(live, default=np.inf),
-                "SA112 the residuals of the surrogate have {:.2g} times the variance "
-                "of the noise, so that the belief is too wide; raise num_histories",
-            ),
-            "independent_trials": (
-                fresh.correlation < own.correlated or is_misfit(last.excess),
-                fresh.correlation,
-                "SA104 simulated trials correlate at the same parameters ({:.2f}), yet "
-                "the likelihood is a product over trials; check how the simulator "
-                "seeds its noise",
-            ),
-            "outcomes_followed": (
-                blur <= own.blurred,
-                blur,
-                "SA120 where simulations have a measurement and where they have none "
-                "is followed coarsely ({:.0%} of repeated simulations would differ "
-                "that do not), so that the belief is too wide; raise num_histories",
-            ),
-            "outcomes_usual": (
-                not rare,
-                min(share),
-                f"SA121 trials {rare} had a measurement, or none, where only {{:.1%}} "
-                "of the simulations near the belief do the same: the simulator lacks a "
-                "way to fail, or the status of the trial is wrong",
-            ),
+        depends = fresh.correlation >= own.correlated and not is_misfit(last.excess)
+        doubts: dict[str, Doubt] = {
+            "confirmed": (fresh.shift <= fresh.limit, fresh.shift),
+            "gaussian_noise": (not has_edges, tails),
+            "noise_known": (known <= 1, known),
+            "smooth_response": (roughness <= own.rough, roughness),
+            "no_misfit": (last.excess <= own.misfit, ratio),
+            "independent_trials": (not depends, fresh.correlation),
+            "outcomes_followed": (blur <= own.blurred, blur),
+            "outcomes_usual": (not rare, min(share)),
         }
+        return doubts, {"rare": rare}
 
     def contradiction(self) -> Contradiction | None:
         """Return what contradicts at the draw that the last stage explains best."""

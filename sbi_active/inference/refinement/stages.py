@@ -221,12 +221,12 @@ class Stages(ABC):
         """Return misfit, mass of each region and expected error at draws (n, d)."""
 
     @abstractmethod
-    def tails(self, stage: Stage) -> tuple[list[float], float]:
-        """Return tail probabilities of the trials and of all together."""
+    def tails(self, stage: Stage) -> list[float]:
+        """Return tail probabilities of the trials and, last, of all together."""
 
-    def doubts(self) -> dict[str, Doubt]:
-        """Return what else is taken for granted, by name."""
-        return {}
+    def doubts(self) -> tuple[dict[str, Doubt], dict[str, Any]]:
+        """Return what else is taken for granted, by name, and details of that."""
+        return {}, {}
 
     def with_more(self, stage: Stage) -> Stage:
         """Return the stage with more of the simulations, where these are of use."""
@@ -295,31 +295,16 @@ class Stages(ABC):
         change = last.change if num > 1 else -1.0
         allowed = own.unsettled * last.draws.shape[1]
         tails = self.tails(last)
+        is_settled = not np.isfinite(own.settled) or (num > 1 and change <= allowed)
+        further, details = self.doubts()
         doubts: dict[str, Doubt] = {
-            "few_modes": (
-                effective >= own.effective,
-                effective,
-                "SA111 at some stage only {:.1%} of the particles counted, as with "
-                "many narrow modes, and a mode may be lost; raise num_histories",
-            ),
-            "settled": (
-                not np.isfinite(own.settled) or (num > 1 and change <= allowed),
-                change,
-                "SA109 the last stage still changed the belief, by {:.2g} nats; raise "
-                "num_histories",
-            ),
-            "small_error": (
-                last.error <= own.untrusted,
-                last.error,
-                "SA105 the belief is off by about {:.2g} nats, since it rests on few "
-                "simulations for so many parameters and numbers; raise num_histories",
-            ),
-            **self.doubts(),
+            "few_modes": (effective >= own.effective, effective),
+            "settled": (is_settled, change),
+            "small_error": (last.error <= own.untrusted, last.error),
+            **further,
         }
         return judged(
-            doubts,
-            tails,
-            edge_mass,
+            *(doubts, details, tails, edge_mass),
             num_simulations=self.spent()[1],
             effective_sample_size=float(last.fit.effective_sample_size),
             error_nats=last.error,

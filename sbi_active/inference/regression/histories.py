@@ -319,29 +319,22 @@ class Histories:
             return None
         pairs = _nearest(np.where(both, distance[first], np.inf), min_pairs)
         scale = np.abs(self.x[rows] + self.observed).max(0)[self.used]
-        noise = estimate_noise(
-            self.x[first[pairs]][:, self.used],
-            self.x[second[pairs]][:, self.used],
-            scale,
-        )
+        repeated = (self.x[at[pairs]][:, self.used] for at in (first, second))
+        noise = estimate_noise(*repeated, scale)
         # Where all trials agree everywhere, or nowhere, there is nothing to compare.
         mixed = np.flatnonzero(agrees.any(0) & ~agrees.all(0))
         near = _nearest(distance, needed)
-        repeated = _nearest(distance[first], min_pairs)
+        again = np.stack([first, second], 1)[_nearest(distance[first], min_pairs)]
+        outcomes = outcomes_of(
+            region, self.z[near], agrees[near], agrees[again], mixed.tolist()
+        )
         return LocalRegression.fit(
             region,
             self.z[rows],
             self.x[rows],
             noise=noise,
             num_trials=len(self.action),
-            outcomes=outcomes_of(
-                region,
-                self.z[near],
-                agrees[near],
-                agrees[first[repeated]],
-                agrees[second[repeated]],
-                mixed.tolist(),
-            ),
+            outcomes=outcomes,
             used=self.used,
             observed=self.observed,
             shapes=shapes,

@@ -134,19 +134,18 @@ def outcomes_of(
     region: Region,
     z: Array,
     agrees: NDArray[np.bool_],
-    first: NDArray[np.bool_],
-    second: NDArray[np.bool_],
+    repeated: NDArray[np.bool_],
     trials: Sequence[int],
 ) -> tuple[TrialOutcome, ...]:
     """Return the regressions of trials in a region.
 
     Simulations z (n, d), whether their outcomes are what was observed (n, t), and the
-    same of simulations that were repeated and of their repetitions, both (r, t).
+    same of simulations that were repeated and of their repetitions, (r, 2, t).
     """
     known: dict[bytes, TrialOutcome] = {}  # with hard edges, many trials agree
     outcomes = []
     for k in trials:
-        pairs = np.stack([first[:, k], second[:, k]], 1)
+        pairs = repeated[:, :, k]
         key = agrees[:, k].tobytes() + pairs.tobytes()
         if key not in known:
             known[key] = TrialOutcome.fit(region, k, z, agrees[:, k], pairs)

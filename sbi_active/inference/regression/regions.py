@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi, chi2
 
 from sbi_active.arrays import Array
@@ -96,13 +95,6 @@ class Region:
 def whole_space(dim: int) -> Region:
     """Return the region without an edge."""
     return Region(np.zeros(dim), np.eye(dim), 1.0, whole=True)
-
-
-def nearest_region(regions: list[Region], z: Array) -> NDArray[np.intp]:
-    """Return the region of each place, shape (n,); -1 where none contains it."""
-    distance = np.stack([region.distance(z) for region in regions])
-    nearest = distance.argmin(0)
-    return np.where(distance.min(0) <= 1, nearest, -1)
 
 
 def cover(

@@ -30,7 +30,7 @@ from scipy.stats import chi2, f
 
 from sbi_active.arrays import Array
 from sbi_active.inference.regression.outcomes import TrialOutcome
-from sbi_active.inference.regression.regions import Basis, Region, nearest_region
+from sbi_active.inference.regression.regions import Basis, Region
 from sbi_active.inference.regression.residuals import (
     NoiseShape,
     ResidualCovariance,
@@ -149,7 +149,7 @@ class LocalRegression:
         n, q = x.shape
         u = region.scaled(z)
         scale = np.sqrt(noise.variance)
-        best: tuple[float, Basis, Array, Array, Array] | None = None
+        best: tuple[float, Basis, Array, Array, Array, Array] | None = None
         roughness = 0.0
         is_inner = np.linalg.norm(u, axis=1) <= region.inner
         # Both intercepts are to be known.
@@ -159,7 +159,7 @@ class LocalRegression:
             if is_split:
                 basis = replace(basis, inner=region.inner)
             is_wave = basis.phase.size > 0
-            if is_wave and best is not None and _misfit(best[3], noise, best[2]) < 3:
+            if is_wave and best is not None and best[5].max(initial=0.0) < 3:
                 break  # a cubic will do, or another stage makes it do
             p = basis.num_features
             if n < p + max(freedom, p // 2):
@@ -176,12 +176,12 @@ class LocalRegression:
                 missed = (residual**2).sum(0) / (n - p) - noise.variance
                 roughness = float((missed / x.var(0).clip(noise.variance)).max())
             if best is None or score < best[0] - gain * q:
-                best = (score, basis, root, residual, coefficient)
+                ratio = (residual**2).sum(0) / (n - p) / noise.variance
+                best = (score, basis, root, residual, coefficient, ratio)
         if best is None:
             return None
-        _, basis, root, residual, coefficient = best
+        _, basis, root, residual, coefficient, ratio = best
         left = n - len(root)
-        ratio = (residual**2).sum(0) / left / noise.variance
         deviation = np.sqrt((residual**2).sum(0) / left + 1e-9 * noise.variance)
         standardized = residual / deviation
         excess = _excess(ratio, alike(standardized, left), left, noise.num_pairs)
@@ -287,7 +287,8 @@ class Surrogate:
 
     def assign(self, z: Array) -> NDArray[np.intp]:
         """Return the region of each place, shape (n,); -1 where there is none."""
-        return nearest_region([r.region for r in self.regressions], z)
+        distance = np.stack([fit.region.distance(z) for fit in self.regressions])
+        return np.where(distance.min(0) <= 1, distance.argmin(0), -1)
 
 
 def fewest_rows(dim: int, *, freedom: int = 20) -> int:
@@ -314,11 +315,6 @@ def _candidates(
         polynomials = [polynomials[0], *powers, *polynomials[1:]]
     num_waves = min(max_waves, num_rows // 4)
     return polynomials + [Basis.waves(s, dim, num_waves) for s in lengths]
-
-
-def _misfit(residual: Array, noise: NoiseEstimate, root: Array) -> float:
-    variance = (residual**2).sum(0) / (len(residual) - len(root))
-    return float((variance / noise.variance).max(initial=0.0))
 
 
 def _excess(

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.arrays import finite
+from sbi_active.expected import require
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
 from sbi_active.messages import Explained, warn
 from sbi_active.simulation.outcomes import (
@@ -78,11 +79,12 @@ def round_rows(
     x = torch.as_tensor(x)
     x = x[:, None] if x.ndim == 1 else x
     dim = parameter_dim(prior)
-    if theta.ndim != 2 or theta.shape[1] != dim or len(x) != len(theta):
-        raise ValueError(
-            f"expected theta (n, {dim}) and x (n, ...) with as many rows; got "
-            f"{tuple(theta.shape)} and {tuple(x.shape)}; give one row a simulation"
-        )
+    require(
+        theta.ndim == 2 and theta.shape[1] == dim and len(x) == len(theta),
+        f"theta (n, {dim}) and x (n, ...) with as many rows",
+        f"{tuple(theta.shape)} and {tuple(x.shape)}",
+        "give one row a simulation",
+    )
     outside = ~within_support(prior, theta)
     if bool(outside.any()):
         row = int(outside.nonzero()[0])
@@ -130,13 +132,13 @@ def require_whole(x: Tensor) -> None:
 def check_proposal(proposal: Any, belief: Distribution | None) -> None:
     """Raise unless theta is drawn from the belief or a truncation of it."""
     truncated = isinstance(proposal, RestrictedPrior) and proposal._prior is belief
-    if proposal is None or proposal is belief or truncated:
-        return
-    raise ValueError(
-        "expected proposal to be the belief or sbi's RestrictedPrior of it, since a "
-        "round with actions is trained by plain maximum likelihood and any other "
-        f"proposal would take the belief's place; got {type(proposal).__name__}; "
-        "pass belief= the distribution theta was drawn from"
+    require(
+        proposal is None or proposal is belief or truncated,
+        "proposal to be the belief or sbi's RestrictedPrior of it, since a round with "
+        "actions is trained by plain maximum likelihood and any other proposal would "
+        "take the belief's place",
+        type(proposal).__name__,
+        "pass belief= the distribution theta was drawn from",
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from scipy.optimize import minimize
@@ -167,9 +167,9 @@ class GaussianProcess:
         free, evidence = _hyperparameters(
             u[some], values[some], few, num_categories, settings
         )
-        variance = _variance(free, noise, len(u), settings)
-        kernel = _kernel(u, u, free, num_categories, settings) + variance.diag()
-        precision = torch.linalg.inv(kernel)
+        kernel = _Kernel(free, num_categories, settings)
+        variance = kernel.noise(noise, len(u))
+        precision = torch.linalg.inv(kernel(u, u) + variance.diag())
         precision = 0.5 * (precision + precision.mT)
         inflation = torch.ones_like(scale)
         if not isinstance(noise, Tensor):
@@ -204,7 +204,7 @@ class GaussianProcess:
     def __call__(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and variance at inputs (m, D), both (m, q), differentiably."""
         cross, trend = self._cross(u), _features(u, self.settings)
-        own = trend.square().sum(1) + _amplitude(self.free, self.settings).square()
+        own = trend.square().sum(1) + self._kernel.amplitude().square()
         variance = own - ((cross @ self.precision) * cross).sum(1)
         variance = variance.clamp_min(self.settings.jitter)[:, None] * self.inflation
         return self._mean(u, cross), variance * self.scale**2
@@ -212,7 +212,7 @@ class GaussianProcess:
     def covariance(self, u: Tensor) -> Tensor:
         """Return the posterior covariance of the first output at (m, D), (m, m)."""
         cross = self._cross(u)
-        own = _kernel(u, u, self.free, self.num_categories, self.settings)
+        own = self._kernel(u, u)
         return self.scale[0].square() * (own - cross @ self.precision @ cross.mT)
 
     def influence(self, u: Tensor) -> Tensor:
@@ -225,8 +225,12 @@ class GaussianProcess:
         residual = self.noise * (self.precision @ self.values)[:, 0]
         return self.scale[0] * (self._cross(u) @ self.precision) * residual
 
+    @property
+    def _kernel(self) -> _Kernel:
+        return _Kernel(self.free, self.num_categories, self.settings)
+
     def _cross(self, u: Tensor) -> Tensor:
-        return _kernel(u, self.u, self.free, self.num_categories, self.settings)
+        return self._kernel(u, self.u)
 
     def _mean(self, u: Tensor, cross: Tensor) -> Tensor:
         taken_off = _features(u, self.settings) @ self.taken_off
@@ -250,46 +254,47 @@ def _features(u: Tensor, settings: ProcessSettings) -> Tensor:
     return settings.trend * torch.cat(parts, 1)
 
 
-def _amplitude(free: Tensor, settings: ProcessSettings) -> Tensor:
-    return free[-2].clamp(-settings.limit, settings.limit).exp()
+class _Kernel(NamedTuple):
+    """A kernel and its hyperparameters, see ``free`` of the process."""
 
+    free: Tensor
+    num_categories: int
+    settings: ProcessSettings
 
-def _kernel(
-    u: Tensor,
-    other: Tensor,
-    free: Tensor,
-    num_categories: int,
-    settings: ProcessSettings,
-) -> Tensor:
-    """Return the covariance without noise of inputs (m, D) and (n, D), (m, n)."""
-    limit, c = settings.limit, u.shape[1] - num_categories
-    length = free[:c].clamp(-limit, limit).exp()
-    a, b = u[:, :c] / length, other[:, :c] / length
-    square = (a.square().sum(1)[:, None] + b.square().sum(1) - 2 * a @ b.T).clamp_min(0)
-    if settings.kind == "smooth":
-        correlation = (-0.5 * square).exp()
-    else:
-        r = (5 * square + 1e-12).sqrt()
-        correlation = (1 + r + r.square() / 3) * (-r).exp()
-    if num_categories:
-        differs = (u[:, None, c:] != other[None, :, c:]).double()
-        rho = torch.nn.functional.logsigmoid(free[c:-2].clamp(-limit, limit))
-        correlation = correlation * (differs @ rho).exp()
-    trend = _features(u, settings) @ _features(other, settings).T
-    return trend + _amplitude(free, settings).square() * correlation
+    def amplitude(self) -> Tensor:
+        """Return the deviation beside the trend."""
+        limit = self.settings.limit
+        return self.free[-2].clamp(-limit, limit).exp()
 
+    def __call__(self, u: Tensor, other: Tensor) -> Tensor:
+        """Return the covariance without noise of inputs (m, D) and (n, D), (m, n)."""
+        free, limit = self.free, self.settings.limit
+        c = u.shape[1] - self.num_categories
+        length = free[:c].clamp(-limit, limit).exp()
+        a, b = u[:, :c] / length, other[:, :c] / length
+        square = a.square().sum(1)[:, None] + b.square().sum(1) - 2 * a @ b.T
+        square = square.clamp_min(0)
+        if self.settings.kind == "smooth":
+            correlation = (-0.5 * square).exp()
+        else:
+            r = (5 * square + 1e-12).sqrt()
+            correlation = (1 + r + r.square() / 3) * (-r).exp()
+        if self.num_categories:
+            differs = (u[:, None, c:] != other[None, :, c:]).double()
+            rho = torch.nn.functional.logsigmoid(free[c:-2].clamp(-limit, limit))
+            correlation = correlation * (differs @ rho).exp()
+        trend = _features(u, self.settings) @ _features(other, self.settings).T
+        return trend + self.amplitude().square() * correlation
 
-def _variance(
-    free: Tensor, noise: str | Tensor, num: int, settings: ProcessSettings
-) -> Tensor:
-    """Return the variance of each row's noise, shape (n,)."""
-    last, limit = free[-1], settings.limit
-    own = free.new_zeros(num)
-    if isinstance(noise, Tensor):
-        own = last.clamp(-2 * limit, limit).sigmoid() * noise.square()
-    elif noise == "learned":
-        own = own + (2 * last.clamp(-limit, limit)).exp()
-    return own + settings.jitter
+    def noise(self, noise: str | Tensor, num: int) -> Tensor:
+        """Return the variance of each row's noise, shape (n,)."""
+        last, limit = self.free[-1], self.settings.limit
+        own = self.free.new_zeros(num)
+        if isinstance(noise, Tensor):
+            own = last.clamp(-2 * limit, limit).sigmoid() * noise.square()
+        elif noise == "learned":
+            own = own + (2 * last.clamp(-limit, limit)).exp()
+        return own + self.settings.jitter
 
 
 def _hyperparameters(
@@ -309,9 +314,9 @@ def _hyperparameters(
 
     def negative_log_evidence(values: Array) -> tuple[float, Array]:
         free = torch.tensor(values, requires_grad=True)
-        kernel = _kernel(u, u, free, num_categories, settings)
-        kernel = kernel + _variance(free, noise, len(u), settings).diag()
-        white, log_volume = _whitened(kernel, y)
+        kernel = _Kernel(free, num_categories, settings)
+        covariance = kernel(u, u) + kernel.noise(noise, len(u)).diag()
+        white, log_volume = _whitened(covariance, y)
         loss = 0.5 * white.square().sum() + y.shape[1] * log_volume
         loss = loss + 0.5 * ((free - center) / deviation).square().sum()
         return float(loss.detach()), torch.autograd.grad(loss, free)[0].numpy()

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import Self
 
+from sbi_active.expected import require
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.rounds.condition import pack
 from sbi_active.inference.rounds.rows import check_proposal, round_rows
@@ -30,8 +31,6 @@ R = TypeVar("R")
 Ours = TypeVar("Ours", bound=Callable[..., Any])
 #: Number of epochs that sbi's own default allows.
 NEVER = 2**31 - 1
-#: Arguments of NPE_C, which choose between losses of several rounds.
-NO_MEANING_WITH_ACTION = ("discard_prior_samples", "use_combined_loss", "num_atoms")
 
 
 def takes(theirs: Callable[P, R]) -> Callable[[Callable[..., Any]], Callable[P, R]]:
@@ -70,25 +69,6 @@ def given_arguments(
         for name, value in given.items()
         if value is not None or name == "clip_max_norm"
     }
-
-
-def require_likelihood_loss(
-    method: Callable[..., Any], given: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Return arguments without those of the losses of several rounds.
-
-    Raises:
-        ValueError: If one of these was given another value than its default.
-    """
-    parameters = inspect.signature(method).parameters
-    for name in NO_MEANING_WITH_ACTION:
-        default = parameters[name].default
-        if given.get(name, default) != default:
-            raise ValueError(
-                f"expected {name} to be left out in a round with actions, which is "
-                f"trained by maximum likelihood; got {given[name]}; drop it"
-            )
-    return {n: v for n, v in given.items() if n not in NO_MEANING_WITH_ACTION}
 
 
 class SilentTracker:
@@ -201,11 +181,12 @@ class ActionRounds(ActiveInference):
         if not self.has_actions:
             return self._sbi.train(**given)
         resume = given.get("resume_training", False)
-        if resume and self._trained_round != max(self._data_round_index):
-            raise ValueError(
-                "expected resume_training after train() on the same rows; got rows "
-                "appended since; train() without resume_training"
-            )
+        require(
+            not resume or self._trained_round == max(self._data_round_index),
+            "resume_training after train() on the same rows",
+            "rows appended since",
+            "train() without resume_training",
+        )
         defaults = self._training_defaults(given) if self._has_settings else {}
         arguments = {**defaults, **given, "retrain_from_scratch": not resume}
         with single_thread() if self._has_settings else nullcontext():
@@ -264,21 +245,22 @@ class ActionRounds(ActiveInference):
     def _is_round(self, action: Tensor | None, belief: Distribution | None) -> bool:
         """Return whether rows have actions, or raise where they must and do not."""
         if action is not None:
-            if self._data_round_index and not self.has_actions:
-                name = type(self).__name__
-                raise ValueError(
-                    "expected rounds without action, since earlier rounds of this "
-                    f"trainer have none; got action=; start a new {name}(prior) for "
-                    "rounds with actions"
-                )
-            return True
-        if self.has_actions or belief is not None:
-            earlier = "earlier rounds of this trainer have actions"
-            since = earlier if self.has_actions else "belief= was given"
-            raise ValueError(
-                f"expected action=, since {since}; got none; pass the action of each "
-                "row, or start a new trainer for rounds without actions"
+            require(
+                self.has_actions or not self._data_round_index,
+                "rounds without action, since earlier rounds of this trainer have none",
+                "action=",
+                f"start a new {type(self).__name__}(prior) for rounds with actions",
             )
+            return True
+        earlier = "earlier rounds of this trainer have actions"
+        since = earlier if self.has_actions else "belief= was given"
+        require(
+            not self.has_actions and belief is None,
+            f"action=, since {since}",
+            "none",
+            "pass the action of each row, or start a new trainer for rounds without "
+            "actions",
+        )
         return False
 
     def _append_round(
@@ -293,6 +275,8 @@ class ActionRounds(ActiveInference):
     ) -> Self:
         belief = self.belief if belief is None else belief
         check_proposal(proposal, belief)
+        if exclude_invalid_x is None:
+            exclude_invalid_x = not self._has_settings
         rows = round_rows(
             theta,
             x,
@@ -300,11 +284,7 @@ class ActionRounds(ActiveInference):
             prior=require_support(self._prior),
             x_shape=self._outcome_shape,
             action_dim=self._action_dim,
-            exclude_invalid=(
-                not self._has_settings
-                if exclude_invalid_x is None
-                else exclude_invalid_x
-            ),
+            exclude_invalid=exclude_invalid_x,
             may_be_invalid=bool(self.trials),
         )
         self._action_dim = rows.action.shape[1]
@@ -346,13 +326,6 @@ class ActionRounds(ActiveInference):
         return self._round  # this round's rows only
 
     def _require_trained(self) -> None:
-        if self._trained_round is None:
-            raise RuntimeError(
-                "expected a network trained on this round's simulations; got new rows "
-                "since the last train(); call train() first"
-            )
-
-    def _require_belief_network(self) -> None:
         if self._trained_round is None:
             raise RuntimeError(
                 "expected a network trained under the current belief; got none since "

@@ -6,6 +6,7 @@ import warnings
 from contextlib import nullcontext
 from copy import deepcopy
 from dataclasses import replace
+from inspect import signature
 from typing import Any
 
 import torch
@@ -17,6 +18,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import Self
 
+from sbi_active.expected import require
 from sbi_active.inference.beliefs.belief import (
     Belief,
     ChainedBelief,
@@ -31,7 +33,7 @@ from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
 from sbi_active.inference.refinement.refining import refine
 from sbi_active.inference.rounds.condition import pack
 from sbi_active.inference.rounds.rows import Observation
-from sbi_active.inference.trainers.action_rounds import require_likelihood_loss, takes
+from sbi_active.inference.trainers.action_rounds import takes
 from sbi_active.inference.trainers.base import Told, is_finite_somewhere
 from sbi_active.inference.trainers.mixture_rounds import MixtureRounds
 from sbi_active.messages import warn
@@ -159,7 +161,16 @@ class ASBI(MixtureRounds, NPE_C):
         return super().train(*args, **kwargs)
 
     def _train_round(self, **arguments: Any) -> ConditionalDensityEstimator:
-        arguments = require_likelihood_loss(NPE_C.train, arguments)
+        for name in ("discard_prior_samples", "use_combined_loss", "num_atoms"):
+            default = signature(NPE_C.train).parameters[name].default
+            value = arguments.pop(name, default)
+            require(
+                value == default,
+                f"{name} to be left out in a round with actions, which is trained by "
+                "maximum likelihood",
+                value,
+                "drop it",
+            )
         # NPE_C.train would choose a multi-round loss here; its parent's train is plain
         # maximum likelihood on the rows that _get_start_index names.
         return PosteriorEstimatorTrainer.train(
@@ -242,7 +253,7 @@ class ASBI(MixtureRounds, NPE_C):
         """
         network, previous = self._neural_net, self.belief
         if required:
-            self._require_belief_network()
+            self._require_trained()
         if self._trained_round is None or network is None or previous is None:
             return None
         condition = pack(trial.x[None], trial.action[None]).to(self._device)

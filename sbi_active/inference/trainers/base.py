@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.expected import require
 from sbi_active.inference.beliefs.belief import Belief, named
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
@@ -170,8 +171,7 @@ class ActiveInference(ABC):
         Raises:
             ValueError: If there is no trial.
         """
-        if not trials:
-            raise ValueError("expected at least one trial; got none; pass trials")
+        require(len(trials) > 0, "at least one trial", "none", "pass trials")
         settings = refinement or RefinementOptions()
         return self._conclude(Told((*trials,), simulator, settings, seed, True))
 
@@ -212,11 +212,7 @@ class ActiveInference(ABC):
         if shape is None:  # no simulations yet: the first trial says
             shape = self.trials[0].x.shape if self.trials else x.shape or (1,)
         rows = outcome_rows(x, shape)
-        if len(rows) != 1:
-            raise ValueError(
-                f"expected one outcome; got {len(rows)} rows; update with one trial "
-                "at a time"
-            )
-        return Observation(
-            action_rows(action, self._action_dim, num_rows=1)[0], rows[0]
-        )
+        advice = "update with one trial at a time"
+        require(len(rows) == 1, "one outcome", f"{len(rows)} rows", advice)
+        executed = action_rows(action, self._action_dim, num_rows=1)[0]
+        return Observation(executed, rows[0])

@@ -11,7 +11,6 @@ from torch.utils.data import DataLoader
 
 from sbi_active.inference.networks.mixture_density import (
     MixtureDensity,
-    TrainingBudget,
     TrainingRecord,
     train_mixture_density,
 )
@@ -88,19 +87,16 @@ class MixtureRounds(ActionRounds):
             rate = config.learning_rate
             self.optimizer = Adam(network.parameters(), rate=rate, fused=self._fused)
         settings, size = self._action_estimator, config.training_batch_size
-        steps, patience = (
-            max(len(rows["train_rows"]) // size, 1),
-            config.stop_after_epochs,
-        )
-        budget = TrainingBudget(
-            num_iterations=min(settings.num_iterations, steps * config.max_num_epochs),
+        steps, patience = len(rows["train_rows"]) // size, config.stop_after_epochs
+        most = max(steps, 1) * config.max_num_epochs
+        return train_mixture_density(
+            *(network, self.optimizer, theta, condition),
+            num_iterations=min(settings.num_iterations, most),
             batch_size=size,
             clip_max_norm=config.clip_max_norm,
             anneal=settings.anneal,
             patience=None if patience == NEVER else patience,
-        )
-        return train_mixture_density(
-            network, self.optimizer, theta, condition, budget=budget, **rows
+            **rows,
         )
 
     def _round_rows(self) -> tuple[Tensor, Tensor]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from copy import deepcopy
 from typing import Any, ClassVar
 
@@ -13,10 +11,10 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import Self
 
+from sbi_active.expected import require
 from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.beliefs.weighted import KernelBelief
-from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.models.factors import (
     ActionFactor,
     Product,
@@ -71,11 +69,9 @@ class ProductRounds(ActionRounds):
     _factor: ClassVar[type[ActionFactor]]
 
     def __init__(self, *args: Any, posterior: str, **kwargs: Any) -> None:
-        if posterior not in SAMPLERS:
-            raise ValueError(
-                f"expected posterior among {', '.join(map(repr, SAMPLERS))}; got "
-                f"{posterior!r}; choose one of these"
-            )
+        known = ", ".join(map(repr, SAMPLERS))
+        advice = f"posterior among {known}", repr(posterior), "choose one of these"
+        require(posterior in SAMPLERS, *advice)
         super().__init__(*args, **kwargs)
         self._sampler = posterior
 
@@ -139,57 +135,38 @@ class ProductRounds(ActionRounds):
         )
 
     def _infer(self, told: Told) -> Belief:
-        trials, settings = told.trials, told.settings
-        require_whole(torch.stack([trial.x for trial in trials]))
+        require_whole(torch.stack([trial.x for trial in told.trials]))
         seed = told.seed()
         if told.simulator is None:
-            self._require_belief_network()
+            self._require_trained()
         belief: Belief | None = None
         if self._may_ask_network(told) and self._trained_round is not None:
-            belief = self._product(trials, settings, seed)
+            belief = self._product(told, seed)
         if told.simulator is not None:
-            with self._aside():
-                if told.afresh:
-                    self._belief = None
-                belief = self._refined(trials, told.simulator, belief, settings, seed)
+            # Rounds and belief stay as they are, whatever is appended meanwhile.
+            aside = object.__new__(type(self))
+            vars(aside).update(vars(self))
+            if told.afresh:
+                aside._belief = None
+            belief = aside._refined(told, belief, seed)
         assert belief is not None
         return belief
 
-    @contextmanager
-    def _aside(self) -> Iterator[None]:
-        """Leave rounds and belief as they were, whatever was appended meanwhile."""
-        names = ["_belief", "_round_belief", "_trained_round", "_neural_net"]
-        names += ["_theta_roundwise", "_x_roundwise", "_prior_masks"]
-        before = {name: getattr(self, name) for name in [*names, "_data_round_index"]}
-        try:
-            yield
-        finally:
-            vars(self).update(before)
-
-    def _refined(
-        self,
-        trials: Sequence[Observation],
-        simulator: Callable[..., Any],
-        start: Belief | None,
-        settings: RefinementOptions,
-        seed: int,
-    ) -> Belief:
+    def _refined(self, told: Told, start: Belief | None, seed: int) -> Belief:
         """Simulate the executed actions where the belief is, and learn that."""
-        prior = require_support(self._prior)
-        belief: Distribution | None = self.belief if start is None else start
+        trials, settings = told.trials, told.settings
+        assert told.simulator is not None
+        belief: Any = self.belief if start is None else start
         begin = "network" if start is not None else "belief"
+        begin = "prior" if belief is self._prior else begin
         action = torch.stack([t.action for t in trials])
         num_simulations = num_missing = 0
-        for stage, share in enumerate(STAGES["prior" if belief is prior else begin]):
-            assert belief is not None
+        for stage, share in enumerate(STAGES[begin]):
             num = int(share * settings.num_histories)
             own = derive_seed(seed, "stage", stage)
-            theta = self._places(belief, num, own)
+            theta = self._places(belief, num, own).repeat_interleave(len(trials), 0)
             rows = rows_of(
-                simulator,
-                theta.repeat_interleave(len(trials), 0),
-                action.repeat(num, 1),
-                derive_seed(own, "x"),
+                *(told.simulator, theta, action.repeat(num, 1), derive_seed(own, "x")),
                 settings.workers,
             )
             assert rows is not None
@@ -201,8 +178,7 @@ class ProductRounds(ActionRounds):
             )
             with forked_generators(own, "train"):
                 self.train()
-            belief = self._product(trials, settings, derive_seed(own, "product"))
-        assert isinstance(belief, Belief)
+            belief = self._product(told, derive_seed(own, "product"))
         belief.diagnostics = belief.diagnostics.extended(
             num_simulations=num_simulations, num_missing=num_missing
         )
@@ -221,13 +197,7 @@ class ProductRounds(ActionRounds):
         return coordinates.to_theta(z)
 
     def _product(
-        self,
-        trials: Sequence[Observation],
-        settings: RefinementOptions,
-        seed: int,
-        *,
-        num_kernels: int = 2_000,
-        num_hints: int = 1_000,
+        self, told: Told, seed: int, *, num_kernels: int = 2_000, num_hints: int = 1_000
     ) -> Belief:
         """Return the belief under this round's network."""
         prior, previous = require_support(self._prior), self._round_belief
@@ -242,22 +212,17 @@ class ProductRounds(ActionRounds):
         chained = self._sampler == "kde"
         self._require_trained()
         learned = self._model(deepcopy(self._neural_net))
-        used = trials[-1:] if chained else trials
+        used = told.trials[-1:] if chained else told.trials
         counted = [t for t in used if _says_something(learned, t, prior)]
-        product = Product(
-            coordinates,
-            learned,
-            counted,
-            region,
-            previous if chained and previous is not prior else None,
-        )
+        before = previous if chained and previous is not prior else None
+        product = Product(coordinates, learned, counted, region, before)
         belief = sample_product(
             prior,
             product,
             hint,
             rng,
-            num_effective=StageSettings().oversampling * settings.num_effective,
-            defensive=settings.defensive,
+            num_effective=StageSettings().oversampling * told.settings.num_effective,
+            defensive=told.settings.defensive,
         )
         sampled: Belief = belief
         if chained:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -13,10 +12,10 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import Self
 
+from sbi_active.expected import require
 from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.beliefs.weighted import KernelBelief
-from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.models.lfire import LFIRE, LFIREModel, fit_log_ratios
 from sbi_active.inference.rounds.rows import (
     Observation,
@@ -91,10 +90,8 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
     ) -> None:
         self._prior = require_support(prior)
         self._settings = LFIRE() if settings is None else settings
-        if num_particles is not None and num_particles < 2:
-            raise ValueError(
-                f"expected num_particles >= 2; got {num_particles}; use about 50"
-            )
+        given = 2 if num_particles is None else num_particles
+        require(given >= 2, "num_particles >= 2", given, "use about 50")
         self._num_particles = num_particles
         self._rows: list[Simulations] = []
         self._model: LFIREModel | None = None
@@ -118,13 +115,14 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         share = len(theta) // len(candidates)
         num = self._num_particles or math.isqrt(share)
         repeats = share // max(num, 1)
-        if repeats < 2 * self._settings.num_folds:
-            raise ValueError(
-                f"expected at least {2 * self._settings.num_folds} simulations of each "
-                f"particle at each action; got {repeats}, of {len(theta)} in all at "
-                f"{len(candidates)} different actions and {num} particles; allow "
-                "more simulations, or fewer actions"
-            )
+        fewest = 2 * self._settings.num_folds
+        require(
+            repeats >= fewest,
+            f"at least {fewest} simulations of each particle at each action",
+            f"{repeats}, of {len(theta)} in all at {len(candidates)} different actions "
+            f"and {num} particles",
+            "allow more simulations, or fewer actions",
+        )
         particles = theta[:num]
         return (
             particles.repeat_interleave(repeats, 0).repeat(len(candidates), 1),
@@ -204,38 +202,34 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         self._model, self._rows = None, []
 
     def _infer(self, told: Told) -> Belief:
-        trials, simulator, settings = told.trials, told.simulator, told.settings
+        trials, seed = told.trials, told.seed()
         require_whole(torch.stack([trial.x for trial in trials]))
-        seed = told.seed()
-        if simulator is None:
+        if told.simulator is None:
             return self._weighted(self.build_posterior(), trials[-1], {})
         if not told.afresh:
             assert self.belief is not None
-            return self._simulated(self.belief, trials[-1], simulator, settings, seed)
-        spent = {"num_simulations": 0, "num_missing": 0}
-        current: Distribution = self._prior
+            return self._simulated(told, self.belief, trials[-1], seed)
+        beliefs: list[Any] = [self._prior]
         for k, trial in enumerate(trials):
             own = derive_seed(seed, "trial", k)
-            belief = self._simulated(current, trial, simulator, settings, own)
-            found, current = belief.diagnostics, belief
-            spent = {name: n + getattr(found, name) for name, n in spent.items()}
-        belief.diagnostics = belief.diagnostics.extended(**spent)
-        return belief
+            beliefs.append(self._simulated(told, beliefs[-1], trial, own))
+        known = [belief.diagnostics for belief in beliefs[1:]]
+        beliefs[-1].diagnostics = known[-1].extended(
+            num_simulations=sum(d.num_simulations for d in known),
+            num_missing=sum(d.num_missing for d in known),
+        )
+        return beliefs[-1]
 
     def _simulated(
-        self,
-        belief: Distribution,
-        trial: Observation,
-        simulator: Callable[..., Any],
-        settings: RefinementOptions,
-        seed: int,
+        self, told: Told, belief: Distribution, trial: Observation, seed: int
     ) -> Belief:
         """Weigh new particles of a belief, simulated at the executed action."""
-        n = settings.num_histories
+        n = told.settings.num_histories
         with forked_generators(seed, "theta"):
             drawn = belief.sample(torch.Size([n]))
         theta, action = self.arrange(drawn, trial.action.expand(n, -1))
-        workers = settings.workers
+        simulator, workers = told.simulator, told.settings.workers
+        assert simulator is not None
         rows = rows_of(simulator, theta, action, derive_seed(seed, "x"), workers)
         assert rows is not None
         folds = derive_seed(seed, "folds")

@@ -6,7 +6,6 @@ from torch.distributions import MultivariateNormal
 from sbi_active.inference.networks.conditioning import Conditioning
 from sbi_active.inference.networks.mixture_density import (
     MixtureDensity,
-    TrainingBudget,
     train_mixture_density,
 )
 from sbi_active.inference.sampling.adam import Adam
@@ -46,7 +45,9 @@ def test_a_network_of_many_numbers_comes_near_the_exact_posterior():
             condition,
             train_rows=torch.arange(3_600),
             held_out_rows=torch.arange(3_600, 4_000),
-            budget=TrainingBudget(num_iterations=160, batch_size=200, anneal=True),
+            num_iterations=160,
+            batch_size=200,
+            anneal=True,
         )
     assert network.baseline_kind == "linear"
     theta, condition = rows(2_000, 2)

@@ -40,7 +40,7 @@ def test_what_a_trained_round_refuses():
     inference = with_round()
     with raises("expected a network trained under the current belief", RuntimeError):
         inference.update(torch.zeros(2), action=torch.zeros(1))
-    with raises("expected a network trained on this round's", RuntimeError):
+    with raises("expected a network trained under the current belief", RuntimeError):
         inference.build_posterior()
     with raises("expected resume_training after train() on the same rows"):
         inference.train(resume_training=True)
