@@ -74,7 +74,7 @@ def gate(trials: Path, **given: Any) -> Answer:
 
 
 def _answered(trials: Path, given: dict[str, Any]) -> Answer:
-    from sbi_active.campaign.storage.manifest import has_manifest
+    from sbi_active.campaign.storage.directory import has_manifest
     from sbi_active.criticism import close_loop
 
     if given["out"] is not None:  # else all is computed before this fails
