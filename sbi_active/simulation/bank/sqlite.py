@@ -160,11 +160,11 @@ def connected(path: Path, mode: str, *, timeout: float) -> sqlite3.Connection:
     )
 
 
-def opened(path: Path, what: str) -> sqlite3.Connection:
-    """Return a connection to a store.
+def opened(path: Path, what: str) -> tuple[sqlite3.Connection, bool]:
+    """Return a connection to a store, and whether it is for one look alone.
 
-    If not even the notes of a reader can be written beside the file, it is read as it
-    is; where its log has to be read as well, others then have to wait.
+    This is the case if not even the notes of a reader can be written beside the file:
+    it is then read as it is, and others have to wait.
 
     Raises:
         ValueError: If there is none, or one of another format.
@@ -180,11 +180,11 @@ def opened(path: Path, what: str) -> sqlite3.Connection:
         is_file = stat.S_ISREG(found.st_mode) and found.st_size > 0
         require(path, is_file, "no file, or an empty one")
     with suppress(sqlite3.OperationalError):
-        return _checked(path, what, "rw")
+        return _checked(path, what, "rw"), False
     log = path.with_name(f"{NAME}-wal")
     if log.exists() and log.stat().st_size:
-        return _checked(path, what, "rw", "locking_mode = EXCLUSIVE")
-    return _checked(path, what, "ro&immutable=1")
+        return _checked(path, what, "rw", "locking_mode = EXCLUSIVE"), True
+    return _checked(path, what, "ro&immutable=1"), True
 
 
 def _checked(path: Path, what: str, mode: str, *first: str) -> sqlite3.Connection:

@@ -51,9 +51,6 @@ _STORES: weakref.WeakSet[Store] = weakref.WeakSet()
 class Store:
     """A file of records in a folder. Any number of processes read, and one writes.
 
-    A reader has the file open for as long as a block of :meth:`reading`, a writer from
-    :meth:`acquire` to :meth:`close`.
-
     Args:
         folder: Folder that has or gets the file.
         what: Name of the store in errors, "bank" or "campaign".
@@ -74,6 +71,7 @@ class Store:
         self.folder, self.path, self._what = folder, folder / NAME, what
         self._guard, self._depth = threading.RLock(), 0
         self._connection: Any = None
+        self._is_alone = False
         self._lock: sqlite3.Connection | None = None
         self._signature: tuple[int, ...] = ()
         _STORES.add(self)
@@ -112,14 +110,17 @@ class Store:
             OSError: If the disk is full or cannot be read or written.
         """
         with self._guard:
-            self._depth += 1
+            is_outer, self._depth = not self._depth, self._depth + 1
             try:
+                is_another = self._found()[:1] != self._signature[:1]
+                if is_outer and is_another and not self.held:
+                    self._disconnect()
                 if self._connection is None:
-                    self._connection = opened(self.path, self._what)
+                    self._connection, self._is_alone = opened(self.path, self._what)
                     name = self._connection.execute("PRAGMA application_id")
                     self._id, self._signature = name.fetchone()[0], self._found()
-                    if not self.held:  # sees the file as it is now, for the whole block
-                        self._connection.execute("BEGIN")
+                if is_outer and not self.held:
+                    self._connection.execute("BEGIN")  # sees one state of the file
                 yield self._connection
             except (sqlite3.Error, UnicodeDecodeError) as error:  # it quotes the file
                 if "locked" in str(error):
@@ -127,8 +128,10 @@ class Store:
                 raise explained(error, self.path, self._what) from error
             finally:
                 self._depth -= 1
-                if not self._depth and not self.held:
-                    self._disconnect()
+                if is_outer and not self.held and self._connection is not None:
+                    self._connection.rollback()
+                    if self._is_alone:
+                        self._disconnect()
 
     def get(self, kind: str, number: int = 0, *, part: str = "head") -> bytes | None:
         """Return the head or the body of a record; None if there is none."""
@@ -261,7 +264,7 @@ class Store:
         """Let others write. The next call opens the file again."""
         with self._guard:
             lock, self._lock = self._lock, None
-            if self._connection is not None:
+            if lock is not None and self._connection is not None:
                 with suppress(sqlite3.Error):  # a full disk must not keep the lock
                     self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             self._disconnect()
@@ -341,7 +344,7 @@ class Store:
     def _disconnect(self) -> None:
         if self._connection is not None:
             self._connection.close()
-        self._connection = None
+        self._connection, self._signature = None, ()
 
 
 def _before_fork() -> None:
