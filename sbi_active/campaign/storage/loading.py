@@ -259,9 +259,7 @@ def _given(what: str, given: Any, storage: Storage, *, reads: bool = False) -> A
 
     Readers get what stands for it where it is a class of its author's own.
     """
-    if given is not None:
-        return given
-    found = storage.given(what, reads=reads)
+    found = storage.given(what, reads=reads) if given is None else given
     if found is None:
         raise ValueError(
             f"expected {what}=, which only its author can make again; got None; pass "

@@ -112,8 +112,8 @@ class Store:
         with self._guard:
             is_outer, self._depth = not self._depth, self._depth + 1
             try:
-                is_another = self._found()[:1] != self._signature[:1]
-                if is_outer and is_another and not self.held:
+                is_same = self.held or self._found()[:1] == self._signature[:1]
+                if is_outer and not is_same:
                     self._disconnect()
                 if self._connection is None:
                     self._connection, self._is_alone = opened(self.path, self._what)
@@ -230,9 +230,12 @@ class Store:
                 same = self._found() == self._signature
                 require(self.path, same, "another file; nothing was written to it now")
                 connection.execute("BEGIN IMMEDIATE")
-                with connection:  # commits, or takes all back
+                try:
                     yield
-                self._signature = self._found()
+                    connection.commit()
+                    self._signature = self._found()
+                finally:
+                    connection.rollback()  # of what was not committed
 
     def acquire(self) -> None:
         """Take the right to write, which ends with :meth:`close` or the process.
