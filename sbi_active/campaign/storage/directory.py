@@ -256,10 +256,12 @@ class Storage:
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        num = len(self._entries)
+        num, is_known = len(self._entries), self.store.held
         with self.store.writing():
             same = self.store.length(LOG) == num
-            if same and (not num or self._line(num) == self._entries[-1]):
+            if same and num and not is_known:  # others may have written since
+                same = self._line(num) == self._entries[-1]
+            if same:
                 yield
                 return
         self.store.close()
