@@ -22,8 +22,7 @@ from sbi_active.campaign.learning.revision import recompute, revise
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.campaign.storage.directory import Storage
-from sbi_active.campaign.storage.loading import load
-from sbi_active.campaign.storage.manifest import make_campaign
+from sbi_active.campaign.storage.loading import load, make_campaign
 from sbi_active.campaign.storage.simulations import num_rows, stored
 from sbi_active.campaign.trials import CampaignTrials
 from sbi_active.design.target import Target

@@ -67,7 +67,7 @@ def criticize(trials: Path, **given: Any) -> Answer:
     campaign, which knows its simulator and its prior, or of recordings, with trials.csv
     or one file *.csv a trial.
     """
-    from sbi_active.campaign.storage.manifest import has_manifest
+    from sbi_active.campaign.storage.directory import has_manifest
 
     if given["out"] is not None:  # else all is computed before this fails
         given["out"].mkdir(parents=True, exist_ok=True)

@@ -14,7 +14,7 @@ from typing import Any
 
 from sbi_active.campaign.storage.codec import decode, encode
 from sbi_active.campaign.storage.directory import BELIEF
-from sbi_active.campaign.storage.manifest import FOR_PEOPLE, write_campaign
+from sbi_active.campaign.storage.loading import FOR_PEOPLE, write_campaign
 from sbi_active.campaign.telling import LOG, STATE
 from sbi_active.migration.described import actions_from, options_from, prior_from
 from sbi_active.migration.segments import copy_bank

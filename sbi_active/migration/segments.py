@@ -43,7 +43,7 @@ def copy_bank(folder: Path, store: Store, name: str) -> int:
     require(path, not lacking and header.get("format") == 1, "no header of release 0.1")
     into, total = Rows(store, name), 0
     with store.writing():
-        store.put(into.key, 0, {key: header[key] for key in kept})
+        store.put(into._key, 0, {key: header[key] for key in kept})
     for file in _files(folder, header):
         columns, runs = _read(file)
         run = columns.pop("run")
@@ -54,7 +54,7 @@ def copy_bank(folder: Path, store: Store, name: str) -> int:
             own = runs[run[start]]
             own = {"run": own["digest"], "seed": own["seed"], "label": own["label"]}
             part = {key: columns[key][start:stop] for key in COLUMNS}
-            into.append(own, {k: torch.from_numpy(v.copy()) for k, v in part.items()})
+            into._write(own, {k: torch.from_numpy(v.copy()) for k, v in part.items()})
     return total
 
 

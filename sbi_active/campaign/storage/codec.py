@@ -9,13 +9,14 @@ from where he gives it again.
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import io
 import json
 import math
+import pkgutil
 import zlib
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from types import MappingProxyType
 from typing import Any
 
@@ -110,8 +111,7 @@ class _Writer:
 
     def __init__(self, known: Mapping[str, Any]) -> None:
         self.arrays: list[Tensor] = []
-        self._roots = {id(value): [name] for name, value in known.items()}
-        self._places = {id(value): [*path] for path, value in _places(known)}
+        self._places = {id(value): path for path, value in _places(known)}
         self._seen: dict[int, tuple[int, Any]] = {}  # kept, as identities are of these
 
     def node(self, value: Any) -> Any:
@@ -119,12 +119,13 @@ class _Writer:
         if type(value) in SCALARS:
             is_plain = not isinstance(value, float) or math.isfinite(value)
             return value if is_plain else {TAG: "float", "value": str(value)}
-        if id(value) in self._roots:
-            return {TAG: "known", "path": self._roots[id(value)]}
+        path = self._places.get(id(value), ())
+        if len(path) == 1:
+            return {TAG: "known", "path": path}
         if id(value) in self._seen:
             return {TAG: "seen", "number": self._seen[id(value)][0]}
         self._seen[id(value)] = len(self._seen), value
-        kind = NAMES.get(type(value))
+        kind = NAMES.get(type(value), "")
         if kind in SEQUENCES:
             return {TAG: kind, "items": [self.node(item) for item in value]}
         if kind in MAPPINGS:
@@ -135,44 +136,33 @@ class _Writer:
         if isinstance(value, torch.dtype | torch.device):
             name = str(value).removeprefix("torch.")
             return {TAG: type(value).__name__, "name": name}
-        if isinstance(value, Tensor):
-            kind = "parameter" if isinstance(value, torch.nn.Parameter) else "tensor"
-            number = self._kept(value.detach().cpu().clone())
-            return {TAG: kind, "array": number, "gradient": value.requires_grad}
-        if isinstance(value, np.ndarray | np.generic):
+        if isinstance(value, Tensor | np.ndarray | np.generic):
             return self._array(value)
-        return self._object(value)
-
-    def _kept(self, tensor: Tensor) -> int:
-        self.arrays.append(tensor)
-        return len(self.arrays) - 1
-
-    def _array(self, value: Any) -> Any:
-        array = np.ascontiguousarray(value)
-        if array.dtype.kind not in "biufc":
-            raise NotStorableError(f"an array of {array.dtype}")
-        single = array.astype(np.float32) if array.dtype == np.float64 else array
-        # Simulations are float32 in most places; the other half need not be stored.
-        lossless = np.array_equal(single, array, equal_nan=array.dtype.kind == "f")
-        stored = torch.from_numpy((single if lossless else array).copy())
-        return {
-            TAG: "array" if isinstance(value, np.ndarray) else "number",
-            "array": self._kept(stored),
-            "shape": [*np.shape(value)],
-            "dtype": array.dtype.str,
-        }
-
-    def _object(self, value: Any) -> Any:
         kind = type(value)
         name = f"{kind.__module__}:{kind.__qualname__}"
         if _class(name) is not kind or not hasattr(value, "__dict__"):
-            if id(value) in self._places:
-                return {TAG: "known", "path": self._places[id(value)]}
+            if path:
+                return {TAG: "known", "path": path}
             raise NotStorableError(f"{kind.__module__}.{kind.__qualname__}")
         if isinstance(value, RowCache):  # what it lacks is simulated again
             value = RowCache(value.most)
         state = [[name, self.node(part)] for name, part in vars(value).items()]
         return {TAG: "object", "class": name, "state": state}
+
+    def _array(self, value: Any) -> Any:
+        if isinstance(value, Tensor):
+            kind = "parameter" if isinstance(value, torch.nn.Parameter) else "tensor"
+            more: dict[str, Any] = {"gradient": value.requires_grad}
+            stored = value.detach().cpu().clone()
+        else:
+            array = np.ascontiguousarray(value)
+            if array.dtype.kind not in "biufc":
+                raise NotStorableError(f"an array of {array.dtype}")
+            kind = "array" if isinstance(value, np.ndarray) else "number"
+            more = {"shape": [*np.shape(value)], "dtype": array.dtype.str}
+            stored = torch.from_numpy(array.copy())
+        self.arrays.append(stored)
+        return {TAG: kind, "array": len(self.arrays) - 1, **more}
 
 
 class _Reader:
@@ -189,24 +179,18 @@ class _Reader:
         kind = node[TAG]
         if kind == "float":
             return float(node["value"])
-        if kind == "known":
-            found = _at(self._known, node["path"])
-            if len(node["path"]) > 1:  # counted by the writer
-                self._seen.append(found)
-            return found
         if kind == "seen":
             return self._seen[node["number"]]
+        if kind == "known" and len(node["path"]) == 1:  # not counted by the writer
+            return self._known[node["path"][0]]
         number = len(self._seen)
-        self._seen.append(None)
-        made: Any
+        made: Any = _blank(kind, node)
+        self._seen.append(made)  # before what it holds, which may be itself
         if kind in MAPPINGS:
-            made = self._seen[number] = MAPPINGS[kind]()
             made.update((self.value(k), self.value(v)) for k, v in node["items"])
         elif kind == "list":
-            made = self._seen[number] = []
             made.extend(self.value(item) for item in node["items"])
         elif kind == "object":
-            made = self._seen[number] = _blank(node["class"])
             for name, part in node["state"]:
                 # Frozen dataclasses refuse to be changed, and modules look first.
                 object.__setattr__(made, name, self.value(part))
@@ -218,6 +202,8 @@ class _Reader:
 
     def _whole(self, kind: str, node: dict[str, Any]) -> Any:
         """Return what cannot contain itself."""
+        if kind == "known":
+            return _at(self._known, node["path"])
         if kind in SEQUENCES:
             return SEQUENCES[kind]([self.value(item) for item in node["items"]])
         if kind == "proxy":
@@ -240,41 +226,41 @@ class _Reader:
 
 def _class(name: str) -> Any:
     """Return the class of a name, of a trusted module that defines it; else None."""
-    module, _, path = name.partition(":")
+    module = name.partition(":")[0]
     if not module.startswith(TRUSTED) or module.endswith("__main__"):
         return None
-    found: Any = importlib.import_module(module)
-    for part in path.split("."):
-        found = getattr(found, part, None)
-    is_own = isinstance(found, type) and found.__module__ == module
-    return found if is_own else None
+    found: Any = None
+    with suppress(AttributeError, ValueError):  # as of a class within a function
+        found = pkgutil.resolve_name(name)
+    return found if getattr(found, "__module__", None) == module else None
 
 
-def _blank(name: str) -> Any:
-    """Return an object of a class with the defaults of fields that came later."""
-    kind = _class(name)
-    if kind is None:
-        raise TypeError(f"no class {name!r} that is stored")
-    made = object.__new__(kind)
-    for entry in dataclasses.fields(kind) if dataclasses.is_dataclass(kind) else ():
+def _blank(kind: str, node: Mapping[str, Any]) -> Any:
+    """Return what is filled later; of an object with defaults of fields added since."""
+    if kind != "object":
+        return MAPPINGS.get(kind, list)()
+    found = _class(node["class"])
+    if not isinstance(found, type):
+        raise TypeError(f"no class {node['class']!r} that is stored")
+    made = object.__new__(found)
+    for entry in dataclasses.fields(found) if dataclasses.is_dataclass(found) else ():
         if entry.default_factory is not dataclasses.MISSING:
             object.__setattr__(made, entry.name, entry.default_factory())
     return made
 
 
-def _places(known: Mapping[str, Any]) -> Iterator[tuple[tuple[Any, ...], Any]]:
-    """Yield where each object below what is known hangs, the nearest last."""
-    levels: list[list[tuple[tuple[Any, ...], Any]]]
-    levels = [[((name,), value) for name, value in known.items()]]
-    seen = {id(value) for value in known.values()}
+def _places(known: Mapping[str, Any]) -> Iterator[tuple[list[Any], Any]]:
+    """Yield what is known, and where each object below it hangs, the nearest first."""
+    level: list[tuple[list[Any], Any]] = [([n], value) for n, value in known.items()]
+    seen = {id(value) for _, value in level}
+    yield from level
     for _ in range(DEPTH):
-        levels.append([])
-        for path, value in levels[-2]:
-            for name, part in _parts(value):
-                if type(part) not in SCALARS and id(part) not in seen:
-                    seen.add(id(part))
-                    levels[-1].append(((*path, name), part))
-    for level in reversed(levels):
+        below = ((p, n, part) for p, value in level for n, part in _parts(value))
+        level = []
+        for path, name, part in below:
+            if type(part) not in SCALARS and id(part) not in seen:
+                seen.add(id(part))
+                level.append(([*path, name], part))
         yield from level
 
 

@@ -16,15 +16,21 @@ from typing import Any
 
 from sbi_active.campaign.state import CampaignState, ModelVersion
 from sbi_active.campaign.storage.codec import NotStorableError, decode, encode
-from sbi_active.campaign.storage.manifest import read_manifest
 from sbi_active.campaign.storage.simulations import form_of
 from sbi_active.campaign.telling import LOG, STATE, SUMMARY, event_of, facts_in
 from sbi_active.messages import Explained
 from sbi_active.simulation.bank.bank import Bank
-from sbi_active.simulation.bank.sqlite import CorruptSegmentError, require, sensible
+from sbi_active.simulation.bank.sqlite import (
+    NAME,
+    CorruptSegmentError,
+    require,
+    sensible,
+)
 from sbi_active.simulation.bank.store import Store
 
-BELIEF = "belief"
+FORMAT, SCHEMA = "sbi-active campaign", 3  # schema 1 was a folder of files
+#: Records: what a campaign is, with a copy, and what was computed.
+MANIFEST, COPY, BELIEF = "campaign", "campaign copy", "belief"
 #: What a state holds beside the settings of the campaign.
 SAVED = ("trials", "processed", "draws", "versions", "is_stale", "batches")
 
@@ -62,7 +68,7 @@ class Storage:
 
     Attributes:
         path: The folder.
-        store: Store of the campaign's records.
+        store: Store of the campaign's records; None without a folder.
         manifest: Description of the campaign.
         notes: Notes on what was given up, a sentence each.
         bank: Folder of the simulations, to be set; None keeps them in the campaign's
@@ -77,26 +83,25 @@ class Storage:
     def __init__(
         self, path: Path | None = None, *, repair: bool = False, prior: Any = None
     ) -> None:
-        self.path, self.notes, self.manifest = path, [], {}
-        self.prior = prior
+        self.path, self.prior = path, prior
+        self.notes: list[str] = []
+        self.manifest: dict[str, Any] = {}
         self.bank: str | None = None
         self._entries: list[dict[str, Any]] = []
         self._saved: dict[str, Any] | None = None
         self._written: Any = None  # the belief that is on the disk
         self._banks: dict[str, Bank] = {}
         self._shared: Store | None = None  # the file of ``bank``
-        self._store = None if path is None else Store(path, "campaign")
-        if self._store is not None:
-            self._read(repair=repair)
+        self.store: Any = None
+        if path is not None:
+            self.store = Store(path, "campaign")
+            if repair and self.store.problems():
+                self._give_up()
+            with self.store.reading():
+                self._read(repair=repair)
 
     def _read(self, *, repair: bool) -> None:
         store = self.store
-        if repair and store.problems():
-            self._give_up_lines()
-            store.salvage()
-            with store.writing():
-                store.delete(SUMMARY)
-            store.close()
         self.manifest = read_manifest(store)
         self._entries = [self._line(k + 1) for k in range(store.length(LOG))]
         self._saved = self._kept(STATE, lambda content: decode(content, known={}))
@@ -105,12 +110,6 @@ class Storage:
                 self._require_whole(self._saved, repair=repair)
         for entry in self._changes:
             self.manifest["simulator"] = entry["simulator"]
-
-    @property
-    def store(self) -> Store:
-        """Store of the campaign's records, where it has a folder."""
-        assert self._store is not None
-        return self._store
 
     def find_bank(
         self, simulator: Callable[..., Any], current: Any, version: int
@@ -122,17 +121,17 @@ class Storage:
             current: The current simulator of the campaign.
             version: Number of its version.
         """
-        is_kept = self._store is not None or self.bank is not None
-        form = form_of(simulator, current) if is_kept and current is not None else None
-        if form is None:
+        is_kept = self.store is not None or self.bank is not None
+        name = form_of(simulator, current) if is_kept and current is not None else None
+        if name is None:
             return None
         changes = len(self._changes) if self.bank is None else 0
-        name = form + f"-model-{version}" * (version > 0)
+        name += f"-model-{version}" * (version > 0)
         name += f"-changed-{changes}" * (changes > 0)
         if name not in self._banks:
             if self.bank is not None and self._shared is None:
                 self._shared = Store(Path(self.bank), make=True)
-            place = self._shared or self.store
+            place: Any = self._shared or self.store
             self._banks[name] = Bank(place, simulator=simulator, name=name)
         return self._banks[name]
 
@@ -144,12 +143,12 @@ class Storage:
             trial: The trial as it is afterwards, or its facts.
             **entries: JSON data.
         """
-        if self._store is None:
+        if self.store is None:
             return
-        line = {"line": len(self._entries) + 1, **event_of(event, trial, **entries)}
+        line = json.loads(json.dumps(event_of(event, trial, **entries)))
         with self._writing():
-            self.store.append(LOG, line)
-        self._entries.append(line)
+            number = self.store.append(LOG, line)
+        self._entries.append({**line, "line": number})  # as it is read again
 
     @property
     def events(self) -> Sequence[Mapping[str, Any]]:
@@ -181,27 +180,25 @@ class Storage:
             state: State of the campaign.
             learner: Learner of the campaign, whose belief is after ``state.processed``.
         """
-        if self._store is None:
+        if self.store is None:
             return
         belief = None if learner.belief is learner.prior else learner.belief
-        known = {"simulator": learner.simulator, "prior": self.prior}
-        content = None
-        if belief is not None and belief is not self._written:
-            content = b""  # it has to be computed again, unless it can be stored
-            with suppress(NotStorableError):
-                content = encode(belief, known=known)
         saved = {
             "lines": len(self._entries),
             **{name: getattr(state, name) for name in SAVED},
             "num_simulated": state.meter.spent,
             "belief": belief is not None,
         }
-        encoded = encode(saved, known={})
+        contents = {STATE: encode(saved, known={})}
+        if belief is not None and belief is not self._written:
+            contents[BELIEF] = b""  # computed again, unless it can be stored
+            with suppress(NotStorableError):
+                known = {"simulator": learner.simulator, "prior": self.prior}
+                contents[BELIEF] = encode(belief, known=known)
         with self._writing():
-            self.store.put(STATE, 0, encoded)
             self.store.delete(SUMMARY)  # which is of the state before
-            if content is not None:
-                self.store.put(BELIEF, 0, content)
+            for kind, content in contents.items():
+                self.store.put(kind, 0, content)
         self._written = belief
 
     def sum_up(self, known: Mapping[str, Any]) -> None:
@@ -224,30 +221,27 @@ class Storage:
         Returns:
             The belief, encoded; None if it is the prior, or to be computed.
         """
-        saved, self._saved = self._saved, None
+        saved, self._saved = self._saved or {}, None
         with sensible(self.store.path):
-            if saved is not None:
-                for name in SAVED:
-                    setattr(state, name, saved[name])
-                state.meter.spent = saved["num_simulated"]
-            for entry in self._entries[saved["lines"] if saved else 0 :]:
+            for name in SAVED if saved else ():
+                setattr(state, name, saved[name])
+            state.meter.spent = saved.get("num_simulated", 0)
+            for entry in self._entries[saved.get("lines", 0) :]:
                 apply(state, entry)
-        if saved is None:
+        if not saved:
             state.is_stale |= len(state.versions) > 1
-        if saved is None or saved["belief"] in (None, False):
+        if saved.get("belief") in (None, False):
             return None
         belief = self._kept(BELIEF, bytes)
-        if not belief and state.processed:
-            state.is_stale = True
+        state.is_stale |= not belief and bool(state.processed)
         return belief or None
 
     def close(self) -> None:
         """Let others write."""
-        for bank in self._banks.values():
-            bank.close()
+        for store in (self._shared, self.store):
+            if store is not None:
+                store.close()
         self._banks.clear()
-        if self._store is not None:
-            self._store.close()
 
     def acquire(self) -> None:
         """Take the right to write.
@@ -256,25 +250,22 @@ class Storage:
             LockedError: If another process has it.
             LogChangedError: If another process wrote since the campaign was loaded.
         """
-        if self._store is None or self._store.held:
-            return
-        self.store.acquire()
-        try:
+        if self.store is not None and not self.store.held:
             with self._writing():
-                last = len(self._entries)
-                if last and self._line(last) != self._entries[-1]:
-                    raise LogChangedError(self.store.path)
-        except BaseException:
-            self.store.close()
-            raise
+                pass
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        self.acquire()
+        num, is_known = len(self._entries), self.store.held
         with self.store.writing():
-            if self.store.length(LOG) != len(self._entries):
-                raise LogChangedError(self.store.path)
-            yield
+            same = self.store.length(LOG) == num
+            if same and num and not is_known:  # others may have written since
+                same = self._line(num) == self._entries[-1]
+            if same:
+                yield
+                return
+        self.store.close()
+        raise LogChangedError(self.store.path)
 
     @property
     def _changes(self) -> list[dict[str, Any]]:
@@ -286,15 +277,20 @@ class Storage:
         require(self.store.path, is_own, f"a line {number} of the log that none writes")
         return line
 
-    def _give_up_lines(self) -> None:
-        """Note what is left of lines of the log that are damaged."""
+    def _give_up(self) -> None:
+        """Give up damaged records, and note what is left of lines of the log."""
+        store = self.store
         with suppress(CorruptSegmentError):  # how many there were
-            for number in range(1, self.store.length(LOG) + 1):
+            for number in range(1, store.length(LOG) + 1):
                 try:
                     self._line(number)
                 except CorruptSegmentError as error:
-                    left = self.store.remains(LOG, number) or error.reason
+                    left = store.remains(LOG, number) or error.reason
                     self.notes.append(f"SA603 given up, tell it again: {left}")
+        store.salvage()
+        with store.writing():
+            store.delete(SUMMARY)
+        store.close()
 
     def _kept(self, what: str, read: Callable[[bytes], Any]) -> Any:
         """Return what was computed; None where it has to be computed again."""
@@ -317,18 +313,51 @@ class Storage:
         reason = f"{len(self._entries)} lines of the log; the state counts"
         reason = f"{reason} {saved['lines']} with {len(told)} trials that were told"
         require(self.store.path, repair, reason)
-        facts = [f for e in self._entries if (f := facts_in(e)) is not None]
+        facts = filter(None, map(facts_in, self._entries))
         last = {f.index: f.status for f in facts}
-        known = [index for index, status in last.items() if status != "pending"]
         self._saved = None
         with self.store.writing():
             self.store.delete(STATE)
-        for trial in [t for t in told if t.index not in known]:
-            self.write("restored", trial)
-            self.notes.append(
-                f"SA603 restored from {STATE}: trial {trial.index}, x = {trial.x}"
-            )
+        for trial in told:
+            if last.get(trial.index, "pending") == "pending":
+                self.write("restored", trial)
+                self.notes.append(
+                    f"SA603 restored from {STATE}: trial {trial.index}, x = {trial.x}"
+                )
         self.close()
+
+
+def has_manifest(folder: Path) -> bool:
+    """Return whether a folder holds a campaign, damaged or of before or not."""
+    if not (folder / NAME).exists():
+        return (folder / "campaign.json").exists()
+    try:
+        return MANIFEST in Store(folder, "campaign").catalog
+    except OSError:
+        return True
+
+
+def read_manifest(store: Store) -> dict[str, Any]:
+    """Return what a campaign is; from the copy where a repair gave up the first.
+
+    Raises:
+        ValueError: If there is none, or one of another schema.
+        CorruptSegmentError: If it does not hold what was written.
+    """
+    manifest = store.json(MANIFEST) or store.json(COPY)
+    if manifest is None:
+        raise ValueError(
+            f"expected a folder with a campaign; got {store.folder} without one; make "
+            "it by Campaign(..., directory=...)"
+        )
+    if (manifest.get("format"), manifest.get("schema")) != (FORMAT, SCHEMA):
+        with sensible(store.path):
+            release = manifest["packages"]["sbi-active"]
+        raise ValueError(
+            f"expected a campaign of schema {SCHEMA}; got {manifest.get('schema')} in "
+            f"{store.path}; use the release of sbi-active that wrote it: {release}"
+        )
+    return manifest
 
 
 def apply(state: CampaignState, entry: Mapping[str, Any]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import operator
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -68,9 +67,8 @@ def form_of(simulator: Any, own: Any) -> Any:
         return "by-index" if simulator.simulator is own else None
     if not (isinstance(simulator, SimulatorModel) and isinstance(own, SimulatorModel)):
         return None
-    mine, yours = (getattr(model, "effects", ()) for model in (simulator, own))
-    same = len(mine) == len(yours) and all(map(operator.is_, mine, yours))
-    if simulator.fn is not own.fn or not same:
+    mine, yours = ([*map(id, getattr(m, "effects", ()))] for m in (simulator, own))
+    if simulator.fn is not own.fn or mine != yours:
         return None
     if simulator.noise is None and own.noise is not None:
         return "noise-free"

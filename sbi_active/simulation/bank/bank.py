@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,18 +18,16 @@ from sbi_active.simulation.bank.fingerprint import (
     simulator_name,
 )
 from sbi_active.simulation.bank.rows import (
-    COLUMNS,
     Rows,
     columns_of,
-    positions,
 )
 from sbi_active.simulation.bank.sqlite import CorruptSegmentError, sensible
 from sbi_active.simulation.bank.store import Store
-from sbi_active.simulation.outcomes import Outcome, Simulations
+from sbi_active.simulation.outcomes import Simulations
 from sbi_active.simulation.workers.store import run_digest
 
 
-class Bank:
+class Bank(Rows):
     r"""Simulated rows on disk, to go on with, read in parts, and reuse.
 
     A row is theta, action, x, its outcome, the seed of its run, its index there, and
@@ -83,10 +81,10 @@ class Bank:
         created: str | None = None,
         name: str = "rows",
     ) -> None:
-        makes = simulator is not None
-        self._store = path if isinstance(path, Store) else Store(Path(path), make=makes)
-        self.path, self._writable = self._store.folder, makes
-        self._rows = Rows(self._store, name)
+        self._writable = simulator is not None
+        is_store = isinstance(path, Store)
+        store = path if is_store else Store(Path(path), make=self._writable)
+        super().__init__(store, name)
         self._proposal: tuple[Distribution | None, str] = (None, "")
         if simulator is None:
             _ = self.header
@@ -98,18 +96,14 @@ class Bank:
             "parameter_names": None if names is None else [*names],
             "shapes": None,
         }
-        key = self._rows.key
-        if self._store.get(key) is None:
+        if self._store.get(self._key) is None:
             is_held = self._store.held
             with self._store.writing():
-                if self._store.get(key) is None:  # nobody was faster
-                    self._store.put(key, 0, mine)
+                if self._store.get(self._key) is None:  # nobody was faster
+                    self._store.put(self._key, 0, mine)
             if not is_held:
                 self._store.close()
         self._require_same_simulator(mine)
-
-    def __len__(self) -> int:
-        return sum(len(segment.rows) for segment in self._rows.segments())
 
     def __enter__(self) -> Bank:
         return self
@@ -124,32 +118,9 @@ class Bank:
             return f"Bank({str(self.path)!r}: {error.reason})"
 
     @property
-    def header(self) -> dict[str, Any]:
-        """Simulator, shapes and names, as they are on the disk."""
-        return self._rows.header
-
-    @property
     def simulator_name(self) -> str:
         """Qualified name of the simulator, and of the function that it wraps."""
         return simulator_name(self.header)
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Number of rows by outcome."""
-        status = [segment.rows["status"] for segment in self._rows.segments()]
-        return {
-            o.name.lower(): sum(int((s == o).sum()) for s in status) for o in Outcome
-        }
-
-    @property
-    def labels(self) -> list[str]:
-        """Names of the proposals, in order of appearance; "" if not known."""
-        return [*dict.fromkeys(segment.label for segment in self._rows.segments())]
-
-    @property
-    def num_bytes(self) -> int:
-        """Size on the disk."""
-        return self._store.num_bytes
 
     def append(
         self,
@@ -216,16 +187,14 @@ class Bank:
         Returns:
             None if there is nothing.
         """
-        own = self._rows.of_run(run)
+        own = self._segments(run)
         if not own:
             return None
         # Copies, since torch takes no column of a table of one row.
-        index, status = (
-            np.concatenate([segment.rows[name] for segment in own])
-            for name in ("index", "status")
-        )
-        x = np.concatenate([self._rows.x(segment) for segment in own])
-        return torch.from_numpy(index), torch.from_numpy(x), torch.from_numpy(status)
+        columns = ([s.rows["index"] for s in own], [self._x(s) for s in own])
+        columns = (*columns, [s.rows["status"] for s in own])
+        index, x, status = (torch.from_numpy(np.concatenate(c)) for c in columns)
+        return index, x, status
 
     def save(self, run: str, **rows: Any) -> None:
         """Store rows of a run; they are on the disk when this returns.
@@ -244,48 +213,7 @@ class Bank:
         self._require_lock()
         proposal, label = self._proposal
         known = {"run": run, "seed": int(rows["seed"]), "label": label}
-        self._rows.append(known, columns_of(rows, proposal, label))
-
-    def read(self, rows: Tensor | Sequence[int] | slice | None = None) -> Simulations:
-        """Return rows.
-
-        Args:
-            rows: Positions, in any order and repeated where wanted; a slice; or a mask
-                over all rows. None reads everything into memory.
-        """
-        names, places = ["theta", "action", "x", "status"], positions(rows, len(self))
-        theta, action, x, status = self._rows.gather(names, places)
-        return Simulations(theta, action, x, status)
-
-    def chunks(self, size: int = 10_000) -> Iterator[Simulations]:
-        """Yield all rows in order, at most ``size`` at a time.
-
-        Of x, memory holds one segment, 4 MiB, and what is yielded. Rows added meanwhile
-        are not seen.
-        """
-        if size < 1:
-            raise ValueError(f"expected size >= 1; got {size}; pass 10_000")
-        total = len(self)
-        for start in range(0, total, size):
-            yield self.read(slice(start, min(start + size, total)))
-
-    def columns(self, *names: str) -> dict[str, Tensor]:
-        """Return whole columns without the others.
-
-        Args:
-            names: Names of columns among ``theta``, ``action``, ``x``, ``status``,
-                ``index`` (of the row in its run), ``seed`` (of the run; a row's own one
-                is ``row_seeds(seed, 1, first=index)``), ``log_proposal``
-                and ``label`` (an index into :attr:`labels`).
-        """
-        readable = {*COLUMNS, "seed", "label"}
-        if unknown := {*names} - readable:
-            raise ValueError(
-                f"expected columns among {sorted(readable)}; got "
-                f"{sorted(unknown)}; name those"
-            )
-        found = self._rows.gather([*names], positions(None, len(self)))
-        return dict(zip(names, found, strict=True))
+        self._write(known, columns_of(rows, proposal, label))
 
     def verify(self) -> list[str]:
         """Return the problems of the file, one line each; none where all is well.
@@ -294,8 +222,8 @@ class Bank:
         """
         wrong = self._store.problems()
         try:
-            for segment in [] if wrong else self._rows.segments():
-                self._rows.x(segment)
+            for segment in [] if wrong else self._segments():
+                self._x(segment)
         except CorruptSegmentError as error:
             wrong = [error.reason]
         return [f"{self._store.path}: {reason}" for reason in wrong]

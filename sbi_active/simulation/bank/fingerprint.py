@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import contextlib
 import functools
 import hashlib
 import inspect
@@ -83,13 +82,13 @@ def _compare(path: str, expected: Any, got: Any) -> Iterator[str]:
 
 def _describe(value: Any, depth: int) -> Any:
     """Return JSON data for anything."""
+    if isinstance(value, np.generic):
+        value = value.item()
     if value is None or isinstance(value, bool | int | str):
         return value
     if isinstance(value, float):
         return value if np.isfinite(value) else str(value)
-    if isinstance(value, torch.Tensor):
-        value = value.detach().cpu().numpy()
-    if isinstance(value, np.ndarray):
+    if _is_array(value):
         return _array(value)
     if isinstance(value, type):
         return _name(value)
@@ -100,6 +99,9 @@ def _describe(value: Any, depth: int) -> Any:
         return [below(item) for item in value]
     if isinstance(value, dict):
         return {str(key): below(item) for key, item in value.items()}
+    if isinstance(value, complex | bytes | set | frozenset):
+        parts = value if isinstance(value, set | frozenset) else [value]
+        return sorted(map(repr, parts))
     if isinstance(value, functools.partial):
         return {
             "function": below(value.func),
@@ -109,10 +111,13 @@ def _describe(value: Any, depth: int) -> Any:
     if isinstance(value, types.MethodType):
         return {"function": below(value.__func__), "self": below(value.__self__)}
     if isinstance(value, types.FunctionType):
+        cells = zip(value.__code__.co_freevars, value.__closure__ or (), strict=True)
+        is_empty = types.CellType()
+        captured = {n: cell.cell_contents for n, cell in cells if cell != is_empty}
         return {
             "name": _name(value),
             "source": _source(value),
-            "captured": below(_captured(value)),
+            "captured": below(captured),
             "defaults": below([*(value.__defaults__ or ())]),
             "globals": _globals([value]),
         }
@@ -129,36 +134,52 @@ def _describe(value: Any, depth: int) -> Any:
     return {**public, **own}
 
 
-def _array(array: np.ndarray) -> Any:
-    if array.size <= SMALL and array.dtype.kind in "iufb":
-        return _describe(array.tolist(), DEPTH)
-    content = hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
-    return {"shape": [*array.shape], "dtype": str(array.dtype), "sha256": content}
+def _is_array(value: Any) -> bool:
+    if isinstance(value, torch.Tensor):
+        return value.device.type != "meta" and value.layout == torch.strided
+    return isinstance(value, np.ndarray) and value.dtype.kind in "biufcSU"
+
+
+def _array(value: Any) -> Any:
+    if isinstance(value, torch.Tensor):
+        value = value.detach().cpu()
+        value = (value.float() if value.dtype == torch.bfloat16 else value).numpy()
+    if value.size <= SMALL and value.dtype.kind in "iufb":
+        return _describe(value.tolist(), DEPTH)
+    content = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+    return {"shape": [*value.shape], "dtype": str(value.dtype), "sha256": content}
+
+
+def _is_setting(value: Any) -> bool:
+    """Return whether a global variable is a setting: numbers, texts, many of them."""
+    if isinstance(value, dict):
+        value = [*value.values()]
+    if isinstance(value, list | tuple | set | frozenset):
+        return all(map(_is_setting, value))
+    scalars = bool | int | float | complex | str | bytes | np.generic
+    return value is None or isinstance(value, scalars) or _is_array(value)
 
 
 def _globals(functions: list[types.FunctionType]) -> dict[str, Any]:
     """Return the global variables that functions use, from function to function.
 
     Args:
-        functions: Functions to begin with.
+        functions: Functions to begin with; those that they name are added.
     """
     found: dict[str, Any] = {}
-    waiting, seen = [f for f in functions if not _is_library(f)], {*functions}
-    while waiting:
-        function = waiting.pop()
+    functions = [function for function in functions if not _is_library(function)]
+    for function in functions:
         changed = _changed_by(function)
         for name in _names_in(function.__code__) & function.__globals__.keys():
             value = function.__globals__[name]
             value = getattr(value, "__wrapped__", value)  # of a cache
             if isinstance(value, types.FunctionType):
-                if value.__module__ == function.__module__ and value not in seen:
-                    seen.add(value)
-                    waiting.append(value)
+                if value.__module__ == function.__module__ and value not in functions:
+                    functions.append(value)
                     defaults = _describe([*(value.__defaults__ or ())], DEPTH)
                     found[name] = {"source": _source(value), "defaults": defaults}
-            elif name not in changed and not name.startswith("__"):
-                with contextlib.suppress(TypeError):
-                    found[name] = _describe(_plain(value), DEPTH)
+            elif name not in changed and name[:2] != "__" and _is_setting(value):
+                found[name] = _describe(value, DEPTH)
     return found
 
 
@@ -174,58 +195,22 @@ def _changed_by(function: types.FunctionType) -> set[str]:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     except (OSError, TypeError, SyntaxError):  # typed at a prompt, or a part of a line
         return set()
+    places: list[Any] = []
     names: set[str] = set()
     for node in ast.walk(tree):
-        place: Any = None
         if isinstance(node, ast.Global):
             names |= {*node.names}
         elif isinstance(node, ast.Subscript) and not isinstance(node.ctx, ast.Load):
-            place = node.value
-        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
-            method = node.func.attr
-            is_change = method in CHANGING or method.endswith("_")
-            place = node.func.value if is_change else None
+            places.append(node)
+        elif isinstance(node, ast.Attribute) and (
+            node.attr in CHANGING or node.attr.endswith("_")
+        ):
+            places.append(node.value)
+    for place in places:
         while isinstance(place, ast.Subscript):  # as in CACHE["a"].append
             place = place.value
-        if isinstance(place, ast.Name):
-            names.add(place.id)
+        names.add(getattr(place, "id", ""))
     return names
-
-
-def _plain(value: Any) -> Any:
-    """Return a global variable that is a setting in the types of JSON, and arrays.
-
-    Raises:
-        TypeError: If it is none: no numbers or texts, nor many of them.
-    """
-    if isinstance(value, dict):
-        _ = [*map(_plain, value)]
-        return {repr(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, set | frozenset):
-        _ = [*map(_plain, value)]
-        return sorted(map(repr, value))
-    if isinstance(value, list | tuple):
-        return [*map(_plain, value)]
-    if isinstance(value, torch.Tensor) and value.device.type != "meta":
-        if value.layout == torch.strided:
-            return value.detach().cpu().double() if value.is_floating_point() else value
-    elif isinstance(value, np.ndarray) and value.dtype.kind in "biufcSU":
-        return value
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, complex | bytes):
-        return repr(value)
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    raise TypeError(type(value).__name__)
-
-
-def _captured(function: types.FunctionType) -> dict[str, Any]:
-    captured: dict[str, Any] = dict.fromkeys(function.__code__.co_freevars)
-    for name, cell in zip(captured, function.__closure__ or (), strict=True):
-        with contextlib.suppress(ValueError):  # not assigned yet
-            captured[name] = cell.cell_contents
-    return captured
 
 
 def _name(thing: Any) -> str:

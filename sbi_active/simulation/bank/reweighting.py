@@ -126,27 +126,22 @@ def reuse(
             f"expected rows of a known proposal in {bank}; got none; simulate with "
             "store=bank.drawn_from(prior, label='prior')"
         )
-    theta, label = column["theta"][rows], column["label"][rows]
-    log_own = column["log_proposal"][rows]
-    log_target = log_density(target, theta)
-    if proposals is None:
-        log_denominator = log_own
-    else:
-        strata = torch.unique(column["action"][rows], dim=0, return_inverse=True)[1]
-        log_denominator = _log_mixture(bank, proposals, theta, label, log_own, strata)
-    log_weight = log_target - log_denominator
+    known = {name: values[rows] for name, values in column.items()}
+    log_denominator = known["log_proposal"]
+    if proposals is not None:
+        log_denominator = _log_mixture(known, proposals, bank.labels)
+    log_weight = log_density(target, known["theta"]) - log_denominator
     if not bool((log_weight > -torch.inf).any()):
         raise ValueError(
             f"expected rows within the support of the target; got {len(rows)} rows, all"
             " of density 0; simulate from the target"
         )
-    weights = log_weight.softmax(0)
-    result = ReusedRows(bank, rows, weights)
-    if result.effective_sample_size < FEW:
+    result = ReusedRows(bank, rows, log_weight.softmax(0))
+    worth = result.effective_sample_size
+    if worth < FEW:
         warn(
-            f"SA304 {len(rows)} rows of the bank are worth "
-            f"{result.effective_sample_size:.1f} draws from the target, fewer than "
-            f"{FEW}: simulate more rows from it, "
+            f"SA304 {len(rows)} rows of the bank are worth {worth:.1f} draws from the "
+            f"target, fewer than {FEW}: simulate more rows from it, "
             + ("or give proposals=" if proposals is None else "or from nearer to it"),
             stacklevel=2,
         )
@@ -154,15 +149,10 @@ def reuse(
 
 
 def _log_mixture(
-    bank: Bank,
-    proposals: Mapping[str, Distribution],
-    theta: Tensor,
-    label: Tensor,
-    log_own: Tensor,
-    strata: Tensor,
+    known: Mapping[str, Tensor], proposals: Mapping[str, Distribution], names: list[str]
 ) -> Tensor:
-    """Return log sum_k n_k / n q_k, counted within each stratum, shape (n,)."""
-    names = bank.labels
+    """Return log sum_k n_k / n q_k of rows, counted among those of each action."""
+    theta, label, log_own = known["theta"], known["label"], known["log_proposal"]
     lacking = [n for k in label.unique() if (n := names[k]) not in proposals]
     if lacking:
         raise ValueError(
@@ -170,6 +160,7 @@ def _log_mixture(
             f"{lacking}; give them, or none at all for weights by each row's own "
             "proposal"
         )
+    strata = torch.unique(known["action"], dim=0, return_inverse=True)[1]
     sizes = torch.bincount(strata).double()
     terms = []
     for code in label.unique():

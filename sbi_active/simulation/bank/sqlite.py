@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import itertools
 import json
 import os
 import platform
 import secrets
-import shutil
 import sqlite3
 import stat
 from collections.abc import Iterable, Iterator, Mapping
@@ -34,7 +32,7 @@ SCHEMA = (
     "NULL, head_digest BLOB NOT NULL, body_digest BLOB NOT NULL, body BLOB NOT NULL, "
     "PRIMARY KEY (kind, number))"
 )
-INSERT = "INSERT OR {} INTO records VALUES (?, ?, ?, ?, ?, ?)"
+INSERT = "INSERT OR REPLACE INTO records VALUES (?, ?, ?, ?, ?, ?)"
 #: Seconds to wait for a moment in which another process tidies up. A choice.
 PATIENCE = 10.0
 SETTINGS = (
@@ -167,6 +165,10 @@ def opened(path: Path, what: str) -> tuple[sqlite3.Connection, bool]:
 
     This is the case if not even the notes of a reader can be written beside the file:
     it is then read as it is, and others have to wait.
+
+    Raises:
+        ValueError: If there is none, or one of another format.
+        CorruptSegmentError: If the file is no store.
     """
     if not os.path.lexists(path):
         make = "make one by Campaign(..., directory=...)"
@@ -210,10 +212,9 @@ def make_store(folder: Path, what: str) -> None:
     """Make a store in a folder of its own, which is made where there is none."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        found = sorted(path.name for path in folder.iterdir())
         own = (".", NAME, LOCK)  # of writers that were killed
-        other = [name for name in found if not name.startswith(own)]
-        if other:
+        names = sorted(path.name for path in folder.iterdir())
+        if other := [name for name in names if not name.startswith(own)]:
             raise ValueError(
                 f"expected a {what} or an empty folder; got {folder} with "
                 f"{other[0]!r}; {_advice(folder, 'choose another folder')}"
@@ -224,31 +225,21 @@ def make_store(folder: Path, what: str) -> None:
             os.replace(fresh, folder / NAME)
             synchronize(folder)
     except (OSError, sqlite3.Error) as error:
-        raise OSError(
-            getattr(error, "errno", errno.EIO),
-            f"expected a folder that can be made for a {what}; got "
-            f"{getattr(error, 'strerror', str(error))!r}; choose a place that can be "
-            "written",
-            str(folder),
-        ) from error
+        raise explained(error, folder / NAME, what) from error
 
 
 def written(folder: Path, name: int, records: Iterable[tuple[Any, ...]]) -> Path:
     """Return a new file with records, all of it on the disk."""
     path = folder / f"{TEMPORARY}{os.getpid()}-{NAME}"
     path.unlink(missing_ok=True)
-    connection = sqlite3.connect(path, isolation_level=None)
-    settings = f"user_version = {FORMAT}", f"application_id = {name}"
-    for setting in ("journal_mode = WAL", *settings):
-        connection.execute(f"PRAGMA {setting}")
-    connection.execute("BEGIN IMMEDIATE")
-    connection.execute(SCHEMA)
-    connection.executemany(INSERT.format("IGNORE"), records)
-    connection.execute("COMMIT")
-    connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-    connection.close()
-    for suffix in ("-wal", "-shm"):
-        path.with_name(path.name + suffix).unlink(missing_ok=True)
+    with closing(sqlite3.connect(path, isolation_level=None)) as connection:
+        settings = f"user_version = {FORMAT}", f"application_id = {name}"
+        for setting in ("journal_mode = WAL", *settings):
+            connection.execute(f"PRAGMA {setting}")
+        connection.execute("BEGIN IMMEDIATE")
+        connection.execute(SCHEMA)
+        connection.executemany(INSERT, records)
+        connection.execute("COMMIT")
     return path
 
 
@@ -273,18 +264,17 @@ def digest_of(name: int, part: str, kind: str, number: int, content: Any) -> Any
 
 
 def explained(error: Exception, path: Path, what: str) -> Exception:
-    """Return an error of SQLite as one of this library."""
-    text = str(error)
-    for words, number in OF_THE_DISK.items():
-        if words in text:
-            return OSError(
-                number,
-                f"expected to write to the {what}; got {text!r}; make room or choose a "
-                "place that can be written, and run again: what was stored before is "
-                "whole",
-                str(path),
-            )
-    return CorruptSegmentError(path, f"what SQLite cannot read ({text})")
+    """Return an error of SQLite or of the disk as one of this library."""
+    text = getattr(error, "strerror", None) or str(error)
+    numbers = [number for words, number in OF_THE_DISK.items() if words in text]
+    if not numbers and not isinstance(error, OSError):
+        return CorruptSegmentError(path, f"what SQLite cannot read ({text})")
+    return OSError(
+        getattr(error, "errno", None) or numbers[0],
+        f"expected to write to the {what}; got {text!r}; make room or choose a place "
+        "that can be written, and run again: what was stored before is whole",
+        str(path),
+    )
 
 
 def _advice(folder: Path, otherwise: str) -> str:
@@ -292,13 +282,6 @@ def _advice(folder: Path, otherwise: str) -> str:
     if any((folder / name).exists() for name in ("bank.json", "campaign.json")):
         return f"bring it up to date by: sbi-active migrate {folder}"
     return otherwise
-
-
-def keep_aside(path: Path) -> None:
-    """Keep a copy under a name ending in ".damaged", beside those of before."""
-    names = (f"{path.name}.damaged" + f"-{n}" * (n > 1) for n in itertools.count(1))
-    copies = (path.with_name(name) for name in names)
-    shutil.copy2(path, next(copy for copy in copies if not os.path.lexists(copy)))
 
 
 def synchronize(folder: Path) -> None:

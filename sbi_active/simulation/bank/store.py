@@ -10,9 +10,11 @@ of its log alone.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import os
 import platform
+import shutil
 import sqlite3
 import threading
 import weakref
@@ -32,7 +34,6 @@ from sbi_active.simulation.bank.sqlite import (
     connected,
     digest_of,
     explained,
-    keep_aside,
     make_store,
     opened,
     require,
@@ -42,9 +43,9 @@ from sbi_active.simulation.bank.sqlite import (
     written,
 )
 
-MOST_LISTED = 1_000  # problems; a catalog may be made up
+MOST_LISTED = 1_000  # records of a kind; a catalog may be made up
 
-_OPEN: weakref.WeakSet[Store] = weakref.WeakSet()
+_STORES: weakref.WeakSet[Store] = weakref.WeakSet()
 
 
 class Store:
@@ -68,13 +69,13 @@ class Store:
 
     def __init__(self, folder: Path, what: str = "bank", *, make: bool = False) -> None:
         self.folder, self.path, self._what = folder, folder / NAME, what
-        self._guard = threading.RLock()
-        self._connection: sqlite3.Connection | None = None
+        self._guard, self._depth = threading.RLock(), 0
+        self._connection: Any = None
+        self._is_alone = False
         self._lock: sqlite3.Connection | None = None
         self._signature: tuple[int, ...] = ()
-        self._depth, self._is_alone = 0, False
-        _OPEN.add(self)
-        if make and not self.path.exists():
+        _STORES.add(self)
+        if make and not os.path.lexists(self.path):
             make_store(folder, what)
         with self.reading():
             pass
@@ -109,34 +110,31 @@ class Store:
             OSError: If the disk is full or cannot be read or written.
         """
         with self._guard:
+            is_outer, self._depth = not self._depth, self._depth + 1
             try:
                 is_same = self.held or self._found()[:1] == self._signature[:1]
-                if self._connection is None or not is_same:
-                    self._open()
-                assert self._connection is not None
-                self._depth += 1
-                try:
-                    yield self._connection
-                finally:
-                    self._depth -= 1
-                if self._is_alone and not self._depth:
+                if is_outer and not is_same:
                     self._disconnect()
+                if self._connection is None:
+                    self._connection, self._is_alone = opened(self.path, self._what)
+                    name = self._connection.execute("PRAGMA application_id")
+                    self._id, self._signature = name.fetchone()[0], self._found()
+                if is_outer and not self.held:
+                    self._connection.execute("BEGIN")  # sees one state of the file
+                yield self._connection
             except (sqlite3.Error, UnicodeDecodeError) as error:  # it quotes the file
                 if "locked" in str(error):
                     raise LockedError(self.folder, *self._holder()) from error
                 raise explained(error, self.path, self._what) from error
+            finally:
+                self._depth -= 1
+                if is_outer and not self.held and self._connection is not None:
+                    self._connection.rollback()
+                    if self._is_alone:
+                        self._disconnect()
 
-    def get(self, kind: str, number: int = 0) -> bytes | None:
-        """Return the head of a record; None if there is none."""
-        return self._read("head", kind, number)
-
-    def body(self, kind: str, number: int = 0) -> bytes:
-        """Return the body of a record that is there."""
-        content = self._read("body", kind, number)
-        require(self.path, content is not None, f"no {kind!r} {number}")
-        return content or b""
-
-    def _read(self, part: str, kind: str, number: int) -> bytes | None:
+    def get(self, kind: str, number: int = 0, *, part: str = "head") -> bytes | None:
+        """Return the head or the body of a record; None if there is none."""
         with self.reading() as connection:
             found = connection.execute(
                 f"SELECT {part}, {part}_digest FROM records WHERE kind = ? AND number "
@@ -150,6 +148,12 @@ class Store:
             same = found[1] == digest_of(self._id, part, kind, number, found[0])
         require(self.path, same, f"{kind!r} {number} with another checksum")
         return found[0]
+
+    def body(self, kind: str, number: int = 0) -> bytes:
+        """Return the body of a record that is there."""
+        content = self.get(kind, number, part="body")
+        require(self.path, content is not None, f"no {kind!r} {number}")
+        return content or b""
 
     def remains(self, kind: str, number: int) -> str:
         """Return what is left of the head of a damaged record, for people."""
@@ -193,11 +197,9 @@ class Store:
             head: Bytes, or JSON data.
             body: Bytes.
         """
-        assert self._connection is not None
-        catalog, records = self.catalog, [sealed(self._id, kind, number, head, body)]
-        if kind != CATALOG and number > catalog.get(kind, -1):
-            records.append(sealed(self._id, CATALOG, 0, {**catalog, kind: number}))
-        self._connection.executemany(INSERT.format("REPLACE"), records)
+        if kind != CATALOG and number > (catalog := self.catalog).get(kind, -1):
+            self.put(CATALOG, 0, {**catalog, kind: number})
+        self._connection.execute(INSERT, sealed(self._id, kind, number, head, body))
 
     def append(self, series: str, head: Any, body: Any = b"") -> int:
         """Write the next record of a series, in :meth:`writing`; return its number."""
@@ -205,14 +207,11 @@ class Store:
         self.put(series, number, head, body)
         return number
 
-    def delete(self, *kinds: str) -> None:
-        """Remove records; for use in :meth:`writing`."""
-        assert self._connection is not None
-        for kind in kinds:
-            self._connection.execute("DELETE FROM records WHERE kind = ?", (kind,))
-        kept = {k: n for k, n in self.catalog.items() if k not in kinds}
-        catalog = sealed(self._id, CATALOG, 0, kept)
-        self._connection.execute(INSERT.format("REPLACE"), catalog)
+    def delete(self, kind: str) -> None:
+        """Remove the records of a kind; for use in :meth:`writing`."""
+        self._connection.execute("DELETE FROM records WHERE kind = ?", (kind,))
+        kept = {name: last for name, last in self.catalog.items() if name != kind}
+        self.put(CATALOG, 0, kept)
 
     @contextmanager
     def writing(self) -> Iterator[None]:
@@ -233,17 +232,17 @@ class Store:
                 connection.execute("BEGIN IMMEDIATE")
                 try:
                     yield
-                    connection.execute("COMMIT")
+                    connection.commit()
                     self._signature = self._found()
                 finally:
-                    if connection.in_transaction:
-                        connection.execute("ROLLBACK")
+                    connection.rollback()  # of what was not committed
 
     def acquire(self) -> None:
         """Take the right to write, which ends with :meth:`close` or the process.
 
         Raises:
             LockedError: If another writer, in this process or another, has it.
+            OSError: If the folder cannot be written.
         """
         with self._guard, self.reading():
             if self.held:
@@ -253,16 +252,12 @@ class Store:
                 lock.execute("PRAGMA journal_mode = MEMORY")  # nothing is written
                 lock.execute("BEGIN EXCLUSIVE")
                 self._lock = lock
-                if self._found() != self._signature:  # nothing old may be remembered
-                    self._open()
+                self._disconnect()  # nothing old may be remembered
                 for left in self.folder.glob(f"{TEMPORARY}*{NAME}*"):  # by the killed
                     left.unlink(missing_ok=True)
-                assert self._connection is not None
-                self._connection.execute("PRAGMA synchronous = OFF")
                 # Only a note; and a file that cannot be written to may be repaired.
                 with suppress(CorruptSegmentError), self.writing():
                     self.put("writer", 0, {"pid": os.getpid(), "host": platform.node()})
-                self._connection.execute("PRAGMA synchronous = FULL")
             except BaseException:
                 self._lock = None
                 lock.close()
@@ -284,20 +279,30 @@ class Store:
         try:
             with self.reading() as connection:
                 found = connection.execute("PRAGMA integrity_check(9)").fetchall()
-                catalog = self.catalog
+                wrong = [str(row[0]) for row in found if row[0] != "ok"]
+                whole = self._whole(connection)
+                for kind, last in self.catalog.items():
+                    numbers = range(min(last, 1), last + 1)
+                    lost = (n for n in numbers if (kind, n) not in whole)
+                    some = itertools.islice(lost, MOST_LISTED)
+                    wrong += [f"{kind!r} {n} changed or lost" for n in some]
         except CorruptSegmentError as error:
             return [error.reason]
-        wrong = [str(row[0]) for row in found if row[0] != "ok"]
-        for kind, last in [] if wrong else catalog.items():
-            for number in range(min(last, 1), last + 1):
-                try:
-                    self.get(kind, number)
-                    self.body(kind, number)
-                except CorruptSegmentError as error:
-                    wrong.append(error.reason)
-                    if len(wrong) > MOST_LISTED:
-                        return wrong
         return wrong
+
+    def _whole(self, connection: sqlite3.Connection) -> dict[tuple[str, int], int]:
+        """Return where the records stand that are as they were written."""
+        whole: dict[tuple[str, int], int] = {}
+        for order in ("", "DESC"):  # from both ends up to what is damaged
+            with suppress(sqlite3.Error):
+                for found in connection.execute(
+                    f"SELECT rowid, * FROM records NOT INDEXED ORDER BY rowid {order}"
+                ):
+                    rowid, kind, number, head, _, _, body = found
+                    if found[1:] == sealed(self._id, kind, number, head, body):
+                        whole[kind, number] = rowid
+                return whole
+        return whole
 
     def salvage(self) -> None:
         """Write the file anew from the records that are whole, and number them anew.
@@ -306,30 +311,23 @@ class Store:
         """
         self.acquire()
         with self.reading() as connection:
-            whole: dict[int, tuple[str, int]] = {}
-            for order in ("", " DESC"):  # from both ends up to what is damaged
-                with suppress(sqlite3.Error):
-                    for row in connection.execute(
-                        "SELECT rowid, kind, number, head, head_digest, body_digest, "
-                        f"body FROM records NOT INDEXED ORDER BY rowid{order}"
-                    ):
-                        if row[1:] == sealed(self._id, row[1], row[2], row[3], row[6]):
-                            whole[row[0]] = row[1:3]
             catalog: dict[str, int] = {}
 
             def renumbered() -> Iterator[tuple[Any, ...]]:
-                for rowid, (kind, number) in sorted(whole.items(), key=lambda w: w[1]):
+                for (kind, number), rowid in sorted(self._whole(connection).items()):
                     read = "SELECT head, body FROM records WHERE rowid = ?"
-                    content = connection.execute(read, (rowid,)).fetchone()
-                    number = number and catalog.get(kind, 0) + 1
+                    head, body = connection.execute(read, (rowid,)).fetchone()
                     if kind != CATALOG:
-                        catalog[kind] = number
-                        yield sealed(self._id, kind, number, content[0], content[1])
+                        catalog[kind] = number and catalog.get(kind, 0) + 1
+                        yield sealed(self._id, kind, catalog[kind], head, body)
                 yield sealed(self._id, CATALOG, 0, catalog)
 
             fresh = written(self.folder, self._id, renumbered())
         self.close()
-        keep_aside(self.path)
+        names = (f"{NAME}.damaged" + f"-{n}" * (n > 1) for n in itertools.count(1))
+        copies = (self.path.with_name(name) for name in names)
+        copy = next(copy for copy in copies if not os.path.lexists(copy))
+        shutil.copy2(self.path, copy)
         os.replace(fresh, self.path)
         synchronize(self.folder)
 
@@ -340,34 +338,27 @@ class Store:
             return state.st_ino, state.st_size, state.st_mtime_ns
         return ()
 
-    def _open(self) -> None:
-        self._disconnect()
-        self._connection, self._is_alone = opened(self.path, self._what)
-        name = self._connection.execute("PRAGMA application_id")
-        self._id = name.fetchone()[0]
-        self._signature = self._found()
-
-    def _disconnect(self) -> None:
-        if self._connection is not None:
-            self._connection.close()
-        self._connection, self._signature = None, ()
-
     def _holder(self) -> tuple[int | None, str]:
         with suppress(Exception):  # it locked a moment ago, or the file is damaged
             found = self.json("writer") or {}
             return int(found["pid"]), str(found["host"])
         return None, platform.node()
 
+    def _disconnect(self) -> None:
+        if self._connection is not None:
+            self._connection.close()
+        self._connection, self._signature = None, ()
+
 
 def _before_fork() -> None:
     """Close connections, which a child must not have, once they are not in use."""
-    for store in [*_OPEN]:
+    for store in [*_STORES]:
         store._guard.acquire()
         store._disconnect()
 
 
 def _after_fork(*, child: bool = False) -> None:
-    for store in [*_OPEN]:
+    for store in [*_STORES]:
         if child and store._lock is not None:  # a child has no right of its parent's
             store._lock.close()
             store._lock = None

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from sbi_active import Campaign
-from sbi_active.campaign.storage.manifest import has_manifest
+from sbi_active.campaign.storage.directory import has_manifest
 from tests.campaign.storage.campaigns import MODEL, draws, facts, go_on, new
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")

@@ -225,6 +225,8 @@ def test_adopted_effects_come_back(tmp_path):
     assert report.verdict == "bias"
     campaign.adopt(report)
     campaign.close()
+    campaign.withdraw(campaign.attach([1.0], [0.5] * 4))  # who closed may go on
+    campaign.close()
 
     reader = Campaign.load(tmp_path / "c")
     assert torch.equal(draws(reader), draws(campaign))

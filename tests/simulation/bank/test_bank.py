@@ -62,7 +62,7 @@ def test_part_of_a_run_is_completed(bank):
     theta, action = draw(300)
     whole = simulate(simulator, theta, action, seed=0)
     with_store = simulate(simulator, theta, action, seed=0, store=bank)
-    run = bank._rows.segments()[0].run
+    run = bank._segments()[0].run
     other = Bank(bank.path.parent / "other", simulator=simulator)
     some = torch.arange(0, 300, 7)
     rows = {k: getattr(whole, k)[some] for k in ("theta", "action", "x", "status")}
@@ -76,7 +76,7 @@ def test_rows_by_position_slice_and_mask(bank, monkeypatch):
     monkeypatch.setattr(module, "SEGMENT_BYTES", 45 * 60)  # about 60 rows a segment
     rows = simulate(simulator, *draw(200), seed=0)
     bank.append(rows, seed=0)
-    assert len(bank._rows.segments()) > 2
+    assert len(bank._segments()) > 2
     some = torch.tensor([199, 3, 3, 70])
     assert torch.equal(bank.read(some).theta, rows.theta[some])
     assert torch.equal(bank.read(slice(50, 150)).theta, rows.theta[50:150])
@@ -153,6 +153,16 @@ def test_readers_go_on_while_another_process_writes(bank):
     assert lengths == sorted(lengths)
     assert len({*lengths}) > 5  # the reader did see the bank grow
     assert len(bank) == 600
+
+
+def test_a_reader_sees_one_state_of_the_file_at_a_time(bank):
+    reader, rows = Bank(bank.path), simulate(simulator, *draw(10), seed=0)
+    with reader._store.reading():
+        assert len(reader) == 0
+        bank.append(rows, seed=0)
+        assert len(reader) == 0
+        assert reader._store.get("rows", 1) is None  # and is no gap
+    assert len(reader) == 10
 
 
 def test_shapes_set_by_another_writer_hold(bank):

@@ -141,7 +141,5 @@ def test_a_folder_that_cannot_be_written(small_disk):
     assert len(Bank(small_disk / "bank").read()) == 100
     with pytest.raises(OSError, match=r"got '.*read.*only.*'; make room or choose"):
         Bank(small_disk / "bank", simulator=simulator).append(rows(), seed=1)
-    with pytest.raises(
-        OSError, match="a folder that can be made for a bank; got 'Read"
-    ):
+    with pytest.raises(OSError, match="to write to the bank; got 'Read-only file"):
         Bank(small_disk / "new", simulator=simulator)

@@ -3,7 +3,9 @@
 import importlib
 import sys
 
+import numpy as np
 import pytest
+import torch
 
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.simulation.bank.fingerprint import differences, fingerprint
@@ -97,11 +99,35 @@ def test_of_methods_and_inner_functions(sled, monkeypatch, of):
 
 
 def test_what_a_simulator_counts_and_keeps_is_no_setting(sled):
-    import torch
-
     before = fingerprint(sled.slide)
     sled.slide(torch.ones(3, 1), torch.ones(3, 1))
     assert sled.CALLS == 1
     assert sled.CACHE
     assert sled.BUFFER[0] == 3
     assert not differences(before, fingerprint(sled.slide))
+
+
+class Rail:
+    def __init__(self, setting):
+        self.setting = setting
+
+    def __call__(self, theta, action):
+        return theta
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (np.float32(1.0), np.float32(2.0)),
+        ({"ice"}, {"ice", "steel"}),
+        (1j, 2j),
+        (b"a", b"b"),
+        (torch.ones(2, dtype=torch.bfloat16), torch.zeros(2, dtype=torch.bfloat16)),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_settings_of_any_kind_are_seen(one, other):
+    before = fingerprint(Rail(one))
+    assert not differences(before, fingerprint(Rail(one)))
+    (line,) = differences(before, fingerprint(Rail(other)))
+    assert line.startswith("simulator.setting ")
