@@ -12,6 +12,7 @@ from sbi_active.criticism.data.sampling import Sampling
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.screening import Screening
+from sbi_active.criticism.misfit.evaluation import evaluate_held_out
 from sbi_active.criticism.next_trial.severe_tests import severe_tests
 from sbi_active.criticism.report.report import Report, build_report
 from sbi_active.criticism.results import (
@@ -22,9 +23,8 @@ from sbi_active.criticism.results import (
     Residuals,
     Tracing,
 )
-from sbi_active.criticism.steps.evaluation import evaluate_held_out
 from sbi_active.criticism.steps.missed_trials import outlying_trials
-from sbi_active.criticism.steps.residuals import find_residuals
+from sbi_active.criticism.steps.predictive import find_residuals
 from sbi_active.criticism.thinning import in_words
 from sbi_active.progress import stage
 from sbi_active.simulation import SimulatorModel
@@ -33,7 +33,9 @@ from sbi_active.simulation import SimulatorModel
 class Steps(Protocol):
     """The steps that a report is of, as :class:`.Criticism` has them."""
 
-    rivals: RivalSet
+    @property
+    def rivals(self) -> RivalSet: ...  # noqa: D102
+
     trials: Trials
     actions: ActionSpace | None
     show_progress: bool

@@ -11,7 +11,6 @@ from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.sensor import sensor_of
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.noise_grid import measurement_sds
-from sbi_active.criticism.steps.tracing import log_priors
 
 
 def thinned_to_need(rivals: RivalSet, trials: Trials) -> tuple[Trials, Sampling | None]:
@@ -37,7 +36,7 @@ def thinned_to_need(rivals: RivalSet, trials: Trials) -> tuple[Trials, Sampling 
     ):
         return trials, None
     sensor = sensor_of(rivals)
-    bare = Search(rivals, sensor, log_priors(rivals.library, ())).model(ModelKey())
+    bare = Search(rivals, sensor).model(ModelKey())
     left = np.full(fit.x.numel(), np.nan)
     left[rivals.measurements.position] = sensor.unit * bare.residual
     sampling = suggested_sampling(fit, left.reshape(fit.x.shape), times)

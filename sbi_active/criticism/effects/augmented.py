@@ -335,17 +335,12 @@ class AugmentedSimulator(SimulatorModel):
         )
         return x[place]
 
-    def _check_null(
-        self,
-        theta: Tensor,
-        action: Tensor,
-        context: Context,
-        *,
-        # Largest difference at the null, in deviations of x over the checked rows:
-        # single precision, with room for a formula's rounding.
-        tolerance: float = 1e-4,
-    ) -> None:
-        """Raise if an effect at its null changes x."""
+    def _check_null(self, theta: Tensor, action: Tensor, context: Context) -> None:
+        """Raise if an effect at its null changes x.
+
+        It may do so by single precision, with room for a formula's rounding.
+        """
+        tolerance = 1e-4  # in deviations of x over the checked rows
         x = self._seeded(theta, {}, action, context)
         shapes = [x.shape, *(u.shape for u in (context.inputs or {}).values())]
         if any(len(x) in shape[1:] for shape in shapes) and len(x) > 1:

@@ -239,13 +239,14 @@ def _rivals(
 
     def rival(effects: Sequence[Effect]) -> Rival:
         return Rival(
-            ModelKey(tuple(e.name for e in effects)),
+            key=ModelKey(tuple(e.name for e in effects)),
             simulator=simulator,
             prior=prior,
             effects=effects,
             nuisances=nuisances,
             error=NoiseGrid([NoiseCell.of(m, sd=scale)]),
             spread=scale,
+            center=np.zeros(len(scale)),
             step=settings.step,
         )
 

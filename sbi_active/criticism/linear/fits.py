@@ -122,18 +122,16 @@ def polished(rival: Rival, u: Array, unit: Array, settings: FitSettings) -> Line
     return centered(rival, model, unit)
 
 
-def refitted(
-    rival: Rival, model: LinearModel, unit: Array, kept: Array, *, steps: int = 30
-) -> Array:
+def refitted(rival: Rival, model: LinearModel, unit: Array, kept: Array) -> Array:
     """Return the best fit of a model to some of the numbers, shape (d,).
+
+    Along a valley that the other numbers held closed it takes some ten steps.
 
     Args:
         rival: The model.
         model: The model linearized at its best fit to all.
         unit: Deviations of residuals in a search, shape (N,) or (2 N,).
         kept: Mask of the numbers, shape (N,).
-        steps: Number of steps at most, a choice. Along a valley that the other numbers
-            held closed a fit takes some ten.
     """
     weight = model.scale if np.isfinite(rival.df) else 1.0
     wide, kept = unit * max(model.rms, 1.0) * weight, np.resize(kept, len(unit))
@@ -142,7 +140,7 @@ def refitted(
         return np.where(kept, residual / wide, 0.0)
 
     start = np.clip(model.u, model.low, model.high)[None]
-    return descend(rival, start, whiten, rival.step, steps)[0][0]
+    return descend(rival, start, whiten, rival.step, 30)[0][0]
 
 
 def along_secants(

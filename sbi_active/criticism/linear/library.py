@@ -58,13 +58,9 @@ class Library:
         """Return the model with one effect where it vanishes, and its columns."""
         return self._singles[name], self._blocks[name]
 
-    def look_at_each(
-        self,
-        *,
-        # Effects whose Gram matrices are computed together.
-        together: int = 12,
-    ) -> None:
-        """Compute the posterior of each effect alone, several at a time."""
+    def look_at_each(self) -> None:
+        """Compute the posterior of each effect alone, a dozen at a time."""
+        together = 12
         for start in range(0, len(self.names), together):
             some = self.names[start : start + together]
             self.prepare(some)
@@ -80,7 +76,7 @@ class Library:
     def optimum(self, name: str) -> tuple[ModelKey, Array]:
         """Return the key of a model with one effect, and its linear optimum, (d,)."""
         model, own = self._singles[name], self._blocks[name]
-        mean = self._posterior((name,)).mean
+        mean = self._posterior((name,)).beside.mean
         u = np.empty(len(model.u))
         u[~own], u[own] = mean[: (~own).sum()], mean[(~own).sum() :] + model.u[own]
         return model.key, np.clip(u, model.low, model.high)

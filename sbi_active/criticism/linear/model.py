@@ -109,6 +109,10 @@ class LinearModel:
         after = cost(self.residual + self.jacobian @ move, self.u + move)
         return (cost(self.residual, self.u) - after) * scale
 
+    def at(self, u: Array) -> Array:
+        """Return the residuals at other places, (n, N) or (n, 2 N), of u (n, d)."""
+        return self.residual + (u - self.u) @ self.jacobian.T
+
     def draws(
         self, mean: Array, cov: Array, num: int, rng: np.random.Generator
     ) -> Array:
@@ -142,9 +146,7 @@ def linearize(
     return _reweighted(model, rival.df) if np.isfinite(rival.df) else model
 
 
-def _in_own_deviations(
-    rival: Rival, model: LinearModel, unit: Array, *, most: float = 4.0
-) -> LinearModel:
+def _in_own_deviations(rival: Rival, model: LinearModel, unit: Array) -> LinearModel:
     r"""Return a linearized rival with deviations that are the simulator's.
 
     A number that the simulator does not give has that of the prior predictive. The
@@ -161,9 +163,6 @@ def _in_own_deviations(
         rival: Rival that is linearized.
         model: Linear model with the residuals of a search.
         unit: Standard deviation of the sensor, shape (N,).
-        most: Square of a residual beyond which it is no typical one, and its score no
-            slope of a Gaussian: with half a score is biased where the model is right,
-            with twice a few numbers far out move all deviations.
     """
     num = model.num
     residual, log_scale, _ = rival.residual(model.u[None], penalized=False)
@@ -172,7 +171,10 @@ def _in_own_deviations(
     if rival.reference is not None:
         log_scale = log_scale - np.log(rival.reference)
         slope, own = jacobian[num:] * residual[num:, None], residual[:num]
-        score = (1 - np.minimum(own**2, most)) / np.sqrt(2)
+        # Beyond a square of four a residual is no typical one, and its score no slope
+        # of a Gaussian: with half a score is biased where the model is right, with
+        # twice a few numbers far out move all deviations.
+        score = (1 - np.minimum(own**2, 4.0)) / np.sqrt(2)
         offset = 0.5 * score**2
         residual = np.append(own, score)
         means = jacobian[:num] + own[:, None] * slope
@@ -252,21 +254,16 @@ def centered(rival: Rival, model: LinearModel, unit: Array) -> LinearModel:
     return replace(model, jacobian=(model.jacobian + other.jacobian) / 2)
 
 
-def with_prior(
-    rival: Rival,
-    u: Array,
-    residual: Array,
-    jacobian: Array,
-    *,
-    # Precision of the Gaussian that stands for a prior between two bounds: wide
-    # enough to leave parameters alone that the trials determine.
-    flat: float = 0.3,
-) -> LinearModel:
-    """Return a linearized rival with the Gaussian that stands for its prior."""
+def with_prior(rival: Rival, u: Array, residual: Array, jacobian: Array) -> LinearModel:
+    """Return a linearized rival with the Gaussian that stands for its prior.
+
+    Between two bounds it is wide enough to leave parameters alone that the trials
+    determine.
+    """
     c = rival.coordinates
     bounded = np.isfinite(c.low) & np.isfinite(c.high)
     scaled = np.zeros(rival.dim, dtype=bool)
-    precision = np.where(c.precision > 0, c.precision, flat)
+    precision = np.where(c.precision > 0, c.precision, 0.3)
     names = {e.name for e in rival.effects}
     for name, place in rival.columns().items():
         if name in names:

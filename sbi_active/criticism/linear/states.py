@@ -196,8 +196,8 @@ class States:
         """Return the probability that each trial has an outcome, by posterior draws."""
         key, rivals = c.model.key, self.search.rivals
         if key not in self._valid:
-            process = c.posterior.log_process > c.posterior.log_sensor
-            own = self.search.errors.posterior(c.model, c.grams, process=process)
+            both = c.posterior
+            own = both.beside if both.log_process > both.log_sensor else both.sensor
             rng = np.random.default_rng(derive_seed(rivals.seed, "outcomes", str(key)))
             u = c.model.draws(own.mean, own.cov, self.num_outcomes, rng)
             split = rivals.rival(key).coordinates.split(u)

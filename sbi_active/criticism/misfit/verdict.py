@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import chain, combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from scipy.stats import chi2
 from sbi_active.arrays import Array
 from sbi_active.criticism.contradictions import OutlyingTrial
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.linear.errors import Posterior
+from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.left_out import Candidate, standard_errors
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
@@ -26,8 +27,7 @@ from sbi_active.criticism.linear.states import States
 from sbi_active.criticism.misfit.guesses import gained_by_guesses
 from sbi_active.criticism.misfit.intervals import covariance, widened
 from sbi_active.criticism.misfit.rule import Choice, Rule
-from sbi_active.criticism.misfit.scored import Scored
-from sbi_active.criticism.misfit.weights import weights_by_error
+from sbi_active.criticism.misfit.scored import Scored, weights_by_error
 from sbi_active.criticism.results import (
     OUTLIER,
     SCATTER,
@@ -208,6 +208,18 @@ class Verdict:
         return self.search.sensor.is_known and is_missed
 
     @cached_property
+    def models(self) -> RivalSet:
+        """The models, with the posteriors of those that are recorded.
+
+        Where every one misses, errors may be larger than declared.
+        """
+        rivals = self.rivals
+        measured = getattr(rivals.model.noise, "measurement_sd", None)
+        if self.is_missed and measured is None:
+            return rivals.widened(2 * self.model(ModelKey()).rms)
+        return rivals.with_effects(rivals.effects)
+
+    @cached_property
     def probabilities(self) -> dict[str, float]:
         """Probabilities of the admitted models, the states of a bare one apart."""
         found: dict[str, float] = {}
@@ -253,12 +265,6 @@ class Verdict:
     def passes(self, key: ModelKey) -> bool:
         """Return whether a model's chi-square passes against the sensor."""
         return self.model(key).chi_square[2] > self.rule.passes
-
-    def posterior(self, key: ModelKey, use: NDArray[np.bool_]) -> Posterior:
-        """Return the posterior of a model by some parts of the trials."""
-        found = self.search.found[key]
-        given = found.model, found.grams, use
-        return self.search.errors.posterior(*given, process=self.is_missed)
 
     def shown(self, key: ModelKey) -> Array:
         """Return the covariance that intervals of a model's coordinates have, (d, d).
@@ -368,12 +374,6 @@ def without(trials: Trials, outlying: Sequence[OutlyingTrial]) -> Trials:
 
 def _missing(search: Search, key: ModelKey) -> list[ModelKey]:
     """Return the subsets of a set that were not fitted, smaller ones first."""
-    wanted: list[ModelKey] = []
-    todo = [key]
-    while todo:
-        for part in todo.pop().parts:
-            if part not in wanted:
-                wanted.append(part)
-                todo.append(part)
-    missing = [k for k in wanted if k not in search.found]
-    return sorted(missing, key=lambda k: len(k.effects))
+    names = key.effects
+    parts = chain.from_iterable(combinations(names, k) for k in range(len(names)))
+    return [part for part in map(ModelKey, parts) if part not in search.found]

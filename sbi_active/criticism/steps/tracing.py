@@ -11,13 +11,13 @@ from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.results import (
-    CATCH_ALLS,
     NONE,
+    SCATTER,
+    UNEXPLAINED,
     Estimate,
     Evidence,
     ModelKey,
 )
-from sbi_active.criticism.steps.detection import alternatives
 from sbi_active.inference.sampling.weights import log_sum_exp
 
 #: All sets of one effect more are together this much less probable, nats.
@@ -26,33 +26,16 @@ COST = float(np.log(3.0))
 RESCALED = (1 / 3, 3.0)
 
 
-def log_priors(
-    effects: Sequence[Effect],
-    catch_alls: Sequence[str] = CATCH_ALLS,
-    *,
-    probability_of_catch_all: float = 0.1,
-    probability_of_none: float = 0.5,
-) -> dict[str, float]:
-    """Return log prior probabilities of none, each effect and the catch-alls.
+def log_priors(effects: Sequence[Effect]) -> dict[str, float]:
+    """Return log prior probabilities of none and of each effect.
 
-    Half is "none". Of the rest the catch-alls have a tenth each, and the families
-    share what is left equally.
-
-    Args:
-        effects: The declared ones.
-        catch_alls: Catch-alls that are compared.
-        probability_of_catch_all: Probability that what is missing, if anything
-            is, is each of the catch-alls.
-        probability_of_none: Probability of the bare model: half, by convention,
-            is neither for nor against.
+    Half is "none", which is neither for nor against. The families share the rest
+    equally.
     """
     members: dict[str, list[str]] = {}
     for effect in effects:
         members.setdefault(str(effect.family), []).append(effect.name)
-    missing = 1 - probability_of_none
-    each = missing * probability_of_catch_all
-    found = {NONE: probability_of_none} | dict.fromkeys(catch_alls, each)
-    share = (missing - len(catch_alls) * each) / max(len(members), 1)
+    found, share = {NONE: 0.5}, 0.5 / max(len(members), 1)
     for names in members.values():
         found |= {name: share / len(names) for name in names}
     return {name: float(np.log(p)) for name, p in found.items()}
@@ -65,7 +48,7 @@ def log_prior(names: tuple[str, ...], prior: Mapping[str, float]) -> float:
     alone. Over all sets of k these means add up to :math:`\binom{n-1}{k-1} \frac1k
     \sum_i p_i`.
     """
-    num, k = sum(name not in (NONE, *CATCH_ALLS) for name in prior), len(names)
+    num, k = len(prior) - 1, len(names)  # all but "none"
     log_mean = log_sum_exp(np.array([prior[name] for name in names])) - np.log(k)
     return float(log_mean + np.log(k / comb(num - 1, k - 1)) - COST * (k - 1))
 
@@ -98,32 +81,38 @@ def log_bayes_factor(
 ) -> float:
     """Return the log Bayes factor of everything else against the bare model.
 
+    The residual process, noise inflation and each effect have equal weights; effects
+    that nothing separates count as one, and effects that nothing separates from the
+    bare model do not count.
+
     Args:
         log_z: Evidences; what was screened out has none to speak of.
         library: All effects.
-        equivalent: Groups of them that no permitted action separates.
+        equivalent: Groups of them that no permitted action separates, with "none" for
+            the bare model.
     """
     names = [e.name for e in library]
+    shares = {UNEXPLAINED: 1.0, SCATTER: 1.0}
+    for name in names:
+        group = next((g for g in equivalent if name in g), frozenset({name}))
+        if NONE not in group:
+            shares[name] = 1 / len(group & {*names})
+    total = sum(shares.values())
     parts = [
-        log_z[ModelKey.of(name)] + float(np.log(w))
-        for name, w in alternatives(names, equivalent).items()
+        log_z[ModelKey.of(name)] + float(np.log(share / total))
+        for name, share in shares.items()
         if ModelKey.of(name) in log_z
     ]
     return float(log_sum_exp(np.array(parts)) - log_z[ModelKey()])
 
 
-def credible_set(
-    probabilities: dict[str, float],
-    *,
-    # of the credible set
-    mass: float = 0.9,
-) -> tuple[str, ...]:
+def credible_set(probabilities: dict[str, float]) -> tuple[str, ...]:
     """Return the smallest set of names with 90 % of the probability, best first."""
     names, total = [], 0.0
     for name, p in probabilities.items():  # most probable first
         names.append(name)
         total += p
-        if total >= mass:
+        if total >= 0.9:
             break
     return (*names,)
 

@@ -12,7 +12,6 @@ from sbi_active.criticism.linear.fits import along_secants
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.sensor import sensor_of
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.steps.tracing import log_priors
 from tests.criticism.misfit.oscillator import EFFECTS as OSCILLATOR
 from tests.criticism.misfit.oscillator import MODEL, PRIOR, trials
 
@@ -66,7 +65,7 @@ def test_parameters_beside_an_effect_without_a_null_are_looked_for_anew():
     )
     sensor = sensor_of(loop.rivals)
     assert sensor is not None
-    search = Search(loop.rivals, sensor, log_priors(loop.effects, ()))
+    search = Search(loop.rivals, sensor)
     search.fit_singles()
     alone = search.found[ModelKey(("drift",))].model.rms
     both = search.fit_set(ModelKey(("limit", "drift"))).model.rms
@@ -79,7 +78,7 @@ def test_a_set_whose_fit_was_lost_is_fitted_again_from_its_part(monkeypatch):
     loop = Criticism(MODEL, PRIOR, trials(cubic=0.5), effects=OSCILLATOR, seed=0)
     sensor = sensor_of(loop.rivals)
     assert sensor is not None
-    search = Search(loop.rivals, sensor, log_priors(loop.effects, ()))
+    search = Search(loop.rivals, sensor)
     search.fit_singles()
     part = search.found[ModelKey(("cubic",))].model
     faint, again = search._faint, []

@@ -18,7 +18,6 @@ from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.misfit.verdict import judge
 from sbi_active.criticism.results import OUTLIER, SCATTER, UNEXPLAINED, ModelKey
 from sbi_active.criticism.steps.detection import REFUTED
-from sbi_active.criticism.steps.tracing import log_priors
 from tests.criticism.forces.test_forces import MODEL, PRIOR, SD, measured
 from tests.criticism.misfit.oscillator import EFFECTS
 from tests.criticism.misfit.oscillator import MODEL as OSCILLATOR
@@ -32,7 +31,7 @@ SOME = ("sin 2q*", "q^3*", "v|v|*", "cos 6 pi t*")
 def few_of(trials, effects):
     rivals = RivalSet(MODEL, PRIOR, trials, effects, seed=0)
     sensor = sensor_of(rivals)
-    return Search(rivals, sensor, log_priors(rivals.library, ()))
+    return Search(rivals, sensor)
 
 
 @pytest.fixture(scope="module")
@@ -176,7 +175,7 @@ def test_likely_models_that_bend_have_samples_of_their_posterior():
     assert own.draws[:, :2].std(0).min() > 0.5
     # Seven standard errors of the slope beside a bias, .135, for all 400 draws.
     assert own.draws[:, 0] * own.draws[:, 1] == pytest.approx(4.0, abs=1.0)
-    linear = loop._judge().states.log_evidence(ModelKey(("bias",)))
+    linear = loop._verdict.states.log_evidence(ModelKey(("bias",)))
     assert own.log_evidence == linear  # asked by one, drawn by the other
     # Left-out trials are predicted along the hyperbola, as by the line without them.
     line = np.concatenate([action, torch.ones_like(action)], 1)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sbi_active.criticism.steps.influence import unless_refuted
+from sbi_active.criticism.misfit.contrary import unless_refuted
 from sbi_active.criticism.under_misfit import Misfit, ModelError, Support
 from tests.criticism.report.reports import flat, report, tracing
 
