@@ -27,13 +27,10 @@ from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summari
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit.contrary import widened
-from sbi_active.criticism.misfit.evaluation import (
-    evaluate_held_out,
-    evaluate_left_out,
-)
+from sbi_active.criticism.misfit.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.misfit.rule import Rule
-from sbi_active.criticism.misfit.verdict import Verdict, judge, without
+from sbi_active.criticism.misfit.verdict import Verdict, judge
 from sbi_active.criticism.misfit.wider_prior import judged
 from sbi_active.criticism.next_trial.next_action import choose_action
 from sbi_active.criticism.results import (
@@ -191,8 +188,8 @@ class Criticism:
         if found.is_missed and (outlying := found.outlying()):
             model, trials, effects = self._parts
             self.set_aside = outlying
-            self._parts = model, without(trials, outlying), effects
-            self.trials = without(self.trials, outlying)
+            self._parts = model, _without(trials, outlying), effects
+            self.trials = _without(self.trials, outlying)
             self._look(thins=False)
             found = self._judge()
         return found
@@ -204,8 +201,8 @@ class Criticism:
 
     @property
     def rivals(self) -> RivalSet:
-        """The models, with the posteriors of those that the verdict records."""
-        return self._verdict.models
+        """The models; after the verdict with the posteriors of those it records."""
+        return self._verdict.models if "_verdict" in vars(self) else self._search.rivals
 
     def misfit(self) -> Verdict | None:
         """Return the models where none explains the trials to the sensor's error.
@@ -368,3 +365,10 @@ class Criticism:
             designed=designed,
             exploratory=exploratory,
         )
+
+
+def _without(trials: Trials, outlying: Sequence[OutlyingTrial]) -> Trials:
+    """Return all trials but some of those that were fitted."""
+    fitted = [k for k, role in enumerate(trials.role) if role == "fit"]
+    gone = {fitted[trial.position] for trial in outlying}
+    return trials.select([k for k in range(len(trials)) if k not in gone])

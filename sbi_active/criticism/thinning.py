@@ -48,22 +48,10 @@ def thinned_to_need(rivals: RivalSet, trials: Trials) -> tuple[Trials, Sampling 
 def in_words(found: Sampling) -> str:
     """Return a text on the samples that were left out, and why."""
     return (
-        f"SA525 of {1 / found.step:.3g} samples a second every "
-        f"{_ordinal(found.every)} is used ({1 / found.suggested_step:.3g} a second; "
+        f"SA525 of {1 / found.step:.3g} samples a second one in {found.every} "
+        f"is used ({1 / found.suggested_step:.3g} a second; "
         "inputs as given): of what the bare model leaves, neighboring innovations of "
         f"an autocorrelated error have a correlation of up to {found.before:.2f} at "
         "higher rates, so that evidence would count the same motion several times, "
         f"and of {found.after:.2f} at this one; thin=False uses all"
     )
-
-
-def _ordinal(number: int) -> str:
-    """Return a number in order.
-
-    Example:
-        >>> [_ordinal(n) for n in (2, 3, 11, 21)]
-        ['2nd', '3rd', '11th', '21st']
-    """
-    ends = {1: "st", 2: "nd", 3: "rd"}
-    teens = 10 < number % 100 < 14
-    return f"{number}{'th' if teens else ends.get(number % 10, 'th')}"

@@ -177,11 +177,7 @@ class AugmentedSimulator(SimulatorModel):
 
     @override
     def __call__(
-        self,
-        theta: Tensor,
-        action: Tensor,
-        seeds: Tensor | None = None,
-        **effects: Any,
+        self, theta: Tensor, action: Tensor, seeds: Tensor | None = None, **effects: Any
     ) -> Tensor:
         phi = self._trial_draws(len(theta), theta.dtype, seeds)
         mean = self._run(theta, action, seeds, effects, phi)
@@ -232,10 +228,7 @@ class AugmentedSimulator(SimulatorModel):
         return {e.name: d for e, d in zip(trial, draws, strict=True)}
 
     def _row_context(
-        self,
-        action: Tensor,
-        index: Tensor | None = None,
-        given: Context | None = None,
+        self, action: Tensor, index: Tensor | None = None, given: Context | None = None
     ) -> Context:
         """Return what effects may know of rows, of the type of their actions."""
         if given is None:

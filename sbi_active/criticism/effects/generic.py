@@ -15,10 +15,7 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.changes import Wrapped
 from sbi_active.criticism.effects.effect import Effect, Hook
 from sbi_active.criticism.effects.table import rows_of
-from sbi_active.criticism.effects.trial_conditions import (
-    conditions_for,
-    has_own_times,
-)
+from sbi_active.criticism.effects.trial_conditions import conditions_for, has_own_times
 from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.noise.base import declared_sds

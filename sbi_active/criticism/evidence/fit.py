@@ -64,6 +64,11 @@ class Fit:
         log_p = self.rival.log_prior(u) + self.rival.log_likelihood(u)
         return u[[int(np.argmax(log_p))]]
 
+    @property
+    def point(self) -> Array:
+        """The point from which one prediction is made, shape (dim,)."""
+        return self.likeliest[0] if self.best is None else self.best
+
     def weighed(
         self, u: Array, residual: Array, rng: np.random.Generator
     ) -> tuple[Array, Array]:
@@ -89,8 +94,13 @@ class Fit:
         log_w = np.nan_to_num(log_w, nan=-1e9, neginf=-1e9, posinf=-1e9)
         if log_w.std() < 0.5:
             return u, residual
-        power = 1.0
-        while effective_sample_size(power * log_w) < 0.2 * len(u):
-            power *= 0.8
-        at = rng.choice(len(u), size=len(u), p=normalized(power * log_w))
+        at = rng.choice(len(u), size=len(u), p=tempered(log_w, 0.2 * len(u)))
         return u[at], residual[at]
+
+
+def tempered(log_w: Array, fewest: float) -> Array:
+    """Return weights, by a power of them that leaves some effective draws, (n,)."""
+    power = 1.0
+    while effective_sample_size(power * log_w) < fewest:
+        power *= 0.8
+    return normalized(power * log_w)

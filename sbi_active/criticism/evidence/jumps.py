@@ -10,10 +10,7 @@ from sbi_active.criticism.rivals.error_models import NoiseGrid
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.engine import search
 from sbi_active.inference.engine.search import laplace_precision
-from sbi_active.inference.sampling.mixtures import (
-    StudentMixture,
-    lower_factors,
-)
+from sbi_active.inference.sampling.mixtures import StudentMixture, lower_factors
 from sbi_active.seeding import derive_seed
 
 #: Finite-difference steps in prior deviations, and where two of them count as one; a

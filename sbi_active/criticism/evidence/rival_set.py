@@ -20,22 +20,14 @@ from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.jumps import STEPS, look_for_jumps
-from sbi_active.criticism.evidence.settings import (
-    NESTED,
-    ROUGH,
-    THOROUGH,
-    settings_of,
-)
+from sbi_active.criticism.evidence.settings import NESTED, ROUGH, THOROUGH, settings_of
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Evidence, ModelKey
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
 from sbi_active.criticism.rivals.error_models import ChannelNoise, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import declared_noise, scattered
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
-from sbi_active.criticism.rivals.trial_simulator import (
-    NUM_REPLICATES,
-    TrialSimulator,
-)
+from sbi_active.criticism.rivals.trial_simulator import NUM_REPLICATES, TrialSimulator
 from sbi_active.inference.engine import Found, WeightedDraws, infer, search
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import AutocorrelatedNoise, GaussianNoise, SimulatorModel

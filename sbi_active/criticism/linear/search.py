@@ -24,6 +24,7 @@ from sbi_active.criticism.linear.fits import (
     FitSettings,
     along_secants,
     best_fit,
+    onward,
     polished,
 )
 from sbi_active.criticism.linear.left_out import Candidate, leave_out
@@ -34,7 +35,6 @@ from sbi_active.criticism.linear.model import (
     chords,
     enlarged,
     has_null,
-    searched_from,
 )
 from sbi_active.criticism.linear.sensor import Sensor
 from sbi_active.criticism.results import ModelKey
@@ -327,14 +327,8 @@ class Search:
         for name in key.effects:
             if name not in base.effects:
                 model = self._with_column(model, parent, name)
-        scale = max(model.rms, 1.0)
-        r, jacobian = searched_from(rival, model)
-        known = r[None] / scale, jacobian[None] / scale
-        u = np.clip(model.u, model.low, model.high)[None]
-        secant, unit = self.settings.secant, self.units * scale
-        own = unit * model.scale if np.isfinite(rival.df) else unit
-        u, _ = along_secants(rival, u, own, secant, known)
-        fits = [self._polished(rival, u[0])]
+        secant, unit = self.settings.secant, self.units * max(model.rms, 1.0)
+        fits = [self._polished(rival, onward(rival, model, self.units, secant))]
         effects = [self.rivals.effects[n] for n in key.effects]
         is_far = not all(map(has_null, effects))
         if is_far or (len(effects) == 1 and not is_force(effects[0])):
@@ -354,7 +348,7 @@ class Search:
         if base.effects or name not in self.library.names:
             beside, own = self.column(base, name)
         else:
-            beside, own = self.library.beside(name)
+            beside, own = self.library.columns[name]
         key = self._joined(model.key, [name])
         new = ~self.columns(key, model.key)
         return enlarged(

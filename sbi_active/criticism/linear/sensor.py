@@ -12,11 +12,7 @@ from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.fits import FitSettings, best_fit
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.rivals.error_models import (
-    ChannelNoise,
-    NoiseCell,
-    NoiseGrid,
-)
+from sbi_active.criticism.rivals.error_models import ChannelNoise, NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import measurement_sds
 
 

@@ -76,10 +76,7 @@ class States:
         return {key: float(np.log(rest)), **states}
 
     def joint(
-        self,
-        key: ModelKey,
-        use: NDArray[np.bool_] | None = None,
-        factor: float = 1.0,
+        self, key: ModelKey, use: NDArray[np.bool_] | None = None, factor: float = 1.0
     ) -> dict[ModelKey, float]:
         """Return a model in each state, and the log evidence of both, nats.
 
@@ -110,10 +107,7 @@ class States:
         return self.mixture(key).log_evidence
 
     def mixture(
-        self,
-        key: ModelKey,
-        use: NDArray[np.bool_] | None = None,
-        factor: float = 1.0,
+        self, key: ModelKey, use: NDArray[np.bool_] | None = None, factor: float = 1.0
     ) -> Mixture:
         """Return the posterior of a model in one state.
 

@@ -17,6 +17,7 @@ from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.contrary import is_left_to_chance, withdrawn
 from sbi_active.criticism.misfit.draws import recorded
 from sbi_active.criticism.misfit.guesses import guess_residual
+from sbi_active.criticism.misfit.scored import weights_by_error
 from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.results import (
     UNEXPLAINED,
@@ -33,14 +34,13 @@ from sbi_active.criticism.steps.equivalence import (
     noise_unit,
 )
 from sbi_active.criticism.steps.predictive import predict
-from sbi_active.criticism.steps.tracing import (
-    credible_set,
-    estimate_of,
-    likeliest_first,
-)
+from sbi_active.criticism.steps.tracing import credible_set
 from sbi_active.criticism.under_misfit import Misfit as Found
 from sbi_active.criticism.under_misfit import ModelError
 from sbi_active.seeding import derive_seed
+
+#: Probability from which an admitted model is recorded with its errors and draws.
+SHOWN = 0.01
 
 
 def traced(
@@ -63,11 +63,13 @@ def traced(
     rivals, states, key = found.rivals, found.states, found.key
     is_unexplained = key.error == UNEXPLAINED  # with an error of no declared size
     chosen = () if is_unexplained else key.effects
-    keys = [*states.keys(ModelKey()), *_shown(found), key]
+    louder = [k for k in found.probabilities if states.louder(k)]
+    louder = [k for k in louder if found.probabilities[k] >= SHOWN]
+    keys = [*states.keys(ModelKey()), *_shown(found), key, *louder]
     keys += [ModelKey((name,)) for name in rivals.effects]
     keys = [k for k in keys if k.error is None or not k.effects]
     groups = equivalent_effects(rivals, None) if near else ()
-    common = _common(found, keys, found.probabilities)
+    common = _common(found, keys, {str(k): p for k, p in found.probabilities.items()})
     aliases: tuple[frozenset[str], ...] = ()
     if found.detection.alarm:
         singles = {n: common["evidences"][n].log_evidence for n in rivals.effects}
@@ -138,7 +140,7 @@ def _common(
 def _shown(found: Verdict) -> list[ModelKey]:
     """Return the admitted models that are recorded with their errors and draws."""
     p = found.choice.probabilities
-    return [key for key in p if p[key] >= 0.01][:8]
+    return [key for key in p if p[key] >= SHOWN][:8]
 
 
 def _guesses(found: Verdict) -> tuple[tuple[str, float], ...]:
@@ -153,8 +155,13 @@ def _weights(misfit: Verdict) -> dict[ModelKey, float]:
     A next action is to tell these apart, six at most: each costs some hundred trials a
     candidate.
     """
-    found = {key: weight for key, weight in misfit.weights.items() if weight >= 0.05}
-    return dict([*found.items()][:6])
+    found = misfit.search.found
+    weights = weights_by_error(
+        {key: candidate.left.square for key, candidate in found.items()},
+        {key: candidate.log_prior for key, candidate in found.items()},
+        derive_seed(misfit.rivals.seed, "weights"),
+    )
+    return dict([(k, w) for k, w in weights.items() if w >= 0.05][:6])
 
 
 def _found(misfit: Verdict, models: Sequence[ModelError]) -> Found:
@@ -223,17 +230,30 @@ def _by_channel(square: Array, channel: NDArray[np.int64]) -> Array:
 
 
 def _estimates(found: Verdict, evidences: dict[str, Evidence]) -> tuple[Estimate, ...]:
-    bare = evidences[str(ModelKey())].log_evidence
-    return likeliest_first(
-        estimate_of(
-            effect,
-            evidences[name],
+    """Return each effect by the draws of the model that has it alone, likeliest first.
+
+    Its phi is the end of the draws.
+    """
+    bare, estimates = evidences[str(ModelKey())].log_evidence, []
+    for name, effect in found.rivals.effects.items():
+        if name not in evidences:
+            continue
+        own = evidences[name]
+        phi = own.draws[:, -effect.phi_dim :]
+        estimate = Estimate(
+            name=name,
+            family=str(effect.family),
+            units=effect.units,
+            describe=effect.describe or "",
             probability=found.inclusion[name],
-            log_bayes_factor=evidences[name].log_evidence - bare,
+            log_bayes_factor=own.log_evidence - bare,
+            mean=phi.mean(0),
+            sd=phi.std(0),
+            effective_sample_size=own.effective_sample_size,
+            engine=own.engine,
         )
-        for name, effect in found.rivals.effects.items()
-        if name in evidences
-    )
+        estimates.append(estimate)
+    return (*sorted(estimates, key=lambda e: -e.probability),)
 
 
 def near_aliases(

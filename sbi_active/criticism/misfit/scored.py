@@ -89,9 +89,7 @@ def predicts_better(one: Array, other: Array) -> float:
 
 
 def weights_by_error(
-    square: Mapping[ModelKey, Array],
-    log_prior: Mapping[ModelKey, float],
-    seed: int,
+    square: Mapping[ModelKey, Array], log_prior: Mapping[ModelKey, float], seed: int
 ) -> dict[ModelKey, float]:
     """Return the weight of each model, largest first, adding up to one.
 

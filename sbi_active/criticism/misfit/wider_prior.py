@@ -11,6 +11,7 @@ from scipy.stats import chi2
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.contradictions import BoundParameter, Bounds
+from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.misfit.contrary import unless_refuted, withdrawn
@@ -88,19 +89,25 @@ def beyond_bounds(rivals: RivalSet, tracing: Tracing) -> Tracing:
         tracing: Tracing with the effects that the data point to.
     """
     keys = [k for k in dict.fromkeys([ModelKey(), tracing.key]) if k in rivals.fits]
-    sides = {key: _sides(rivals, key) for key in keys}
-    if not any(side.any() for side in sides.values()):
+    fits = [rivals.fits[key] for key in keys]
+    sides = [_sides(fit, derive_seed(rivals.seed, "bounds")) for fit in fits]
+    if not any(side.any() for side in sides):
         return _unless_none(tracing, Bounds())
-    last = keys[-1]
-    whiten, square = _explained(rivals, last)
+    start, own = fits[-1].point, rivals.rival(ModelKey(keys[-1].effects))
+    whiten = rivals.noise.whitener(own.residual(start[None])[0][0])
+    u = _best(rivals, own, whiten, start[None])
+    assert u is not None
+    square = float((whiten(own.residual(u[None])[0][0]) ** 2).sum())
+    dim = rivals.prior.event_shape[0]
     found: list[BoundParameter] = []
     p_value, replaces = float("nan"), ""
-    for key, side in sides.items():
+    for key, fit, side in zip(keys, fits, sides, strict=True):
         if not side.any():
             continue
         rival = _moved(rivals.rival(key), side)
-        u = _best(rivals, rival, whiten, _starts(rivals, key, last))
-        held = _told(rivals, key, side, rival, u)
+        starts = np.stack([fit.point, np.r_[start[:dim], fit.point[dim:]]])
+        u = _best(rivals, rival, whiten, starts)
+        held = _told(rivals, fit, side, rival, u)
         found += held
         if key != ModelKey() or u is None or not held:
             continue
@@ -124,14 +131,12 @@ def _unless_none(tracing: Tracing, bounds: Bounds) -> Tracing:
     return replace(tracing, bounds=bounds)
 
 
-def _sides(rivals: RivalSet, key: ModelKey) -> NDArray[np.int64]:
+def _sides(fit: Fit, seed: int) -> NDArray[np.int64]:
     """Return at which bound each of theta and phi is in a model, (d,): -1, 1 or 0."""
-    fit = rivals.fits[key]
     c = fit.rival.coordinates
     own = sum(c.joint.sizes)
     if fit.best is None:
-        rng = np.random.default_rng(derive_seed(rivals.seed, "bounds"))
-        u = fit.sample.draws(NUM_DRAWS, rng)
+        u = fit.sample.draws(NUM_DRAWS, np.random.default_rng(seed))
     else:  # where draws are as wide as misfit asks, some reach any bound
         u = fit.best[None]
     side = c.sides(u[:, :own])
@@ -145,28 +150,6 @@ def _sides(rivals: RivalSet, key: ModelKey) -> NDArray[np.int64]:
     vanishes = np.abs(c.from_z(z[None])[0, :own] - ends) < 1e-6
     side[first:][vanishes[first:]] = 0
     return side
-
-
-def _explained(rivals: RivalSet, key: ModelKey) -> tuple[Whitener, float]:
-    """Return the whitener of residuals of a model's best fit, and its chi-square."""
-    rival = rivals.rival(ModelKey(key.effects))
-    start = _start(rivals, key)
-    whiten = rivals.noise.whitener(rival.residual(start[None])[0][0])
-    u = _best(rivals, rival, whiten, start[None])
-    assert u is not None
-    return whiten, float((whiten(rival.residual(u[None])[0][0]) ** 2).sum())
-
-
-def _start(rivals: RivalSet, key: ModelKey) -> Array:
-    """Return the coordinates that a model predicts from, (d,)."""
-    fit = rivals.fits[key]
-    return fit.likeliest[0] if fit.best is None else fit.best
-
-
-def _starts(rivals: RivalSet, key: ModelKey, other: ModelKey) -> Array:
-    """Return starts of a refit: a model's own best fit, and theta of another's."""
-    own, dim = _start(rivals, key), rivals.prior.event_shape[0]
-    return np.stack([own, np.r_[_start(rivals, other)[:dim], own[dim:]]])
 
 
 def _moved(rival: Rival, side: NDArray[np.int64]) -> Rival:
@@ -217,17 +200,13 @@ def _tail(
 
 
 def _told(
-    rivals: RivalSet,
-    key: ModelKey,
-    side: NDArray[np.int64],
-    rival: Rival,
-    u: Array | None,
+    rivals: RivalSet, fit: Fit, side: NDArray[np.int64], rival: Rival, u: Array | None
 ) -> list[BoundParameter]:
     """Return the parameters of a model at bounds, and where they are beyond them.
 
     One that stays inside though its bound was moved is not held by it.
     """
-    c = rivals.fits[key].rival.coordinates
+    c = fit.rival.coordinates
     z = np.full(c.dim, np.nan) if u is None else rival.coordinates.to_z(u[None])[0]
     names = rivals.names_of(rival)
     found = []
@@ -241,7 +220,7 @@ def _told(
         found.append(
             BoundParameter(
                 name=names[k],
-                model=str(ModelKey(key.effects)),
+                model=str(ModelKey(rival.key.effects)),
                 side="lower" if side[k] < 0 else "upper",
                 bound=float(bound),
                 beyond=float(beyond),

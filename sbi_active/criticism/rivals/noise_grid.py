@@ -11,11 +11,7 @@ from torch.distributions import Distribution
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.rivals.error_models import (
-    ChannelNoise,
-    NoiseCell,
-    NoiseGrid,
-)
+from sbi_active.criticism.rivals.error_models import ChannelNoise, NoiseCell, NoiseGrid
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.noise.base import NoiseModel, declared_sds
 from sbi_active.simulation.noise.posterior import NoisePosterior, SdGrid

@@ -27,12 +27,7 @@ from numpy.typing import NDArray
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.rivals.error_models import (
-    LOG_2PI,
-    NoiseGrid,
-    Whitener,
-    drawn,
-)
+from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseGrid, Whitener, drawn
 from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.weights import log_sum_exp
 

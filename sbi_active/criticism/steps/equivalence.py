@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
 from sbi_active.actions import ActionSpace
 from sbi_active.arrays import Array
@@ -95,8 +96,10 @@ def equivalent_effects(
                 for a, b in (pair, pair[::-1])
                 for u in every_u[:num_far]
             )
-    names = [NONE, *[e.name for e in effects]]
-    return _groups(names, same)
+    names = np.array([NONE, *[e.name for e in effects]])
+    num, group = connected_components(same, directed=False)
+    found = (frozenset(names[group == g].tolist()) for g in range(num))
+    return tuple(g for g in found if len(g) > 1)
 
 
 def noise_unit(rivals: RivalSet, simulator: TrialSimulator) -> Array:
@@ -191,11 +194,7 @@ class _World:
         return True
 
     def _rest(
-        self,
-        c: SearchCoordinates,
-        u: Array,
-        aim: Array,
-        both: NDArray[np.bool_],
+        self, c: SearchCoordinates, u: Array, aim: Array, both: NDArray[np.bool_]
     ) -> tuple[Array, bool, bool]:
         """Return the rest of predictions that parameters leave, by Gauss-Newton steps.
 
@@ -269,17 +268,6 @@ def _alike(left: list[tuple[Array, float]], local: list[bool]) -> Array:
             close = distance < SAME and distance < RELATIVE**2 * size
             same[i, j] = same[j, i] = float(close)
     return np.stack([same, told])
-
-
-def _groups(names: list[str], same: NDArray[Any]) -> tuple[frozenset[str], ...]:
-    groups: list[set[str]] = []
-    for i, name in enumerate(names):
-        joined = {name} | {names[j] for j in np.flatnonzero(same[i])}
-        for group in [g for g in groups if g & joined]:
-            groups.remove(group)
-            joined |= group
-        groups.append(joined)
-    return tuple(frozenset(g) for g in groups if len(g) > 1)
 
 
 def every_action(rivals: RivalSet, actions: ActionSpace) -> Trials:

@@ -182,10 +182,7 @@ def predict(
 
 
 def correlated_errors(
-    noise: NoiseGrid,
-    cells: Array,
-    sizes: Array,
-    rng: np.random.Generator,
+    noise: NoiseGrid, cells: Array, sizes: Array, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Return errors along each trial, and their deviations, shape (n, N).
 

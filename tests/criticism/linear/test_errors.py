@@ -41,7 +41,6 @@ def problem(*, low=-np.inf, ragged=False, num=NUM, differs=False):
         scaled=np.array([False, True]),
         low=np.array([-np.inf, low]),
         high=np.array([np.inf, np.inf]),
-        own=2,
         trial_of=np.array([-1, -1]),
         num=len(m),
         scale=np.ones(len(m)),

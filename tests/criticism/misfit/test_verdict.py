@@ -8,7 +8,12 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import HalfNormal, Normal
 
-from sbi_active import BoxActions, GaussianNoise, SimulatorModel
+from sbi_active import (
+    BoxActions,
+    DiscreteActions,
+    GaussianNoise,
+    SimulatorModel,
+)
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces import force_effects
@@ -253,3 +258,13 @@ def test_a_larger_noise_is_chosen_again_without_each_trial(size, effects, verdic
     assert loop.judged(evaluation).verdict == verdict
     if tracing.chosen:
         assert tracing.p_value > REFUTED
+
+
+def test_a_set_with_an_effect_on_the_noise_has_draws_for_the_next_action():
+    loop = scattered(lambda action: 0.1 + 0.3 * action.abs(), BIAS, LOUDER)
+    tracing = loop.trace()
+    both = "bias + louder"
+    assert tracing.probabilities[both] > 0.01
+    assert tracing.evidences[both].draws.shape[1] == 3
+    actions = DiscreteActions(torch.linspace(-2, 2, 5))
+    assert loop.next_action(actions).candidates.shape == (5, 1)
