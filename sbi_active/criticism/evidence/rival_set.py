@@ -122,7 +122,8 @@ class RivalSet:
         new = copy(self)
         factors = np.geomspace(1.0, max(largest, 2.0), 14)
         new._factors = factors, np.full(len(factors), -np.log(len(factors)))
-        new.noise, new.fits = self.noise.scaled(*new._factors), {}
+        new.noise, new.fits, new._modes = self.noise.scaled(*new._factors), {}, {}
+        vars(new).pop("_process", None)  # which has that noise
         return new
 
     def noise_of(self, measurements: Measurements) -> NoiseGrid:
