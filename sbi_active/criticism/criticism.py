@@ -334,7 +334,8 @@ class Criticism:
         Args:
             evaluation: The error before and after; None if not requested.
         """
-        return judged(self.rivals, self.trace(), evaluation)
+        tracing = self.trace()  # which the posteriors of the models come with
+        return judged(self.rivals, tracing, evaluation)
 
     def report(
         self,

@@ -238,7 +238,7 @@ class Verdict:
         measured = getattr(rivals.model.noise, "measurement_sd", None)
         if self.is_missed and measured is None:
             return rivals.widened(2 * self.model(ModelKey()).rms)
-        return rivals.with_effects(rivals.effects)
+        return rivals
 
     @cached_property
     def probabilities(self) -> dict[ModelKey, float]:
