@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from torch.distributions import Distribution
 
@@ -27,11 +26,12 @@ from sbi_active.criticism.effects.joint_prior import joint_prior
 from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summarize
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.screening import linear_models
-from sbi_active.criticism.misfit.evaluation import evaluate_left_out
+from sbi_active.criticism.misfit.contrary import widened
+from sbi_active.criticism.misfit.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.misfit.rule import Rule
-from sbi_active.criticism.misfit.stand_ins import judged
-from sbi_active.criticism.misfit.verdict import Verdict, judge, without
+from sbi_active.criticism.misfit.verdict import Verdict, judge
+from sbi_active.criticism.misfit.wider_prior import judged
 from sbi_active.criticism.next_trial.next_action import choose_action
 from sbi_active.criticism.results import (
     Detection,
@@ -42,9 +42,7 @@ from sbi_active.criticism.results import (
 )
 from sbi_active.criticism.rivals.further_trials import with_known_inputs
 from sbi_active.criticism.steps.equivalence import equivalent_effects, is_large
-from sbi_active.criticism.steps.evaluation import evaluate_held_out
-from sbi_active.criticism.steps.refuted import widened
-from sbi_active.criticism.steps.residuals import find_residuals
+from sbi_active.criticism.steps.predictive import NUM_DRAWS, find_residuals
 from sbi_active.criticism.thinning import thinned_to_need
 from sbi_active.expected import suggests
 from sbi_active.progress import stage
@@ -137,10 +135,9 @@ class Criticism:
         require_fitting(model, prior, trials, self.effects, actions)
         if actions is not None:
             actions = with_known_inputs(model, trials.fit, actions)
-        self.actions = actions
+        self.actions, self.trials = actions, trials
         #: Sampling of the trajectories; None if not looked for.
         self.sampling: Sampling | None = None
-        self.trials = trials
         self._parts = model, trials, self.effects
         if summaries is None:
             many = trials.x[0].numel() > MANY and not obstacle(*self._parts)
@@ -156,35 +153,26 @@ class Criticism:
             self._parts = short.model, short.trials, short.effects
             self.num_summaries = len(short.weight)
         self._warm_up = require_warm_up(warm_up, *self._parts[1:])
-        self._thins = thin and not summaries
         #: Trials that every model misses by far more than the others.
         self.set_aside: tuple[OutlyingTrial, ...] = ()
-        self._look()
+        self._look(thins=thin and not summaries)
         #: Hash of the noise, the effects and all priors, as they were declared.
         self.digest = digest(model, prior, self.effects)
-        self._equivalent: tuple[frozenset[str], ...] | None = None
-        self._residuals: Residuals | None = None
-        self._detection: Detection | None = None
-        self._tracing: Tracing | None = None
-        self._verdict: Verdict | None = None
 
-    def _look(self) -> None:
+    def _look(self, *, thins: bool) -> None:
         """Make the models of the trials that are there."""
         with stage("a look at the simulator", show_progress=self.show_progress):
-            self.rivals = self._models()
-            if self._thins:
-                self._thins = False
+            rivals = self._models()
+            if thins:
                 model, trials, effects = self._parts
-                self.trials, self.sampling = thinned_to_need(self.rivals, trials)
+                self.trials, self.sampling = thinned_to_need(rivals, trials)
                 if self.trials is not trials:
                     self._parts = model, self.trials, effects
-                    self.rivals = self._models()
+                    rivals = self._models()
             #: Effects that linear evidence set aside; None where all are fitted.
-            self._linear, self.screening = linear_models(self.rivals)
-        self._is_large = self._linear is not None and is_large(self.rivals.library)
-        self._fewer = {"num_draws": FEW_DRAWS} if self._is_large else {}
-        # Each model's held-out errors would take as much as the verdict.
-        self._scored = None if self._is_large else self._parts[1].held_out
+            self._search, self.screening = linear_models(rivals)
+        self._is_large = is_large(rivals.library)
+        self._equivalent: tuple[frozenset[str], ...] | None = None
 
     def _models(self) -> RivalSet:
         model, trials, effects = self._parts
@@ -193,37 +181,44 @@ class Criticism:
             *own, actions=self.actions, seed=self.seed, warm_up=self._warm_up
         )
 
+    @cached_property
+    def _verdict(self) -> Verdict:
+        """What the models say, without trials that are not to decide it."""
+        found = self._judge()
+        if found.is_missed and (outlying := found.outlying()):
+            model, trials, effects = self._parts
+            self.set_aside = outlying
+            self._parts = model, _without(trials, outlying), effects
+            self.trials = _without(self.trials, outlying)
+            self._look(thins=False)
+            found = self._judge()
+        return found
+
     def _judge(self) -> Verdict:
-        """Return what the models say."""
-        if self._verdict is None:
-            search, groups = self._linear, self.equivalent()
-            with self._fitting("models fitted"):
-                self._verdict = judge(search, groups, self.rule)
-            if self._verdict.is_missed and not self.set_aside:
-                self.set_aside = found = self._verdict.outlying()
-                if found:  # they are not to decide what the others say
-                    model, trials, effects = self._parts
-                    self._parts = model, without(trials, found), effects
-                    self.trials, self._equivalent = without(self.trials, found), None
-                    self._look()
-                    self._verdict = None
-                    return self._judge()
-        return self._verdict
+        groups = self.equivalent()
+        with stage("models fitted", show_progress=self.show_progress):
+            return judge(self._search, groups, self.rule)
+
+    @property
+    def rivals(self) -> RivalSet:
+        """The models; after the verdict with the posteriors of those it records."""
+        return self._verdict.models if "_verdict" in vars(self) else self._search.rivals
 
     def misfit(self) -> Verdict | None:
         """Return the models where none explains the trials to the sensor's error.
 
         None if one does, or where the size of that error is not declared.
         """
-        found = self._judge()
-        return found if found.is_missed else None
+        return self._verdict if self._verdict.is_missed else None
 
     def residuals(self) -> Residuals:
         """Return the residuals of the bare model."""
-        self.trace()  # by which models have their posteriors
-        if self._residuals is None:
-            self._residuals = find_residuals(self.rivals)
         return self._residuals
+
+    @cached_property
+    def _residuals(self) -> Residuals:
+        self.trace()  # by which models have their posteriors
+        return find_residuals(self.rivals)
 
     def equivalent(self) -> tuple[frozenset[str], ...]:
         """Return groups of effects that no permitted action separates.
@@ -235,30 +230,30 @@ class Criticism:
             return ()
         if self._equivalent is None:
             with stage("effects told apart", show_progress=self.show_progress):
-                self._equivalent = equivalent_effects(self.rivals, self.actions)
+                found = equivalent_effects(self._search.rivals, self.actions)
+                self._equivalent = found
         return self._equivalent
 
     def detect(self) -> Detection:
         """Return whether the bare model misses the data."""
-        if self._detection is None:
-            self._detection = self._judge().detection
-        return self._detection
+        return self._verdict.detection
 
     def trace(self) -> Tracing:
         """Return the tracing: the effect that the data point to."""
-        if self._tracing is None:
-            tracing = self._traced()
-            if tracing.misfit is None:
-                tracing = widened(tracing, self.rivals.seed, self.rivals.within)
-            self._tracing = replace(tracing, set_aside=self.set_aside)
         return self._tracing
 
-    def _traced(self) -> Tracing:
-        found = self._judge()
-        # What separates effects of a large library, the next action looks for.
-        actions = None if self._is_large else self.actions
-        with self._fitting("verdict, sets of effects fitted"):
-            return traced(found, self._scored, actions=actions, near=not self._is_large)
+    @cached_property
+    def _tracing(self) -> Tracing:
+        found, large = self._verdict, self._is_large
+        # Each model's held-out errors would take as much as the verdict; and what
+        # separates effects of a large library, the next action looks for.
+        held_out = None if large else self._parts[1].held_out
+        actions = None if large else self.actions
+        with stage("verdict, sets of effects fitted", show_progress=self.show_progress):
+            tracing = traced(found, held_out, actions=actions, near=not large)
+        if tracing.misfit is None:
+            tracing = widened(tracing, self.seed, self.rivals.within)
+        return replace(tracing, set_aside=self.set_aside)
 
     def add(
         self, effects: Sequence[str] | None = None
@@ -273,13 +268,14 @@ class Criticism:
             Without effects, the bare simulator and its prior.
         """
         names = self.trace().chosen if effects is None else (*effects,)
-        if lost := {*names} - {e.name for e in self.rivals.library}:
+        known = self._search.rivals
+        if lost := {*names} - {e.name for e in known.library}:
             raise ValueError(
-                f"expected effects among {', '.join(self.rivals.effects) or 'none'}; "
+                f"expected effects among {', '.join(known.effects) or 'none'}; "
                 f"got {', '.join(sorted(lost))}; declare them in Criticism(effects=...)"
             )
         declared = {e.name: e for e in self.effects}  # acting on x, not its summaries
-        every = (*names, *[e.name for e in self.rivals.nuisances])
+        every = (*names, *[e.name for e in known.nuisances])
         if not (added := [declared[n] for n in every]):
             return self.model, self.prior
         index = int(self.trials.index.max()) + 1
@@ -319,12 +315,15 @@ class Criticism:
     @cached_property
     def _evaluation(self) -> Evaluation | None:
         tracing, trials = self.trace(), self._parts[1]
+        num = FEW_DRAWS if self._is_large else NUM_DRAWS
         if (held_out := trials.held_out) is not None:
-            return evaluate_held_out(self.rivals, tracing, held_out, **self._fewer)
+            return evaluate_held_out(self.rivals, tracing, held_out, num_draws=num)
         if int(self.trials.valid.sum()) < FEWEST_TRIALS:
             return None
-        options: dict[str, Any] = {"show_progress": self.show_progress, **self._fewer}
-        return evaluate_left_out(self._judge(), trials.fit, **options)
+        shown = self.show_progress
+        return evaluate_left_out(
+            self._verdict, trials.fit, num_draws=num, show_progress=shown
+        )
 
     def judged(self, evaluation: Evaluation | None) -> Tracing:
         """Return the tracing, unless trials that had no part in it speak against it.
@@ -335,18 +334,8 @@ class Criticism:
         Args:
             evaluation: The error before and after; None if not requested.
         """
-        return judged(self.rivals, self.trace(), evaluation)
-
-    def _fitting(
-        self, what: str, total: int | None = None
-    ) -> AbstractContextManager[None]:
-        """Show progress of a block that fits models."""
-        fits, before = self.rivals.fits, len(self.rivals.fits)
-        return stage(
-            what,
-            show_progress=self.show_progress,
-            count=lambda: (len(fits) - before, total),
-        )
+        tracing = self.trace()  # which the posteriors of the models come with
+        return judged(self.rivals, tracing, evaluation)
 
     def report(
         self,
@@ -377,3 +366,10 @@ class Criticism:
             designed=designed,
             exploratory=exploratory,
         )
+
+
+def _without(trials: Trials, outlying: Sequence[OutlyingTrial]) -> Trials:
+    """Return all trials but some of those that were fitted."""
+    fitted = [k for k, role in enumerate(trials.role) if role == "fit"]
+    gone = {fitted[trial.position] for trial in outlying}
+    return trials.select([k for k in range(len(trials)) if k not in gone])

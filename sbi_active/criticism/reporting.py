@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from typing import Any
 
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.misfit.evaluation import evaluate_held_out
 from sbi_active.criticism.next_trial.severe_tests import severe_tests
 from sbi_active.criticism.report.report import Report, build_report
 from sbi_active.criticism.report.words import caution
 from sbi_active.criticism.results import NONE, Evaluation, Tracing
-from sbi_active.criticism.steps.evaluation import evaluate_held_out
 from sbi_active.criticism.steps.missed_trials import outlying_trials
-from sbi_active.criticism.steps.residuals import find_residuals
+from sbi_active.criticism.steps.predictive import find_residuals
 from sbi_active.criticism.thinning import in_words
 from sbi_active.progress import stage
 

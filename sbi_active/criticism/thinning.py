@@ -12,7 +12,6 @@ from sbi_active.criticism.linear.sensor import sensor_of
 from sbi_active.criticism.report.words import caution
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.noise_grid import measurement_sds
-from sbi_active.criticism.steps.tracing import log_priors
 
 
 def thinned_to_need(rivals: RivalSet, trials: Trials) -> tuple[Trials, Sampling | None]:
@@ -38,7 +37,7 @@ def thinned_to_need(rivals: RivalSet, trials: Trials) -> tuple[Trials, Sampling 
     ):
         return trials, None
     sensor = sensor_of(rivals)
-    bare = Search(rivals, sensor, log_priors(rivals.library, ())).model(ModelKey())
+    bare = Search(rivals, sensor).model(ModelKey())
     left = np.full(fit.x.numel(), np.nan)
     left[rivals.measurements.position] = sensor.unit * bare.residual
     sampling = suggested_sampling(fit, left.reshape(fit.x.shape), times)
@@ -49,17 +48,5 @@ def thinned_to_need(rivals: RivalSet, trials: Trials) -> tuple[Trials, Sampling 
 
 def in_words(found: Sampling) -> str:
     """Return a text on the samples that were left out, and why."""
-    every = _ordinal(found.every)
-    return caution("SA525", 1 / found.step, every, 1 / found.suggested_step, found)
-
-
-def _ordinal(number: int) -> str:
-    """Return a number in order.
-
-    Example:
-        >>> [_ordinal(n) for n in (2, 3, 11, 21)]
-        ['2nd', '3rd', '11th', '21st']
-    """
-    ends = {1: "st", 2: "nd", 3: "rd"}
-    teens = 10 < number % 100 < 14
-    return f"{number}{'th' if teens else ends.get(number % 10, 'th')}"
+    rates = 1 / found.step, found.every, 1 / found.suggested_step
+    return caution("SA525", *rates, found)

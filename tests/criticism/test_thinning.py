@@ -54,7 +54,7 @@ def test_what_is_smooth_is_thinned_with_a_sentence():
     assert int(kept.sum()) == 6 * (240 // every)
     assert len(criticism.rivals.measurements) == 5 * (240 // every)
     report = criticism.report()
-    assert f"of 50 samples a second every {every}th is used" in flat(report)
+    assert f"of 50 samples a second one in {every} is used" in flat(report)
     assert len([w for w in report.warnings if "samples a second" in w]) == 1
     # The next trial would be thinned as well.
     x, _ = criticism.trials.template()

@@ -177,11 +177,7 @@ class AugmentedSimulator(SimulatorModel):
 
     @override
     def __call__(
-        self,
-        theta: Tensor,
-        action: Tensor,
-        seeds: Tensor | None = None,
-        **effects: Any,
+        self, theta: Tensor, action: Tensor, seeds: Tensor | None = None, **effects: Any
     ) -> Tensor:
         phi = self._trial_draws(len(theta), theta.dtype, seeds)
         mean = self._run(theta, action, seeds, effects, phi)
@@ -232,10 +228,7 @@ class AugmentedSimulator(SimulatorModel):
         return {e.name: d for e, d in zip(trial, draws, strict=True)}
 
     def _row_context(
-        self,
-        action: Tensor,
-        index: Tensor | None = None,
-        given: Context | None = None,
+        self, action: Tensor, index: Tensor | None = None, given: Context | None = None
     ) -> Context:
         """Return what effects may know of rows, of the type of their actions."""
         if given is None:
@@ -335,17 +328,12 @@ class AugmentedSimulator(SimulatorModel):
         )
         return x[place]
 
-    def _check_null(
-        self,
-        theta: Tensor,
-        action: Tensor,
-        context: Context,
-        *,
-        # Largest difference at the null, in deviations of x over the checked rows:
-        # single precision, with room for a formula's rounding.
-        tolerance: float = 1e-4,
-    ) -> None:
-        """Raise if an effect at its null changes x."""
+    def _check_null(self, theta: Tensor, action: Tensor, context: Context) -> None:
+        """Raise if an effect at its null changes x.
+
+        It may do so by single precision, with room for a formula's rounding.
+        """
+        tolerance = 1e-4  # in deviations of x over the checked rows
         x = self._seeded(theta, {}, action, context)
         shapes = [x.shape, *(u.shape for u in (context.inputs or {}).values())]
         if any(len(x) in shape[1:] for shape in shapes) and len(x) > 1:

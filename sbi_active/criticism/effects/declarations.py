@@ -50,17 +50,12 @@ def _require_once(names: Sequence[str], expected: str) -> None:
         )
 
 
-def _reaches_null(
-    effect: Effect,
-    *,
-    # Step from the null towards a draw: a null on the edge of a support belongs to
-    # it.
-    step: float = 1e-6,
-) -> bool:
+def _reaches_null(effect: Effect) -> bool:
+    """Return whether the prior allows the null; on the edge of a support it does."""
     draws = effect.declared_draws()
     null = effect.null_phi(NUM_DRAWS)
     known = null.isfinite()
-    near = torch.where(known, null + step * (draws - null), draws)
+    near = torch.where(known, null + 1e-6 * (draws - null), draws)
     exact = torch.where(known, null, draws)
     return bool((effect.log_prob(torch.cat([exact, near])) > -torch.inf).any())
 

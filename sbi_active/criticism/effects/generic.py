@@ -15,10 +15,7 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.changes import Wrapped
 from sbi_active.criticism.effects.effect import Effect, Hook
 from sbi_active.criticism.effects.table import rows_of
-from sbi_active.criticism.effects.trial_conditions import (
-    conditions_for,
-    has_own_times,
-)
+from sbi_active.criticism.effects.trial_conditions import conditions_for, has_own_times
 from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation import SimulatorModel
 from sbi_active.simulation.noise.base import declared_sds
@@ -101,20 +98,19 @@ def generic_effects(
     return [*found, *_of_sensors(trials.x, names, sd, draws, late)]
 
 
-def typical_delay(times: Tensor, *, most_samples: float = 10.0) -> float:
-    """Return one prior deviation of delays and lags, s.
+def typical_delay(times: Tensor) -> float:
+    """Return one prior deviation of delays and lags, s, ten samples at most.
 
     Args:
         times: Sample times of one recording, or of several, shape (k,) or (t, k), NaN
             for none.
-        most_samples: Samples of a recording that delays and lags are at most.
     """
     rows = times.reshape(-1, times.shape[-1]).double()
     known = [row[row.isfinite()] for row in rows]
     span = max(float(row.max() - row.min()) for row in known)
     gaps = torch.cat([row.diff() for row in known])
     step = float(gaps[gaps > 0].median()) if bool((gaps > 0).any()) else span
-    return min(LATE * span, most_samples * step)
+    return min(LATE * span, 10 * step)
 
 
 def _made(
@@ -184,13 +180,10 @@ def _of_sensors(
     sd: Tensor | None,
     draws: tuple[Tensor, Tensor] | None,
     late: Mapping[str, Tensor],
-    *,
-    # Sensors along a trajectory that have effects each for itself.
-    most_sensors: int = 4,
 ) -> list[Effect]:
-    """Return effects of one sensor, or of each where few have a series of their own."""
+    """Return effects of one sensor, or of each of up to four with their own series."""
     num = 1 if x.ndim == 2 else x.shape[2]
-    if num == 1 or x.ndim > 3 or num > most_sensors:
+    if num == 1 or x.ndim > 3 or num > 4:
         if num == 1 and sd is not None:
             sd = sd.mean().reshape(1)  # a sample is no channel
         return _of_sensor(sd, draws, late)

@@ -208,15 +208,9 @@ def _trained(
     return torch.linalg.qr(rows.T).Q.T / sd, center * sd
 
 
-def _components(
-    y: Tensor,
-    num: int,
-    *,
-    # Share of the variance, in units of the noise, that the components leave out.
-    negligible: float = 1e-4,
-) -> Tensor:
-    """Return principal directions, shape (k, N)."""
+def _components(y: Tensor, num: int) -> Tensor:
+    """Return principal directions, shape (k, N), of all variance but 1e-4."""
     _, size, rows = torch.linalg.svd(y, full_matrices=False)
     share = 1 - size.square().cumsum(0) / size.square().sum().clamp_min(1e-300)
-    enough = int((share > negligible).sum()) + 1
+    enough = int((share > 1e-4).sum()) + 1
     return rows[: min(num, enough)]

@@ -54,7 +54,6 @@ def varying_parameters(
     trials: Trials,
     *,
     scale: float = 0.5,
-    num_draws: int = 256,
 ) -> list[Effect]:
     r"""Return effects that make each parameter depend on what the trials show.
 
@@ -75,7 +74,6 @@ def varying_parameters(
         scale: Prior standard deviation of phi: the change of a parameter, in its own
             prior deviations, from the middle to an end of the range. A third
             and three times are tried as well, so that half or twice says little else.
-        num_draws: Draws of the prior that tell its deviations to some 5 %.
 
     Returns:
         Effects for ``close_loop(effects=...)``, up to (action_dim + 1) a parameter.
@@ -93,7 +91,7 @@ def varying_parameters(
     """
     low, high = support_bounds(support_of(prior), prior.event_shape[0])
     with forked_generators(0, "deviations"):
-        sd = prior.sample(torch.Size([num_draws])).double().std(0)
+        sd = prior.sample(torch.Size([256])).double().std(0)  # to some 5 %
     names = model.parameter_names or [f"theta_{j + 1}" for j in range(len(sd))]
     effects = []
     for j, name in enumerate(names):

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.results import Evidence
-from sbi_active.criticism.rivals.error_models import ErrorModel, NoiseGrid
+from sbi_active.criticism.rivals.error_models import NoiseGrid
+from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.engine import Fit as Sampled
 from sbi_active.inference.engine import WeightedDraws
@@ -42,7 +43,7 @@ class Fit:
     known: NDArray[np.bool_] | None = None
 
     @property
-    def error(self) -> ErrorModel:
+    def error(self) -> NoiseGrid | ResidualProcess:
         """The error of the numbers that it is fitted to."""
         error = self.rival.error
         if self.known is None:
@@ -63,29 +64,26 @@ class Fit:
         log_p = self.rival.log_prior(u) + self.rival.log_likelihood(u)
         return u[[int(np.argmax(log_p))]]
 
+    @property
+    def point(self) -> Array:
+        """The point from which one prediction is made, shape (dim,)."""
+        return self.likeliest[0] if self.best is None else self.best
+
     def weighed(
-        self,
-        u: Array,
-        residual: Array,
-        rng: np.random.Generator,
-        *,
-        linear: float = 0.5,
-        fewest: float = 0.2,
+        self, u: Array, residual: Array, rng: np.random.Generator
     ) -> tuple[Array, Array]:
         """Return draws of a linear model, weighed by the simulator where it bends.
 
         Along the valley of two parameters that make up for each other a Gaussian
-        leaves it soon.
+        leaves it soon. None is weighed up to a deviation of the log density ratio of
+        half a nat; and since few draws would make for a narrow interval, weights leave
+        a fifth of them at least, by a power of them.
 
         Args:
             u: Draws, shape (n, dim).
             residual: Residuals of the simulator there, of the numbers that it is fitted
                 to, shape (n, N).
             rng: Source of what is drawn from them.
-            linear: Deviation of the log density ratio up to which none is weighed,
-                nats.
-            fewest: Share of draws that weights leave at least, by a power of them: few
-                would make for a narrow interval.
         """
         if self.linear is None:
             return u, residual
@@ -94,10 +92,15 @@ class Fit:
             linear_residual = linear_residual[:, self.known]
         log_w = error.log_likelihood(residual) - error.log_likelihood(linear_residual)
         log_w = np.nan_to_num(log_w, nan=-1e9, neginf=-1e9, posinf=-1e9)
-        if log_w.std() < linear:
+        if log_w.std() < 0.5:
             return u, residual
-        power = 1.0
-        while effective_sample_size(power * log_w) < fewest * len(u):
-            power *= 0.8
-        at = rng.choice(len(u), size=len(u), p=normalized(power * log_w))
+        at = rng.choice(len(u), size=len(u), p=tempered(log_w, 0.2 * len(u)))
         return u[at], residual[at]
+
+
+def tempered(log_w: Array, fewest: float) -> Array:
+    """Return weights, by a power of them that leaves some effective draws, (n,)."""
+    power = 1.0
+    while effective_sample_size(power * log_w) < fewest:
+        power *= 0.8
+    return normalized(power * log_w)

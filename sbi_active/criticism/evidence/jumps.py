@@ -10,10 +10,7 @@ from sbi_active.criticism.rivals.error_models import NoiseGrid
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.engine import search
 from sbi_active.inference.engine.search import laplace_precision
-from sbi_active.inference.sampling.mixtures import (
-    StudentMixture,
-    lower_factors,
-)
+from sbi_active.inference.sampling.mixtures import StudentMixture, lower_factors
 from sbi_active.seeding import derive_seed
 
 #: Finite-difference steps in prior deviations, and where two of them count as one; a
@@ -21,16 +18,12 @@ from sbi_active.seeding import derive_seed
 STEPS, SAME_SLOPE = (1e-4, 1e-3, 1e-2, 5e-2, 0.2), 0.1
 
 
-def look_for_jumps(
-    rival: Rival, *, seed: int, small: float = 0.1, num_probed: int = 4
-) -> tuple[float, bool, Array]:
+def look_for_jumps(rival: Rival, *, seed: int) -> tuple[float, bool, Array]:
     """Return a step for finite differences, whether they mean anything, and roughness.
 
     Args:
         rival: The bare model, with the declared noise.
         seed: Seed of all draws.
-        small: Deviations of the noise below which a roughness does not matter.
-        num_probed: Places at which slopes are compared.
 
     Returns:
         The step, in prior deviations; whether the simulator is smooth; and the
@@ -39,7 +32,8 @@ def look_for_jumps(
     noise = rival.error
     assert isinstance(noise, NoiseGrid)
     none = np.zeros(len(rival.simulator.measurements))
-    drawn = rival.coordinates.sample(num_probed, seed=derive_seed(seed, "probe"))
+    small = 0.1 * noise.typical_sd  # a roughness below it does not matter
+    drawn = rival.coordinates.sample(4, seed=derive_seed(seed, "probe"))
     fine, is_steady = probe_step(rival, drawn)
     own = derive_seed(seed, "roughness")
     if is_steady or rival.simulator.is_stochastic:
@@ -48,20 +42,18 @@ def look_for_jumps(
     # the coarse step.
     if fine is not None:
         rough, _ = local_roughness(rival, step=fine, seed=own)
-        if (rough < small * noise.typical_sd).all():
+        if (rough < small).all():
             return fine, True, none
     rough, around = local_roughness(rival, step=STEPS[-1], seed=own)
-    if (rough < small * noise.typical_sd).all():
+    if (rough < small).all():
         # It jumps somewhere in the prior, and not where the fit is.
-        fine, is_steady = probe_step(rival, around[:num_probed])
+        fine, is_steady = probe_step(rival, around[: len(drawn)])
         if fine is not None and is_steady:
             return fine, True, none
     return STEPS[-1], False, rough
 
 
-def probe_step(
-    rival: Rival, u: Array, *, coarse: float = 5e-2, similar_slope: float = 0.5
-) -> tuple[float | None, bool]:
+def probe_step(rival: Rival, u: Array) -> tuple[float | None, bool]:
     """Return a step for finite differences, and whether slopes hold over a coarse one.
 
     The step is the smallest whose slope agrees with that of twice the step within 10 %
@@ -72,12 +64,8 @@ def probe_step(
     Args:
         rival: The bare model.
         u: Places, shape (n, dim).
-        coarse: Coarse step in deviations of the prior, whose slope is of the
-            same kind where nothing jumps.
-        similar_slope: Difference of slopes over it, as a share, from which it
-            is not.
     """
-    whiten = rival.error.start()
+    whiten, coarse = rival.error.start(), 5e-2
 
     def slope(step: float) -> Array:
         return rival.jacobian(u, whiten, step)[1]
@@ -89,20 +77,11 @@ def probe_step(
     for step in STEPS:
         fine = slope(step)
         if apart(fine, slope(2 * step)) < SAME_SLOPE:
-            return step, step >= coarse or apart(fine, slope(coarse)) < similar_slope
+            return step, step >= coarse or apart(fine, slope(coarse)) < 0.5
     return None, False
 
 
-def local_roughness(
-    rival: Rival,
-    *,
-    step: float,
-    seed: int,
-    inflation: float = 1.5,
-    rounds: int = 2,
-    per_coefficient: int = 3,
-    fewest_draws: int = 64,
-) -> tuple[Array, Array]:
+def local_roughness(rival: Rival, *, step: float, seed: int) -> tuple[Array, Array]:
     r"""Return the standard deviation of what no smooth function follows, shape (N,).
 
     It also returns the draws around the best fit that show it, shape (n, dim).
@@ -122,11 +101,6 @@ def local_roughness(
         rival: The bare model, with the declared noise.
         step: Step of finite differences.
         seed: Seed of the draws.
-        inflation: Inflation of a covariance that draws are taken with.
-        rounds: Number of looks, each as far around the mode as the noise found
-            before says.
-        per_coefficient: Draws a coefficient of the local regression.
-        fewest_draws: Draws of it at least.
 
     References:
         Gramacy & Lee, Statistics and Computing 22 (2012), for the nugget of
@@ -139,12 +113,12 @@ def local_roughness(
     found = search(rival, rng, settings=THOROUGH)
     assert found is not None  # residuals are bounded
     best = found.modes[:1]
-    num = max(per_coefficient * (dim + 1) * (dim + 2) // 2, fewest_draws)
+    num = max(3 * (dim + 1) * (dim + 2) // 2, 64)  # three a coefficient
     rough = np.zeros(len(rival.simulator.measurements))
-    for _ in range(rounds):
+    for _ in range(2):  # as far around the mode as the noise found before says
         wide = noise.with_extra(rough)
         whiten = wide.whitener(rival.residual(best)[0][0])
-        cov = inflation * np.linalg.inv(laplace_precision(rival, best, whiten)[0])
+        cov = 1.5 * np.linalg.inv(laplace_precision(rival, best, whiten)[0])
         u = StudentMixture(best, lower_factors(cov)).sample(num, rng)
         u = np.clip(u, c.low, c.high)
         mean, _, _ = rival.simulator.predict(*c.split(u))
@@ -158,13 +132,7 @@ def quadratic(z: Array) -> Array:
     return np.concatenate([np.ones((len(z), 1)), z, z[:, i] * z[:, j]], 1)
 
 
-def _beside_quadratic(
-    u: Array,
-    x: Array,
-    *,
-    # Median absolute deviation of a normal variable of unit variance.
-    median: float = 0.6745,
-) -> Array:
+def _beside_quadratic(u: Array, x: Array) -> Array:
     """Return the deviation of x, shape (n, N), around a quadratic function of u."""
     dim = u.shape[1]
     scale = u.std(0)
@@ -178,5 +146,6 @@ def _beside_quadratic(
         fit = np.linalg.lstsq(basis[has], column[has], rcond=None)[0]
         rest = np.abs(column[has] - basis[has] @ fit)
         lost = np.sqrt(has.sum() / freedom)
-        found[k] = np.median(rest) / median * lost
+        # By the median absolute deviation of a normal variable of unit variance.
+        found[k] = np.median(rest) / 0.6745 * lost
     return found

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,30 +20,21 @@ from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.jumps import STEPS, look_for_jumps
-from sbi_active.criticism.evidence.predicted_before import NUM_DRAWS as NUM_BEFORE
-from sbi_active.criticism.evidence.predicted_before import predicted_before
-from sbi_active.criticism.evidence.settings import (
-    NESTED,
-    ROUGH,
-    THOROUGH,
-    settings_of,
-)
+from sbi_active.criticism.evidence.settings import NESTED, ROUGH, THOROUGH, settings_of
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Evidence, ModelKey
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
-from sbi_active.criticism.rivals.error_models import ErrorModel, NoiseGrid
+from sbi_active.criticism.rivals.error_models import ChannelNoise, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import declared_noise, scattered
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
-from sbi_active.criticism.rivals.trial_simulator import (
-    NUM_REPLICATES,
-    TrialSimulator,
-)
+from sbi_active.criticism.rivals.trial_simulator import NUM_REPLICATES, TrialSimulator
 from sbi_active.inference.engine import Found, WeightedDraws, infer, search
-from sbi_active.inference.engine.search import SearchSettings
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import AutocorrelatedNoise, GaussianNoise, SimulatorModel
 
-NUM_DRAWS = 400  # kept of a model; a mean is then known to a 20th of a deviation
+#: Kept of a model, whose means are then known to a 20th of a deviation; and of the
+#: prior, whose deviations are known to 5 % at a simulation of all trials.
+NUM_DRAWS, NUM_BEFORE = 400, 200
 #: Trials from which their order may be what residuals follow.
 FEW_TRIALS = 5
 
@@ -71,8 +64,7 @@ class RivalSet:
         is_smooth: Whether derivatives mean anything.
         roughness: Deviation of what no smooth function of the parameters follows, which
             ``noise`` has on top of the declared one, shape (N,); 0 where it is smooth.
-        fits: The rivals that were asked for.
-        found: Modes of some that are not fitted yet.
+        fits: Rivals with their posteriors, of those that were asked for.
     """
 
     def __init__(
@@ -85,25 +77,25 @@ class RivalSet:
         actions: ActionSpace | None = None,
         seed: int = 0,
         warm_up: float = 0.0,
-        # Deviations of the prior predictive beyond which a number counts as that far.
-        farthest: float = 1e3,
     ) -> None:
         self.model, self.prior, self.trials, self.seed = model, prior, trials, seed
-        self.actions = actions
-        self.effects = {e.name: e for e in effects if e.scope == "campaign"}
-        self.library = [*self.effects.values()]
+        self.actions, self.warm_up = actions, warm_up
+        self.library = [e for e in effects if e.scope == "campaign"]
+        self.effects = {e.name: e for e in self.library}
         self.nuisances = [e for e in effects if e.scope == "trial"]
         index = int(trials.index.max()) + 1
         augmented = AugmentedSimulator(model, effects, next_index=index)
         seed_of_trials = derive_seed(seed, "trials")
         self.simulator = TrialSimulator(augmented, trials, seed=seed_of_trials)
         self.measurements = self.simulator.measurements
-        self.warm_up = warm_up
         self._factors: tuple[Array, Array] | None = None
         self.noise = self.noise_of(self.measurements)
         self._predictives: dict[tuple[bytes | None, ...], tuple[Array, Array]] = {}
+        self._modes: dict[tuple[ModelKey, bytes], Found] = {}
+        self.fits: dict[ModelKey, Fit] = {}
         self.center, self.spread = self.prior_predictive(self.simulator)
-        reach = farthest * np.hypot(self.spread, self.noise.typical_sd)
+        # Beyond a thousand deviations of the prior predictive a number is as far.
+        reach = 1e3 * np.hypot(self.spread, self.noise.typical_sd)
         self.measurements = self.measurements.bounded(self.center, reach)
         self.simulator.measurements = self.measurements
         self.step, self.is_smooth = STEPS[0], True
@@ -113,27 +105,32 @@ class RivalSet:
         )
         if self.roughness.any():
             self.noise = self.noise.with_extra(self.roughness)
-        self.fits: dict[ModelKey, Fit] = {}
-        self.found: dict[ModelKey, Found] = {}
+
+    def with_effects(self, names: Iterable[str]) -> RivalSet:
+        """Return these models without other effects; their priors stay."""
+        new = copy(self)
+        new.effects, new.fits = {name: self.effects[name] for name in names}, {}
+        return new
+
+    def widened(self, largest: float) -> RivalSet:
+        """Return these models with errors that may be larger than declared.
+
+        Args:
+            largest: Largest value of their unknown factor, which is log-uniform from
+                one.
+        """
+        new = copy(self)
+        factors = np.geomspace(1.0, max(largest, 2.0), 14)
+        new._factors = factors, np.full(len(factors), -np.log(len(factors)))
+        new.noise, new.fits, new._modes = self.noise.scaled(*new._factors), {}, {}
+        vars(new).pop("_process", None)  # which has that noise
+        return new
 
     def noise_of(self, measurements: Measurements) -> NoiseGrid:
         """Return the errors of some measurements."""
         seed = derive_seed(self.seed, "noise")
         noise = declared_noise(self.model.noise, measurements, seed=seed)
         return noise if self._factors is None else noise.scaled(*self._factors)
-
-    def widen(self, largest: float, *, num_factors: int = 14) -> None:
-        """Let errors be larger than declared, by an unknown factor.
-
-        Args:
-            largest: Largest value of the factor, which is log-uniform from one.
-            num_factors: Factors on the declared noise where every model
-                misses by more.
-        """
-        factors = np.geomspace(1.0, max(largest, 2.0), num_factors)
-        weights = np.full(num_factors, -np.log(num_factors))
-        self._factors = factors, weights
-        self.noise = self.noise.scaled(factors, weights)
 
     def rival(
         self, key: ModelKey, *, suspect: int | None = None, **further: Any
@@ -146,7 +143,7 @@ class RivalSet:
             **further: Arguments of :class:`.Rival` for a sum of squares.
         """
         return Rival(
-            key,
+            key=key,
             simulator=self.simulator,
             prior=self.prior,
             effects=[self.effects[name] for name in key.effects],
@@ -159,21 +156,17 @@ class RivalSet:
         )
 
     def _error_model(
-        self,
-        error: str | None,
-        suspect: int | None,
-        *,
-        # Deviations of the noise that a gross error may have: it tells next to nothing.
-        gross: float = 1e3,
-    ) -> ErrorModel:
+        self, error: str | None, suspect: int | None
+    ) -> NoiseGrid | ResidualProcess:
         if error == SCATTER:
             return scattered(self.noise)
         if error == UNEXPLAINED:
-            return self.residual_process()
+            return self._process
         if error is None or suspect is None:
             return self.noise
         at = self.measurements.trial == suspect
-        return self.noise.with_extra(np.where(at, gross * self.noise.typical_sd, 0.0))
+        # With a thousand deviations of the noise a number tells next to nothing.
+        return self.noise.with_extra(np.where(at, 1e3 * self.noise.typical_sd, 0.0))
 
     @property
     def has_known_noise(self) -> bool:
@@ -185,29 +178,25 @@ class RivalSet:
         """Return draws of a model, (n, d), moved into the bounds of its prior."""
         return self.rival(key).coordinates.within(z)
 
+    @cached_property
+    def _process(self) -> ResidualProcess:
+        noise = self.noise
+        if isinstance(noise, ChannelNoise):
+            best = self.fit().likeliest
+            noise = noise.settled(self.rival(ModelKey()).residual(best)[0][0])
+        return self.residual_process(noise, np.ones(len(self.measurements), bool))
+
     def residual_process(
-        self, noise: NoiseGrid | None = None, at: NDArray[np.bool_] | None = None
-    ) -> ResidualProcess:
-        """Return the noise with a smooth function of the action and time.
-
-        Args:
-            noise: Noise without it; None takes that of the bare model, and keeps what
-                is made of it.
-            at: Mask of the numbers that it is of, shape (N,); None for all.
-        """
-        if noise is not None:
-            every = np.ones(len(self.measurements), dtype=bool)
-            return self._beside_process(noise, every if at is None else at)
-        if not hasattr(self, "_process"):
-            noise = self.noise.settled(self._bare_residual)
-            self._process = self.residual_process(noise)
-        return self._process
-
-    def _beside_process(
         self, noise: NoiseGrid, at: NDArray[np.bool_]
     ) -> ResidualProcess:
+        """Return some numbers' noise with a smooth function of the action and time.
+
+        Args:
+            noise: Noise without it.
+            at: Mask of the numbers, shape (N,).
+        """
         return ResidualProcess(
-            noise if at.all() else noise.part(at),
+            noise.part(at),
             self.measurements.part(at),
             action=self.scaled_actions(),
             order=self.scaled_order(),
@@ -215,12 +204,7 @@ class RivalSet:
             spread=None if self.simulator.is_stochastic else self.spread[at],
         )
 
-    def _bare_residual(self) -> Array:
-        return self.rival(ModelKey()).residual(self.fit().likeliest)[0][0]
-
-    def scaled_actions(
-        self, trials: Trials | None = None, *, apart: float = 100.0
-    ) -> Array:
+    def scaled_actions(self, trials: Trials | None = None) -> Array:
         """Return actions in ranges of the action space, those of the fit first.
 
         Actions that are labels are so far from each other that a smooth function of
@@ -228,20 +212,15 @@ class RivalSet:
 
         Args:
             trials: Further trials.
-            apart: Ranges of the action space between two trials whose
-                actions are labels.
         """
+        own = self.trials.action.numpy()
+        action = own if trials is None else np.r_[own, trials.action.numpy()]
         if self.trials.action_is_label:  # which says nothing of how near trials are
-            parts = [self.trials, *([] if trials is None else [trials])]
-            labels = np.concatenate([part.action.numpy() for part in parts])
-            return labels * apart
-        action = some = self.trials.action.numpy()
+            return 100.0 * action
         if self.actions is not None:
             draws = self.actions.sample((256,), seed=0).double().numpy()
-            some = np.concatenate([draws, action])
-        width = np.ptp(some, axis=0)
-        if trials is not None:
-            action = np.concatenate([action, trials.action.numpy()])
+            own = np.concatenate([draws, own])
+        width = np.ptp(own, axis=0)
         return action / np.where(width > 0, width, 1.0)
 
     def scaled_order(self, trials: Trials | None = None) -> Array | None:
@@ -274,48 +253,51 @@ class RivalSet:
                 searches from many draws of the prior.
         """
         if key not in self.fits:
-            rival, seed = self.rival(key), derive_seed(self.seed, "evidence", str(key))
-            rng = np.random.default_rng(seed)
-            found = self.found.pop(key, None) or self.search(key, near)
-            sample = self._inferred(rival, found, rng)
-            self.fits[key] = self._record(rival, sample, seed)
+            self.fits[key] = self.sampled(key, near)
         return self.fits[key]
 
     def search(self, key: ModelKey, near: Array | None = None) -> Found:
-        """Return the modes of a rival, see :meth:`fit`."""
-        rival, seed = self.rival(key), derive_seed(self.seed, "search", str(key))
-        how = THOROUGH if near is None else NESTED
-        how = how if self.is_smooth else ROUGH
-        return _searched(rival, near, how, seed)
+        """Return the modes of a rival, computed once, see :meth:`fit`."""
+        asked = key, b"" if near is None else near.tobytes()
+        if asked not in self._modes:
+            rng = np.random.default_rng(derive_seed(self.seed, "search", str(key)))
+            how = THOROUGH if near is None else NESTED
+            how = how if self.is_smooth else ROUGH
+            found = search(self.rival(key), rng, near, how)
+            assert found is not None  # residuals are bounded
+            self._modes[asked] = found
+        return self._modes[asked]
 
-    def _inferred(
-        self, rival: Rival, found: Found, rng: np.random.Generator
-    ) -> WeightedDraws:
-        is_bare = rival.key == ModelKey()
+    def sampled(self, key: ModelKey, near: Array | None = None) -> Fit:
+        """Return one rival with a sample of its posterior, see :meth:`fit`."""
+        rival, seed = self.rival(key), derive_seed(self.seed, "evidence", str(key))
         repeats = NUM_REPLICATES if self.simulator.is_stochastic else 1
-        settings = settings_of(len(self.trials) * repeats, is_bare=is_bare)
-        fit = infer(rival, rng, found=found, settings=settings)
-        if len(fit.u):
-            return fit
-        u = rival.sample_prior(NUM_DRAWS, rng)  # nothing has a likelihood
-        equal = np.full(len(u), 1 / len(u))
-        return replace(fit, u=u, weight=equal, log_likelihood=equal * -np.inf)
-
-    def _record(
-        self,
-        rival: Rival,
-        sample: WeightedDraws,
-        seed: int,
-        *,
-        # Draws of largest weight, among which the best fit is sought.
-        num_top: int = 20,
-    ) -> Fit:
-        u = sample.draws(NUM_DRAWS, np.random.default_rng(seed))
-        best = sample.u[np.argsort(sample.weight)[-num_top:]]
-        own = sum(rival.coordinates.joint.sizes)
+        settings = settings_of(len(self.trials) * repeats, is_bare=key == ModelKey())
+        rng, found = np.random.default_rng(seed), self.search(key, near)
+        sample = infer(rival, rng, found=found, settings=settings)
+        if not len(sample.u):  # nothing has a likelihood
+            u = rival.sample_prior(NUM_DRAWS, rng)
+            equal = np.full(len(u), 1 / len(u))
+            sample = replace(sample, u=u, weight=equal, log_likelihood=equal * -np.inf)
+        drawn = sample.draws(NUM_DRAWS, np.random.default_rng(seed))
+        best = sample.u[np.argsort(sample.weight)[-20:]]
         residual = rival.residual(best, penalized=False)[0]
         square = [(rival.error.whitener(r)(r) ** 2).sum() for r in residual]
-        evidence = Evidence(
+        return Fit(rival, sample, self.record(rival, sample, drawn, float(min(square))))
+
+    def record(
+        self, rival: Rival, sample: WeightedDraws, u: Array, chi_square: float
+    ) -> Evidence:
+        """Return the record of a rival.
+
+        Args:
+            rival: The rival.
+            sample: Sample of its posterior.
+            u: Draws that are shown, shape (n, dim).
+            chi_square: Smallest whitened residual sum of squares.
+        """
+        own = sum(rival.coordinates.joint.sizes)
+        return Evidence(
             key=rival.key,
             log_evidence=sample.log_evidence,
             standard_error=sample.standard_error,
@@ -323,9 +305,8 @@ class RivalSet:
             engine=sample.method,
             names=self.names_of(rival),
             draws=rival.coordinates.to_z(u)[:, :own],
-            best_chi_square=float(min(square)),
+            best_chi_square=chi_square,
         )
-        return Fit(rival, sample, evidence)
 
     def names_of(self, rival: Rival) -> tuple[str, ...]:
         """Return the names of the parameters of a rival and its effects."""
@@ -334,21 +315,28 @@ class RivalSet:
             names = [f"theta_{i + 1}" for i in range(self.prior.event_shape[0])]
         return (*names, *[n for e in rival.effects for n in e.phi_names])
 
+    @cached_property
+    def prior_draws(self) -> Array:
+        """Draws of the bare model's prior, shape (n, dim), which are simulated."""
+        return self._prior_draws(len(self.trials))[1]
+
+    def _prior_draws(self, num_trials: int) -> tuple[SearchCoordinates, Array]:
+        c = SearchCoordinates(self.prior, (), self.nuisances, num_trials)
+        return c, c.sample(NUM_BEFORE, seed=derive_seed(self.seed, "spread"))
+
     def typical_deviation(self) -> Array:
         """Return the deviation of a random simulator's numbers before the data, (N,).
 
         It is the geometric mean over draws of the prior.
         """
-        c = self.rival(ModelKey()).coordinates
-        u = c.sample(NUM_BEFORE, seed=derive_seed(self.seed, "spread"))
-        sd = self.simulator.predict(*c.split(u))[1]
+        split = self.rival(ModelKey()).coordinates.split(self.prior_draws)
+        sd = self.simulator.predict(*split)[1]
         assert sd is not None  # it is random
         log_sd = np.log(np.where(np.isfinite(sd), sd, self.spread))
         return np.exp(log_sd.mean(0))
 
     def prior_predictive(self, simulator: TrialSimulator) -> tuple[Array, Array]:
         """Return mean and deviation of each number before the data, shapes (N,)."""
-        m = simulator.measurements
         trials = simulator.trials
         asked = (
             trials.action,
@@ -356,19 +344,24 @@ class RivalSet:
             trials.index,
             trials.sample_times,
             trials.input_times,
-            m.position,
+            simulator.measurements.position,
         )
         key = tuple(None if a is None else np.asarray(a).tobytes() for a in asked)
         if key not in self._predictives:
-            seed = derive_seed(self.seed, "spread")
-            c = SearchCoordinates(self.prior, (), self.nuisances, len(trials))
-            self._predictives[key] = predicted_before(simulator, c, seed=seed)
+            c, u = self._prior_draws(len(trials))
+            self._predictives[key] = _moments(simulator.predict(*c.split(u))[0])
         return self._predictives[key]
 
 
-def _searched(
-    rival: Rival, near: Array | None, how: SearchSettings, seed: int
-) -> Found:
-    found = search(rival, np.random.default_rng(seed), near, how)
-    assert found is not None  # residuals are bounded
-    return found
+def _moments(mean: Array) -> tuple[Array, Array]:
+    """Return mean and deviation over draws (n, N) of each number, shapes (N,)."""
+    finite = np.isfinite(mean).any(0)
+    center, spread = np.zeros((2, mean.shape[1]))
+    center[finite] = np.nanmean(mean[:, finite], axis=0)
+    spread[finite] = np.nanstd(mean[:, finite], axis=0)
+    typical = np.median(spread[spread > 0]) if (spread > 0).any() else 1.0
+    if finite.any() and not finite.all():
+        # No draw gives a number there: any that the others give is as good.
+        center[~finite] = np.mean(center[finite])
+        spread[~finite] = np.hypot(typical, np.std(center[finite]))
+    return center, np.maximum(spread, 1e-3 * typical)

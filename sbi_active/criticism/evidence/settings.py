@@ -29,7 +29,7 @@ NESTED = SearchSettings(
 ROUGH = replace(NESTED, num_screened=128, num_starts=8, max_starts=8, phases=2)
 
 
-def settings_of(num_trials: int, *, is_bare: bool, most: int = 3_000) -> Settings:
+def settings_of(num_trials: int, *, is_bare: bool) -> Settings:
     """Return the settings of what is spent on a model.
 
     The bare model is every comparison's other side, and its posterior is shown; an
@@ -38,8 +38,8 @@ def settings_of(num_trials: int, *, is_bare: bool, most: int = 3_000) -> Setting
     Args:
         num_trials: Number of simulated trials in a row.
         is_bare: Whether it is the model without effects.
-        most: Rows of all trials that one model may take.
     """
+    most = 3_000  # rows of all trials
     if is_bare:
         return Settings(plenty=4.0, num_simulations=3 * most * num_trials)
     return Settings(

@@ -18,38 +18,6 @@ from sbi_active.arrays import Array
 Basis = Callable[[Array, Array, float, Array], Array]
 
 
-@dataclass(frozen=True, kw_only=True)
-class ForceSettings:
-    """Sizes of forces and of what they are functions of.
-
-    Attributes:
-        share: Prior deviation of a force, in root mean squares of what the motion
-            takes.
-        turning: Speed below which dry friction turns over, in units of v.
-        smooth: Length over which a free shape is smooth, in its range.
-        reach: Range of a slide in units of q that 90 % of the time lies within.
-        smallest: Root mean square of a form below which it does not act.
-        margin: Share of the range of q and v by which free shapes reach beyond it.
-        num_draws: Number of parameters at which nominal trials are run.
-        num_trials: Number of trials at each, at most.
-        early: Share of a trial after which what a constant force did is read.
-        push: That force, N or N m; what it does is proportional to it.
-    """
-
-    share: float = 0.2
-    turning: float = 0.05
-    smooth: float = 0.2
-    reach: float = 1.5
-    smallest: float = 1e-6
-    margin: float = 0.1
-    num_draws: int = 4
-    num_trials: int = 6
-    early: float = 0.01
-    push: float = 1e-3
-
-
-SIZES = ForceSettings()
-
 #: Numbers of a free shape.
 NUM_SHAPES = 7
 #: Points on which a free shape is laid.
@@ -57,7 +25,8 @@ GRID = np.linspace(0.0, 1.0, 101)
 
 
 def _sign(v: Array) -> Array:
-    return np.tanh(v / SIZES.turning)
+    """Return dry friction, which turns over below a twentieth of the speed's unit."""
+    return np.tanh(v / 0.05)
 
 
 #: Family and function of each form, of (q, v, t, trial).
@@ -174,7 +143,7 @@ class FormForce:
 
 def _shapes() -> Array:
     """Return the largest eigenfunctions of a smooth kernel, times their deviations."""
-    apart = (GRID[:, None] - GRID) / SIZES.smooth
+    apart = (GRID[:, None] - GRID) / 0.2  # the length over which it is smooth
     values, vectors = np.linalg.eigh(np.exp(-0.5 * apart**2))
     largest = np.argsort(-values)[:NUM_SHAPES]
     return (vectors[:, largest] * np.sqrt(values[largest])).T

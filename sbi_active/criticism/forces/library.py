@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,6 @@ from sbi_active.criticism.forces.dictionary import (
     FORMS,
     FREE,
     NUM_SHAPES,
-    SIZES,
     FormForce,
     Joint,
 )
@@ -30,6 +30,8 @@ from sbi_active.simulation import SimulatorModel
 
 #: How families of forces begin: their forms are alternatives of one cause.
 FAMILY = "force in "
+#: Constant force, N or N m, whose effect early in a trial tells of inertia.
+PUSH = 1e-3
 #: Prefix of forces that depend on another joint.
 COUPLING = "coupling with "
 
@@ -43,7 +45,6 @@ def force_effects(
     slides: Sequence[str] = (),
     include: str | Sequence[str] = "*",
     exclude: str | Sequence[str] = (),
-    free: bool = True,
     seed: int = 0,
 ) -> list[Effect]:
     r"""Return generalized forces that a simulator may lack, on each of its joints.
@@ -54,7 +55,8 @@ def force_effects(
     with b of a dictionary, each scaled to a root mean square of a fifth of the force
     that nominal motion takes, so that phi is about one. Every form is in the family of
     what it depends on ("force in q of hinge"): trials tell the family first, and the
-    form within it only where they reach far enough.
+    form within it only where they reach far enough. Free shapes f(q), f(v), f(t) and
+    f(q) v are smooth forms that are in no dictionary (``exclude="free*"``).
 
     The simulator takes ``force=`` and adds ``total_force(force, q, v, t)`` in each
     step. MuJoCo models of ``sbi_active.mujoco`` do.
@@ -71,8 +73,6 @@ def force_effects(
             in metres means nothing.
         include: Patterns of names of effects, as in "*of hinge" or "sin*".
         exclude: Patterns of names of effects that are taken out.
-        free: Whether to add free shapes f(q), f(v), f(t) and f(q) v, smooth forms that
-            are in no dictionary.
         seed: Seed of the draws.
 
     Raises:
@@ -113,8 +113,8 @@ def force_effects(
     order = _range_of(trials.index)
     found: list[Effect] = []
     for joint in known:
-        scale = SIZES.share * nominal.force[joint.dof]
-        for name, family, force in _forces(joint, known, nominal, free=free):
+        scale = 0.2 * nominal.force[joint.dof]  # a prior deviation
+        for name, family, force in _forces(joint, known, nominal):
             sized = _sized(force, nominal, scale)
             if sized is not None:
                 found.append(_effect(name, family, sized, order))
@@ -127,26 +127,21 @@ def is_force(effect: Effect) -> bool:
 
 
 def _forces(
-    joint: Joint, joints: Sequence[Joint], nominal: Trajectories, *, free: bool
+    joint: Joint, joints: Sequence[Joint], nominal: Trajectories
 ) -> Iterator[tuple[str, str, FormForce]]:
     """Yield name, family and force of all forms on a joint."""
-    horizon = float(np.ptp(nominal.time))
+    force = FormForce(joint, "", 1.0, float(np.ptp(nominal.time)))
     for form, (what, _) in FORMS.items():
         family = f"{FAMILY}{what} of {joint.name}"
-        yield f"{form} of {joint.name}", family, FormForce(joint, form, 1.0, horizon)
-    for other in joints:
-        if other is joint:
-            continue
-        for form in ("q", "v"):
-            name = f"{form} of {other.name} on {joint.name}"
-            force = FormForce(joint, form, 1.0, horizon, other)
-            yield name, f"{COUPLING}{joint.name}", force
-    if free:
-        for what in FREE:
-            depends = "q and v" if what == "q times v" else what
-            form = f"free f({what})"
-            family = f"{FAMILY}{depends} of {joint.name}"
-            yield f"{form} of {joint.name}", family, FormForce(joint, form, 1, horizon)
+        yield f"{form} of {joint.name}", family, replace(force, form=form)
+    for other, form in product((j for j in joints if j is not joint), ("q", "v")):
+        name = f"{form} of {other.name} on {joint.name}"
+        coupled = replace(force, form=form, other=other)
+        yield name, f"{COUPLING}{joint.name}", coupled
+    for what in FREE:
+        form, depends = f"free f({what})", what.replace(" times ", " and ")
+        family = f"{FAMILY}{depends} of {joint.name}"
+        yield f"{form} of {joint.name}", family, replace(force, form=form)
 
 
 def _sized(force: FormForce, nominal: Trajectories, scale: float) -> FormForce | None:
@@ -158,7 +153,7 @@ def _sized(force: FormForce, nominal: Trajectories, scale: float) -> FormForce |
         values = force.values(q, v, float(t) - begin, np.ones(len(q)))
         squares.append((values**2).sum(1).mean())
     size = float(np.sqrt(np.mean(squares)))
-    return None if size < SIZES.smallest else replace(force, size=scale / size)
+    return None if size < 1e-6 else replace(force, size=scale / size)
 
 
 def _effect(
@@ -208,7 +203,7 @@ def _joints(
     found = []
     for k, name in enumerate(names):
         q, v = nominal.q[..., k], nominal.v[..., k]
-        away = np.percentile(np.abs(q), 90) / SIZES.reach if name in slides else 1.0
+        away = np.percentile(np.abs(q), 90) / 1.5 if name in slides else 1.0
         position = float(max(away, 1e-12))
         velocity = float(max(np.sqrt(np.mean(v**2)), 1e-12))
         low, high = zip(_ends(q / position), _ends(v / velocity), strict=True)
@@ -219,7 +214,7 @@ def _joints(
 
 def _ends(values: Any) -> tuple[float, float]:
     low, high = float(values.min()), float(values.max())
-    margin = SIZES.margin * max(high - low, 1e-6)
+    margin = 0.1 * max(high - low, 1e-6)  # by which free shapes reach beyond
     return low - margin, high + margin
 
 
@@ -252,7 +247,7 @@ class _Recorder:
         self.seen[float(t)] = q.copy(), v.copy()
         force = np.zeros_like(v)
         if self.dof is not None:
-            force[:, self.dof] = SIZES.push * phi[:, 0]
+            force[:, self.dof] = PUSH * phi[:, 0]
         return force
 
     def read(self) -> tuple[Array, Array, Array]:
@@ -275,21 +270,21 @@ def trajectories(
     Raises:
         ValueError: If the simulator never asks what the force is.
     """
-    some = torch.linspace(0, len(trials) - 1, min(SIZES.num_trials, len(trials))).long()
+    some = torch.linspace(0, len(trials) - 1, min(6, len(trials))).long()
     picked = trials.select(some.unique().tolist())
     generator = torch.Generator().manual_seed(seed)
     with forked_generators(int(torch.randint(2**31, (), generator=generator))):
-        theta = prior.sample(torch.Size([SIZES.num_draws])).double()
+        theta = prior.sample(torch.Size([4])).double()
     time, q, v = _recorded(model, picked, theta, None)
     kept = np.isfinite(q).all((1, 2)) & np.isfinite(v).all((1, 2))
     q, v = q[kept], v[kept]
-    early = max(int(np.searchsorted(time, SIZES.early * time[-1])), 1)
+    early = max(int(np.searchsorted(time, 0.01 * time[-1])), 1)
     acceleration = np.gradient(v, time, axis=1)
     force = np.empty(v.shape[2])
     for dof in range(v.shape[2]):
         pushed = _recorded(model, picked, theta, dof)[2][kept]
         gained = (pushed - v)[:, early, dof] / (time[early] - time[0])
-        inertia = SIZES.push / np.maximum(np.abs(np.median(gained)), 1e-12)
+        inertia = PUSH / np.maximum(np.abs(np.median(gained)), 1e-12)
         force[dof] = inertia * np.sqrt(np.mean(acceleration[..., dof] ** 2))
     return Trajectories(time, q, v, force)
 

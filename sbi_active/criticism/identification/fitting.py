@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -15,12 +15,7 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.identification.posterior import (
-    TINY,
-    Draws,
-    Unknowns,
-    sample,
-)
+from sbi_active.criticism.identification.posterior import TINY, Draws, Unknowns, sample
 from sbi_active.criticism.identification.settings import IdentifySettings
 from sbi_active.criticism.linear.fits import best_fit, polished
 from sbi_active.criticism.linear.model import (
@@ -167,26 +162,24 @@ def fitted(
         settings: Settings of what is spent.
     """
     own, rng = settings, np.random.default_rng(seed)
-    rival = _rivals(model, prior, trials, beside, own, seed)
+    bare = _bare(model, prior, trials, beside, own, seed)
     doubtful = [e for e in beside if e.scope == "campaign"]
-    fit, unit = _searched(rival(()), own, seed)
-    linear = _beside(rival(doubtful), fit, unit, own)
+    fit, unit = _searched(bare, own, seed)
+    linear = _beside(_with(bare, doubtful), fit, unit, own)
     if aliases := _aliases(linear, own.alias):
         doubtful = [e for e in doubtful if e.name not in aliases]
-        linear = _beside(rival(doubtful), fit, unit, own)
+        linear = _beside(_with(bare, doubtful), fit, unit, own)
     m, c = linear.measurements, linear.rival.coordinates
     share = 1.0 if known_sd is None else ((known_sd[m.channel] / unit) ** 2).min()
     errors = own.errors(m, float(share))
     filters = Filters(errors, m, 0 * m.trial, m.channel)
-    there, some = np.zeros(len(doubtful), dtype=bool), rival(())
+    there, some = np.zeros(len(doubtful), dtype=bool), bare
     for again in range(own.linearized):
         known: list[float | None] = [None] * filters.num_groups
         if known_sd is not None:
             known = [*(known_sd / linear.sizes)]
-        draw = partial(
-            *(sample, filters.grams(linear.rows), errors, linear.unknowns, known, rng),
-            settings=own.sampler,
-        )
+        given = filters.grams(linear.rows), errors, linear.unknowns, known, rng
+        draw = partial(sample, *given, settings=own.sampler)
         draws = draw(sweeps=own.sampler.few)
         before, there = there, draws.present.mean(0) > own.likely
         free = np.append(there, True)[linear.effect]
@@ -197,7 +190,7 @@ def fitted(
         if is_near or again == own.linearized - 1:
             break
         if is_new:
-            some = rival([e for e, kept in zip(doubtful, there, strict=True) if kept])
+            some = _with(bare, [e for e, k in zip(doubtful, there, strict=True) if k])
             fit, unit = _settled(some, u[free], linear.unit, own)
             linear = linear.around(fit, free, unit, own.tried)
         else:
@@ -208,15 +201,15 @@ def fitted(
     return Fitted(**vars(linear), errors=errors, draws=draws, aliases=aliases)
 
 
-def _rivals(
+def _bare(
     model: SimulatorModel,
     prior: Distribution,
     trials: Trials,
     beside: Sequence[Effect],
     settings: IdentifySettings,
     seed: int,
-) -> Callable[[Sequence[Effect]], Rival]:
-    """Return what makes a rival of some effects; all share their simulations."""
+) -> Rival:
+    """Return the rival without effects, whose simulations all others share."""
     index = int(trials.index.max()) + 1
     augmented = AugmentedSimulator(model, beside, next_index=index)
     simulator = TrialSimulator(augmented, trials, seed=seed)
@@ -235,21 +228,23 @@ def _rivals(
         )
     spread = [max(m.x[m.channel == c].std(), TINY) for c in range(num)]
     scale = np.array(spread)[m.channel]
-    nuisances = [e for e in beside if e.scope == "trial"]
+    return Rival(
+        key=ModelKey(),
+        simulator=simulator,
+        prior=prior,
+        effects=(),
+        nuisances=[e for e in beside if e.scope == "trial"],
+        error=NoiseGrid([NoiseCell.of(m, sd=scale)]),
+        spread=scale,
+        center=np.zeros(len(scale)),
+        step=settings.step,
+    )
 
-    def rival(effects: Sequence[Effect]) -> Rival:
-        return Rival(
-            ModelKey(tuple(e.name for e in effects)),
-            simulator=simulator,
-            prior=prior,
-            effects=effects,
-            nuisances=nuisances,
-            error=NoiseGrid([NoiseCell.of(m, sd=scale)]),
-            spread=scale,
-            step=settings.step,
-        )
 
-    return rival
+def _with(bare: Rival, effects: Sequence[Effect]) -> Rival:
+    """Return a rival with some effects."""
+    key = ModelKey(tuple(e.name for e in effects))
+    return replace(bare, key=key, effects=effects)
 
 
 def _searched(

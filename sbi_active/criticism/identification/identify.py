@@ -15,6 +15,7 @@ from sbi_active.criticism.checks import require_fitting
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.effects.trial_conditions import conditions_for
+from sbi_active.criticism.evidence.fit import tempered
 from sbi_active.criticism.identification.fitting import Fitted, fitted
 from sbi_active.criticism.identification.settings import IdentifySettings
 from sbi_active.criticism.identification.spread import spread
@@ -24,7 +25,6 @@ from sbi_active.inference.beliefs.weighted import KernelBelief
 from sbi_active.inference.engine.importance import pareto_shape
 from sbi_active.inference.sampling.weights import (
     effective_sample_size,
-    normalized,
     scott,
 )
 from sbi_active.seeding import derive_seed, forked_generators
@@ -244,10 +244,7 @@ def _weighed(
     log_w = _log_ratio(found, some)
     effective = effective_sample_size(log_w)
     # Few draws would make for a narrow interval: rather that of the linear model.
-    power = 1.0
-    while effective_sample_size(power * log_w) < own.fewest_kept:
-        power *= 0.8
-    u, p = draws.u.copy(), normalized(power * log_w)
+    u, p = draws.u.copy(), tempered(log_w, own.fewest_kept)
     u[order] = u[rng.choice(some, size=len(order), p=p)]
     return u, effective, pareto_shape(log_w)
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.linear.mixture import WIDTHS, summed
+from sbi_active.criticism.linear.mixture import WIDTHS, Mixture, summed
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.processes import (
     Filters,
@@ -52,28 +52,26 @@ FEWEST, NUM_FOLDS = 6, 8
 
 @dataclass(frozen=True)
 class Posterior:
-    """The evidence of a linear model, and its posterior.
+    """A linear model's posterior given each of the errors.
 
     Attributes:
-        log_sensor: Log evidence with the sensor's error alone, nats.
-        log_process: Log evidence with a residual process beside it, or a parameter
-            that differs from trial to trial, nats.
-        mean: Mean of u given the process, shape (d,).
-        cov: Covariance of u given the process, shape (d, d).
-        size: s of the process, posterior mean.
-        time_scale: tau of it, posterior median.
-        variances: Mean square of the process, and of what each parameter does that may
-            differ from trial to trial, each times its probability; sensor variances,
-            shape (1 + v,).
+        sensor: Posterior with the sensor's error alone.
+        beside: Posterior with a residual process beside it, or a parameter that differs
+            from trial to trial.
     """
 
-    log_sensor: float
-    log_process: float
-    mean: Array
-    cov: Array
-    size: float
-    time_scale: float
-    variances: Array
+    sensor: Mixture
+    beside: Mixture
+
+    @property
+    def log_sensor(self) -> float:
+        """Log evidence with the sensor's error alone, nats."""
+        return self.sensor.log_evidence
+
+    @property
+    def log_process(self) -> float:
+        """Log evidence beside a process, nats."""
+        return self.beside.log_evidence
 
     @property
     def log_evidence(self) -> float:
@@ -215,7 +213,6 @@ class Errors:
         folds: Array | None = None,
         *,
         factor: float = 1.0,
-        process: bool = True,
     ) -> Posterior:
         """Return the evidence and the posterior of a model.
 
@@ -224,7 +221,6 @@ class Errors:
             grams: Gram matrices of its rows.
             folds: Parts that count, bool, shape (f,); None takes all.
             factor: Factor on the scales of the effects' priors.
-            process: Whether u is given the process; else the sensor's error alone.
         """
         use = np.ones(self.num_folds, bool) if folds is None else folds
         gram = grams.gram[:, use].sum(1)
@@ -232,29 +228,19 @@ class Errors:
         log_weight += self.constants(grams, use)
         log_weight += model.offset[use[self.fold]].sum()
         n, widths = len(self.log_sensor), [factor * width for width in WIDTHS]
-        sensor = summed(gram[:n], log_weight[:n], model, widths)
-        beside = summed(gram[n:], log_weight[n:], model, widths)
-        own = beside if process else sensor
-        log_z = sensor.log_evidence, beside.log_evidence
-        if not process:
-            nothing = np.zeros(1 + self.varying.shape[1])
-            return Posterior(*log_z, own.mean, own.cov, 0.0, 1.0, nothing)
+        return Posterior(
+            summed(gram[:n], log_weight[:n], model, widths),
+            summed(gram[n:], log_weight[n:], model, widths),
+        )
+
+    def process(self, beside: Mixture) -> tuple[float, float]:
+        """Return the mean size and the median time scale of a model's process."""
         shape = len(self.kernels), len(self.times), len(self.sizes)
-        p, end = own.share, self.num_processes
-        process = p[:end].reshape(shape).sum((0, 1)) @ self.sizes**2
-        differ = p[end:].reshape(-1, len(self.spreads))
-        log_p = log_sum_exp(own.log_z[:end], axis=1)
+        log_p = log_sum_exp(beside.log_z[: self.num_processes], axis=1)
         each = np.exp(log_p - log_sum_exp(log_p)).reshape(shape)
         sizes, times = each.sum((0, 1)), each.sum((0, 2))
-        middle = int(np.searchsorted(np.cumsum(times), 0.5))
-        return Posterior(
-            *log_z,
-            own.mean,
-            own.cov,
-            float(sizes @ self.sizes),
-            float(self.times[min(middle, len(self.times) - 1)]),
-            np.append(process, differ @ self.spreads**2),
-        )
+        middle = min(int(np.searchsorted(np.cumsum(times), 0.5)), len(self.times) - 1)
+        return float(sizes @ self.sizes), float(self.times[middle])
 
     def constants(self, grams: Grams, use: Any = slice(None)) -> Array:
         """Return the log constants of densities of some parts of the trials, (h,)."""
@@ -324,17 +310,19 @@ class Errors:
         own = [np.unique(self.fold[trial == t]) for t in np.unique(trial)]
         return [np.isin(np.arange(self.num_folds), parts) for parts in own]
 
-    def weight(self, posterior: Posterior) -> Array:
+    def weight(self, beside: Mixture) -> Array:
         """Return weights of the squared errors of trials, mean one, shape (N,).
 
         Weights are the inverse of their mean variance: where a parameter differs from
         trial to trial, a trial that depends on it more tells less of everything else.
 
         Args:
-            posterior: Posterior of a model.
+            beside: Posterior of a model beside a process, or what differs.
         """
-        process, *differ = posterior.variances
-        variance = 1 + process + self.varying**2 @ np.array(differ)
+        p, end = beside.share, self.num_processes
+        process = p[:end].reshape(-1, len(self.sizes)).sum(0) @ self.sizes**2
+        differ = p[end:].reshape(-1, len(self.spreads)) @ self.spreads**2
+        variance = 1 + process + self.varying**2 @ differ
         count = np.bincount(self.fold, minlength=self.num_folds)
         mean = np.bincount(self.fold, variance, self.num_folds) / count
         weight = 1 / mean[self.fold]

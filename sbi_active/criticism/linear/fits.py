@@ -11,12 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.linear.model import (
-    LinearModel,
-    centered,
-    linearize,
-    searched_from,
-)
+from sbi_active.criticism.linear.model import LinearModel, centered, linearize
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.sampling.least_squares import descend
 
@@ -107,33 +102,49 @@ def polished(rival: Rival, u: Array, unit: Array, settings: FitSettings) -> Line
     """
     model = linearize(rival, u, unit)
     for _ in range(settings.rounds - 1):
-        scale = max(model.rms, 1.0)
-        if model.promised < settings.worth * scale**2:
+        if model.promised < settings.worth * max(model.rms, 1.0) ** 2:
             break
-        r, jacobian = searched_from(rival, model)
-        known = r[None] / scale, jacobian[None] / scale
-        start, wide = np.clip(model.u, model.low, model.high)[None], unit * scale
-        if np.isfinite(rival.df):
-            wide = wide * model.scale
-        new, _ = along_secants(rival, start, wide, settings.secant, known)
-        if (new[0] == model.u).all():
+        new = onward(rival, model, unit, settings.secant)
+        if (new == model.u).all():
             break
-        model = linearize(rival, new[0], unit)
+        model = linearize(rival, new, unit)
     return centered(rival, model, unit)
 
 
-def refitted(
-    rival: Rival, model: LinearModel, unit: Array, kept: Array, *, steps: int = 30
-) -> Array:
+def onward(rival: Rival, model: LinearModel, unit: Array, steps: int) -> Array:
+    """Return the place that a search along secants from a linear model ends at, (d,).
+
+    Args:
+        rival: Rival with the model's coordinates.
+        model: Linear model of it.
+        unit: Deviations of residuals in a search, shape (N,) or (2 N,).
+        steps: Number of steps at most.
+    """
+    scale = max(model.rms, 1.0)
+    wide, num = unit * scale, model.num
+    if np.isfinite(rival.df):
+        wide = wide * model.scale
+    r, jacobian = model.residual, model.jacobian
+    if rival.reference is not None:  # deviations have the residuals of a search
+        r = rival.residual(model.u[None])[0][0]
+        slope = jacobian[num:] / np.sqrt(2)
+        means = jacobian[:num] - r[:num, None] * slope
+        jacobian = np.r_[means, slope / np.maximum(r[num:, None], 1e-3)]
+    start = np.clip(model.u, model.low, model.high)[None]
+    known = r[None] / scale, jacobian[None] / scale
+    return along_secants(rival, start, wide, steps, known)[0][0]
+
+
+def refitted(rival: Rival, model: LinearModel, unit: Array, kept: Array) -> Array:
     """Return the best fit of a model to some of the numbers, shape (d,).
+
+    Along a valley that the other numbers held closed it takes some ten steps.
 
     Args:
         rival: The model.
         model: The model linearized at its best fit to all.
         unit: Deviations of residuals in a search, shape (N,) or (2 N,).
         kept: Mask of the numbers, shape (N,).
-        steps: Number of steps at most, a choice. Along a valley that the other numbers
-            held closed a fit takes some ten.
     """
     weight = model.scale if np.isfinite(rival.df) else 1.0
     wide, kept = unit * max(model.rms, 1.0) * weight, np.resize(kept, len(unit))
@@ -142,7 +153,7 @@ def refitted(
         return np.where(kept, residual / wide, 0.0)
 
     start = np.clip(model.u, model.low, model.high)[None]
-    return descend(rival, start, whiten, rival.step, steps)[0][0]
+    return descend(rival, start, whiten, rival.step, 30)[0][0]
 
 
 def along_secants(

@@ -41,11 +41,6 @@ class LeftOut:
     fit: Array
 
     @property
-    def num_parts(self) -> int:
-        """Number of parts that count."""
-        return int(np.isfinite(self.square).sum())
-
-    @property
     def mean_square(self) -> float:
         """Over the parts that count, in sensor variances."""
         return float(np.nanmean(self.square))
@@ -102,17 +97,16 @@ def leave_out(
     folds: NDArray[np.bool_] | None = None,
     *,
     weight: Array | float = 1.0,
-    width: float = 3.0,
 ) -> LeftOut:
     """Return a model's errors on each part of the trials that it was not fitted to.
+
+    Refits are to follow the trials: effects' priors are three times as wide.
 
     Args:
         model: Linear model.
         errors: Errors, which say what the parts are.
         folds: Parts that count, shape (f,); None takes all.
         weight: Weight of each squared error, in refits and in what is returned, (N,).
-        width: Factor on the scale of effects' priors in refits, which are to
-            follow the trials.
     """
     f = errors.num_folds
     use = np.ones(f, bool) if folds is None else folds
@@ -121,11 +115,12 @@ def leave_out(
     rows = model.rows * np.sqrt(each)[:, None]
     rows[:, 0] -= rows[:, 1:] @ (model.center - model.u)
     scaled = rows / max(float(np.sqrt(np.mean(each * model.residual**2))), 1.0)
-    gram = np.stack([_gram(scaled[fold == j]) for j in range(f)])
+    parts = [scaled[fold == j] for j in range(f)]
+    gram = np.stack([part.T @ part for part in parts])
     rows, scaled = rows[: model.num], scaled[: model.num]
     gram[~use] = 0.0
     total = gram.sum(0)
-    prior = np.diag(1 / model.widened(width) ** 2)
+    prior = np.diag(1 / model.widened(3.0) ** 2)
     without = total - gram
     low, high = model.low - model.center, model.high - model.center
     refits = bounded(without[:, 1:, 1:] + prior, without[:, 1:, 0], low, high)
@@ -169,7 +164,7 @@ def standard_errors(
     posterior = best.posterior
     if use is not None:
         posterior = errors.posterior(best.model, best.grams, use)
-    weight = errors.weight(posterior)
+    weight = errors.weight(posterior.beside)
     known: dict[ModelKey, Array] = {}
 
     def standard(c: Candidate) -> Array:
@@ -181,26 +176,23 @@ def standard_errors(
     return standard
 
 
-def bounded(
-    system: Array, right: Array, low: Array, high: Array, *, steps: int = 30
-) -> Array:
+def bounded(system: Array, right: Array, low: Array, high: Array) -> Array:
     r"""Return the x within bounds that minimize :math:`x^T A x / 2 - b^T x`, (n, d).
 
     If the best x without bounds were only clipped, other coordinates would keep values
-    that are right only with the clipped ones.
+    that are right only with the clipped ones. Each step of a search within bounds ends
+    at one or at the best x.
 
     Args:
         system: A, shape (n, d, d), positive definite.
         right: b, shape (n, d).
         low: Lower bounds, shape (d,).
         high: Upper bounds, shape (d,).
-        steps: Steps of a search within bounds, each of which ends at one or at
-            the best x.
     """
     free = np.linalg.solve(system, right[..., None])[..., 0]
     x = np.clip(free, low, high)
     some = np.flatnonzero((x != free).any(1))
-    for _ in range(steps if len(some) else 0):
+    for _ in range(30 if len(some) else 0):
         gradient = np.einsum("nij,nj->ni", system[some], x[some]) - right[some]
         new = x[some] - within(system[some], gradient, x[some], low, high)
         new = np.clip(new, low, high)
@@ -256,7 +248,3 @@ def _expected(
         pull = rows[own, 1:][:, free].T @ error[own]
         found[j] = pull @ np.linalg.solve(precision[np.ix_(free, free)], pull)
     return found
-
-
-def _gram(rows: Array) -> Array:
-    return rows.T @ rows

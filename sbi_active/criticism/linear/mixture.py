@@ -40,10 +40,7 @@ class Mixture:
 
 
 def summed(
-    gram: Array,
-    log_weight: Array,
-    model: LinearModel,
-    widths: Sequence[float] = (1.0,),
+    gram: Array, log_weight: Array, model: LinearModel, widths: Sequence[float] = (1.0,)
 ) -> Mixture:
     """Return the posterior of a linear model, summed over hypotheses of the errors.
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,8 @@ from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.least_squares import within
 
+#: What a linear model has one of for each coordinate.
+COORDINATES = ("u", "center", "sd", "scaled", "low", "high", "trial_of")
 #: Share of the squares that is added to them, so that a flat direction is solved for.
 RIDGE = 1e-9
 
@@ -35,7 +39,6 @@ class LinearModel:
         scaled: Coordinates of effects whose prior has an unknown scale, bool, (d,).
         low: Lower bounds, shape (d,).
         high: Upper bounds, shape (d,).
-        own: Coordinates of theta and phi; those of the trials' nuisances follow.
         trial_of: The trial that each coordinate belongs to, -1 for all, shape (d,).
         num: Number of measured numbers, N.
         scale: Unit of each residual in deviations of the sensor, shape (N,); one unless
@@ -53,7 +56,6 @@ class LinearModel:
     scaled: NDArray[np.bool_]
     low: Array
     high: Array
-    own: int
     trial_of: NDArray[np.int64]
     num: int
     scale: Array
@@ -109,6 +111,27 @@ class LinearModel:
         after = cost(self.residual + self.jacobian @ move, self.u + move)
         return (cost(self.residual, self.u) - after) * scale
 
+    def part(self, at: NDArray[Any]) -> LinearModel:
+        """Return the model of some of its coordinates, the others held where it is."""
+        own = {name: getattr(self, name)[at] for name in COORDINATES}
+        return replace(self, jacobian=self.jacobian[:, at], **own)
+
+    def joined(self, others: Sequence[LinearModel]) -> LinearModel:
+        """Return the model with the coordinates of others after its own."""
+        every = [self, *others]
+        own = {n: np.concatenate([getattr(m, n) for m in every]) for n in COORDINATES}
+        jacobian = np.concatenate([model.jacobian for model in every], 1)
+        return replace(self, jacobian=jacobian, **own)
+
+    def from_here(self) -> LinearModel:
+        """Return the model with coordinates that count from where it is."""
+        shifted = {n: getattr(self, n) - self.u for n in ("u", "center", "low", "high")}
+        return replace(self, **shifted)
+
+    def at(self, u: Array) -> Array:
+        """Return the residuals at other places, (n, N) or (n, 2 N), of u (n, d)."""
+        return self.residual + (u - self.u) @ self.jacobian.T
+
     def draws(
         self, mean: Array, cov: Array, num: int, rng: np.random.Generator
     ) -> Array:
@@ -142,9 +165,7 @@ def linearize(
     return _reweighted(model, rival.df) if np.isfinite(rival.df) else model
 
 
-def _in_own_deviations(
-    rival: Rival, model: LinearModel, unit: Array, *, most: float = 4.0
-) -> LinearModel:
+def _in_own_deviations(rival: Rival, model: LinearModel, unit: Array) -> LinearModel:
     r"""Return a linearized rival with deviations that are the simulator's.
 
     A number that the simulator does not give has that of the prior predictive. The
@@ -161,9 +182,6 @@ def _in_own_deviations(
         rival: Rival that is linearized.
         model: Linear model with the residuals of a search.
         unit: Standard deviation of the sensor, shape (N,).
-        most: Square of a residual beyond which it is no typical one, and its score no
-            slope of a Gaussian: with half a score is biased where the model is right,
-            with twice a few numbers far out move all deviations.
     """
     num = model.num
     residual, log_scale, _ = rival.residual(model.u[None], penalized=False)
@@ -172,7 +190,10 @@ def _in_own_deviations(
     if rival.reference is not None:
         log_scale = log_scale - np.log(rival.reference)
         slope, own = jacobian[num:] * residual[num:, None], residual[:num]
-        score = (1 - np.minimum(own**2, most)) / np.sqrt(2)
+        # Beyond a square of four a residual is no typical one, and its score no slope
+        # of a Gaussian: with half a score is biased where the model is right, with
+        # twice a few numbers far out move all deviations.
+        score = (1 - np.minimum(own**2, 4.0)) / np.sqrt(2)
         offset = 0.5 * score**2
         residual = np.append(own, score)
         means = jacobian[:num] + own[:, None] * slope
@@ -252,21 +273,16 @@ def centered(rival: Rival, model: LinearModel, unit: Array) -> LinearModel:
     return replace(model, jacobian=(model.jacobian + other.jacobian) / 2)
 
 
-def with_prior(
-    rival: Rival,
-    u: Array,
-    residual: Array,
-    jacobian: Array,
-    *,
-    # Precision of the Gaussian that stands for a prior between two bounds: wide
-    # enough to leave parameters alone that the trials determine.
-    flat: float = 0.3,
-) -> LinearModel:
-    """Return a linearized rival with the Gaussian that stands for its prior."""
+def with_prior(rival: Rival, u: Array, residual: Array, jacobian: Array) -> LinearModel:
+    """Return a linearized rival with the Gaussian that stands for its prior.
+
+    Between two bounds it is wide enough to leave parameters alone that the trials
+    determine.
+    """
     c = rival.coordinates
     bounded = np.isfinite(c.low) & np.isfinite(c.high)
     scaled = np.zeros(rival.dim, dtype=bool)
-    precision = np.where(c.precision > 0, c.precision, flat)
+    precision = np.where(c.precision > 0, c.precision, 0.3)
     names = {e.name for e in rival.effects}
     for name, place in rival.columns().items():
         if name in names:
@@ -283,7 +299,6 @@ def with_prior(
         scaled=scaled,
         low=c.low,
         high=c.high,
-        own=sum(c.joint.sizes),
         trial_of=c.trial_of(),
         num=rival.num_observed,
         scale=np.ones(rival.num_observed),
@@ -352,24 +367,6 @@ def chords(
     if np.isfinite(rival.df):
         r /= model.scale
     return ((r - before) / step[:, None]).T
-
-
-def searched_from(rival: Rival, model: LinearModel) -> tuple[Array, Array]:
-    """Return the residual and the derivatives that a search from a model goes on from.
-
-    Args:
-        rival: Rival with the model's coordinates.
-        model: Linear model of it.
-
-    Returns:
-        Shapes (N,) and (N, d), or (2 N,) and (2 N, d) of a random simulator.
-    """
-    if rival.reference is None:
-        return model.residual, model.jacobian
-    num, r = model.num, rival.residual(model.u[None])[0][0]
-    slope = model.jacobian[num:] / np.sqrt(2)
-    jacobian = model.jacobian[:num] - r[:num, None] * slope
-    return r, np.concatenate([jacobian, slope / np.maximum(r[num:, None], 1e-3)])
 
 
 def at_null(rival: Rival, effect: Effect, tried: float) -> tuple[Array, Array]:

@@ -26,23 +26,6 @@ from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
 
 
-@dataclass(frozen=True, kw_only=True)
-class TimeScales:
-    """Time scales of a process that are told apart.
-
-    Attributes:
-        sample: The shortest, in steps from sample to sample; one half as long is hardly
-            told from white noise.
-        series: The longest, as a share of a series; one twice as long is hardly told
-            from a trend.
-        apart: Factor between neighbors, about.
-    """
-
-    sample: float = 0.8
-    series: float = 0.8
-    apart: float = 2.1
-
-
 @dataclass(frozen=True)
 class Processes:
     """Hypotheses of an error, h of them, those with the smooth kernel last.
@@ -215,17 +198,17 @@ def alike(m: Measurements, fold: NDArray[np.int64]) -> list[NDArray[np.intp]]:
     return [np.stack(series) for series in same.values()]
 
 
-def time_scales(
-    m: Measurements,
-    fold: NDArray[np.int64],
-    settings: TimeScales = TimeScales(),  # noqa: B008  (frozen)
-) -> Array:
-    """Return the time scales that some measurements tell apart, shape (t,)."""
-    own = settings
+def time_scales(m: Measurements, fold: NDArray[np.int64]) -> Array:
+    """Return the time scales that some measurements tell apart, shape (t,).
+
+    They go from .8 steps from sample to sample, of which half is hardly told from white
+    noise, to .8 of a series, of which twice is hardly told from a trend, a factor of
+    about 2.1 apart.
+    """
     spans = [np.ptp(m.time[at]) for at in series_of(m, fold)]
-    low = own.sample * m.step
-    high = max(own.series * max(float(np.median(spans)), m.step), 2 * low)
-    return np.geomspace(low, high, 2 + round(np.log(high / low) / np.log(own.apart)))
+    low = 0.8 * m.step
+    high = max(0.8 * max(float(np.median(spans)), m.step), 2 * low)
+    return np.geomspace(low, high, 2 + round(np.log(high / low) / np.log(2.1)))
 
 
 class Filter:

@@ -20,9 +20,8 @@ from sbi_active.criticism.linear.fits import JUMPING, FitSettings
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.sensor import sensor_of
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.rivals.channel_noise import ChannelNoise
+from sbi_active.criticism.rivals.error_models import ChannelNoise
 from sbi_active.criticism.steps.equivalence import MANY
-from sbi_active.criticism.steps.tracing import log_priors
 
 #: Effects that are kept: the best alone, members of the best pairs, and those whose
 #: linear optimum leaves the smallest residual of the simulator itself.
@@ -52,15 +51,15 @@ def linear_models(rivals: RivalSet) -> tuple[Search, Screening | None]:
     aside counts.
 
     Args:
-        rivals: The models, with all effects; what is set aside leaves them.
+        rivals: The models, with all effects.
 
     Returns:
-        The models; None for a screening where all effects are to be fitted.
+        The models, without what is set aside; None for a screening where all effects
+        are to be fitted.
     """
     sensor = sensor_of(rivals)
-    prior = log_priors(rivals.library, ())
     settings = JUMPING if rivals.roughness.any() else FitSettings()
-    search = Search(rivals, sensor, prior, settings)
+    search = Search(rivals, sensor, settings)
     if isinstance(rivals.noise, ChannelNoise):
         # What is missing may be seen in one channel alone, and no error of it.
         search.fit_singles()
@@ -68,15 +67,15 @@ def linear_models(rivals: RivalSet) -> tuple[Search, Screening | None]:
         models = [c.model for c in search.found.values()]
         best = min(models, key=lambda model: _log_sizes(model.residual, channel))
         sensor = sensor_of(rivals, [search.model(ModelKey()), best])
-        search = Search(rivals, sensor, prior, settings)
-    found = None
-    if len(rivals.effects) > MANY:
-        search.library.look_at_each()
-        found = _best_of(search, rivals.effects)
+        search = Search(rivals, sensor, settings)
+    if len(rivals.effects) <= MANY:
+        return search, None
+    search.library.look_at_each()
+    found = _best_of(search, rivals.effects)
     if found is None:
         return search, None
     found = _with_kin(found, search)
-    rivals.effects = {n: rivals.effects[n] for n in found.kept}
+    search.rivals = rivals.with_effects(found.kept)
     return search, found if found.behind else None
 
 

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.evidence.predicted_before import NUM_DRAWS
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.linear.errors import Errors
@@ -25,6 +24,7 @@ from sbi_active.criticism.linear.fits import (
     FitSettings,
     along_secants,
     best_fit,
+    onward,
     polished,
 )
 from sbi_active.criticism.linear.left_out import Candidate, leave_out
@@ -35,13 +35,12 @@ from sbi_active.criticism.linear.model import (
     chords,
     enlarged,
     has_null,
-    searched_from,
 )
 from sbi_active.criticism.linear.sensor import Sensor
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
-from sbi_active.criticism.steps.tracing import log_prior
+from sbi_active.criticism.steps.tracing import log_prior, log_priors
 from sbi_active.seeding import derive_seed
 
 
@@ -52,24 +51,24 @@ class Search:
     Args:
         rivals: The models and the trials; smooth.
         sensor: The sensor's error.
-        prior: Log prior probabilities of "none" and each effect.
         settings: Settings of what is spent on fits.
 
     Attributes:
         found: Fitted models, the bare one first.
         errors: Errors that all models share; known after the bare fit.
+        prior: Log prior probabilities of "none" and each effect of the library.
         names: Effects that change the prediction, of which sets are fitted.
         units: Deviations of residuals in a search, (N,); (2 N,) if it is random.
     """
 
     rivals: RivalSet
     sensor: Sensor
-    prior: dict[str, float]
     settings: FitSettings = FitSettings()
     found: dict[ModelKey, Candidate] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         effects = self.rivals.effects.values()
+        self.prior = log_priors(self.rivals.library)
         self.names = [e.name for e in effects if e.hook != "noise"]
         self._rivals: dict[ModelKey, Rival] = {}
         self._reference: Array | None = None
@@ -107,8 +106,7 @@ class Search:
             return False
         self._looked_again = True
         key, settings = ModelKey(), self.settings
-        found = self.rivals.found[key] = self.rivals.search(key)
-        own = self.rival(key)
+        found, own = self.rivals.search(key), self.rival(key)
         best = min(
             (self._polished(own, u) for u in found.modes[: settings.num_kept]),
             key=lambda fit: fit.cost,
@@ -318,11 +316,8 @@ class Search:
         return self._rivals[key]
 
     def _fit_bare(self) -> LinearModel:
-        rival = self.rival(ModelKey())
-        # Draws of the prior predictive, which are simulated already.
-        seed = derive_seed(self.rivals.seed, "spread")
-        u = rival.coordinates.sample(NUM_DRAWS, seed=seed)
-        return best_fit(rival, u, self.units, self.settings)
+        own = self.rival(ModelKey()), self.rivals.prior_draws, self.units
+        return best_fit(*own, self.settings)
 
     def _fit(self, key: ModelKey, parents: Sequence[ModelKey]) -> LinearModel:
         """Fit a set of effects from the smaller one that leaves least."""
@@ -332,14 +327,8 @@ class Search:
         for name in key.effects:
             if name not in base.effects:
                 model = self._with_column(model, parent, name)
-        scale = max(model.rms, 1.0)
-        r, jacobian = searched_from(rival, model)
-        known = r[None] / scale, jacobian[None] / scale
-        u = np.clip(model.u, model.low, model.high)[None]
-        secant, unit = self.settings.secant, self.units * scale
-        own = unit * model.scale if np.isfinite(rival.df) else unit
-        u, _ = along_secants(rival, u, own, secant, known)
-        fits = [self._polished(rival, u[0])]
+        secant, unit = self.settings.secant, self.units * max(model.rms, 1.0)
+        fits = [self._polished(rival, onward(rival, model, self.units, secant))]
         effects = [self.rivals.effects[n] for n in key.effects]
         is_far = not all(map(has_null, effects))
         if is_far or (len(effects) == 1 and not is_force(effects[0])):
@@ -359,7 +348,7 @@ class Search:
         if base.effects or name not in self.library.names:
             beside, own = self.column(base, name)
         else:
-            beside, own = self.library.beside(name)
+            beside, own = self.library.columns[name]
         key = self._joined(model.key, [name])
         new = ~self.columns(key, model.key)
         return enlarged(

@@ -8,15 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.evidence.predicted_before import NUM_DRAWS
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.fits import FitSettings, best_fit
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.rivals.channel_noise import ChannelNoise, SettledNoise
-from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
+from sbi_active.criticism.rivals.error_models import ChannelNoise, NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import measurement_sds
-from sbi_active.seeding import derive_seed
 
 
 @dataclass(frozen=True)
@@ -55,28 +52,27 @@ def sensor_of(rivals: RivalSet, likely: Sequence[LinearModel] = ()) -> Sensor:
         return Sensor(unit, NoiseGrid([NoiseCell.of(m, sd=unit)]), is_known=True)
     df = float(np.median([cell.df for cell in grid.cells]))
     if np.isfinite(df):
-        grid = grid.of_cells([replace(cell, df=np.inf) for cell in grid.cells])
+        cells = [replace(cell, df=np.inf) for cell in grid.cells]
+        grid = replace(grid, cells=cells)
     if noise is None:
         unit = rivals.typical_deviation()
         cells = [replace(cell, sd=unit) for cell in grid.cells]
-        return Sensor(unit, grid.of_cells(cells), is_known=True)
+        return Sensor(unit, replace(grid, cells=cells), is_known=True)
     unit, is_declared = grid.cells[0].sd, noise.posterior is None
     one_size = all((cell.sd == unit).all() for cell in grid.cells)
     if is_declared and one_size and len(grid.scales) == 1:
         return Sensor(unit, grid, is_known=True, df=df)
 
     unit = grid.typical_sd
-    if not isinstance(grid, ChannelNoise):
-        return Sensor(unit, grid, is_known=False, df=df)
-    if not likely:
-        rival, seed = rivals.rival(ModelKey()), derive_seed(rivals.seed, "spread")
-        u = rival.coordinates.sample(NUM_DRAWS, seed=seed)
-        likely = [best_fit(rival, u, unit, FitSettings())]
-    each = [SettledNoise(grid, model.residual * unit) for model in likely]
-    cells = [
-        replace(cell, log_weight=log_p)
-        for one in each
-        for cell, log_p in zip(one.cells, one.log_prior, strict=True)
-    ]
-    noise = NoiseGrid(cells, scales=each[0].scales)
-    return Sensor(unit, noise, is_known=False)
+    if isinstance(grid, ChannelNoise):
+        if not likely:
+            bare = rivals.rival(ModelKey())
+            likely = [best_fit(bare, rivals.prior_draws, unit, FitSettings())]
+        each = [grid.settled(model.residual * unit) for model in likely]
+        cells = [
+            replace(cell, log_weight=log_p)
+            for one in each
+            for cell, log_p in zip(one.cells, one.log_prior, strict=True)
+        ]
+        grid = NoiseGrid(cells, scales=each[0].scales)
+    return Sensor(unit, grid, is_known=False, df=df)

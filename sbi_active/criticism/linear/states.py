@@ -76,10 +76,7 @@ class States:
         return {key: float(np.log(rest)), **states}
 
     def joint(
-        self,
-        key: ModelKey,
-        use: NDArray[np.bool_] | None = None,
-        factor: float = 1.0,
+        self, key: ModelKey, use: NDArray[np.bool_] | None = None, factor: float = 1.0
     ) -> dict[ModelKey, float]:
         """Return a model in each state, and the log evidence of both, nats.
 
@@ -110,10 +107,7 @@ class States:
         return self.mixture(key).log_evidence
 
     def mixture(
-        self,
-        key: ModelKey,
-        use: NDArray[np.bool_] | None = None,
-        factor: float = 1.0,
+        self, key: ModelKey, use: NDArray[np.bool_] | None = None, factor: float = 1.0
     ) -> Mixture:
         """Return the posterior of a model in one state.
 
@@ -196,8 +190,8 @@ class States:
         """Return the probability that each trial has an outcome, by posterior draws."""
         key, rivals = c.model.key, self.search.rivals
         if key not in self._valid:
-            process = c.posterior.log_process > c.posterior.log_sensor
-            own = self.search.errors.posterior(c.model, c.grams, process=process)
+            both = c.posterior
+            own = both.beside if both.log_process > both.log_sensor else both.sensor
             rng = np.random.default_rng(derive_seed(rivals.seed, "outcomes", str(key)))
             u = c.model.draws(own.mean, own.cov, self.num_outcomes, rng)
             split = rivals.rival(key).coordinates.split(u)

@@ -1,6 +1,5 @@
-"""Verdicts when every model is wrong: one evidence, left-out trials, what remains.
+"""Verdicts: one rule, the draws and errors behind it, what speaks against it.
 
-This package contains linearized models, the errors that all of them share, and the rule
-that selects helpful effects and names causes. The samplers of a posterior are in
-``evidence``.
+This package contains the rule that selects helpful effects and names causes, and the
+results that follow from it. Fits are in ``linear``, samplers in ``evidence``.
 """

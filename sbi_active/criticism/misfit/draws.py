@@ -9,39 +9,94 @@ from numpy.typing import NDArray
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.evidence.fit import Fit
-from sbi_active.criticism.evidence.rival_set import NUM_DRAWS, RivalSet
-from sbi_active.criticism.linear.errors import Posterior
+from sbi_active.criticism.evidence.rival_set import NUM_DRAWS
+from sbi_active.criticism.linear.fits import refitted
+from sbi_active.criticism.linear.mixture import Mixture
 from sbi_active.criticism.linear.model import LinearModel, reweighted_at
 from sbi_active.criticism.linear.search import Search
-from sbi_active.criticism.results import Evidence, ModelKey
+from sbi_active.criticism.misfit.verdict import Verdict
+from sbi_active.criticism.results import OUTLIER, Evidence, ModelKey
 from sbi_active.criticism.rivals.rival import Rival
+from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.inference.engine import WeightedDraws
 from sbi_active.inference.sampling.weights import effective_sample_size, normalized
 from sbi_active.seeding import derive_seed
 
 
-def bends(search: Search, key: ModelKey, *, num: int = 16, most: float = 0.5) -> bool:
+def recorded(found: Verdict, key: ModelKey) -> Evidence:
+    """Return the record of a model, and keep its draws.
+
+    The bare model and those that are likely have samples of the simulator's own
+    posterior where they bend and no model misses; of less than fifty effective draws
+    a linear model's, since a few would claim to know what is open.
+
+    Args:
+        found: Verdict with the model.
+        key: Key of the model.
+    """
+    models = found.models
+    if key not in models.fits:
+        fit = None
+        if not found.is_missed and _is_sampled(found, key):
+            near = found.search.model(key).u[None] if key.effects else None
+            fit = models.sampled(key, near)
+            log_z = found.states.log_evidence(key)
+            fit = replace(fit, evidence=replace(fit.evidence, log_evidence=log_z))
+        if fit is None or fit.evidence.effective_sample_size < 50:
+            fit = _linear(found, key)
+        models.fits[key] = fit
+    return models.fits[key].evidence
+
+
+def fitted(found: Verdict, key: ModelKey, use: NDArray[np.bool_]) -> Fit:
+    """Return a model with its posterior by some parts of the trials.
+
+    Args:
+        found: Verdict with the model.
+        key: Key of the model.
+        use: Parts of the trials that count, shape (f,).
+    """
+    whole = found.models.fits.get(key)
+    if not (found.is_missed or whole is None or whole.evidence.engine == "linear"):
+        return _left_out(whole, use[found.search.errors.fold])
+    return _linear(found, key, use)
+
+
+def _is_sampled(found: Verdict, key: ModelKey) -> bool:
+    states, search = found.states, found.search
+    if key not in search.found:
+        return False
+    rivals = found.rivals
+    is_dear = rivals.measurements.is_sequence or rivals.simulator.is_stochastic
+    if is_dear and key not in (ModelKey(), found.key):
+        return False
+    others = [*search.found, *states.keys(ModelKey())]
+    least = max(map(states.log_evidence, others)) - THRESHOLD
+    several = len(key.effects) > 1 and key != found.key
+    if several or (key.effects and states.log_evidence(key) < least):
+        return False
+    return bends(search, key)
+
+
+def bends(search: Search, key: ModelKey) -> bool:
     """Return whether the simulator leaves a linear model where its posterior lies.
 
-    A normal posterior is then another one than the simulator's.
+    A normal posterior is then another one than the simulator's. It does so from a
+    standard deviation of half a nat of the log density ratio of simulator and linear
+    model, over 16 draws; with half of it more models are sampled.
 
     Args:
         search: Search that has fitted the model.
         key: Key of the model.
-        num: Number of posterior draws that are simulated.
-        most: Standard deviation over the draws of the log density ratio of simulator
-            and linear model up to which a model counts as linear, nats. With half, more
-            models are sampled.
     """
     rivals, sensor = search.rivals, search.sensor
     if not rivals.is_smooth:
         return False  # its jumps leave any model, and count as noise
     c = search.found[key]
     m, rng = c.model, np.random.default_rng(derive_seed(rivals.seed, "bends"))
-    use = np.ones(search.errors.num_folds, bool)
-    own = search.errors.posterior(m, c.grams, use, process=False)
-    u = m.draws(own.mean, own.cov, num, rng)
-    rival, linear = rivals.rival(key), m.residual + (u - m.u) @ m.jacobian.T
+    own = c.posterior.sensor
+    u = m.draws(own.mean, own.cov, 16, rng)
+    rival, linear = rivals.rival(key), m.at(u)
     fails = rivals.can_fail and not rivals.measurements.is_sequence
     if fails or rivals.simulator.is_stochastic:
         ratio = rival.log_likelihood(u) + 0.5 * (linear**2).sum(1)
@@ -49,93 +104,77 @@ def bends(search: Search, key: ModelKey, *, num: int = 16, most: float = 0.5) ->
         noise = rivals.noise if np.isfinite(sensor.df) else sensor.noise
         log_p, unit = noise.log_likelihood, search.unit * m.scale
         ratio = log_p(rival.residual(u)[0]) - log_p(unit * linear)
-    return not ratio.std() < most  # NaN: not simulated
+    return not ratio.std() < 0.5  # NaN: not simulated
 
 
-def linear_fit(
-    rivals: RivalSet,
-    key: ModelKey,
-    model: LinearModel,
-    center: Array,
-    cov: Array,
-    log_z: float,
-    *,
-    best: Array | None = None,
-    shown: Array | None = None,
-    louder: Array | None = None,
-    chi_square: float | None = None,
-    unit: Array | None = None,
-    known: NDArray[np.bool_] | None = None,
-    suspect: int | None = None,
-) -> Fit:
+def _linear(found: Verdict, key: ModelKey, use: NDArray[np.bool_] | None = None) -> Fit:
     """Return a linear model with its draws as its posterior sample.
 
+    Wide draws of what misses leave the valleys of what bends: trials are predicted from
+    the best fit. Beside a gross error, its trial tells little.
+
     Args:
-        rivals: Rivals that the model is one of.
+        found: Verdict with the model.
         key: Key of the model, with an error or with effects on the noise.
-        model: Fitted model of its effects on the prediction.
-        center: Center of its posterior, shape (d,).
-        cov: Covariance of its posterior, shape (d, d).
-        log_z: Log evidence of the model, nats.
-        best: Point from which other trials are predicted, shape (d,); None takes the
-            draws.
-        shown: Covariance of the draws that intervals are of, shape (d, d); None takes
-            that of those which predict.
-        louder: Draws of effects on the noise, natural values, shape (n, k).
-        chi_square: Chi-square with these effects; None takes the fitted model's.
-        unit: Unit of the model's residuals, shape (N,), where draws are to be weighed
-            by the simulator; None leaves them.
-        known: Mask of the numbers that the posterior knows, shape (N,); None for all.
-        suspect: Place of the trial that a gross error is in; None without one.
+        use: Parts of the trials that count, shape (f,); None takes all.
     """
+    states, search, models = found.states, found.search, found.models
+    known = None if use is None else use[search.errors.fold]
+    rival = models.rival(key, suspect=found.suspect if key.error == OUTLIER else None)
+    model = search.model(states.predicting(key))
+    seed = derive_seed(models.seed, "linear", str(model.key))
+    best, mode, square = None, model.u, model.chi_square[0]
+    unit: Array | None = None
+
+    def drawn(center: Array, cov: Array) -> Array:
+        return model.draws(center, cov, NUM_DRAWS, np.random.default_rng(seed))
 
     def linear(u: Array) -> Array:
-        residual = model.residual + (u - model.u) @ model.jacobian.T
-        return unit * model.scale * residual[:, : model.num]
+        return unit * model.at(u)[:, : model.num]
 
-    rival = rivals.rival(key, suspect=suspect)
-    u, at, mode = drawn(rivals, model, center, cov), best, model.u
-    if louder is not None:
-        u, mode = _with_louder(rival, model, u, louder), None
-    equal = np.full(NUM_DRAWS, 1 / NUM_DRAWS)
+    if found.is_missed:
+        log_z, best = search.found[key].posterior.log_process, model.u
+        if known is not None:
+            best = refitted(search.rival(key), model, search.units, known)
+        u = drawn(best, found.covariance(key))
+    else:
+        own = at = states.mixture(key, use)
+        if key.effects and found.key == ModelKey(key.effects, OUTLIER):
+            at = states.mixture(found.key, use)
+        if use is not None and np.isfinite(search.sensor.df):
+            model, at = by_weights(model, search, use)
+        log_z, u = own.log_evidence, drawn(at.mean, at.cov)
+        unit = search.unit * model.scale
+        if states.louder(key):
+            phi, square = states.louder_draws(key, use)[0], states.chi_square(key)[0]
+            u, mode, unit = _with_louder(rival, u, phi), None, None
     sample = WeightedDraws(
         u=u,
-        weight=equal,
+        weight=np.full(NUM_DRAWS, 1 / NUM_DRAWS),
         log_evidence=log_z,
         standard_error=0.0,
         effective_sample_size=float(NUM_DRAWS),
         method="linear",
     )
-    own = sum(rival.coordinates.joint.sizes)
-    if shown is not None:
-        u = drawn(rivals, model, center, shown)
-    evidence = Evidence(
-        key=key,
-        log_evidence=log_z,
-        standard_error=0.0,
-        effective_sample_size=float(NUM_DRAWS),
-        engine="linear",
-        names=rivals.names_of(rival),
-        draws=rival.coordinates.to_z(u)[:, :own],
-        best_chi_square=model.chi_square[0] if chi_square is None else chi_square,
-        best=None if at is None else rival.coordinates.to_z(at[None])[0, :own],
-    )
+    if found.is_missed and use is None:
+        u = drawn(model.u, found.shown(key))
+    evidence = models.record(rival, sample, u, square)
+    if best is not None:
+        z = rival.coordinates.to_z(best[None])[0, : evidence.draws.shape[1]]
+        evidence = replace(evidence, best=z)
     weighs = None if unit is None else linear
-    return Fit(rival, sample, evidence, at, mode, weighs, known)
+    return Fit(rival, sample, evidence, best, mode, weighs, known)
 
 
-def _with_louder(rival: Rival, model: LinearModel, u: Array, phi: Array) -> Array:
+def _with_louder(rival: Rival, u: Array, phi: Array) -> Array:
     """Return draws of a model with draws of effects on the noise, shape (n, d).
 
     Args:
         rival: Rival with these effects.
-        model: Model without them.
-        u: Draws of its coordinates, shape (n, d').
+        u: Draws of the coordinates without theirs, shape (n, d').
         phi: Draws of theirs, natural values, shape (m, k), repeated as needed.
     """
-    c, noisy = rival.coordinates, np.zeros(rival.dim, dtype=bool)
-    for effect in rival.effects:
-        noisy[rival.columns()[effect.name]] = effect.hook == "noise"
+    c, noisy = rival.coordinates, ~rival.searched
     drawn = np.empty((len(u), rival.dim))
     drawn[:, ~noisy] = u
     z = c.to_z(np.where(noisy, 0.0, drawn))
@@ -144,13 +183,7 @@ def _with_louder(rival: Rival, model: LinearModel, u: Array, phi: Array) -> Arra
     return np.clip(drawn, c.low, c.high)
 
 
-def drawn(rivals: RivalSet, model: LinearModel, center: Array, cov: Array) -> Array:
-    """Return draws of a model's coordinates within their bounds, (NUM_DRAWS, d)."""
-    rng = np.random.default_rng(derive_seed(rivals.seed, "linear", str(model.key)))
-    return model.draws(center, cov, NUM_DRAWS, rng)
-
-
-def left_out_fit(whole: Fit, known: NDArray[np.bool_]) -> Fit:
+def _left_out(whole: Fit, known: NDArray[np.bool_]) -> Fit:
     """Return a sampled model with its posterior by some of the numbers.
 
     What bends has no linear model that could be fitted again; its draws are weighed by
@@ -167,33 +200,25 @@ def left_out_fit(whole: Fit, known: NDArray[np.bool_]) -> Fit:
     log_w += fit.error.log_likelihood(residual[:, known])
     log_w -= whole.error.log_likelihood(residual)
     log_w = np.where(np.isfinite(log_w), log_w, -np.inf)
-    sample = WeightedDraws(
-        u=own.u,
-        weight=normalized(log_w),
-        log_evidence=own.log_evidence,
-        standard_error=own.standard_error,
-        effective_sample_size=effective_sample_size(log_w),
-        method=own.method,
-    )
-    return replace(fit, sample=sample)
+    effective = effective_sample_size(log_w)
+    weighed = replace(own, weight=normalized(log_w), effective_sample_size=effective)
+    return replace(fit, sample=weighed)
 
 
 def by_weights(
-    model: LinearModel, search: Search, use: NDArray[np.bool_], *, rounds: int = 5
-) -> tuple[LinearModel, Posterior]:
+    model: LinearModel, search: Search, use: NDArray[np.bool_]
+) -> tuple[LinearModel, Mixture]:
     """Return a model of t errors with the weights of a fit to some parts, and the fit.
 
     Args:
         model: Model with the weights of the fit to all.
         search: Search with the errors.
         use: Parts of the trials that count, shape (f,).
-        rounds: Times that weights follow from residuals, and the fit from weights;
-            two agree to some percent of a deviation.
     """
     errors = search.errors
-    for _ in range(rounds):
+    for _ in range(5):  # two agree to some percent of a deviation
         grams = errors.grams(model.rows)
-        own = errors.posterior(model, grams, use, process=False)
+        own = errors.posterior(model, grams, use).sensor
         u = np.clip(own.mean, model.low, model.high)
         model = reweighted_at(model, u, search.sensor.df)
     return model, own

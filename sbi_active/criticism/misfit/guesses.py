@@ -54,15 +54,11 @@ TERMS: dict[str, Callable[[Tensor], Tensor]] = {
 REMAINS = 0.75
 
 
-def guess_residual(
-    search: Search, *, better: float = 0.9
-) -> tuple[tuple[str, float], ...]:
+def guess_residual(search: Search) -> tuple[tuple[str, float], ...]:
     """Return formulas that the bare model's residual follows, best first.
 
     Args:
         search: The models, with the bare one.
-        better: Probability that a guess predicts a new part better, before all
-            that were tried count.
 
     Returns:
         Formulas and their log evidence above that of the bare model with its process,
@@ -72,7 +68,7 @@ def guess_residual(
         return _guess_of_numbers(search)
     bare = search.found[ModelKey()]
     terms = [*_terms(search)]
-    least = 1 - (1 - better) / max(len(terms), 1)
+    least = 1 - (1 - 0.9) / max(len(terms), 1)  # all that were tried count
     excess = max(bare.left.mean_square - 1, 1e-2)
     found = []
     for name, term in terms:
@@ -173,13 +169,7 @@ def _terms(search: Search, *, of_all: bool = False) -> Iterator[tuple[str, Array
 
 
 def _distinct(
-    search: Search,
-    own: NDArray[np.bool_],
-    where: str,
-    seen: list[Array],
-    *,
-    # Cosine short of 1 at which two terms are one.
-    same: float = 1e-9,
+    search: Search, own: NDArray[np.bool_], where: str, seen: list[Array]
 ) -> Iterator[tuple[str, Array]]:
     """Yield formulas of some numbers that are none of those seen, which they join."""
     for name, value in _variables(search, own):
@@ -188,7 +178,7 @@ def _distinct(
             size = float(np.linalg.norm(term))
             if not np.isfinite(size) or size < 1e-9 * np.sqrt(len(term)):
                 continue
-            if any(abs(other @ term) / size > 1 - same for other in seen):
+            if any(abs(other @ term) / size > 1 - 1e-9 for other in seen):
                 continue
             seen.append(term / size)
             yield pattern.format(name) + where, term

@@ -45,7 +45,7 @@ def covariance(own: Candidate, errors: Errors, action: Array) -> Array:
         errors: Errors that all models share.
         action: Action of each trial, shape (t, action_dim).
     """
-    model, given = own.model, own.posterior
+    model, given = own.model, own.posterior.beside
     found = shared_process(model, errors, action)
     mean, cov = found or (given.mean, given.cov + own.left.jackknife())
     apart = model.u - np.clip(mean, model.low, model.high)
@@ -102,8 +102,6 @@ def _processes(
     errors: Errors,
     places: Array,
     between: list[tuple[Array, Array]],
-    *,
-    thinned: int = 2,
 ) -> tuple[Array, Array]:
     """Return Gram matrices with a process, (h, k, k), and log constants, (h,).
 
@@ -112,12 +110,10 @@ def _processes(
         errors: Errors that all models share.
         places: Numbers of each series, by trial, then channel, shape (b, n).
         between: Eigenvalues and vectors of what trials share, by hypothesis.
-        thinned: Step through the sizes of the process, of which a half tells as
-            much.
     """
     num = errors.num_folds
     blocks = model.rows[places].reshape(num, -1)
-    variance = errors.sizes[::thinned] ** 2
+    variance = errors.sizes[::2] ** 2  # of which a half tells as much
     variances = np.stack([np.ones(len(variance)), variance], 1)
     own = Processes.grid(variances, errors.times, errors.kernels)
     grams, logs = [], []
@@ -154,23 +150,18 @@ def _differing(
     return np.concatenate(grams), np.concatenate(logs)
 
 
-def _between(
-    action: Array,
-    num: int,
-    *,
-    # Shares of the process that trials have in common, and the length over which
-    # they do, in deviations of the action.
-    shares: tuple[float, ...] = (0.5, 0.9),
-    lengths: tuple[float, ...] = (0.7, 1e3),
-) -> list[tuple[Array, Array]]:
-    """Return eigenvalues and vectors of what trials share, for each hypothesis."""
+def _between(action: Array, num: int) -> list[tuple[Array, Array]]:
+    """Return eigenvalues and vectors of what trials share, for each hypothesis.
+
+    They share some of the process, over a length in deviations of the action or all.
+    """
     spread = action.std(0)
     some = spread > 0
     scaled = action[:, some] / spread[some]
     square = ((scaled[:, None] - scaled) ** 2).sum(-1)
     found = [(np.ones(num), np.eye(num))]
-    for share in shares:
-        for length in lengths if some.any() else lengths[-1:]:
+    for share in (0.5, 0.9):
+        for length in (0.7, 1e3) if some.any() else (1e3,):
             kernel = share * np.exp(-0.5 * square / length**2)
             values, vectors = eigh(kernel + (1 - share) * np.eye(num))
             found.append((np.clip(values, 0, None), vectors))

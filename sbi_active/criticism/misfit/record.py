@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,40 +13,34 @@ from sbi_active.actions import ActionSpace
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.evidence.fit import Fit
-from sbi_active.criticism.linear.fits import refitted
-from sbi_active.criticism.misfit.draws import (
-    bends,
-    by_weights,
-    left_out_fit,
-    linear_fit,
-)
+from sbi_active.criticism.linear.search import Search
+from sbi_active.criticism.misfit.contrary import is_left_to_chance, withdrawn
+from sbi_active.criticism.misfit.draws import recorded
 from sbi_active.criticism.misfit.guesses import guess_residual
-from sbi_active.criticism.misfit.near_aliases import near_aliases
+from sbi_active.criticism.misfit.scored import weights_by_error
 from sbi_active.criticism.misfit.verdict import Verdict
 from sbi_active.criticism.results import (
-    OUTLIER,
     UNEXPLAINED,
     Estimate,
     Evidence,
     ModelKey,
     Tracing,
 )
+from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.criticism.steps.detection import THRESHOLD
-from sbi_active.criticism.steps.equivalence import equivalent_effects
-from sbi_active.criticism.steps.influence import is_left_to_chance, withdrawn
-from sbi_active.criticism.steps.predictive import predict
-from sbi_active.criticism.steps.tracing import (
-    credible_set,
-    estimate_of,
-    likeliest_first,
+from sbi_active.criticism.steps.equivalence import (
+    equivalent_effects,
+    every_action,
+    noise_unit,
 )
+from sbi_active.criticism.steps.predictive import predict
+from sbi_active.criticism.steps.tracing import credible_set
 from sbi_active.criticism.under_misfit import Misfit as Found
 from sbi_active.criticism.under_misfit import ModelError
+from sbi_active.seeding import derive_seed
 
-#: Probability from which an admitted model is recorded with its errors and draws, and
-#: how many are at most.
-SHOWN, MOST_SHOWN = 0.01, 8
+#: Probability from which an admitted model is recorded with its errors and draws.
+SHOWN = 0.01
 
 
 def traced(
@@ -62,91 +58,89 @@ def traced(
         actions: The permitted ones, for what they hardly separate.
         near: Whether to look for groups that these trials do not separate as well.
     """
-    rivals, key = found.rivals, found.key
     if found.is_missed:
         return _beside_misfit(found, held_out)
+    rivals, states, key = found.rivals, found.states, found.key
     is_unexplained = key.error == UNEXPLAINED  # with an error of no declared size
     chosen = () if is_unexplained else key.effects
-    shown = [k for k, p in found.choice.probabilities.items() if p >= SHOWN]
-    keys = [*found.states.keys(ModelKey()), *shown[:MOST_SHOWN], key]
+    louder = [k for k in found.probabilities if states.louder(k)]
+    louder = [k for k in louder if found.probabilities[k] >= SHOWN]
+    keys = [*states.keys(ModelKey()), *_shown(found), key, *louder]
     keys += [ModelKey((name,)) for name in rivals.effects]
-    keys = [k for k in dict.fromkeys(keys) if k.error is None or not k.effects]
-    probabilities = found.probabilities
-    evidences = {str(k): _record(found, k) for k in keys}
+    keys = [k for k in keys if k.error is None or not k.effects]
     groups = equivalent_effects(rivals, None) if near else ()
+    common = _common(found, keys, {str(k): p for k, p in found.probabilities.items()})
     aliases: tuple[frozenset[str], ...] = ()
     if found.detection.alarm:
-        singles = {n: evidences[n].log_evidence for n in rivals.effects}
+        singles = {n: common["evidences"][n].log_evidence for n in rivals.effects}
         known = [*found.equivalent, *groups]
         aliases = near_aliases(found.search, singles, actions, known)
-    effects = ModelKey(key.effects)
-    gain = found.states.log_evidence(ModelKey(found.choice.key.effects, UNEXPLAINED))
+    effects, best = ModelKey(key.effects), found.choice.key
+    gain = states.log_evidence(ModelKey(best.effects, UNEXPLAINED))
+    has_size, trials = found.search.sensor.is_known, rivals.trials
     tracing = Tracing(
         verdict=str(ModelKey(chosen) if chosen else ModelKey(error=key.error)),
         chosen=chosen,
-        probabilities=probabilities,
-        inclusion=found.inclusion,
-        credible_set=credible_set(probabilities),
-        equivalent=(*found.equivalent,),
         near=groups,
         aliases=aliases,
-        estimates=_estimates(found, evidences),
-        evidences=evidences,
-        robust=found.is_robust(),
         guesses=_guesses(found) if is_unexplained else (),
         beside=key.effects if is_unexplained else (),
         outliers=found.outliers,
-        needed=found.states.needed(effects, THRESHOLD) if chosen else (),
-        p_value=_tail(found, effects),
-        log_process=gain - found.states.log_evidence(found.choice.key),
-        trial_names=dict(
-            zip(rivals.trials.index.tolist(), rivals.trials.names, strict=True)
-        ),
+        needed=states.needed(effects, THRESHOLD) if chosen else (),
+        p_value=states.chi_square(effects)[1] if has_size else float("nan"),
+        log_process=gain - states.log_evidence(best),
+        trial_names=dict(zip(trials.index.tolist(), trials.names, strict=True)),
+        **common,
     )
     return withdrawn(tracing) if is_left_to_chance(tracing) else tracing
 
 
 def _beside_misfit(misfit: Verdict, held_out: Trials | None) -> Tracing:
     """Return the verdict where every model misses, or several effects fit."""
-    rivals, search, choice = misfit.rivals, misfit.search, misfit.choice
-    if getattr(rivals.model.noise, "measurement_sd", None) is None:
-        rivals.widen(2 * search.found[ModelKey()].model.rms)
-    singles = [ModelKey((name,)) for name in search.names]
-    shown = [k for k, p in choice.probabilities.items() if p >= SHOWN][:MOST_SHOWN]
-    tabled = [*dict.fromkeys([*shown, choice.key, ModelKey()])]
-    weights = _weights(misfit)
-    evidences = {}
-    for key in dict.fromkeys([*tabled, *singles, *weights]):
-        if key not in rivals.fits:
-            rivals.fits[key] = _beside(misfit, key)
-        evidences[str(key)] = rivals.fits[key].evidence
-    models = [_scored(misfit, key, held_out) for key in tabled]
-    found = _found(misfit, tuple(models), weights)
-    named = found.named
-    probabilities = {str(k): choice.probabilities.get(k, 0.0) for k in tabled}
-    probabilities |= {
-        n: choice.probabilities.get(ModelKey((n,)), 0.0) for n in search.names
-    }
+    search, choice = misfit.search, misfit.choice
+    singles = {name: ModelKey((name,)) for name in search.names}
+    tabled = [*dict.fromkeys([*_shown(misfit), choice.key, ModelKey()])]
+    named, p = choice.named, choice.probabilities
+    probabilities = {str(k): p.get(k, 0.0) for k in tabled}
+    probabilities |= {n: p.get(k, 0.0) for n, k in singles.items()}
     ordered = dict(sorted(probabilities.items(), key=lambda item: -item[1]))
-    beside = {k.effects[0]: search.found[k].posterior.log_process for k in singles}
-    guess = not (choice.key.effects if rivals.measurements.is_sequence else named)
+    keys = [*tabled, *singles.values(), *_weights(misfit)]
+    common = _common(misfit, keys, ordered)
+    beside = {n: search.found[k].posterior.log_process for n, k in singles.items()}
+    timed = misfit.rivals.measurements.is_sequence
     return Tracing(
         verdict=str(ModelKey(named)) if named else misfit.key.error or UNEXPLAINED,
         chosen=choice.key.effects,
-        probabilities=ordered,
-        inclusion=misfit.inclusion,
-        credible_set=credible_set(ordered),
-        equivalent=(*misfit.equivalent,),
         near=(),
         aliases=near_aliases(search, beside, None),
-        estimates=_estimates(misfit, evidences),
-        evidences=evidences,
-        robust=misfit.is_robust(),
-        guesses=_guesses(misfit) if guess else (),
+        guesses=() if (choice.key.effects if timed else named) else _guesses(misfit),
         beside=tuple(n for n in choice.key.effects if n not in named),
-        misfit=found,
+        misfit=_found(misfit, [_scored(misfit, key, held_out) for key in tabled]),
         p_value=misfit.model(choice.key).chi_square[2],
+        **common,
     )
+
+
+def _common(
+    found: Verdict, keys: Sequence[ModelKey], probabilities: dict[str, float]
+) -> dict[str, Any]:
+    """Return what a tracing has in any case, with records of some models."""
+    evidences = {str(k): recorded(found, k) for k in dict.fromkeys(keys)}
+    return {
+        "probabilities": probabilities,
+        "inclusion": found.inclusion,
+        "credible_set": credible_set(probabilities),
+        "equivalent": (*found.equivalent,),
+        "estimates": _estimates(found, evidences),
+        "evidences": evidences,
+        "robust": found.is_robust(),
+    }
+
+
+def _shown(found: Verdict) -> list[ModelKey]:
+    """Return the admitted models that are recorded with their errors and draws."""
+    p = found.choice.probabilities
+    return [key for key in p if p[key] >= SHOWN][:8]
 
 
 def _guesses(found: Verdict) -> tuple[tuple[str, float], ...]:
@@ -155,150 +149,37 @@ def _guesses(found: Verdict) -> tuple[tuple[str, float], ...]:
     return guess_residual(found.search) if known or not is_timed else ()
 
 
-def _tail(found: Verdict, key: ModelKey) -> float:
-    """Return the tail of a model's chi-square; NaN where the error has no size."""
-    known = found.search.sensor.is_known
-    return found.states.chi_square(key)[1] if known else float("nan")
+def _weights(misfit: Verdict) -> dict[ModelKey, float]:
+    """Return the models that count, by their errors on left-out parts.
 
-
-def fitted(found: Verdict, key: ModelKey, use: NDArray[np.bool_]) -> Fit:
-    """Return a linear model with its posterior by some parts of the trials.
-
-    Args:
-        found: Verdict with the model.
-        key: Key of the model.
-        use: Parts of the trials that count, shape (f,).
+    A next action is to tell these apart, six at most: each costs some hundred trials a
+    candidate.
     """
-    known = use[found.search.errors.fold]
-    if found.is_missed:
-        return _beside(found, key, use, known)
-    whole = found.rivals.fits.get(key)
-    if whole is not None and whole.evidence.engine != "linear":
-        return left_out_fit(whole, known)
-    return _alone(found, key, use, known)
-
-
-def _alone(
-    found: Verdict,
-    key: ModelKey,
-    use: NDArray[np.bool_] | None = None,
-    known: NDArray[np.bool_] | None = None,
-) -> Fit:
-    """Return a model that may fit. Beside a gross error, its trial tells little."""
-    states, search = found.states, found.search
-    at = own = states.mixture(key, use)
-    if key.effects and found.key == ModelKey(key.effects, OUTLIER):
-        at = states.mixture(found.key, use)
-    model = search.model(states.predicting(key))
-    if use is not None and np.isfinite(search.sensor.df):
-        model, at = by_weights(model, search, use)
-    given = found.rivals, key, model, at.mean, at.cov, own.log_evidence
-    options = {"known": known, "suspect": found.suspect}
-    if not states.louder(key):
-        return linear_fit(*given, unit=search.unit, **options)
-    phi, square = states.louder_draws(key, use)[0], states.chi_square(key)[0]
-    return linear_fit(*given, louder=phi, chi_square=square, **options)
-
-
-def _beside(
-    misfit: Verdict,
-    key: ModelKey,
-    use: NDArray[np.bool_] | None = None,
-    known: NDArray[np.bool_] | None = None,
-) -> Fit:
-    """Return a model that misses.
-
-    Wide draws leave the valleys of what bends: left-out trials are predicted from the
-    best fit, and so are others.
-    """
-    own, errors = misfit.search.found[key], misfit.search.errors
-    model, log_z, best = own.model, own.posterior.log_process, own.model.u
-    if use is not None:
-        search, kept = misfit.search, use[errors.fold]
-        best = refitted(search.rival(key), model, search.units, kept)
-    return linear_fit(
-        *(misfit.rivals, key, model, best, misfit.covariance(key), log_z),
-        best=best,
-        shown=misfit.shown(key) if use is None else None,
-        known=known,
+    found = misfit.search.found
+    weights = weights_by_error(
+        {key: candidate.left.square for key, candidate in found.items()},
+        {key: candidate.log_prior for key, candidate in found.items()},
+        derive_seed(misfit.rivals.seed, "weights"),
     )
+    return dict([(k, w) for k, w in weights.items() if w >= 0.05][:6])
 
 
-def _record(found: Verdict, key: ModelKey, *, fewest: float = 50.0) -> Evidence:
-    """Return the record of a model that may fit, and keep its draws.
-
-    The bare model and those that are likely have samples of the simulator's own
-    posterior where they bend.
-
-    Args:
-        found: Verdict with the model.
-        key: Key of the model.
-        fewest: Effective draws from which such a sample is taken, and not a linear
-            model's. Half and twice say little else: it is some hundreds or a few.
-    """
-    rivals = found.rivals
-    if key not in rivals.fits and _is_sampled(found, key):
-        fit = rivals.fit(key, found.search.model(key).u[None] if key.effects else None)
-        if fit.evidence.effective_sample_size >= fewest:
-            log_z = found.states.log_evidence(key)
-            evidence = replace(fit.evidence, log_evidence=log_z)
-            rivals.fits[key] = replace(fit, evidence=evidence)
-        else:
-            del rivals.fits[key]  # a few draws would claim to know what is open
-    if key not in rivals.fits:
-        rivals.fits[key] = _alone(found, key)
-    return rivals.fits[key].evidence
-
-
-def _is_sampled(found: Verdict, key: ModelKey) -> bool:
-    states, search = found.states, found.search
-    if key not in search.found:
-        return False
-    rivals = found.rivals
-    is_dear = rivals.measurements.is_sequence or rivals.simulator.is_stochastic
-    if is_dear and key not in (ModelKey(), found.key):
-        return False
-    others = [*search.found, *states.keys(ModelKey())]
-    least = max(map(states.log_evidence, others)) - THRESHOLD
-    several = len(key.effects) > 1 and key != found.key
-    if several or (key.effects and states.log_evidence(key) < least):
-        return False
-    return bends(search, key)
-
-
-def _weights(
-    misfit: Verdict,
-    *,
-    # Weight by the error on left-out parts from which a next action is to tell a
-    # model from others, and how many are at most: each costs some hundred trials a
-    # candidate.
-    counts: float = 0.05,
-    most_counted: int = 6,
-) -> dict[ModelKey, float]:
-    """Return the models that count, by their errors on left-out parts."""
-    weights = misfit.weights
-    kept = [key for key, weight in weights.items() if weight >= counts]
-    return {key: weights[key] for key in kept[:most_counted]}
-
-
-def _found(
-    misfit: Verdict, models: tuple[ModelError, ...], weights: dict[ModelKey, float]
-) -> Found:
+def _found(misfit: Verdict, models: Sequence[ModelError]) -> Found:
     choice, search = misfit.choice, misfit.search
     m = search.rivals.measurements
-    last = search.found[choice.key]
+    size, time_scale = search.errors.process(search.found[choice.key].posterior.beside)
     return Found(
-        models=models,
+        models=(*models,),
         helps=choice.key.effects,
         named=choice.named,
         support=choice.support,
         open_forms=_open_forms(misfit),
         sensor=np.sqrt(_by_channel(search.unit**2, m.channel)),
         passes=misfit.passes(choice.key),
-        size=last.posterior.size,
-        time_scale=last.posterior.time_scale if m.is_sequence else np.nan,
+        size=size,
+        time_scale=time_scale if m.is_sequence else np.nan,
         left_out="trials" if search.errors.is_by_trial else "parts of trials",
-        weights={str(key): weight for key, weight in weights.items()},
+        weights={str(key): weight for key, weight in _weights(misfit).items()},
         instead=choice.instead,
     )
 
@@ -336,12 +217,11 @@ def _scored(misfit: Verdict, key: ModelKey, held_out: Trials | None) -> ModelErr
 
 def _held_out(misfit: Verdict, key: ModelKey, held_out: Trials) -> Array:
     """Return the root mean square error on held-out trials by channel, (c,)."""
-    prediction = predict(misfit.rivals, held_out, key=key)
+    prediction = predict(misfit.models, held_out, key=key)
     m = Measurements.of(held_out, is_sequence=True)
     channel = np.zeros(int(np.prod(m.shape)), dtype=np.int64)
     channel[m.position] = m.channel
-    x = held_out.x.double().numpy().ravel()[prediction.position]
-    error = x - prediction.middle
+    error = prediction.of(held_out) - prediction.middle
     return np.sqrt(_by_channel(error**2, channel[prediction.position]))
 
 
@@ -350,14 +230,90 @@ def _by_channel(square: Array, channel: NDArray[np.int64]) -> Array:
 
 
 def _estimates(found: Verdict, evidences: dict[str, Evidence]) -> tuple[Estimate, ...]:
-    bare = evidences[str(ModelKey())].log_evidence
-    return likeliest_first(
-        estimate_of(
-            effect,
-            evidences[name],
+    """Return each effect by the draws of the model that has it alone, likeliest first.
+
+    Its phi is the end of the draws.
+    """
+    bare, estimates = evidences[str(ModelKey())].log_evidence, []
+    for name, effect in found.rivals.effects.items():
+        if name not in evidences:
+            continue
+        own = evidences[name]
+        phi = own.draws[:, -effect.phi_dim :]
+        estimate = Estimate(
+            name=name,
+            family=str(effect.family),
+            units=effect.units,
+            describe=effect.describe or "",
             probability=found.inclusion[name],
-            log_bayes_factor=evidences[name].log_evidence - bare,
+            log_bayes_factor=own.log_evidence - bare,
+            mean=phi.mean(0),
+            sd=phi.std(0),
+            effective_sample_size=own.effective_sample_size,
+            engine=own.engine,
         )
-        for name, effect in found.rivals.effects.items()
-        if name in evidences
-    )
+        estimates.append(estimate)
+    return (*sorted(estimates, key=lambda e: -e.probability),)
+
+
+def near_aliases(
+    search: Search,
+    log_z: Mapping[str, float],
+    actions: ActionSpace | None,
+    known: Sequence[frozenset[str]] = (),
+) -> tuple[frozenset[str], ...]:
+    r"""Return pairs of effects that are nearly the same here.
+
+    Both have an evidence within log 20 of the best effect's, so that neither is worth
+    an alarm against the other, and fitted to the trials their predictions differ
+    over the permitted actions by less than the noise in the root mean square:
+
+    .. math::
+        \tfrac1N \sum_i (m_{a,i} - m_{b,i})^2 / s_i^2 < 1 .
+
+    They are not equivalent: repeated trials, or stronger data, tell them apart.
+
+    Args:
+        search: Search that has fitted each effect alone.
+        log_z: Evidence of each effect alone, nats.
+        actions: The permitted ones; None compares on the trials at hand.
+        known: Groups that are listed already.
+
+    Returns:
+        Pairs, none of them within a known group.
+    """
+    best = max((log_z[name] for name in search.names), default=-np.inf)
+    likely = [name for name in search.names if log_z[name] > best - THRESHOLD]
+    if len(likely) < 2:
+        return ()
+    mean = _predictions(search, likely, actions)
+    found = []
+    for a, b in combinations(likely, 2):
+        gap = mean[a] - mean[b]
+        gap, pair = gap[np.isfinite(gap)], frozenset({a, b})
+        is_close = gap.size > 0 and np.mean(gap**2) < 1
+        if is_close and not any(pair <= group for group in known):
+            found.append(pair)
+    return tuple(found)
+
+
+def _predictions(
+    search: Search, names: Sequence[str], actions: ActionSpace | None
+) -> dict[str, Array]:
+    """Return what each effect predicts at its best fit, in deviations, (N,) each."""
+    models = {name: search.model(ModelKey((name,))) for name in names}
+    if actions is None:
+        return {n: -m.scale * m.residual[: m.num] for n, m in models.items()}
+    rivals = search.rivals
+    trials = every_action(rivals, actions)
+    seed = derive_seed(rivals.seed, "aliases")
+    simulator = TrialSimulator(rivals.simulator.model, trials, seed=seed)
+    unit, found = noise_unit(rivals, simulator), {}
+    for name, model in models.items():
+        coordinates = rivals.rival(model.key).coordinates
+        theta, phi = coordinates.split(model.u[None])
+        for effect in rivals.nuisances:
+            null = effect.null_phi(len(trials), finite=True)
+            phi[effect.name] = null.reshape(1, len(trials), -1)
+        found[name] = simulator.predict(theta, phi)[0][0] / unit
+    return found

@@ -143,42 +143,37 @@ class Rule:
                 effect of a set gain over it; None where none were made.
         """
         probabilities = self._probabilities(models, timed=timed)
-        inclusion = {
-            n: sum(v for k, v in probabilities.items() if n in k.effects) for n in names
-        }
         alike = {
             n: next((g for g in equivalent if n in g), frozenset({n})) for n in names
         }
 
-        def helping(
-            top: ModelKey,
-        ) -> tuple[ModelKey, dict[str, float], dict[str, float]]:
+        def share(group: frozenset[str]) -> float:
+            return sum(v for k, v in probabilities.items() if group & {*k.effects})
+
+        def helping(top: ModelKey) -> tuple[ModelKey, dict[str, float]]:
             near = self.stand_ins(models, top, names)
-            groups = {n: group.union(near.get(n, ())) for n, group in alike.items()}
-            pooled = {
-                n: sum(v for k, v in probabilities.items() if groups[n] & {*k.effects})
-                for n in names
-            }
-            return *self._pruned(models, top, pooled, timed=timed), pooled
+            pooled = {n: share(g.union(near.get(n, ()))) for n, g in alike.items()}
+            return self._pruned(models, top, pooled, timed=timed)
 
         top, *larger = self.starts(models, names, timed=timed)
-        key, better, pooled = helping(top)
+        key, better = helping(top)
         for start in larger:
             again = helping(start)
             # What a further effect drives out was not there for it.
             if {*again[0].effects} > {*key.effects}:
-                key, better, pooled = again
-        support = {}
-        for n in key.effects:
-            # Which of several that no action separates it is nobody can tell.
-            either = sum(v for k, v in probabilities.items() if alike[n] & {*k.effects})
-            support[n] = Support(
-                inclusion=either,
+                key, better = again
+        support = {
+            n: Support(
+                # Which of several that no action separates it is nobody can tell.
+                inclusion=share(alike[n]),
                 better=better[n],
                 gained=max(models[key].gain(models[key.without(n)]), 0.0),
                 remains=_remains(models, key, n),
                 guessed=-np.inf if guessed is None else guessed(key, n),
             )
+            for n in key.effects
+        }
+        inclusion = {n: share(frozenset({n})) for n in names}
         named = tuple(n for n, own in support.items() if self.is_cause(own))
         if _explains(models, key):
             named = key.effects

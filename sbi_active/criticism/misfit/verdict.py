@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import chain, combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +18,9 @@ from scipy.stats import chi2
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.contradictions import OutlyingTrial
-from sbi_active.criticism.data.trials import Trials
-from sbi_active.criticism.linear.errors import Posterior
+from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.linear.left_out import Candidate, standard_errors
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
@@ -27,8 +29,8 @@ from sbi_active.criticism.misfit.guesses import gained_by_guesses
 from sbi_active.criticism.misfit.intervals import covariance, widened
 from sbi_active.criticism.misfit.rule import Choice, Rule
 from sbi_active.criticism.misfit.scored import Scored
-from sbi_active.criticism.misfit.weights import weights_by_error
 from sbi_active.criticism.results import (
+    NONE,
     OUTLIER,
     SCATTER,
     UNEXPLAINED,
@@ -37,9 +39,8 @@ from sbi_active.criticism.results import (
 )
 from sbi_active.criticism.steps.detection import LEVEL, THRESHOLD
 from sbi_active.criticism.steps.missed_trials import outlying_trials
-from sbi_active.criticism.steps.tracing import RESCALED, kind_of, log_bayes_factor
+from sbi_active.criticism.steps.tracing import RESCALED
 from sbi_active.inference.sampling.weights import log_sum_exp
-from sbi_active.seeding import derive_seed
 
 
 def judge(
@@ -110,13 +111,33 @@ class Verdict:
     def _log_bayes_factor(
         self, use: NDArray[np.bool_] | None = None, factor: float = 1.0
     ) -> float:
-        """Return the log Bayes factor of everything else against the bare model."""
-        names = (UNEXPLAINED, SCATTER, *self.rivals.effects)
-        keys = [ModelKey(), *map(ModelKey.of, names)]
-        log_z = {
-            key: self.states.mixture(key, use, factor).log_evidence for key in keys
-        }
-        return log_bayes_factor(log_z, self.rivals.library, self.equivalent)
+        """Return the log Bayes factor of everything else against the bare model.
+
+        The residual process, noise inflation and each effect have equal weights;
+        effects that nothing separates count as one, and effects that nothing separates
+        from the bare model, or that were screened out, do not count.
+        """
+        every = {e.name for e in self.rivals.library}
+        shares = {UNEXPLAINED: 1.0, SCATTER: 1.0}
+        for effect in self.rivals.library:
+            group = self._group(effect.name)
+            if NONE not in group:
+                shares[effect.name] = 1 / len(group & every)
+        total, kept = sum(shares.values()), {*self.rivals.effects, UNEXPLAINED, SCATTER}
+
+        def log_z(name: str) -> float:
+            return self.states.mixture(ModelKey.of(name), use, factor).log_evidence
+
+        parts = [
+            log_z(name) + float(np.log(share / total))
+            for name, share in shares.items()
+            if name in kept
+        ]
+        return float(log_sum_exp(np.array(parts)) - log_z(NONE))
+
+    def _group(self, name: str) -> frozenset[str]:
+        """Return the effects that no permitted action tells from one, with it."""
+        return next((g for g in self.equivalent if name in g), frozenset({name}))
 
     @cached_property
     def standard(self) -> Callable[[Candidate], Array]:
@@ -208,16 +229,27 @@ class Verdict:
         return self.search.sensor.is_known and is_missed
 
     @cached_property
-    def probabilities(self) -> dict[str, float]:
+    def models(self) -> RivalSet:
+        """The models, with the posteriors of those that are recorded.
+
+        Where every one misses, errors may be larger than declared.
+        """
+        rivals = self.rivals
+        measured = getattr(rivals.model.noise, "measurement_sd", None)
+        if self.is_missed and measured is None:
+            return rivals.widened(2 * self.model(ModelKey()).rms)
+        return rivals
+
+    @cached_property
+    def probabilities(self) -> dict[ModelKey, float]:
         """Probabilities of the admitted models, the states of a bare one apart."""
-        found: dict[str, float] = {}
+        found = {ModelKey((name,)): 0.0 for name in self.rivals.effects}
         for key, p in self.choice.probabilities.items():
             for own, share in self.states.share(key).items():
                 # What an effect on the noise makes of the error is an effect as well.
-                name = str(own if own.error is None or not key.effects else key)
-                found[name] = found.get(name, 0.0) + p * share
-        every = dict.fromkeys(self.rivals.effects, 0.0) | found
-        return dict(sorted(every.items(), key=lambda item: -item[1]))
+                model = own if own.error is None or not key.effects else key
+                found[model] = found.get(model, 0.0) + p * share
+        return dict(sorted(found.items(), key=lambda item: -item[1]))
 
     @cached_property
     def inclusion(self) -> dict[str, float]:
@@ -253,12 +285,6 @@ class Verdict:
     def passes(self, key: ModelKey) -> bool:
         """Return whether a model's chi-square passes against the sensor."""
         return self.model(key).chi_square[2] > self.rule.passes
-
-    def posterior(self, key: ModelKey, use: NDArray[np.bool_]) -> Posterior:
-        """Return the posterior of a model by some parts of the trials."""
-        found = self.search.found[key]
-        given = found.model, found.grams, use
-        return self.search.errors.posterior(*given, process=self.is_missed)
 
     def shown(self, key: ModelKey) -> Array:
         """Return the covariance that intervals of a model's coordinates have, (d, d).
@@ -298,31 +324,32 @@ class Verdict:
             self._covariances[key] = covariance(*given)
         return self._covariances[key]
 
-    @cached_property
-    def weights(self) -> dict[ModelKey, float]:
-        """Weight of each model by its errors on left-out parts."""
-        found = self.search.found
-        return weights_by_error(
-            {key: candidate.left.square for key, candidate in found.items()},
-            {key: candidate.log_prior for key, candidate in found.items()},
-            derive_seed(self.rivals.seed, "weights"),
-        )
-
     def chosen_by(self, use: NDArray[np.bool_]) -> ModelKey:
         """Return the model that is chosen by some parts of the trials.
 
         Args:
             use: Parts of the trials that count, shape (f,).
         """
-        search = self.search
-        if self._log_bayes_factor(use) < THRESHOLD and not self.detection.by_chi_square:
+        key = self._chosen(use)
+        if key is None:
             return ModelKey()
-        standard = standard_errors(search.found, search.errors, use)
-        key = self._settled(partial(self._scored, use=use, standard=standard)).key
         if self.is_missed:
             return key if key.effects else ModelKey(error=UNEXPLAINED)
         joint = self.states.joint(key, use)
         return max(joint, key=joint.__getitem__)
+
+    def _chosen(
+        self, use: NDArray[np.bool_] | None = None, factor: float = 1.0
+    ) -> ModelKey | None:
+        """Return the effects that help; None without an alarm."""
+        gains = self._log_bayes_factor(use, factor) >= THRESHOLD
+        if not gains and not self.detection.by_chi_square:
+            return None
+        standard = self.standard
+        if use is not None:
+            standard = standard_errors(self.search.found, self.search.errors, use)
+        given = {"use": use, "factor": factor, "standard": standard}
+        return self._settled(partial(self._scored, **given)).key
 
     def outlying(self) -> tuple[OutlyingTrial, ...]:
         """Return the trials that err far more than the others let expect.
@@ -348,32 +375,24 @@ class Verdict:
 
     def is_robust(self) -> bool:
         """Return whether effect priors of another scale leave what helps."""
-        own = kind_of(self.choice.key, self.rivals, self.equivalent)
-        for factor in RESCALED:
-            other = ModelKey()
-            gains = self._log_bayes_factor(factor=factor) >= THRESHOLD
-            if gains or self.detection.by_chi_square:
-                other = self._settled(partial(self._scored, factor=factor)).key
-            if kind_of(other, self.rivals, self.equivalent) != own:
-                return False
-        return True
+        own = self._kind(self.choice.key)
+        others = (self._chosen(factor=f) or ModelKey() for f in RESCALED)
+        return all(self._kind(other) == own for other in others)
 
+    def _kind(self, key: ModelKey) -> frozenset[str]:
+        """Return the subject of a set: families of forces, or groups of effects."""
 
-def without(trials: Trials, outlying: Sequence[OutlyingTrial]) -> Trials:
-    """Return all trials but some of those that were fitted."""
-    fitted = [k for k, role in enumerate(trials.role) if role == "fit"]
-    gone = {fitted[trial.position] for trial in outlying}
-    return trials.select([k for k in range(len(trials)) if k not in gone])
+        def kind(effect: Effect) -> str:
+            if is_force(effect):
+                return str(effect.family)
+            group = self._group(effect.name)
+            return effect.name if NONE in group else min(group)
+
+        return frozenset(kind(self.rivals.effects[name]) for name in key.effects)
 
 
 def _missing(search: Search, key: ModelKey) -> list[ModelKey]:
     """Return the subsets of a set that were not fitted, smaller ones first."""
-    wanted: list[ModelKey] = []
-    todo = [key]
-    while todo:
-        for part in todo.pop().parts:
-            if part not in wanted:
-                wanted.append(part)
-                todo.append(part)
-    missing = [k for k in wanted if k not in search.found]
-    return sorted(missing, key=lambda k: len(k.effects))
+    names = key.effects
+    parts = chain.from_iterable(combinations(names, k) for k in range(len(names)))
+    return [part for part in map(ModelKey, parts) if part not in search.found]

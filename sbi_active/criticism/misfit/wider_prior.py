@@ -1,7 +1,8 @@
-"""Parameters at bounds of the prior, and what a wider one would give."""
+"""Whether a verdict's effects stand in for a wider prior, or for something else."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -10,17 +11,67 @@ from scipy.stats import chi2
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.contradictions import BoundParameter, Bounds
+from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.results import NONE, UNEXPLAINED, ModelKey, Tracing
+from sbi_active.criticism.forces.library import is_force
+from sbi_active.criticism.misfit.contrary import unless_refuted, withdrawn
+from sbi_active.criticism.results import (
+    NONE,
+    UNEXPLAINED,
+    Evaluation,
+    ModelKey,
+    Tracing,
+)
 from sbi_active.criticism.rivals.error_models import Whitener
 from sbi_active.criticism.rivals.rival import Rival
-from sbi_active.criticism.steps.detection import THRESHOLD
-from sbi_active.criticism.steps.influence import withdrawn
+from sbi_active.criticism.steps.detection import LEVEL, THRESHOLD
 from sbi_active.inference.sampling.least_squares import descend
 from sbi_active.seeding import derive_seed
 
 #: Draws of a posterior that say whether it lies at a bound, and steps of a refit.
 NUM_DRAWS, STEPS = 400, 30
+
+
+def judged(
+    rivals: RivalSet, tracing: Tracing, evaluation: Evaluation | None
+) -> Tracing:
+    """Return the tracing, and whether its forces are stand-ins.
+
+    A force is adopted as an explanation only if the chi-square of its model has a tail
+    probability of at least .01, and the error on trials that were not used falls. A
+    force with which that error rises is withdrawn, and so are effects that a wider
+    prior makes up for.
+
+    Args:
+        rivals: The models.
+        tracing: Tracing with the effects that the data point to.
+        evaluation: Error before and after on trials that had no part in it.
+    """
+    tracing = beyond_bounds(rivals, unless_refuted(tracing, evaluation))
+    effects = {e.name: e for e in rivals.library}
+    if not any(is_force(effects[name]) for name in tracing.chosen):
+        return tracing
+    if evaluation is not None:
+        rmse = evaluation.table.set_index("metric").to_dict("index")["rmse"]
+        if rmse["ratio"] >= 1:
+            return replace(withdrawn(tracing), refuted=(rmse["before"], rmse["after"]))
+    return replace(tracing, stand_in=(*_reasons(rivals, tracing, evaluation),))
+
+
+def _reasons(
+    rivals: RivalSet, tracing: Tracing, evaluation: Evaluation | None
+) -> Iterator[str]:
+    if tracing.p_value < LEVEL:
+        yield f"its chi-square has p = {tracing.p_value:.2g}"
+    if evaluation is not None and evaluation.p_value < LEVEL:
+        yield f"that of held-out trials has p = {evaluation.p_value:.2g}"
+    if any(name.startswith("free") for name in tracing.chosen):
+        yield "its form is free"
+    families = [e.family for e in rivals.library if e.name in tracing.chosen]
+    if len({*families}) < len(families):
+        yield "it takes several forms of one family"
+    if tracing.log_process > 1.1:  # it does not explain all
+        yield f"a residual process beside it gains {tracing.log_process:.1f} nats"
 
 
 def beyond_bounds(rivals: RivalSet, tracing: Tracing) -> Tracing:
@@ -38,19 +89,25 @@ def beyond_bounds(rivals: RivalSet, tracing: Tracing) -> Tracing:
         tracing: Tracing with the effects that the data point to.
     """
     keys = [k for k in dict.fromkeys([ModelKey(), tracing.key]) if k in rivals.fits]
-    sides = {key: _sides(rivals, key) for key in keys}
-    if not any(side.any() for side in sides.values()):
+    fits = [rivals.fits[key] for key in keys]
+    sides = [_sides(fit, derive_seed(rivals.seed, "bounds")) for fit in fits]
+    if not any(side.any() for side in sides):
         return _unless_none(tracing, Bounds())
-    last = keys[-1]
-    whiten, square = _explained(rivals, last)
+    start, own = fits[-1].point, rivals.rival(ModelKey(keys[-1].effects))
+    whiten = rivals.noise.whitener(own.residual(start[None])[0][0])
+    u = _best(rivals, own, whiten, start[None])
+    assert u is not None
+    square = float((whiten(own.residual(u[None])[0][0]) ** 2).sum())
+    dim = rivals.prior.event_shape[0]
     found: list[BoundParameter] = []
     p_value, replaces = float("nan"), ""
-    for key, side in sides.items():
+    for key, fit, side in zip(keys, fits, sides, strict=True):
         if not side.any():
             continue
         rival = _moved(rivals.rival(key), side)
-        u = _best(rivals, rival, whiten, _starts(rivals, key, last))
-        held = _told(rivals, key, side, rival, u)
+        starts = np.stack([fit.point, np.r_[start[:dim], fit.point[dim:]]])
+        u = _best(rivals, rival, whiten, starts)
+        held = _told(rivals, fit, side, rival, u)
         found += held
         if key != ModelKey() or u is None or not held:
             continue
@@ -74,21 +131,12 @@ def _unless_none(tracing: Tracing, bounds: Bounds) -> Tracing:
     return replace(tracing, bounds=bounds)
 
 
-def _sides(
-    rivals: RivalSet,
-    key: ModelKey,
-    *,
-    # Distance of an effect's null to a bound, in prior deviations, that is
-    # rounding.
-    near: float = 1e-6,
-) -> NDArray[np.int64]:
+def _sides(fit: Fit, seed: int) -> NDArray[np.int64]:
     """Return at which bound each of theta and phi is in a model, (d,): -1, 1 or 0."""
-    fit = rivals.fits[key]
     c = fit.rival.coordinates
     own = sum(c.joint.sizes)
     if fit.best is None:
-        rng = np.random.default_rng(derive_seed(rivals.seed, "bounds"))
-        u = fit.sample.draws(NUM_DRAWS, rng)
+        u = fit.sample.draws(NUM_DRAWS, np.random.default_rng(seed))
     else:  # where draws are as wide as misfit asks, some reach any bound
         u = fit.best[None]
     side = c.sides(u[:, :own])
@@ -99,54 +147,27 @@ def _sides(
     first = own - len(declared)  # of a simulator that was extended there are more
     z[first:own] = declared
     ends = np.where(side < 0, c.low[:own], c.high[:own])
-    vanishes = np.abs(c.from_z(z[None])[0, :own] - ends) < near
+    vanishes = np.abs(c.from_z(z[None])[0, :own] - ends) < 1e-6
     side[first:][vanishes[first:]] = 0
     return side
 
 
-def _explained(rivals: RivalSet, key: ModelKey) -> tuple[Whitener, float]:
-    """Return the whitener of residuals of a model's best fit, and its chi-square."""
-    rival = rivals.rival(ModelKey(key.effects))
-    start = _start(rivals, key)
-    whiten = rivals.noise.whitener(rival.residual(start[None])[0][0])
-    u = _best(rivals, rival, whiten, start[None])
-    assert u is not None
-    return whiten, float((whiten(rival.residual(u[None])[0][0]) ** 2).sum())
+def _moved(rival: Rival, side: NDArray[np.int64]) -> Rival:
+    """Return a rival with some of its bounds moved by the width of the prior.
 
-
-def _start(rivals: RivalSet, key: ModelKey) -> Array:
-    """Return the coordinates that a model predicts from, (d,)."""
-    fit = rivals.fits[key]
-    return fit.likeliest[0] if fit.best is None else fit.best
-
-
-def _starts(rivals: RivalSet, key: ModelKey, other: ModelKey) -> Array:
-    """Return starts of a refit: a model's own best fit, and theta of another's."""
-    own, dim = _start(rivals, key), rivals.prior.event_shape[0]
-    return np.stack([own, np.r_[_start(rivals, other)[:dim], own[dim:]]])
-
-
-def _moved(
-    rival: Rival,
-    side: NDArray[np.int64],
-    *,
-    # Share of a positive parameter's bound that a moved one keeps of it: what has a
-    # sign keeps it, since a simulator may not know what a negative friction is.
-    kept: float = 0.1,
-    # Move of a bound, in widths of the prior. Half of it still reaches what a prior
-    # barely excludes, twice asks too much of the simulator.
-    wider: float = 1.0,
-) -> Rival:
-    """Return a rival with some of its bounds moved."""
+    Half of that still reaches what a prior barely excludes, twice asks too much of the
+    simulator. A positive parameter keeps its sign and a tenth of its bound, since a
+    simulator may not know what a negative friction is.
+    """
     c = rival.coordinates
-    zero, width = -c.shift / c.scale, wider * (c.high - c.low)
+    zero, width = -c.shift / c.scale, c.high - c.low
     low, high = c.low.copy(), c.high.copy()
     for k in np.flatnonzero(side):
         end, bound = (low, c.low[k]) if side[k] < 0 else (high, c.high[k])
         end[k] = bound + side[k] * width[k]
         is_signed = not c.is_log[k] and side[k] * (zero[k] - bound) > 0
         if is_signed:
-            last = zero[k] + kept * (bound - zero[k])
+            last = zero[k] + 0.1 * (bound - zero[k])
             end[k] = max(end[k], last) if side[k] < 0 else min(end[k], last)
     c.low, c.high = low, high
     return rival
@@ -179,17 +200,13 @@ def _tail(
 
 
 def _told(
-    rivals: RivalSet,
-    key: ModelKey,
-    side: NDArray[np.int64],
-    rival: Rival,
-    u: Array | None,
+    rivals: RivalSet, fit: Fit, side: NDArray[np.int64], rival: Rival, u: Array | None
 ) -> list[BoundParameter]:
     """Return the parameters of a model at bounds, and where they are beyond them.
 
     One that stays inside though its bound was moved is not held by it.
     """
-    c = rivals.fits[key].rival.coordinates
+    c = fit.rival.coordinates
     z = np.full(c.dim, np.nan) if u is None else rival.coordinates.to_z(u[None])[0]
     names = rivals.names_of(rival)
     found = []
@@ -203,7 +220,7 @@ def _told(
         found.append(
             BoundParameter(
                 name=names[k],
-                model=str(ModelKey(key.effects)),
+                model=str(ModelKey(rival.key.effects)),
                 side="lower" if side[k] < 0 else "upper",
                 bound=float(bound),
                 beyond=float(beyond),

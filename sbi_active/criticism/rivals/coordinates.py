@@ -92,18 +92,15 @@ class SearchCoordinates:
         low, high = (end[: z.shape[1]] for end in self._bounds())
         return np.clip(z, low, high)
 
-    def sides(
-        self, u: Array, *, at_edge: float = 0.05, edge: float = 0.01, open: float = 0.2
-    ) -> NDArray[np.int64]:
+    def sides(self, u: Array) -> NDArray[np.int64]:
         """Return the bound at which each of the first coordinates lies, (k,).
+
+        They lie at one if a twentieth of the draws is near it, within a hundredth of
+        the prior's range. From a deviation of a fifth of that range (of a uniform prior
+        it is .29) trials leave a parameter open: it is near any bound now and then.
 
         Args:
             u: Draws of a posterior, shape (n, k).
-            at_edge: Share of draws near a bound from which they lie at it.
-            edge: Distance to a bound that is near, in ranges of the prior.
-            open: Deviation, in that range, from which trials leave a
-                parameter open: it is near any bound now and then. Of a
-                uniform prior it is .29.
 
         Returns:
             -1 for the lower one, 1 for the upper one, 0 for none.
@@ -112,9 +109,9 @@ class SearchCoordinates:
         bounded = np.isfinite(low) & np.isfinite(high)
         low, high = np.where(bounded, low, 0.0), np.where(bounded, high, 1.0)
         place = (u - low) / (high - low)
-        below, above = (place < edge).mean(0), (place > 1 - edge).mean(0)
-        is_there = np.maximum(below, above) > at_edge
-        is_there &= bounded & (place.std(0) <= open)
+        below, above = (place < 0.01).mean(0), (place > 0.99).mean(0)
+        is_there = np.maximum(below, above) > 0.05
+        is_there &= bounded & (place.std(0) <= 0.2)
         return np.where(is_there, np.where(below > above, -1, 1), 0)
 
     def split(self, u: Array) -> tuple[Tensor, dict[str, Tensor]]:
@@ -128,21 +125,14 @@ class SearchCoordinates:
             phi[effect.name] = p.reshape(len(z), self.num_trials, effect.phi_dim)
         return theta, phi
 
-    def log_prob(
-        self,
-        u: Array,
-        *,
-        # Distance from a bound, in deviations of the prior, within which densities are
-        # those there.
-        rounding: float = 1e-6,
-    ) -> Array:
+    def log_prob(self, u: Array) -> Array:
         """Return log prior densities with respect to u, shape (n,)."""
         inside = ((u >= self.low) & (u <= self.high)).all(1)
         density = np.full(len(u), -np.inf)
         if not inside.any():
             return density
         # A bound itself may round to beyond.
-        u = np.clip(u[inside], self.low + rounding, self.high - rounding)
+        u = np.clip(u[inside], self.low + 1e-6, self.high - 1e-6)
         z = torch.from_numpy(self.to_z(u))
         own = sum(self.joint.sizes)
         log_p = self.joint.log_prob(z[:, :own]).double()
@@ -164,34 +154,25 @@ class SearchCoordinates:
         step serves them all.
         """
         own = sum(self.joint.sizes)
-        rows = [*np.eye(self.dim)[:own]]
-        at = own
+        entry, at = [np.arange(own)], own
         for effect in self.nuisances:
-            for j in range(effect.phi_dim):
-                row = np.zeros(self.dim)
-                row[at + j : at + effect.phi_dim * self.num_trials : effect.phi_dim] = 1
-                rows.append(row)
-            at += effect.phi_dim * self.num_trials
-        return rows
+            entry.append(np.tile(np.arange(at, at + effect.phi_dim), self.num_trials))
+            at += effect.phi_dim
+        return [*(np.concatenate(entry) == np.arange(at)[:, None]).astype(float)]
 
     def trial_of(self) -> NDArray[np.int64]:
         """Return the trial that each coordinate belongs to, -1 for all, (dim,)."""
-        own = sum(self.joint.sizes)
-        parts = [np.full(own, -1)]
-        for effect in self.nuisances:
-            parts.append(np.repeat(np.arange(self.num_trials), effect.phi_dim))
-        return np.concatenate(parts).astype(np.int64)
+        trials = np.arange(self.num_trials)
+        own = [np.repeat(trials, effect.phi_dim) for effect in self.nuisances]
+        return np.concatenate([np.full(sum(self.joint.sizes), -1), *own])
 
-    def _for_units(
-        self,
-        *,
-        # Draws that give a prior's mean and deviation to some 3 %; they only set units.
-        num_draws: int = 1_000,
-    ) -> Array:
+    def _for_units(self) -> Array:
         """Return draws by which each part has the same units beside any others.
 
         A null, or an end of another search, is carried from one rival to the next.
+        A thousand draws give a prior's mean and deviation to some 3 %.
         """
+        num_draws = 1_000
         with forked_generators(0):
             parts = [self.joint.prior.sample(torch.Size([num_draws])).double()]
         for effect in self.joint.effects:
@@ -221,18 +202,15 @@ class SearchCoordinates:
         ]
         for e in self.nuisances:
             low, high = support_bounds(support_of(e.prior), e.phi_dim)
-            pairs.append(
-                (np.tile(low, self.num_trials), np.tile(high, self.num_trials))
-            )
+            low, high = (np.tile(end, self.num_trials) for end in (low, high))
+            pairs.append((low, high))
         low, high = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
         at = self.joint.sizes[0]
         for effect in self.joint.effects:
             own = slice(at, at + effect.phi_dim)
             least, most = dissipative_bounds(effect)
-            low[own], high[own] = (
-                np.maximum(low[own], least),
-                np.minimum(high[own], most),
-            )
+            low[own] = np.maximum(low[own], least)
+            high[own] = np.minimum(high[own], most)
             at += effect.phi_dim
         return low, high
 
@@ -268,21 +246,13 @@ def dissipative_bounds(effect: Effect) -> tuple[Array, Array]:
     return low, high
 
 
-def _runs_away(
-    effect: Effect,
-    phi: torch.Tensor,
-    *,
-    # Speeds far beyond any tried, and the exponent of the speed from which a force
-    # outgrows damping in proportion to it.
-    speeds: tuple[float, ...] = (1e3, 1e4),
-    exponent: float = 1.5,
-    # Degrees of freedom, and states, at which a force is asked.
-    num_dofs: int = 64,
-    num_states: int = 8,
-) -> bool:
-    """Return whether the force drives at high speeds, and ever more so."""
-    rng = np.random.default_rng(0)
-    shape = num_states, num_dofs
+def _runs_away(effect: Effect, phi: torch.Tensor) -> bool:
+    """Return whether the force drives at high speeds, and ever more so.
+
+    Speeds are far beyond any tried, and it outgrows damping in proportion to them.
+    """
+    rng, speeds = np.random.default_rng(0), (1e3, 1e4)
+    num_states, num_dofs = shape = 8, 64
     ways = np.where(rng.random(shape) < 0.5, -1.0, 1.0)
     q = rng.uniform(-1, 1, shape)
     context = Context(index=torch.zeros(num_states, dtype=torch.float64))
@@ -299,4 +269,4 @@ def _runs_away(
             return False
         sizes.append(np.abs(power).mean())
     growth = np.log(sizes[1] / sizes[0]) / np.log(speeds[1] / speeds[0])
-    return bool(growth > exponent)
+    return bool(growth > 1.5)

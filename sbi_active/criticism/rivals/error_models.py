@@ -1,20 +1,32 @@
-"""Distributions of the measurement error, with what is unknown summed out.
+r"""Distributions of the measurement error, with what is unknown summed out.
 
 The correlation time and the size of the noise belong to the bare model and to every
 rival alike. Each is a grid, so that a likelihood is a sum over its cells and no rival
 pays for them with a coordinate.
+
+Where the size is unknown in each channel by itself, channels are independent given the
+parameters and the correlation time, and the sum over the sizes is one over each channel
+in turn,
+
+.. math::
+    p(r) = \sum_\tau w_\tau \prod_c \sum_s w_{cs}\, p(r_c \mid \tau, s\, \sigma_c),
+
+and no combination of sizes is looked at by itself. What has further unknowns that all
+channels share (a gross error in one trial, a smooth function of the action) takes the
+ratio of the sizes from the bare model's best fit, and sums over their common factor.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
-from typing_extensions import override
+from typing_extensions import Self, override
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
@@ -23,46 +35,6 @@ from sbi_active.inference.sampling.weights import log_sum_exp
 Whitener = Callable[[Array], Array]
 
 LOG_2PI = float(np.log(2 * np.pi))
-
-
-class ErrorModel(ABC):
-    """Density of the residual, observation minus noise-free output.
-
-    Attributes:
-        is_known: Whether nothing of it is unknown, so that one transform whitens all.
-    """
-
-    is_known = False
-
-    @abstractmethod
-    def log_likelihood(self, residual: Array) -> Array:
-        """Return log densities, shape (n,), of residuals, shape (n, N)."""
-
-    @abstractmethod
-    def start(self) -> Whitener:
-        """Return the whitening transform to start a least-squares search with."""
-
-    @abstractmethod
-    def whitener(self, residual: Array) -> Whitener:
-        """Return the whitening transform that a residual (N,) makes most probable.
-
-        It maps (..., N) to (..., N), linearly.
-        """
-
-    @abstractmethod
-    def noise_posterior(
-        self, residual: Array, rng: np.random.Generator
-    ) -> tuple[NDArray[np.intp], Array]:
-        """Return a cell and a size of the noise for each residual, at random.
-
-        Args:
-            residual: Residuals, shape (n, N).
-            rng: Source of the draws.
-
-        Returns:
-            Cells, shape (n,), and factors on their deviations, shape (n,), or (n, c)
-            where each channel has its own.
-        """
 
 
 @dataclass(frozen=True)
@@ -95,10 +67,9 @@ class NoiseCell:
         log_weight: float = 0.0,
     ) -> NoiseCell:
         """Return noise of some standard deviation, shape (N,), and correlation time."""
+        rho = np.zeros(len(measurements))
         if correlation_time > 0:
             rho = np.exp(-measurements.gap / correlation_time)
-        else:
-            rho = np.zeros(len(measurements))
         return cls(log_weight, sd, np.minimum(rho, 1 - 1e-9), df)
 
     def whiten(self, residual: Array) -> Array:
@@ -116,35 +87,55 @@ class NoiseCell:
         return float(np.log(self.sd).sum() + 0.5 * np.log1p(-(self.rho**2)).sum())
 
 
-class NoiseGrid(ErrorModel):
+@dataclass(frozen=True)
+class NoiseGrid:
     """Noise whose correlation and size are known up to a grid.
 
-    Args:
+    Attributes:
         cells: Cells of the correlation time and the noise model's own parameters.
         scales: Factors on the standard deviation, shape (j,).
-        log_weights: Log prior probabilities, shape (j,).
+        log_weights: Log prior probabilities of these, shape (j,); None for equal ones.
+        offset: Log probability that is added to all, of noise that stands for another.
+        ratio: Sizes of the channels in units of a common one, shape (c,), where a
+            prediction asks for those of each; None for one size.
     """
 
-    def __init__(
-        self,
-        cells: list[NoiseCell],
-        *,
-        scales: Array | None = None,
-        log_weights: Array | None = None,
-    ) -> None:
-        total = log_sum_exp(np.array([cell.log_weight for cell in cells]))
-        self.cells = cells
-        self.log_prior = np.array([cell.log_weight - total for cell in cells])
-        self.scales = np.ones(1) if scales is None else scales
-        self.is_known = len(cells) == len(self.scales) == 1
-        self.log_scale_prior = (
-            np.full(len(self.scales), -np.log(len(self.scales)))
-            if log_weights is None
-            else log_weights - log_sum_exp(log_weights)
-        )
+    cells: Sequence[NoiseCell]
+    scales: Array = field(default_factory=lambda: np.ones(1))
+    log_weights: Array | None = None
+    offset: float = 0.0
+    ratio: Array | None = None
 
-    @override
+    @cached_property
+    def log_prior(self) -> Array:
+        """Log prior probability of each cell."""
+        weights = np.array([cell.log_weight for cell in self.cells])
+        return weights - log_sum_exp(weights) + self.offset
+
+    @cached_property
+    def log_scale_prior(self) -> Array:
+        """Log prior probability of each scale."""
+        if self.log_weights is None:
+            return np.full(len(self.scales), -np.log(len(self.scales)))
+        return self.log_weights - log_sum_exp(self.log_weights)
+
+    @property
+    def is_known(self) -> bool:
+        """Whether nothing of it is unknown, so that one transform whitens all."""
+        return self.shape == (1, 1)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Numbers of cells and scales."""
+        return len(self.cells), len(self.scales)
+
+    @property
+    def typical_sd(self) -> Array:
+        """Geometric mean over the cells, shape (N,)."""
+        return np.exp(np.mean([np.log(cell.sd) for cell in self.cells], 0))
+
     def log_likelihood(self, residual: Array) -> Array:
+        """Return log densities, shape (n,), of residuals, shape (n, N)."""
         return log_sum_exp(self.joint(residual).reshape(len(residual), -1), axis=1)
 
     def joint(self, residual: Array) -> Array:
@@ -167,74 +158,153 @@ class NoiseGrid(ErrorModel):
         joint = self.joint(residual[None])[0]
         return np.exp(joint - log_sum_exp(joint))
 
-    @override
     def start(self) -> Whitener:
-        cell, scale = self._typical()
-        return lambda residual: cell.whiten(residual) / scale
+        """Return the whitening transform to start a least-squares search with."""
+        middle = np.argsort(self.scales)[len(self.scales) // 2]
+        cell = self.cells[int(np.argmax(self.log_prior))]
+        return self._whitener(cell, self.scales[middle])
 
-    @override
     def whitener(self, residual: Array) -> Whitener:
-        best = np.unravel_index(np.argmax(self.joint(residual[None])[0]), self.shape)
-        cell, scale = self.cells[best[0]], self.scales[best[1]]
-        return lambda residual: cell.whiten(residual) / scale
+        """Return the whitening transform that a residual (N,) makes most probable.
 
-    @override
+        It maps (..., N) to (..., N), linearly.
+        """
+        best = np.unravel_index(np.argmax(self.joint(residual[None])[0]), self.shape)
+        return self._whitener(self.cells[int(best[0])], self.scales[best[1]])
+
     def noise_posterior(
         self, residual: Array, rng: np.random.Generator
     ) -> tuple[NDArray[np.intp], Array]:
+        """Return a cell and a size of the noise for each residual, at random.
+
+        Args:
+            residual: Residuals, shape (n, N).
+            rng: Source of the draws.
+
+        Returns:
+            Cells, shape (n,), and factors on their deviations, shape (n,), or (n, c)
+            where each channel has its own.
+        """
         cell, scale = drawn(self.joint(residual), rng)
         return cell, self.sizes(self.scales[scale])
 
     def sizes(self, scales: Array) -> Array:
         """Return the sizes of :meth:`noise_posterior` that scales (n,) stand for."""
-        return scales
+        return scales if self.ratio is None else scales[:, None] * self.ratio
 
     def by_number(self, sizes: Array) -> Array:
         """Return the size of each number, shape (n, N), from those of draws."""
         return np.broadcast_to(sizes[:, None], (len(sizes), len(self.cells[0].sd)))
 
-    @property
-    def typical_sd(self) -> Array:
-        """Geometric mean over the cells, shape (N,)."""
-        return np.exp(np.mean([np.log(cell.sd) for cell in self.cells], 0))
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Numbers of cells and scales."""
-        return len(self.cells), len(self.scales)
-
-    def scaled(self, scales: Array, log_weights: Array) -> NoiseGrid:
+    def scaled(self, scales: Array, log_weights: Array) -> Self:
         """Return this noise with further factors on its standard deviation."""
         product = np.multiply.outer(self.scales, scales).ravel()
         weight = np.add.outer(self.log_scale_prior, log_weights).ravel()
-        return NoiseGrid(self.cells, scales=product, log_weights=weight)
+        return replace(self, scales=product, log_weights=weight)
 
-    def with_extra(self, sd: Array) -> NoiseGrid:
+    def with_extra(self, sd: Array) -> Self:
         """Return this noise with an independent error of deviation sd, shape (N,)."""
         cells = [replace(cell, sd=np.hypot(cell.sd, sd)) for cell in self.cells]
-        return self.of_cells(cells)
+        return replace(self, cells=cells)
 
-    def settled(self, residual: Callable[[], Array]) -> NoiseGrid:
-        """Return this noise with one unknown size, where each channel has its own.
-
-        Args:
-            residual: Function that returns a residual that tells the ratio of sizes,
-                shape (N,).
-        """
-        return self
-
-    def part(self, at: NDArray[np.bool_]) -> NoiseGrid:
+    def part(self, at: NDArray[np.bool_]) -> Self:
         """Return this noise of some of the numbers, shape (N,)."""
         cells = [replace(c, sd=c.sd[at], rho=c.rho[at]) for c in self.cells]
-        return self.of_cells(cells)
+        return replace(self, cells=cells)
 
-    def of_cells(self, cells: list[NoiseCell]) -> NoiseGrid:
-        """Return noise of other cells, and sizes as here."""
-        return NoiseGrid(cells, scales=self.scales, log_weights=self.log_scale_prior)
+    def _whitener(self, cell: NoiseCell, scale: Any) -> Whitener:
+        return lambda residual: cell.whiten(residual) / scale
 
-    def _typical(self) -> tuple[NoiseCell, float]:
-        middle = np.argsort(self.scales)[len(self.scales) // 2]
-        return self.cells[int(np.argmax(self.log_prior))], float(self.scales[middle])
+
+@dataclass(frozen=True, kw_only=True)
+class ChannelNoise(NoiseGrid):
+    """Gaussian noise with an unknown size in each channel.
+
+    The sd of its cells is each channel's middle size; ``scales`` are of all alike.
+
+    Attributes:
+        channel: Channel of each number, shape (N,).
+        factors: Sizes of each channel in units of its middle one, shape (c, j).
+        log_factors: Log prior probabilities of these, shape (c, j).
+    """
+
+    channel: NDArray[np.int64]
+    factors: Array
+    log_factors: Array
+
+    is_known = False  # type: ignore[assignment]
+
+    @override
+    def joint(self, residual: Array) -> Array:
+        parts = []
+        for cell, prior in zip(self.cells, self.log_prior, strict=True):
+            each = log_sum_exp(self._by_size(cell, residual), axis=3).sum(2)
+            parts.append(prior + self.log_scale_prior + each - cell.log_scale)
+        return np.stack(parts, 1)
+
+    @override
+    def whitener(self, residual: Array) -> Whitener:
+        cell, sizes = self.likeliest(residual)
+        unit, own = sizes[self.channel], self.cells[cell]
+        return lambda residual: own.whiten(residual / unit)
+
+    def likeliest(self, residual: Array) -> tuple[int, Array]:
+        """Return the cell and the sizes (c,) that a residual (N,) points to."""
+        joint = self.joint(residual[None])[0]
+        cell, scale = np.unravel_index(np.argmax(joint), joint.shape)
+        by_size = self._by_size(self.cells[int(cell)], residual[None])[0, scale]
+        best = by_size.argmax(1)
+        return int(cell), self.scales[scale] * self.factors[np.arange(len(best)), best]
+
+    def settled(self, residual: Array) -> NoiseGrid:
+        """Return noise with sizes whose ratio is that which a residual (N,) points to.
+
+        For that residual it is as probable as this one, so that models with either can
+        be compared.
+        """
+        _, ratio = self.likeliest(residual)
+        unit = ratio[self.channel]
+        cells = [replace(cell, sd=cell.sd * unit) for cell in self.cells]
+        new = NoiseGrid(cells, scales=np.geomspace(1 / 30, 30, 40), ratio=ratio)
+        one = residual[None]
+        apart = self.log_likelihood(one) - new.log_likelihood(one)
+        return replace(new, offset=apart[0])
+
+    @override
+    def noise_posterior(
+        self, residual: Array, rng: np.random.Generator
+    ) -> tuple[NDArray[np.intp], Array]:
+        cells, scales = drawn(self.joint(residual), rng)
+        sizes = np.empty((len(residual), len(self.factors)))
+        for cell in np.unique(cells):
+            own = np.flatnonzero(cells == cell)
+            by_size = self._by_size(self.cells[cell], residual[own])
+            at_scale = by_size[np.arange(len(own)), scales[own]]
+            for c, factors in enumerate(self.factors):
+                (picked,) = drawn(at_scale[:, c], rng)
+                sizes[own, c] = self.scales[scales[own]] * factors[picked]
+        return cells, sizes
+
+    @override
+    def by_number(self, sizes: Array) -> Array:
+        return sizes[:, self.channel]
+
+    @override
+    def part(self, at: NDArray[np.bool_]) -> Self:
+        return replace(super().part(at), channel=self.channel[at])
+
+    def _by_size(self, cell: NoiseCell, residual: Array) -> Array:
+        """Return log p(residual of a channel, size | cell, scale), (n, k, c, j).
+
+        Up to the log scale of the cell.
+        """
+        member = self.channel[:, None] == np.arange(len(self.factors))
+        square, count = cell.whiten(residual) ** 2 @ member, member.sum(0)
+        size = self.scales[:, None, None] * self.factors  # (k, c, j)
+        log_p = -0.5 * square[:, None, :, None] / size**2
+        log_p = log_p - count[:, None] * (np.log(size) + 0.5 * LOG_2PI)
+        total = log_sum_exp(self.log_factors, axis=1)[:, None]
+        return log_p + (self.log_factors - total)
 
 
 def drawn(log_p: Array, rng: np.random.Generator) -> tuple[NDArray[np.intp], ...]:

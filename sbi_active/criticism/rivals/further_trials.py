@@ -115,18 +115,11 @@ def _signals(
     return {name: recorded[name].where(known, played[name]) for name in recorded}
 
 
-def _same(
-    trials: Trials,
-    action: Tensor,
-    *,
-    # Relative and absolute difference of actions that are the same in single
-    # precision.
-    rtol: float = 1e-5,
-    atol: float = 1e-7,
-) -> Tensor:
+def _same(trials: Trials, action: Tensor) -> Tensor:
     """Return a mask of the trials that have each action, shape (a, t)."""
     own, asked = trials.action.double(), action.double()
-    return torch.isclose(asked[:, None], own[None], rtol=rtol, atol=atol).all(-1)
+    # As far as single precision tells.
+    return torch.isclose(asked[:, None], own[None], rtol=1e-5, atol=1e-7).all(-1)
 
 
 def _starts(start: Any, first: Tensor, found: Tensor) -> Any:

@@ -11,8 +11,7 @@ from torch.distributions import Distribution
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.rivals.channel_noise import ChannelNoise
-from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
+from sbi_active.criticism.rivals.error_models import ChannelNoise, NoiseCell, NoiseGrid
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.noise.base import NoiseModel, declared_sds
 from sbi_active.simulation.noise.posterior import NoisePosterior, SdGrid
@@ -22,8 +21,8 @@ from sbi_active.simulation.noise.posterior import NoisePosterior, SdGrid
 NUM_TIMES, INDEPENDENT = 14, 0.3
 #: Draws that stand for a posterior over noise parameters.
 NUM_DRAWS = 24
-#: Inflation of the noise, 1 + |N(0, 2.5^2)|, by its quantiles.
-INFLATION_SD, NUM_INFLATIONS = 2.5, 14
+#: Quantiles of the inflation of the noise.
+NUM_INFLATIONS = 14
 
 
 def declared_noise(
@@ -74,16 +73,11 @@ def declared_noise(
         sd = sds[_channel_of(measurements, len(sds))]
         df = values.get("df", np.inf)
         tau = values.get("correlation_time")
-        if tau is not None:
-            cells.append(
-                NoiseCell.of(
-                    measurements, sd=sd, correlation_time=tau, log_weight=weight
-                )
-            )
-        elif measurements.has_time and np.isinf(df):
+        if tau is None and measurements.has_time and np.isinf(df):
             cells += _correlated(measurements, sd, weight)
-        else:
-            cells.append(NoiseCell.of(measurements, sd=sd, df=df, log_weight=weight))
+            continue
+        own = {"correlation_time": tau or 0.0, "df": df, "log_weight": weight}
+        cells.append(NoiseCell.of(measurements, sd=sd, **own))
     return NoiseGrid(cells)
 
 
@@ -115,7 +109,7 @@ def _product(
     ]
     if sd.num_channels == 1:
         return NoiseGrid(cells, scales=factors[0], log_weights=log_p[0])
-    return ChannelNoise(cells, channel=channel, factors=factors, log_factor_prior=log_p)
+    return ChannelNoise(cells, channel=channel, factors=factors, log_factors=log_p)
 
 
 def measurement_sds(noise: NoiseModel | None, measurements: Measurements) -> Any:
@@ -135,16 +129,11 @@ def measurement_sds(noise: NoiseModel | None, measurements: Measurements) -> Any
 
 
 def scattered(noise: NoiseGrid) -> NoiseGrid:
-    """Return the noise inflated by an unknown factor, summed out."""
-    weights = np.full(NUM_INFLATIONS, -np.log(NUM_INFLATIONS))
-    return noise.scaled(inflations(), weights)
-
-
-def inflations() -> Array:
-    """Return quantiles of 1 + |N(0, 2.5^2)|, equally likely factors on the noise."""
+    """Return the noise inflated by 1 + |N(0, 2.5^2)|, summed out by its quantiles."""
     levels = torch.arange(0.5, NUM_INFLATIONS) / NUM_INFLATIONS
     half_normal = torch.distributions.Normal(0.0, 1.0).icdf(0.5 + 0.5 * levels)
-    return 1 + INFLATION_SD * half_normal.double().numpy()
+    factors = 1 + 2.5 * half_normal.double().numpy()
+    return noise.scaled(factors, np.full(NUM_INFLATIONS, -np.log(NUM_INFLATIONS)))
 
 
 def _correlated(
@@ -152,18 +141,12 @@ def _correlated(
 ) -> list[NoiseCell]:
     if not measurements.has_time or not np.isfinite(measurements.gap).any():
         return [NoiseCell.of(measurements, sd=sd, log_weight=log_weight)]
-    step, span = measurements.step, measurements.span
-    times = np.geomspace(0.5 * step, 2 * span, NUM_TIMES)
-    each = log_weight + np.log1p(-INDEPENDENT) - np.log(NUM_TIMES)
-    independent = NoiseCell.of(
-        measurements, sd=sd, log_weight=log_weight + np.log(INDEPENDENT)
-    )
+    times = np.geomspace(0.5 * measurements.step, 2 * measurements.span, NUM_TIMES)
+    each = np.full(NUM_TIMES, np.log1p(-INDEPENDENT) - np.log(NUM_TIMES))
+    some = zip([0.0, *times], [np.log(INDEPENDENT), *each], strict=True)
     return [
-        independent,
-        *[
-            NoiseCell.of(measurements, sd=sd, correlation_time=t, log_weight=each)
-            for t in times
-        ],
+        NoiseCell.of(measurements, sd=sd, correlation_time=t, log_weight=log_weight + w)
+        for t, w in some
     ]
 
 

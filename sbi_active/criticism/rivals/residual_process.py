@@ -24,17 +24,10 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from typing_extensions import override
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.rivals.error_models import (
-    LOG_2PI,
-    ErrorModel,
-    NoiseGrid,
-    Whitener,
-    drawn,
-)
+from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseGrid, Whitener, drawn
 from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.weights import log_sum_exp
 
@@ -58,7 +51,7 @@ class _Basis:
     variances: Array  # v, (m,)
 
 
-class ResidualProcess(ErrorModel):
+class ResidualProcess:
     """Noise plus a smooth function of the action and time.
 
     Args:
@@ -72,9 +65,9 @@ class ResidualProcess(ErrorModel):
         lengths: Length scales, in ranges of the action space.
         spread: Deviation of the prior predictive, shape (N,); None has the noise as the
             only unit.
-        num_amplitudes: Number of amplitudes, a choice: neighbors are a factor of two
-            apart where the process may be 500 times the noise.
     """
+
+    is_known = False
 
     def __init__(
         self,
@@ -86,14 +79,13 @@ class ResidualProcess(ErrorModel):
         largest: float,
         lengths: tuple[float, ...] = LENGTHS,
         spread: Array | None = None,
-        num_amplitudes: int = 10,
     ) -> None:
         self.noise, self.measurements, self.spread = noise, measurements, spread
         self.lengths = lengths
-        self.amplitudes = np.geomspace(1.0, max(largest, 3.0), num_amplitudes)
-        # With an unknown size of the noise, the amplitude is a multiple of it.
-        self._log_amplitude = -np.log(num_amplitudes)
-        typical = noise.typical_sd
+        # With an unknown size of the noise, the amplitude is a multiple of it. They are
+        # a factor of two apart where the process may be 500 times the noise.
+        self.amplitudes = np.geomspace(1.0, max(largest, 3.0), 10)
+        typical = self.typical_sd = noise.typical_sd
         self._bases: list[_Basis] = []
         units = {False: typical}
         if spread is not None:
@@ -117,25 +109,17 @@ class ResidualProcess(ErrorModel):
                     )
                 )
 
-    @override
     def log_likelihood(self, residual: Array) -> Array:
+        """Return log densities, shape (n,), of residuals, shape (n, N)."""
         return log_sum_exp(self._joint(residual).reshape(len(residual), -1), axis=1)
 
-    @override
     def start(self) -> Whitener:
+        """Return the whitening transform to start a least-squares search with."""
         return self.noise.start()
 
-    @override
     def whitener(self, residual: Array) -> Whitener:
-        return self._whitener(*self._likeliest(residual))
-
-    def _likeliest(self, residual: Array) -> tuple[_Basis, float, float]:
-        """Return the process, amplitude and scale that a residual (N,) points to."""
-        joint = self._joint(residual[None])[0]
-        basis, a, scale = np.unravel_index(np.argmax(joint), joint.shape)
-        return self._bases[basis], self.amplitudes[a], self.noise.scales[scale]
-
-    def _whitener(self, basis: _Basis, a: float, scale: float) -> Whitener:
+        """Return the whitening transform that a residual (N,) makes most probable."""
+        basis, a, scale = self._likeliest(residual)
         cell = self.noise.cells[basis.cell]
         shrink = 1 / np.sqrt(1 + a**2 * basis.variances) - 1
 
@@ -144,6 +128,12 @@ class ResidualProcess(ErrorModel):
             return e + ((e @ basis.directions) * shrink) @ basis.directions.T
 
         return whiten
+
+    def _likeliest(self, residual: Array) -> tuple[_Basis, float, float]:
+        """Return the process, amplitude and scale that a residual (N,) points to."""
+        joint = self._joint(residual[None])[0]
+        basis, a, scale = np.unravel_index(np.argmax(joint), joint.shape)
+        return self._bases[basis], self.amplitudes[a], self.noise.scales[scale]
 
     def condition(
         self,
@@ -192,10 +182,10 @@ class ResidualProcess(ErrorModel):
         explained = np.einsum("mi,mi->m", weight, cell.whiten(across) / scale)
         return mean, np.sqrt(np.maximum((a * new_unit) ** 2 - explained, 0.0))
 
-    @override
     def noise_posterior(
         self, residual: Array, rng: np.random.Generator
     ) -> tuple[NDArray[np.intp], Array]:
+        """Return a cell and a size of the noise for each residual, at random."""
         basis, _, scale = drawn(self._joint(residual), rng)
         cells = np.array([b.cell for b in self._bases])[basis]
         return cells, self.noise.sizes(self.noise.scales[scale])
@@ -204,33 +194,24 @@ class ResidualProcess(ErrorModel):
         """Return the spread, in the median as large as the noise."""
         return spread * np.median(sd / spread)
 
-    def _inputs(
-        self,
-        action: Array,
-        order: Array | None,
-        *,
-        # Length scale along the order of the trials, in their span.
-        order_length: float = 0.3,
-    ) -> list[Array]:
+    def _inputs(self, action: Array, order: Array | None) -> list[Array]:
         """Return the places of trials for each process, in lengths, (t, columns)."""
         inputs = [action / length for length in self.lengths]
         if order is not None:
-            inputs.append(order[:, None] / order_length)
+            inputs.append(order[:, None] / 0.3)  # of their span
         return inputs
 
     def _joint(self, residual: Array) -> Array:
         """Return log p(residual, basis, amplitude, scale), shape (n, bases, ...)."""
-        return np.stack([self._with(residual, basis) for basis in self._bases], 1)
-
-    def _with(self, residual: Array, basis: _Basis) -> Array:
-        """Return log p(residual, amplitude, scale), shape (n, amplitudes, scales)."""
-        cell, num = self.noise.cells[basis.cell], residual.shape[1]
-        e = cell.whiten(residual)
-        q = (e @ basis.directions) ** 2
-        rest = np.maximum(np.einsum("ni,ni->n", e, e) - q.sum(1), 0.0)
-        square = rest[:, None] + q @ (1 / self._total(basis)).T
-        log_p = -0.5 * square[..., None] / self.noise.scales**2
-        return log_p + self._log_constant(basis, num)
+        found = []
+        for basis in self._bases:
+            e = self.noise.cells[basis.cell].whiten(residual)
+            q = (e @ basis.directions) ** 2
+            rest = np.maximum(np.einsum("ni,ni->n", e, e) - q.sum(1), 0.0)
+            square = rest[:, None] + q @ (1 / self._total(basis)).T
+            log_p = -0.5 * square[..., None] / self.noise.scales**2
+            found.append(log_p + self._log_constant(basis, residual.shape[1]))
+        return np.stack(found, 1)
 
     def grams(self, rows: Array) -> tuple[Array, Array]:
         """Return Gram matrices of rows whitened by each process and amplitude.
@@ -262,7 +243,7 @@ class ResidualProcess(ErrorModel):
         cell, scales = self.noise.cells[basis.cell], self.noise.scales
         log_det = 0.5 * np.log(self._total(basis)).sum(1)[:, None] + cell.log_scale
         log_p = self.noise.log_scale_prior - num * (np.log(scales) + 0.5 * LOG_2PI)
-        return log_p - log_det + basis.log_weight + self._log_amplitude
+        return log_p - log_det + basis.log_weight - np.log(len(self.amplitudes))
 
 
 def _coordinates(m: Measurements, place: Array, span: float) -> tuple[Array, Array]:
@@ -276,15 +257,12 @@ def _kernel(rows: tuple[Array, Array], columns: tuple[Array, Array]) -> Array:
     return np.exp(-0.5 * distance) * (rows[1][:, None] == columns[1][None])
 
 
-def _features(
-    points: Array,
-    channel: Array,
-    *,
-    # Points that represent the process; as many as there are up to here.
-    max_points: int = 300,
-) -> Array:
-    """Return F, shape (N, m), with F F^T the process's covariance at unit amplitude."""
-    some = np.unique(np.linspace(0, len(points) - 1, max_points).astype(int))
+def _features(points: Array, channel: Array) -> Array:
+    """Return F, shape (N, m), with F F^T the process's covariance at unit amplitude.
+
+    Up to 300 points represent the process.
+    """
+    some = np.unique(np.linspace(0, len(points) - 1, 300).astype(int))
     few = points[some], channel[some]
     values, vectors = eigh(_kernel(few, few))
     keep = values > NEGLIGIBLE * values.max()

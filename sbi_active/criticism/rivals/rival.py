@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,8 @@ from sbi_active.arrays import Array
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
-from sbi_active.criticism.rivals.error_models import ErrorModel, NoiseGrid, Whitener
+from sbi_active.criticism.rivals.error_models import NoiseGrid, Whitener
+from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.criticism.rivals.validity import log_outcomes
 
@@ -22,10 +24,11 @@ STEP = 1e-3  # of finite differences, in deviations of the prior
 LOG_SCALE = 1 + 2 * float(np.log(30.0))
 
 
+@dataclass(eq=False, kw_only=True)
 class Rival:
     r"""A model of the trials, :math:`p(x | z)\, p(z)` with z = (theta, phi).
 
-    Args:
+    Attributes:
         key: Key of the rival.
         simulator: Simulator of the trials, shared by all rivals.
         prior: Prior of theta.
@@ -39,39 +42,30 @@ class Rival:
         reference: Deviation of a random simulator's numbers, shape (N,), where it is
             part of a sum of squares; None leaves it to the likelihood.
         df: Degrees of freedom of the error, for the weights of a sum of squares.
-
-    Attributes:
         coordinates: Coordinates of z.
         num_trials: Number of trials.
         num_observed: Number of measured numbers of all trials.
     """
 
-    def __init__(
-        self,
-        key: ModelKey,
-        *,
-        simulator: TrialSimulator,
-        prior: Distribution,
-        effects: Sequence[Effect],
-        nuisances: Sequence[Effect] = (),
-        error: ErrorModel,
-        spread: Array,
-        center: Array | None = None,
-        step: float = STEP,
-        reference: Array | None = None,
-        df: float = np.inf,
-    ) -> None:
-        self.key, self.effects = key, (*effects,)
-        self.simulator, self.error, self.spread = simulator, error, spread
-        self.center = np.zeros(len(spread)) if center is None else center
-        self.step = step
-        self.reference, self.df = reference, df
-        self.num_trials = len(simulator.trials)
-        self.num_observed = len(simulator.measurements)
+    key: ModelKey
+    simulator: TrialSimulator
+    prior: Distribution
+    effects: Sequence[Effect]
+    nuisances: Sequence[Effect]
+    error: NoiseGrid | ResidualProcess
+    spread: Array
+    center: Array
+    step: float = STEP
+    reference: Array | None = None
+    df: float = np.inf
+
+    def __post_init__(self) -> None:
+        self.num_trials = len(self.simulator.trials)
+        self.num_observed = len(self.simulator.measurements)
         self.coordinates = SearchCoordinates(
-            prior, effects, nuisances, len(simulator.trials)
+            self.prior, self.effects, self.nuisances, self.num_trials
         )
-        self._white = error.start()
+        self._white = self.error.start()
 
     @property
     def dim(self) -> int:
@@ -81,8 +75,7 @@ class Rival:
     @property
     def theta_dim(self) -> int:
         """Number of coordinates of the simulator's own parameters."""
-        phi = sum(place.stop - place.start for place in self.columns().values())
-        return self.dim - phi
+        return int(self.prior.event_shape[0])
 
     def columns(self) -> dict[str, slice]:
         """Return the places of each effect's phi among the coordinates, by name."""
@@ -105,7 +98,7 @@ class Rival:
         return np.concatenate([flags, np.ones(self.dim - len(flags), bool)])
 
     def residual(
-        self, u: Array, *, penalized: bool = True, largest: float = 1e100
+        self, u: Array, *, penalized: bool = True
     ) -> tuple[Array, Array, Array]:
         """Return residuals in units of the declared noise.
 
@@ -115,7 +108,6 @@ class Rival:
                 that drives it away: the spread of the prior predictive, in units of the
                 noise. False gives what the likelihood has there, the prior predictive
                 itself as the number's distribution.
-            largest: Bound on a residual, so that its square is finite.
 
         Returns:
             Observation minus prediction divided by the effects' factor on the noise,
@@ -134,25 +126,18 @@ class Rival:
             scale = sd if scale is None else scale * sd
         if missing.any() and not penalized:
             residual = np.where(missing, m.x - self.center, residual)
-            wide = self.spread / self._unit
+            wide = self.spread / self.error.typical_sd
             scale = np.where(missing, wide, 1.0 if scale is None else scale)
         if scale is not None:
             scale = np.maximum(scale, 1e-12)
             residual, log_scale = residual / scale, np.log(scale)
         flags = log_outcomes(probability, m.valid)
-        residual = np.clip(residual, -largest, largest)
+        residual = np.clip(residual, -1e100, 1e100)  # so that its square is finite
         if self.reference is not None:
             # Half of its square is the log of a deviation, but for a constant.
             square = LOG_SCALE + 2 * (log_scale - np.log(self.reference))
             residual = np.concatenate([residual, np.sqrt(np.maximum(square, 0))], 1)
         return residual, log_scale, flags
-
-    @property
-    def _unit(self) -> Array:
-        """Typical standard deviation of the noise, shape (N,)."""
-        noise = getattr(self.error, "noise", self.error)
-        assert isinstance(noise, NoiseGrid)
-        return noise.typical_sd
 
     @property
     def num_simulations(self) -> int:

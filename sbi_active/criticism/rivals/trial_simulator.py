@@ -112,10 +112,11 @@ class TrialSimulator:
     def _predict_all(
         self, theta: Tensor, phi: dict[str, Tensor]
     ) -> tuple[Array, Array | None, Array]:
-        m = self.measurements
         repeats = NUM_REPLICATES if self.is_stochastic else 1
-        size = max(1, (int(np.prod(m.shape)) + self._num_inputs()) * repeats)
-        most = max(1, CHUNK // size)
+        numbers = int(np.prod(self.measurements.shape)) + self._num_inputs()
+        most = max(1, CHUNK // max(1, numbers * repeats))
+        if self.is_stochastic and not self.model.base.fn_takes_seeds:
+            most = 1  # the global generators draw the same for all
         parts = []
         for start in range(0, len(theta), most):
             rows = slice(start, start + most)
@@ -154,23 +155,9 @@ class TrialSimulator:
         seeds = None
         if self.is_stochastic:
             seeds = row_seeds(self.seed, t * repeats).repeat(n)
-        rows = theta.repeat_interleave(t * repeats, 0).to(self._dtype)
-        tiled = self._tiled(phi, repeats)
-        together = len(rows)
-        if self.is_stochastic and not self.model.base.fn_takes_seeds:
-            together = t * repeats  # the global generators draw the same for all
-        parts = []
-        for start in range(0, len(rows), together):
-            own = slice(start, start + together)
-            of_own = {name: p[own] for name, p in tiled.items()}
-            given = None if seeds is None else seeds[own]
-            with forked_generators(derive_seed(self.seed, "replicates")):
-                parts.append(
-                    self._simulate(
-                        rows[own], of_own, action[own], context.at(own), given
-                    )
-                )
-        x = torch.cat(parts)
+        rows, tiled = theta.repeat_interleave(t * repeats, 0), self._tiled(phi, repeats)
+        with forked_generators(derive_seed(self.seed, "replicates")):
+            x = self._simulate(rows, tiled, action, context, seeds)
         x = x.reshape(n, repeats, t, *x.shape[1:])
         flat = self._at_measured_times(x)  # (n, repeats, t * numbers)
         valid = np.isfinite(flat.reshape(n, repeats, t, -1)).any(-1).mean(1)
@@ -244,19 +231,14 @@ class TrialSimulator:
         return simulated.reshape(n, repeats, -1)
 
 
-def _moments(
-    x: Array,
-    *,
-    # Draws with a number from which a mean and a deviation are taken, at least.
-    fewest: int = 4,
-) -> tuple[Array, Array]:
+def _moments(x: Array) -> tuple[Array, Array]:
     """Return mean and deviation over replicates, shape (n, r, N), of those with x.
 
     NaN where fewer than a quarter of them, and at least 4, give a number.
     """
     finite = np.isfinite(x)
     count = finite.sum(1)
-    enough = count >= max(fewest, x.shape[1] // 4)
+    enough = count >= max(4, x.shape[1] // 4)
     safe = np.maximum(count, 2)
     mean = np.where(finite, x, 0.0).sum(1) / safe
     square = np.where(finite, x - mean[:, None], 0.0) ** 2

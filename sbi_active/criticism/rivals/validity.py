@@ -43,14 +43,11 @@ def log_outcomes(
     return log_sum_exp(np.stack(each), axis=0) - np.log(len(rates)) - agreed
 
 
-def surprising_outcomes(
-    residuals: Residuals, *, surprising: float = 0.05
-) -> tuple[list[int], list[int]]:
+def surprising_outcomes(residuals: Residuals) -> tuple[list[int], list[int]]:
     """Return places of trials whose validity the model holds for improbable.
 
     Args:
         residuals: Residuals with the probability of a measurement in each trial.
-        surprising: Probability below which an outcome is named.
 
     Returns:
         Those without a measurement and those with one, of a probability below 1/20.
@@ -59,6 +56,6 @@ def surprising_outcomes(
     if p is None:
         return [], []
     valid = np.isfinite(residuals.x.reshape(len(p), -1)).any(1)
-    lost = np.flatnonzero(~valid & (p > 1 - surprising))
-    kept = np.flatnonzero(valid & (p < surprising))
+    lost = np.flatnonzero(~valid & (p > 0.95))
+    kept = np.flatnonzero(valid & (p < 0.05))
     return lost.tolist(), kept.tolist()

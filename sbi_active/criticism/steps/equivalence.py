@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
 from sbi_active.actions import ActionSpace
 from sbi_active.arrays import Array
@@ -43,12 +44,7 @@ def is_large(effects: Collection[Effect]) -> bool:
 
 
 def equivalent_effects(
-    rivals: RivalSet,
-    actions: ActionSpace | None,
-    *,
-    num_far: int = 2,
-    agreement: float = 0.8,
-    num_theta: int = 6,
+    rivals: RivalSet, actions: ActionSpace | None
 ) -> tuple[frozenset[str], ...]:
     r"""Return groups of effects whose predictions can be told apart by no action.
 
@@ -69,21 +65,16 @@ def equivalent_effects(
     Args:
         rivals: The models.
         actions: The permitted ones; None compares on the trials at hand.
-        num_far: Number of parameters at which a pair that is alike near its
-            null is compared far from it.
-        agreement: Share of the parameters at which two effects must look the
-            same.
-        num_theta: Number of parameters at which effects are compared; five of
-            six agree by ``agreement``.
     """
+    # Of six parameters five must agree; far from its null a pair is compared at two.
+    num_theta, agreement, num_far = 6, 0.8, 2
     trials = rivals.trials if actions is None else every_action(rivals, actions)
     world = _World(rivals, trials)
     effects = [e for e in rivals.effects.values() if e.hook != "noise"]
     votes = np.zeros((2, len(effects) + 1, len(effects) + 1))
     local = [bool(e.null_phi(1).isfinite().all()) for e in effects]
-    every_u = world.coordinates.sample(
-        num_theta, seed=derive_seed(rivals.seed, "theta")
-    )
+    seed = derive_seed(rivals.seed, "theta")
+    every_u = world.coordinates.sample(num_theta, seed=seed)
     for u in every_u:
         left = world.left_over(u, effects)
         vote = _alike(left, local)
@@ -105,8 +96,10 @@ def equivalent_effects(
                 for a, b in (pair, pair[::-1])
                 for u in every_u[:num_far]
             )
-    names = [NONE, *[e.name for e in effects]]
-    return _groups(names, same)
+    names = np.array([NONE, *[e.name for e in effects]])
+    num, group = connected_components(same, directed=False)
+    found = (frozenset(names[group == g].tolist()) for g in range(num))
+    return tuple(g for g in found if len(g) > 1)
 
 
 def noise_unit(rivals: RivalSet, simulator: TrialSimulator) -> Array:
@@ -126,20 +119,13 @@ class _World:
         trials: Trials that are predicted.
     """
 
-    def __init__(
-        self,
-        rivals: RivalSet,
-        trials: Trials,
-        *,
-        # Step from the null, in deviations of the prior.
-        step: float = 1e-4,
-    ) -> None:
+    def __init__(self, rivals: RivalSet, trials: Trials) -> None:
         self.simulator = TrialSimulator(
             rivals.simulator.model, trials, seed=derive_seed(rivals.seed, "equivalence")
         )
         self.prior, self.is_smooth = rivals.prior, rivals.is_smooth
         self.unit = noise_unit(rivals, self.simulator)
-        self.step = max(rivals.step, step)
+        self.step = max(rivals.step, 1e-4)  # from the null, in deviations of the prior
         self.coordinates = SearchCoordinates(self.prior, (), (), len(trials))
 
     def predict(
@@ -208,18 +194,7 @@ class _World:
         return True
 
     def _rest(
-        self,
-        c: SearchCoordinates,
-        u: Array,
-        aim: Array,
-        both: NDArray[np.bool_],
-        *,
-        # Distance, in noise units, at which a search has found what it looked for.
-        found: float = 1e-4,
-        # Share of the rest from which a step has not lowered it.
-        ended: float = 0.99,
-        # Steps of a search for parameters that imitate such an effect.
-        num_search: int = 6,
+        self, c: SearchCoordinates, u: Array, aim: Array, both: NDArray[np.bool_]
     ) -> tuple[Array, bool, bool]:
         """Return the rest of predictions that parameters leave, by Gauss-Newton steps.
 
@@ -229,7 +204,7 @@ class _World:
         """
         rest, has_ended = (aim - self.predict(c, u[None])[0])[both], False
         # Where the simulator jumps, a search for parameters finds the jumps.
-        for _ in range(num_search):
+        for _ in range(6):
             slope = self.slopes(c, u)[1][both]
             slope = np.where(np.isfinite(slope), slope, 0.0)
             move = np.linalg.lstsq(slope, rest, rcond=1e-9)[0]
@@ -241,12 +216,12 @@ class _World:
                 after = (aim - self.predict(c, to[None])[0])[both]
                 if np.linalg.norm(after) < size:
                     u, rest = to, after
-                    has_ended = bool(np.linalg.norm(after) > ended * size)
+                    has_ended = bool(np.linalg.norm(after) > 0.99 * size)
                     break
             else:
                 has_ended = bool(np.linalg.norm(rest - slope @ move) > 0.5 * size)
                 break
-            if np.linalg.norm(rest) < found:
+            if np.linalg.norm(rest) < 1e-4:  # noise units
                 break
         return rest, bool(((u > c.low) & (u < c.high)).all()), has_ended
 
@@ -295,28 +270,14 @@ def _alike(left: list[tuple[Array, float]], local: list[bool]) -> Array:
     return np.stack([same, told])
 
 
-def _groups(names: list[str], same: NDArray[Any]) -> tuple[frozenset[str], ...]:
-    groups: list[set[str]] = []
-    for i, name in enumerate(names):
-        joined = {name} | {names[j] for j in np.flatnonzero(same[i])}
-        for group in [g for g in groups if g & joined]:
-            groups.remove(group)
-            joined |= group
-        groups.append(joined)
-    return tuple(frozenset(g) for g in groups if len(g) > 1)
+def every_action(rivals: RivalSet, actions: ActionSpace) -> Trials:
+    """Return the trials at hand and one of every permitted action, in random order.
 
-
-def every_action(
-    rivals: RivalSet,
-    actions: ActionSpace,
-    *,
-    # A choice: of a list that is longer, or a box, so many actions stand for all.
-    max_actions: int = 48,
-) -> Trials:
-    """Return the trials at hand and one of every permitted action, in random order."""
+    Of a list that is longer, or a box, 48 actions stand for all.
+    """
     values = actions.listed()
-    if values is None or len(values) > max_actions:
-        values = actions.sample((max_actions,), seed=derive_seed(rivals.seed, "every"))
+    if values is None or len(values) > 48:
+        values = actions.sample((48,), seed=derive_seed(rivals.seed, "every"))
     order = np.random.default_rng(rivals.seed).permutation(len(values))
     own = rivals.trials
     template, first = own.template()

@@ -71,7 +71,7 @@ def missed_trials(
     place = np.full(trials.x.numel(), -1)
     place[m.position] = np.arange(len(m))
     rows = place[after.position]  # the first part of a trial may not be scored
-    x = trials.x.double().numpy().reshape(-1)[after.position]
+    x = after.of(trials)
     sensor = _sensor(rivals, tracing.misfit, m)
     tails = []
     misfit = tracing.misfit
@@ -105,38 +105,29 @@ def missed_trials(
     return (*sorted(found, key=lambda trial: -trial.size),)
 
 
-def outlying_trials(
-    squares: Sequence[float],
-    *,
-    level: float = LEVEL,
-    least_spread: float = 0.5,
-    fewest_trials: int = 5,
-) -> list[tuple[int, float]]:
+def outlying_trials(squares: Sequence[float]) -> list[tuple[int, float]]:
     """Return fitted trials whose error is far beyond what all others show.
 
-    The test is Student's t of the logarithms, each trial against the others.
+    The test is Student's t of the logarithms, each trial against the others, with the
+    level's share of each (Bonferroni). Fewer than five do not show how errors differ.
+    Logarithms have a deviation of at least a half, so that none of ten trials is called
+    outlying that errs by less than three times the others, the smallest gross error;
+    half and twice make it two and ten times.
 
     Args:
         squares: Mean squared error of each trial on the fit to the others, in sensor
             variances, shape (t,). Less than one is no better than one.
-        level: Probability that any of ordinary trials is called so (Bonferroni).
-        least_spread: Deviation that logarithms of mean squared errors have at
-            least, so that none of ten is called outlying that errs by less than
-            three times the others, the smallest gross error; half and twice
-            make it two and ten times.
-        fewest_trials: Number of trials below which their errors do not show how
-            errors differ.
 
     Returns:
         Positions and how many times the median of the others the error is, largest
         first.
     """
     logs, found = np.log(np.maximum(squares, 1.0)), []
-    for k in range(len(logs) if len(logs) >= fewest_trials else 0):
+    for k in range(len(logs) if len(logs) >= 5 else 0):
         others = np.delete(logs, k)
         n = len(others)
-        spread = max(others.std(ddof=1), least_spread) * np.sqrt(1 + 1 / n)
-        if student.sf((logs[k] - others.mean()) / spread, n - 1) < level / len(logs):
+        spread = max(others.std(ddof=1), 0.5) * np.sqrt(1 + 1 / n)
+        if student.sf((logs[k] - others.mean()) / spread, n - 1) < LEVEL / len(logs):
             found.append((k, float(np.exp(0.5 * (logs[k] - np.median(others))))))
     return sorted(found, key=lambda each: -each[1])
 

@@ -6,6 +6,8 @@ finds where the trial starts, and predicts the rest.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
@@ -14,7 +16,6 @@ from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 
 
@@ -24,8 +25,6 @@ def conditioned(
     u: Array,
     simulator: TrialSimulator,
     rng: np.random.Generator,
-    *,
-    num_steps: int = 4,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Return theta and phi with nuisances drawn given the first part of each trial.
 
@@ -38,21 +37,12 @@ def conditioned(
         u: Draws of its coordinates, shape (n, dim).
         simulator: Simulator of the trials that were not fitted.
         rng: Source of the draws.
-        num_steps: Gauss-Newton steps at the posterior's mean.
     """
-    key, m = fit.rival.key, simulator.measurements
+    m = simulator.measurements
     center, spread = rivals.prior_predictive(simulator)
     error = rivals.noise_of(m)
-    rival = Rival(
-        key,
-        simulator=simulator,
-        prior=rivals.prior,
-        effects=[rivals.effects[name] for name in key.effects],
-        nuisances=rivals.nuisances,
-        error=error,
-        spread=spread,
-        center=center,
-    )
+    given = {"error": error, "spread": spread, "center": center}
+    rival = replace(fit.rival, simulator=simulator, **given)
     own = fit.rival.residual(u.mean(0, keepdims=True))[0][0]
     size = np.sqrt(np.mean((own / rivals.noise.typical_sd) ** 2))
     unit = error.typical_sd * max(size, 1e-3)
@@ -72,7 +62,7 @@ def conditioned(
         for t in range(len(simulator))
     ]
     gains: list[tuple[Array, Array]] = []
-    for _ in range(num_steps):
+    for _ in range(4):  # Gauss-Newton steps
         r, jacobian = rival.jacobian(point, whiten, rivals.step)
         gains = [_gain(jacobian[0], c.precision, *block) for block in blocks]
         _correct(point, r, c.center, c.precision, blocks, gains)

@@ -1,4 +1,4 @@
-"""Posterior predictive of a rival, in trials that it was or was not fitted to."""
+"""Posterior predictive of a rival, in trials fitted or not, and residuals."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.results import ModelKey, Residuals
 from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
@@ -55,6 +55,10 @@ class Prediction:
     def middle(self) -> Array:
         """Prediction that errors refer to: that of the best fit, or the mean, (N,)."""
         return self.mean.mean(0) if self.at_best is None else self.at_best
+
+    def of(self, trials: Trials) -> Array:
+        """Return what was measured in the trials that are predicted, (N,)."""
+        return trials.x.double().numpy().reshape(-1)[self.position]
 
     @property
     def log_density(self) -> Array:
@@ -156,8 +160,9 @@ def predict(
     for t in range(each.shape[1]):
         at = (m.trial == t) & ~drops
         residual = (m.x - mean)[:, at]
-        if extra[at].any():
-            each[:, t] = _independent(residual, sd[:, at])
+        if extra[at].any():  # independent numbers, as beside the residual process
+            e, own = residual / sd[:, at], np.log(sd[:, at])
+            each[:, t] = (-0.5 * e**2 - own - 0.5 * LOG_2PI).sum(1)
         else:
             log_scale = np.log(factor[:, at]).sum(1)
             e = residual / factor[:, at]
@@ -177,10 +182,7 @@ def predict(
 
 
 def correlated_errors(
-    noise: NoiseGrid,
-    cells: Array,
-    sizes: Array,
-    rng: np.random.Generator,
+    noise: NoiseGrid, cells: Array, sizes: Array, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Return errors along each trial, and their deviations, shape (n, N).
 
@@ -220,6 +222,46 @@ def _log_density(
     return log_p - np.log(own_sizes).sum(1)
 
 
-def _independent(residual: Array, sd: Array) -> Array:
-    """Return log densities of independent numbers, as beside the residual process."""
-    return (-0.5 * (residual / sd) ** 2 - np.log(sd) - 0.5 * LOG_2PI).sum(1)
+def find_residuals(
+    rivals: RivalSet,
+    key: ModelKey = ModelKey(),  # noqa: B008  (frozen)
+) -> Residuals:
+    """Return the residuals of one rival.
+
+    Args:
+        rivals: The models and their trials.
+        key: Key of the model.
+    """
+    trials, m, noise = rivals.trials, rivals.measurements, rivals.model.noise
+    prediction = predict(rivals, key=key)
+    mean, sd = prediction.moments()
+    times = trials.sample_times
+    times = rivals.model.sample_times if times is None else times
+    kind = "stochastic"
+    if noise is not None:
+        kind = "declared" if noise.posterior is None else "estimated"
+    x, follows, correlation = trials.x.numpy(), np.isfinite(m.gap), 0.0
+    if follows.any():  # the posterior mean of that of neighboring errors
+        weight = rivals.noise.posterior(m.x - prediction.mean.mean(0)).sum(1)
+        rho = [float(np.median(c.rho[follows])) for c in rivals.noise.cells]
+        correlation = float(weight @ np.array(rho))
+
+    def filled(values: Array) -> Array:
+        every = np.full(x.size, np.nan)
+        every[m.position] = values
+        return every.reshape(x.shape)
+
+    return Residuals(
+        action=trials.action.numpy(),
+        index=trials.index.numpy(),
+        times=None if times is None else times.numpy(),
+        x=x,
+        mean=filled(mean),
+        sd=filled(sd),
+        refitted=filled((m.x - mean) / sd),
+        correlation=correlation,
+        noise=kind,
+        probability_valid=prediction.probability_valid.mean(0),
+        roughness=filled(rivals.roughness) if rivals.roughness.any() else None,
+        names=trials.names,
+    )

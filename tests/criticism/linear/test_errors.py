@@ -41,7 +41,6 @@ def problem(*, low=-np.inf, ragged=False, num=NUM, differs=False):
         scaled=np.array([False, True]),
         low=np.array([-np.inf, low]),
         high=np.array([np.inf, np.inf]),
-        own=2,
         trial_of=np.array([-1, -1]),
         num=len(m),
         scale=np.ones(len(m)),
@@ -85,7 +84,7 @@ def test_the_evidence_is_that_of_the_dense_integral(ragged):
     logs, means = np.array(logs), np.array(means)
     p = np.exp(logs - logs.max())
     assert found.log_process == pytest.approx(np.log(np.mean(p)) + logs.max())
-    assert found.mean == pytest.approx(p @ means / p.sum())
+    assert found.beside.mean == pytest.approx(p @ means / p.sum())
     alone = []
     for width in WIDTHS:
         prior = np.diag(model.widened(width) ** 2)
@@ -117,8 +116,8 @@ def test_a_parameter_that_differs_from_trial_to_trial_is_a_dense_integral_too():
     varies = np.log(np.mean(np.exp(np.array(logs) - max(logs)))) + max(logs)
     both = np.logaddexp(without.log_process, varies) - np.log(2)
     assert found.log_process == pytest.approx(both)
-    assert found.size == pytest.approx(without.size)  # those of the process
-    assert found.time_scale == without.time_scale
+    own, other = errors.process(found.beside), plain.process(without.beside)
+    assert own == pytest.approx(other)
     use = np.arange(errors.num_folds) != 3
     part = errors.posterior(model, errors.grams(model.rows), use)
     assert (

@@ -48,7 +48,6 @@ def line():
         scaled=np.zeros(2, bool),
         low=-everywhere,
         high=everywhere,
-        own=2,
         trial_of=np.full(2, -1),
         num=16,
         scale=np.ones(16),

@@ -11,7 +11,6 @@ from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.sensor import sensor_of
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.steps.tracing import log_priors
 
 SENSOR, NUM_TRIALS, LIMIT, SLOPE = 0.5, 14, 14.0, 2.0
 
@@ -62,7 +61,7 @@ def test_parameters_beside_an_effect_without_a_null_are_looked_for_anew():
         summaries=0,
     )
     sensor = sensor_of(loop.rivals)
-    search = Search(loop.rivals, sensor, log_priors(loop.effects, ()))
+    search = Search(loop.rivals, sensor)
     search.fit_singles()
     alone = search.found[ModelKey(("drift",))].model.rms
     both = search.fit_set(ModelKey(("limit", "drift"))).model.rms

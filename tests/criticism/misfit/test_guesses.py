@@ -57,7 +57,9 @@ def test_a_guess_is_the_term_that_is_missing_of_numbers():
 def test_the_evidence_of_the_residual_process_is_that_of_its_covariances():
     """Against normal densities of what the linear model leaves, all summed out."""
     search = searched(0.8 * ACTION**3)
-    model, process = search.found[ModelKey()].model, search.rivals.residual_process()
+    model, rivals = search.found[ModelKey()].model, search.rivals
+    at = np.ones(len(rivals.measurements), dtype=bool)
+    process = rivals.residual_process(rivals.noise, at)
     prior = model.jacobian @ np.diag(model.sd**2) @ model.jacobian.T
     mean = model.residual + model.jacobian @ (model.center - model.u)
     num = len(mean)

@@ -3,7 +3,7 @@
 import torch
 
 from sbi_active import DiscreteActions
-from sbi_active.criticism.misfit import near_aliases as room
+from sbi_active.criticism.misfit import record
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.detection import THRESHOLD
 from tests.criticism.steps.linear_world import NOISE, judged, measured, rivals
@@ -18,7 +18,7 @@ PAIR = frozenset({"curve", "twin"})
 def near_aliases(some, actions, known=()):
     found = judged(some)
     log_z = {n: found.states.log_evidence(ModelKey((n,))) for n in some.effects}
-    return room.near_aliases(found.search, log_z, actions, known)
+    return record.near_aliases(found.search, log_z, actions, known)
 
 
 def twin(distance):

@@ -8,7 +8,7 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import HalfNormal
 
-from sbi_active import GaussianNoise, SimulatorModel
+from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces import force_effects
@@ -118,7 +118,7 @@ def test_likely_models_that_bend_have_samples_of_their_posterior():
     assert own.draws[:, :2].std(0).min() > 0.5
     # Seven standard errors of the slope beside a bias, .135, for all 400 draws.
     assert own.draws[:, 0] * own.draws[:, 1] == pytest.approx(4.0, abs=1.0)
-    linear = loop._judge().states.log_evidence(ModelKey(("bias",)))
+    linear = loop._verdict.states.log_evidence(ModelKey(("bias",)))
     assert own.log_evidence == linear  # asked by one, drawn by the other
     # Left-out trials are predicted along the hyperbola, as by the line without them.
     line = np.concatenate([action, torch.ones_like(action)], 1)
@@ -168,3 +168,13 @@ def test_a_larger_noise_is_chosen_again_without_each_trial(size, effects, verdic
     assert loop.judged(evaluation).verdict == verdict
     if tracing.chosen:
         assert tracing.p_value > REFUTED
+
+
+def test_a_set_with_an_effect_on_the_noise_has_draws_for_the_next_action():
+    loop = scattered(lambda action: 0.1 + 0.3 * action.abs(), BIAS, LOUDER)
+    tracing = loop.trace()
+    both = "bias + louder"
+    assert tracing.probabilities[both] > 0.01
+    assert tracing.evidences[both].draws.shape[1] == 3
+    actions = DiscreteActions(torch.linspace(-2, 2, 5))
+    assert loop.next_action(actions).candidates.shape == (5, 1)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sbi_active.criticism.misfit.weights import weights_by_error
+from sbi_active.criticism.misfit.scored import weights_by_error
 from sbi_active.criticism.results import ModelKey
 
 BARE, ONE, TWO = ModelKey(), ModelKey(("one",)), ModelKey(("two",))

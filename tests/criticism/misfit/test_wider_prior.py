@@ -89,8 +89,10 @@ def test_a_bound_of_phi_is_told_and_its_null_is_none():
     prior = BoxUniform(torch.zeros(1), torch.full((1,), 0.1))
     strong = Effect.keyword("drag", prior=prior)
     loop = criticism(0.1, effect=strong, drag=0.3)
-    tracing = beyond_bounds(loop.rivals, replace(loop.trace(), chosen=("drag",)))
     assert loop.trace().chosen == ("drag",)
+    tracing = beyond_bounds(loop.rivals, replace(loop.trace(), chosen=("drag",)))
+    # Asked first of all, it has the posteriors as well.
+    assert criticism(0.1, effect=strong, drag=0.3).judged(None).bounds.parameters
     (found,) = [p for p in tracing.bounds.parameters if p.name == "drag"]
     assert (found.model, found.side) == ("drag", "upper")
     assert found.beyond > 0.15

@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal, norm
 from sbi_active import AutocorrelatedNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials, close_loop
 from sbi_active.criticism.data import Measurements
-from sbi_active.criticism.rivals.channel_noise import ChannelNoise
+from sbi_active.criticism.rivals.error_models import ChannelNoise
 from sbi_active.criticism.rivals.noise_grid import declared_noise
 from sbi_active.criticism.steps.predictive import _log_density
 
@@ -67,7 +67,8 @@ def test_evidence_is_the_sum_over_every_combination_of_sizes(gap):
 def test_with_a_settled_ratio_it_is_as_probable_where_the_ratio_is_from():
     m = measured()
     grid = declared_noise(noise_of(), m)
-    settled = grid.settled(lambda: m.x)
+    assert isinstance(grid, ChannelNoise)
+    settled = grid.settled(m.x)
     assert settled.log_likelihood(m.x[None])[0] == pytest.approx(
         grid.log_likelihood(m.x[None])[0]
     )

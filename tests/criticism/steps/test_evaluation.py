@@ -5,11 +5,10 @@ import pytest
 from scipy.stats import norm
 
 from sbi_active.criticism import Trials
-from sbi_active.criticism.misfit.evaluation import evaluate_left_out
+from sbi_active.criticism.misfit.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.steps.evaluation import evaluate_held_out
-from sbi_active.criticism.steps.residuals import find_residuals
+from sbi_active.criticism.steps.predictive import find_residuals
 from tests.criticism.steps.linear_world import (
     ACTION,
     NOISE,

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sbi_active.criticism.steps.influence import unless_refuted
+from sbi_active.criticism.misfit.contrary import unless_refuted
 from tests.criticism.report.reports import misfit, tracing
 
 

@@ -11,9 +11,9 @@ from torch.distributions import HalfNormal, Independent
 
 from sbi_active import AutocorrelatedNoise, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials, close_loop
+from sbi_active.criticism.misfit.evaluation import evaluate_held_out
 from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.results import NONE
-from sbi_active.criticism.steps.evaluation import evaluate_held_out
 from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR
 from tests.criticism.misfit.oscillator import trials as oscillations
 from tests.criticism.steps.linear_world import (

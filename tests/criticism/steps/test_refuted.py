@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from sbi_active.criticism.misfit.contrary import widened
 from sbi_active.criticism.results import Estimate, Evidence, ModelKey, Tracing
-from sbi_active.criticism.steps.refuted import widened
 
 RNG = np.random.default_rng(0)
 

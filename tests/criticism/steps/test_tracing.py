@@ -26,7 +26,7 @@ def tracing_of(x, **keywords):
 def test_probabilities_are_priors_times_evidences(phi):
     x = measured(**phi)
     found = judged(rivals(x))
-    states, prior = found.states, log_priors(found.rivals.library, ())
+    states, prior = found.states, log_priors(found.rivals.library)
     log_p = {}
     for key in found.choice.probabilities:
         of_set = log_prior(key.effects, prior) if key.effects else prior["none"]
@@ -46,7 +46,7 @@ def test_probabilities_are_priors_times_evidences(phi):
     for own, value in log_p.items():
         name = str(ModelKey(own.effects) if own.effects else own)
         expected[name] = expected.get(name, 0.0) + np.exp(value - total)
-    told = found.probabilities
+    told = {str(key): p for key, p in found.probabilities.items()}
     assert sum(told.values()) == pytest.approx(1)
     assert {k: p for k, p in told.items() if p > 0} == pytest.approx(expected)
     chosen = traced(found, None).chosen

@@ -1,13 +1,8 @@
-r"""Influence of trials on a verdict: its Bayes factor with each one left out.
-
-.. math::
-    Z(x_{-k}) = Z(x)\, E_{p(z | x)}\left[\frac{p(x_{-k} | z)}{p(x | z)}\right],
-
-from the weighted sample behind the evidence, which costs no simulation.
-"""
+"""What speaks against a verdict's effects, and models that the trials refute."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -19,23 +14,21 @@ from sbi_active.criticism.results import (
     NONE,
     OUTLIER,
     UNEXPLAINED,
+    Estimate,
     Evaluation,
+    Evidence,
     ModelKey,
     Tracing,
 )
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.criticism.under_misfit import Misfit
+from sbi_active.seeding import derive_seed
 
 #: Score of trials that speaks against effects.
 DENSITY = "log predictive density"
 
 
-def is_left_to_chance(
-    tracing: Tracing,
-    *,
-    # Odds against a gross error from which one trial may speak for an effect alone.
-    decisive: float = 50.0,
-) -> bool:
+def is_left_to_chance(tracing: Tracing) -> bool:
     """Return whether the effects of a verdict may be one trial's gross error.
 
     This is the case if the verdict falls without the trial that a gross error would be
@@ -46,7 +39,7 @@ def is_left_to_chance(
     suspect = next(iter(tracing.outliers))
     p = tracing.probabilities
     declared = sum(v for name, v in p.items() if name not in (NONE, *CATCH_ALLS))
-    return suspect in tracing.needed and declared < decisive * p.get(OUTLIER, 0.0)
+    return suspect in tracing.needed and declared < 50 * p.get(OUTLIER, 0.0)
 
 
 def unless_refuted(tracing: Tracing, evaluation: Evaluation | None) -> Tracing:
@@ -140,3 +133,53 @@ def withdrawn(tracing: Tracing) -> Tracing:
         instead_of=str(ModelKey(tracing.chosen)),
         misfit=None if misfit is None else replace(misfit, helps=(), named=()),
     )
+
+
+def widened(
+    tracing: Tracing, seed: int, within: Callable[[ModelKey, Array], Array]
+) -> Tracing:
+    r"""Return a verdict whose refuted models have draws that know of it.
+
+    The posterior of a model that misses the trials is as narrow as the sensor allows,
+    about a wrong place. Draws of one that is behind the verdict's by a Bayes factor of
+    20 are spread by the root of the ratio of both chi-squares (Birge), and moved by
+    what separates both models' means, :math:`(\bar u_v - \bar u)\, n` with a standard
+    normal n for each draw: the verdict's effects, left out, shift what is left.
+
+    Args:
+        tracing: Tracing with effects as the verdict.
+        seed: Seed of the draws.
+        within: Moves draws of a model, shape (n, k), into the bounds of its prior.
+
+    References:
+        Birge, Physical Review 40 (1932), for the ratio.
+    """
+    best = tracing.evidences.get(str(ModelKey(tracing.chosen)))
+    if not tracing.chosen or best is None:
+        return tracing
+    found = dict(tracing.evidences)
+    for name, own in found.items():
+        near = own.log_evidence > best.log_evidence - THRESHOLD
+        if near or own.key.error is not None:
+            continue
+        draws = _widened(own, best, derive_seed(seed, "refuted", name))
+        draws = within(own.key, draws)
+        found[name] = replace(own, draws=draws, narrow=own.draws)
+    estimates = [_estimate(e, found[e.name].draws) for e in tracing.estimates]
+    return replace(tracing, evidences=found, estimates=(*estimates,))
+
+
+def _estimate(estimate: Estimate, draws: Array) -> Estimate:
+    """Return an effect's estimate by the draws of the model that has it alone."""
+    phi = draws[:, -len(estimate.mean) :]
+    return replace(estimate, mean=phi.mean(0), sd=phi.std(0))
+
+
+def _widened(own: Evidence, best: Evidence, seed: int) -> Array:
+    ratio = own.best_chi_square / max(best.best_chi_square, 1.0)
+    mean = own.draws.mean(0)
+    known = dict(zip(best.names, best.draws.mean(0), strict=True))
+    apart = np.array([known.get(n, m) for n, m in zip(own.names, mean, strict=True)])
+    normal = np.random.default_rng(seed).normal(size=(len(own.draws), 1))
+    spread = np.sqrt(max(ratio, 1.0)) * (own.draws - mean)
+    return mean + spread + normal * (apart - mean)
