@@ -12,6 +12,8 @@ import torch
 from sbi_active.design import LikelihoodGain, RatioGain
 from sbi_active.design.estimators.base import CandidateSimulations, standard_error
 from sbi_active.design.estimators.contrast import ContrastiveGain, InfoNCEGain
+from tests.design.fragile import PRIOR as FRAGILE_PRIOR
+from tests.design.fragile import Fragile, log_normal
 from tests.linear_gaussian import PRIOR, ExactLikelihood, ExactRatio, information
 
 ACTIONS = torch.tensor([[0.0], [0.5], [1.0], [2.0]])
@@ -93,3 +95,35 @@ def test_a_wrong_ratio_is_wrong_but_for_info_nce():
     assert (gain > EXACT + 3 * error)[1:].all()
     gain, error = estimate(InfoNCEGain(), steep, simulations)
     assert (gain < EXACT + 3 * error + 1e-6).all()
+
+
+class FragileLikelihood:
+    """Measurements or none, with their exact likelihood."""
+
+    exact_likelihood = True
+
+    def __init__(self, luck):
+        self.world = Fragile(luck)
+
+    def log_likelihood(self, x, theta, action):
+        log_v = self.world.log_valid(theta.double(), action.double())
+        lost = torch.log1p(-log_v.exp().clamp_max(1 - 1e-12))
+        measured = log_v + log_normal(x - action * theta)
+        return torch.where(x.isnan(), lost, measured)[:, 0]
+
+
+@pytest.mark.parametrize("luck", [0.0, 0.4])
+@pytest.mark.parametrize(
+    "estimator",
+    [
+        LikelihoodGain(num_contrastive=500),
+        InfoNCEGain(num_contrastive=511),
+    ],
+)
+def test_outcomes_without_a_measurement_are_information(estimator, luck):
+    model = FragileLikelihood(luck)
+    simulations = model.world.simulations(512, 0)
+    gain, error = estimate(estimator, model, simulations, FRAGILE_PRIOR)
+    exact = model.world.exact()
+    assert ((gain - exact["counted"]).abs() < 3 * error + 0.01).all()
+    assert ((gain - exact["dropped"]).abs() > 3 * error).any()  # negative control

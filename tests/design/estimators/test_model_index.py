@@ -110,3 +110,33 @@ def test_a_difference_hidden_in_a_long_trajectory():
     exact = torch.tensor(exact)
     assert (gain.mean(1) <= exact + 3 * error).all()
     assert (gain.mean(1) > exact - 0.1 - 3 * error).all()
+
+
+@dataclass
+class Mixed:
+    """A predictive of 60 posterior draws' means, drawn again and again, and noise."""
+
+    probability: float
+    center: float
+    spread: float
+    noise: float = 1.0
+
+    def predict_mean(self, action, num_samples, seed):
+        generator = torch.Generator().manual_seed(seed)
+        mean = self.center + self.spread * torch.randn(60, generator=generator)
+        mean = mean[torch.randint(60, (num_samples,), generator=generator)]
+        mean = (mean * action)[:, None]
+        return mean, torch.full_like(mean, self.noise)
+
+    def predict(self, action, num_samples, seed):
+        mean, sd = self.predict_mean(action, num_samples, seed)
+        generator = torch.Generator().manual_seed(seed + 1)
+        return mean + sd * torch.randn(num_samples, 1, generator=generator)
+
+
+def test_draws_that_stand_for_the_same_parameters_tell_nothing_by_it():
+    """Two posteriors of few draws, far apart: each outcome is near one draw."""
+    rivals = [Mixed(0.5, 0.0, 50.0, 0.01)] * 2
+    gains = torch.stack([estimate(rivals, 400, seed)[0] for seed in range(4)])
+    error = gains.std(0) / 4**0.5
+    assert (gains.mean(0) < 3 * error + 0.02).all()

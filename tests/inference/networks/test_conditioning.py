@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sbi_active.inference import MixtureDensity
-from sbi_active.inference.networks.baseline import Baseline, local
+from sbi_active.inference.networks.baseline import Baseline, local, precision_factor
 from sbi_active.tasks.numerical import NumericalTask
 from tests import linear_gaussian
 
@@ -122,3 +122,15 @@ def test_degenerate_rows(theta, x, action):
         net = settings.build(theta, condition, action.shape[1])
         assert net.log_prob(theta, condition).isfinite().all()
         assert net.sample(torch.Size([2]), condition).isfinite().all()
+
+
+def test_factor_survives_rounding():
+    generator = torch.Generator().manual_seed(0)
+    size = 10.0 ** torch.linspace(0, 12, 50, dtype=torch.float64)[:, None, None]
+    jacobian = size * torch.randn(50, 3, 2, dtype=torch.float64, generator=generator)
+    precision = torch.eye(3, dtype=torch.float64) + jacobian @ jacobian.mT
+    lost = torch.linalg.cholesky_ex(precision)[1] > 0
+    assert 5 < lost.sum() < 45  # a plain factorization raises
+    factor = precision_factor(precision)
+    error = (factor @ factor.mT - precision).abs().amax((1, 2))
+    assert (error / precision.abs().amax((1, 2))).max() < 1e-12

@@ -3,6 +3,7 @@
 import torch
 from torch.distributions import MultivariateNormal
 
+from sbi_active.inference.networks.conditioning import Conditioning
 from sbi_active.inference.networks.mixture_density import (
     MixtureDensity,
     TrainingBudget,
@@ -14,6 +15,9 @@ from sbi_active.seeding import forked_generators
 NUM, SD = 300, 2.0
 TIMES = torch.linspace(0.1, 1.0, NUM)
 BASIS = torch.stack([TIMES, torch.sin(8 * TIMES)])
+
+
+ALL_ROWS = {"scaling": "action", "whiten": True, "baseline": "best"}
 
 
 def rows(num: int, seed: int):
@@ -51,3 +55,21 @@ def test_a_network_of_many_numbers_comes_near_the_exact_posterior():
     with torch.no_grad():
         score = network.log_prob(theta[None], condition).mean()
     assert exact(theta, condition) - score < 0.15
+
+
+def test_an_outcome_that_lacks_a_number_is_seen_by_the_others():
+    theta, condition = rows(300, 0)
+    whole = condition.clone()
+    condition[5, :NUM], condition[9, 4] = torch.nan, torch.nan
+    own = Conditioning(theta, condition, 1, **ALL_ROWS)
+    assert own.num_frames == 2
+    seen, frames = own(condition)
+    before, _ = own(whole)
+    assert bool(seen.isfinite().all())
+    directions = slice(0, 32)
+    assert bool((seen[5, directions] == 0).all())  # nothing was measured
+    apart = (seen[9] - before[9])[directions].norm()
+    assert float(apart) < 0.2 * float(before[9, directions].norm())
+    # No frame is trusted where a number lacks.
+    for row in (5, 9):
+        assert bool((frames.mean[row] == 0).all())

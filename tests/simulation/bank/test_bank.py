@@ -91,6 +91,14 @@ def test_rows_by_position_slice_and_mask(bank, monkeypatch):
             bank.read(bad)
 
 
+def test_a_run_of_one_row_goes_on(bank):
+    theta, action = draw(1)
+    first = simulate(simulator, theta, action, seed=3, store=bank)
+    again = simulate(simulator, theta, action, seed=3, store=bank)
+    assert same(first, again)
+    assert len(bank) == 1
+
+
 def test_what_a_writer_that_died_left_is_removed(bank):
     simulate(simulator, *draw(4), seed=0, store=bank)
     bank.close()
@@ -153,6 +161,14 @@ def test_readers_go_on_while_another_process_writes(bank):
     assert lengths == sorted(lengths)
     assert len({*lengths}) > 5  # the reader did see the bank grow
     assert len(bank) == 600
+
+
+def test_shapes_set_by_another_writer_hold(bank):
+    late = Bank(bank.path, simulator=simulator)
+    bank.append(Simulations(*draw(3), torch.rand(3, 3)), seed=0)
+    bank.close()
+    with late, pytest.raises(ValueError, match=r"'x': \[3\]}, as in the bank"):
+        late.append(Simulations(*draw(3), torch.rand(3, 4)), seed=1)
 
 
 def test_the_lock_goes_with_its_process(bank):
