@@ -60,6 +60,16 @@ def test_the_first_trial_alone_leaves_the_prior_marked():
     assert c.ask().index == 1
 
 
+def test_a_number_beyond_all_simulations_but_near_stays_and_is_named():
+    c = campaign()
+    c.tell(2.5, action=[1.0])
+    with pytest.warns(UserWarning, match="trial 0"):
+        belief = c.update()
+    assert belief.diagnostics.trustworthy is False
+    assert "leaves it out" not in belief.diagnostics.warnings[0]
+    assert float(belief.mean) > 0.9
+
+
 @pytest.mark.parametrize("least", [1.1, 0.985])
 def test_a_measurement_where_the_simulator_hardly_gives_one(least):
     def lost(theta, action):
@@ -170,6 +180,20 @@ def test_what_is_refused_leaves_no_trace(told, text):
         c.tell(**told)
     assert c.pending is not None
     assert c.history == ()
+
+
+@pytest.mark.parametrize("make", [np.float32, torch.tensor, int, list])
+def test_what_is_told_is_a_copy(make):
+    c = campaign()
+    told = [1.0] if make is list else make(1)
+    array = np.array([0.5], dtype=np.float32)
+    trial = c.tell(told, action=array)
+    array[0] = 7.0
+    assert trial.action.tolist() == [0.5]
+    again = c.tell(array, action=[1.0])
+    array[0] = 9.0
+    assert again.x.tolist() == [7.0]
+    assert (trial.x.tolist(), trial.x.dtype) == ([1.0], torch.float32)
 
 
 def test_a_robot_that_changes_its_action_changes_no_record():

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sbi_active import Campaign
+from sbi_active import BoxActions, Campaign
 from sbi_active.simulation.bank import Bank, LockedError
 from tests.campaign.storage.campaigns import (
     MODEL,
@@ -112,6 +112,19 @@ def test_correct_and_withdraw_keep_the_old_lines(tmp_path):
     again = Campaign.load(tmp_path / "c")
     assert [t.status for t in again.history] == ["withdrawn", "ok"]
     assert torch.equal(again.history[1].x, x)
+
+
+def test_attached_before_and_while_a_trial_is_pending(tmp_path):
+    campaign = new(tmp_path / "c")
+    campaign.attach([1.0], [0.3, 0.5, 0.7, 0.9])
+    asked = campaign.ask()
+    campaign.attach([2.0], status="invalid")
+    assert campaign.pending.index == asked.index == 1
+    campaign.close()
+
+    again = Campaign.load(tmp_path / "c", simulator=MODEL)
+    assert [t.status for t in again.state.trials] == ["ok", "pending", "invalid"]
+    assert again.state.trials[2].x.isnan().all()
 
 
 def test_what_is_refused_is_written_down(tmp_path):
@@ -247,6 +260,17 @@ def test_a_bank_that_campaigns_share(tmp_path, caplog):
     whole = draws(go_on(campaign, 1))
     assert bool(((whole.mean(0) - TRUTH[0]).abs() < 4 * whole.std(0)).all())
     assert len(Bank(tmp_path / "bank", name="drawn")) > 200
+
+
+def test_earlier_rows_of_other_actions_are_not_taken(tmp_path):
+    options = replace(OPTIONS, bank=tmp_path / "bank")
+    with new(simulator=counted, method="asbi", options=options) as campaign:
+        assert campaign.posterior is not None
+    CALLS.clear()
+    fast = {"actions": BoxActions([3.0], [4.0]), "options": options}
+    with new(simulator=counted, method="asbi", **fast) as campaign:
+        assert campaign.posterior is not None
+    assert sum(CALLS) >= OPTIONS.num_simulations
 
 
 def test_a_pickled_copy_lives_in_memory(tmp_path):

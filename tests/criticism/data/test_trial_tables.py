@@ -106,6 +106,8 @@ SHORT = "trial,time,action_v,x_y"
             "= 0 s in rows 1 and 3 .* trial 1; remove",
         ),
         (["1\t0\t1\t5"], "trial\ttime\taction_v\tx_y", r"by commas.*sep='\\t'\)\)"),
+        (["1,0,1,5", "2,0,1,5"], SHORT, "the same numbers in trials 1 and 2 of trials"),
+        (["1,0,1,5", "1,1,1,4 cm"], SHORT, r"row 2 \(trial 1\); got '4 cm' .*once, in"),
         (["1,0,1,"], SHORT, "at least one valid trial"),
     ],
 )
