@@ -1,11 +1,13 @@
 """Generic effects of recordings: which there are, and that a loop finds them."""
 
+import pickle
+
 import pytest
 import torch
 from sbi.utils import BoxUniform
 
 from sbi_active import GaussianNoise, SimulatorModel
-from sbi_active.criticism import Criticism, Trials, generic_effects
+from sbi_active.criticism import Context, Criticism, Trials, generic_effects
 from sbi_active.criticism.effects.changes import delayed_input, played
 from tests.criticism.motor_world import GRID, MODEL, NOISE, PRIOR, measured, speed
 
@@ -35,6 +37,17 @@ def test_a_recording_has_an_actuator_and_a_sensor():
     assert {e.name for e in effects} == ACTUATOR | SENSOR
     assert {e.name for e in effects if e.hook == "input"} == ACTUATOR
     assert not [e for e in effects if e.hook == "action"]
+
+
+def test_effects_travel_to_other_processes():
+    x = torch.rand(4, 19).double()
+    times = torch.linspace(0, 1, 19).double()
+    context = Context(torch.arange(4), times)
+    for effect in generic_effects(MODEL, measured(0, {}), prior=PRIOR):
+        there = pickle.loads(pickle.dumps(effect))
+        if effect.hook == "observation":
+            rows = (x, effect.declared_draws()[:4], x, context)
+            assert torch.equal(there.apply(*rows), effect.apply(*rows))
 
 
 def distorted(change):

@@ -178,3 +178,17 @@ def test_a_prior_of_any_shape_counts():
     assert [low, high] == pytest.approx(expected, abs=0.12)
     low, high = belief.interval(0.999)["frequency"]
     assert low < 3.0 < high
+
+
+def test_what_nothing_tells_keeps_its_prior():
+    def deaf(theta, action):
+        return mean(
+            torch.cat([theta[:, :2], TRUTH[2].expand(len(theta), 1)], 1), action
+        )
+
+    belief = identify(model(fn=deaf), PRIOR, Trials(ACTION, recorded()))
+    low, high = belief.interval()["gain"]
+    assert low == pytest.approx(0.5 + 0.025 * 1.5, abs=0.05)
+    assert high == pytest.approx(2.0 - 0.025 * 1.5, abs=0.05)
+    low, high = belief.interval()["frequency"]
+    assert high - low < 0.05

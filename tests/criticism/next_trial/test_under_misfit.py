@@ -1,5 +1,7 @@
 """The next action where every model misses."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,7 @@ from scipy.stats import entropy
 
 from sbi_active import DiscreteActions
 from sbi_active.criticism import Criticism
+from sbi_active.criticism.next_trial import next_action
 from tests.criticism.misfit.oscillator import ACTION, EFFECTS, MODEL, PRIOR, trials
 
 LARGER = DiscreteActions(torch.cat([ACTION, torch.tensor([[3.0], [4.0]])]))
@@ -38,3 +41,25 @@ def test_trials_unlike_those_at_hand_tell_most(missed):
     gain = chosen.information_gain
     assert gain[-2:].min() > gain[:-2].max()
     assert gain[-2:].max() > 0.2
+
+
+def test_an_action_that_some_draws_alone_chose_is_chosen_again(missed, monkeypatch):
+    """Its report is of other draws, and there it may tell nothing."""
+    select, calls = next_action._select, []
+
+    def unlucky(rivals, tracing, names, p, candidates, **options):
+        design = select(rivals, tracing, names, p, candidates, **options)
+        calls.append(len(candidates))
+        if options:
+            return design
+        gain = design.expected_information_gain.clone()
+        gain[design.index] = 0.0
+        return replace(design, expected_information_gain=gain)
+
+    first = missed.next_action()
+    monkeypatch.setattr(next_action, "_select", unlucky)
+    chosen = missed.next_action()
+    assert calls[0] == len(LARGER.values)
+    assert 0 < calls[1] < calls[0]
+    assert chosen.action is not None
+    assert chosen.action[0] != first.action[0]

@@ -72,6 +72,19 @@ def test_few_simulations_are_unbiased():
     assert abs(mean - exact(3.0, inverse)) < 3 * float(sd) + 0.05
 
 
+def test_what_is_bent_counts_as_noise():
+    torch.manual_seed(0)
+    theta = BELIEF.sample((400,))
+    straight = theta.double() @ jacobian(3.0).T
+    bent = straight + 0.5 * theta[:, :1].double() ** 2 * torch.cos(5 * TIMES)
+    action = torch.tensor([[0.0], [1.0]])
+    case = simulations(torch.stack([straight, bent]), GaussianNoise(0.1), theta, action)
+    gain = LinearGain()(None, case, BELIEF).mean(1)
+    assert 0 < float(gain[1]) < float(gain[0])
+    (note,) = LinearGain().remarks(case)
+    assert "noise deviations off what is linear" in note
+
+
 def test_of_some_parameters_it_is_exact_with_the_others_as_nuisances():
     """I(theta_S; x) = (log |S| - log |S after|) / 2 by the covariances of theta_S."""
     gain = LinearGain([0, 2])(None, linear_case(GaussianNoise(0.1)), BELIEF)
