@@ -65,7 +65,7 @@ def summarize(rows: Rows) -> str:
             if cell is None:
                 continue
             is_last = cell["round"] == cell["round"].max()
-            final = last[method] = cell["intervol"][is_last].to_numpy()
+            final = last[method] = np.asarray(cell["intervol"][is_last])
             medians = [*cell.groupby("round")["intervol"].median()]
             table.append(
                 [
