@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -54,6 +55,10 @@ class Rows:
         return len(self.theta)
 
 
+#: Of a task, a part and the number of a file: parameters, actions and seeds.
+Draw = Callable[[Any, str, int], tuple[Tensor, Tensor, Tensor]]
+
+
 def draw(task: Any, part: str, number: int) -> tuple[Tensor, Tensor, Tensor]:
     """Return parameters, actions and seeds of a file of rows."""
     seed = derive_seed(0, "pouring bank", part, number)
@@ -85,12 +90,13 @@ class Filling:
     report: bool = False
 
 
-def fill(filling: Filling, task: Any) -> None:
-    """Simulate the files that are missing."""
+def fill(filling: Filling, task: Any, draw: Draw) -> None:
+    """Simulate the files that are missing, and print what the folder holds."""
     folder = filling.folder / filling.part
     folder.mkdir(parents=True, exist_ok=True)
     mine, of = map(int, filling.share.split("/"))
-    for number in range(mine, -(-filling.rows // ROWS_A_FILE), of):
+    numbers = range(mine, -(-filling.rows // ROWS_A_FILE), of)
+    for number in () if filling.report else numbers:
         path = folder / f"{number:05d}.npz"
         if path.exists():
             continue
@@ -108,6 +114,7 @@ def fill(filling: Filling, task: Any) -> None:
                 cpu_seconds=spent,
             )
         whole.replace(path)
+    print(report(filling.folder, filling.part))
 
 
 def read(folder: Path, part: str) -> Rows:
@@ -152,6 +159,4 @@ def report(folder: Path, part: str) -> str:
 
 def main(filling: Filling) -> None:
     """Pour from the prior, as poses."""
-    if not filling.report:
-        fill(filling, get_task("pouring"))
-    print(report(filling.folder, filling.part))
+    fill(filling, get_task("pouring"), draw)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -109,11 +109,14 @@ class Round:
 def rounds(
     task: Any,
     learned: Any,
+    believed: Callable[[np.ndarray], Any],
+    points: np.ndarray,
     *,
     num: int,
     seed: int,
     is_active: bool,
     tempered: float = TEMPERED,
+    name: tuple[str, ...] = (),
 ) -> Iterator[Round]:
     """Yield the rounds of a campaign.
 
@@ -121,14 +124,16 @@ def rounds(
         task: Task whose real system is asked.
         learned: Likelihoods of images, with ``actions``, ``gains`` and
             ``log_likelihood``.
+        believed: Belief by its log density at the points, up to a constant.
+        points: Parameters that carry a belief, shape (n, d).
         num: Number of rounds.
         seed: Seed of the campaign.
         is_active: Whether actions are chosen by their gain, or at random.
         tempered: Exponent of the number of trials in the power of their product.
+        name: Names beside the seed of what is real.
     """
-    points = GridBelief.middles().double().numpy()
     total = np.zeros(len(points))
-    belief, earlier = GridBelief.uniform(), Earlier(list)
+    belief, earlier = believed(total), Earlier(list)
     for index in range(num):
         start = time.process_time()
         gain = error = np.full((2, len(learned.actions)), np.nan)
@@ -142,10 +147,10 @@ def rounds(
         delta, place = divmod(choice, gain.shape[1])
         action = learned.actions[place]
         designed = time.process_time()
-        own_seed = derive_seed(seed, "real", index)
+        own_seed = derive_seed(seed, "real", *name, index)
         image = task.real_system(action, seed=own_seed)
         total += learned.log_likelihood(points, image, delta, place, earlier)
-        belief = GridBelief(torch.from_numpy(total * (index + 1.0) ** -tempered))
+        belief = believed(total * (index + 1.0) ** -tempered)
         ended = time.process_time()
         yield Round(
             *(index, delta, place, action, image, gain, error, belief),

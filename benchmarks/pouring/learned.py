@@ -16,7 +16,7 @@ tells nothing. The prior is uniform on [0, 1]^d.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -134,10 +134,12 @@ class ByAction:
     Attributes:
         learned: By delta and action.
         actions: Shape (a, 3).
+        inputs: Function of parameters (n, d) and an action to what likelihoods take.
     """
 
     learned: list[list[Learned]]
     actions: Tensor
+    inputs: Callable[[np.ndarray, Tensor], np.ndarray] = lambda theta, action: theta
 
     def gains(
         self, belief: Any, earlier: Earlier, seed: int
@@ -150,9 +152,14 @@ class ByAction:
         values = [
             [
                 own.likelihood.gain(
-                    theta, NUM_OUTER, np.random.default_rng(seed), earlier[delta, place]
+                    self.inputs(theta, action),
+                    NUM_OUTER,
+                    np.random.default_rng(seed),
+                    earlier[delta, place],
                 )
-                for place, own in enumerate(by_action)
+                for place, (own, action) in enumerate(
+                    zip(by_action, self.actions, strict=True)
+                )
             ]
             for delta, by_action in enumerate(self.learned)
         ]
@@ -172,7 +179,8 @@ class ByAction:
         """
         own = self.learned[delta][place]
         seen, before = own.seen(image, delta), earlier[delta, place]
-        found = own.likelihood.at(theta, seen, before)
+        known = self.inputs(theta, self.actions[place])
+        found = own.likelihood.at(known, seen, before)
         if seen is not None and len(seen):
             before.append(seen)
         return doubted(found, own.likelihood.power)

@@ -30,7 +30,7 @@ and so is ``DOUBT``, the share of outcomes that tell nothing of theta.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -43,7 +43,10 @@ from sbi_active.inference.emulation.likelihood import correlation_root
 from sbi_active.inference.emulation.summaries import Statistic, learned_statistic
 from sbi_active.inference.regression.outcomes import TrialOutcome
 from sbi_active.inference.regression.regions import whole_space
-from sbi_active.inference.sampling.gaussian_process import GaussianProcess
+from sbi_active.inference.sampling.gaussian_process import (
+    GaussianProcess,
+    ProcessSettings,
+)
 
 Array = NDArray[Any]
 
@@ -57,6 +60,8 @@ SHARED = 0.5
 #: Share of outcomes that are taken to tell nothing.
 DOUBT = 0.1
 LOG_SQUARE = -1.27, np.pi**2 / 2  # mean and variance of log chi^2 of one degree
+MOST_SQUARED = 4  # parameters whose squares trends and variances may have
+LEAST_TOLD = 0.03  # share of a parameter's variance that a statistic is kept for
 SLOPE = 0.5  # deviation a priori of coefficients of the noise's log variance
 
 
@@ -107,13 +112,18 @@ class ImageLikelihood:
     shared: float = SHARED
 
     @staticmethod
-    def fit(theta: Array, summary: Array, is_empty: Array) -> ImageLikelihood:
+    def fit(
+        theta: Array, summary: Array, is_empty: Array, *, num_wanted: int | None = None
+    ) -> ImageLikelihood:
         """Learn from pours.
 
         Args:
-            theta: Parameters within [0, 1], shape (n, d).
+            theta: Parameters, and then what else is known of a pour, within [0, 1],
+                shape (n, d).
             summary: Shape (n, q).
             is_empty: Whether no cube is in view, shape (n,).
+            num_wanted: Entries of theta that statistics are learned for, of which those
+                are kept that left-out pours tell; None takes all, and keeps all.
         """
         z = 2 * theta - 1
         empty = filled = None
@@ -127,9 +137,19 @@ class ImageLikelihood:
             return ImageLikelihood(
                 None, (), none, none, none, np.eye(1), 5.0, empty, filled
             )
-        statistic, own = learned_statistic(summary[seen], z[seen], seed=0)
+        statistic, own = learned_statistic(
+            summary[seen], z[seen][:, :num_wanted], seed=0
+        )
+        if num_wanted is not None:
+            statistic, own = _that_tell(statistic, own, z[seen][:, :num_wanted])
+        degree = 1 if z.shape[1] > MOST_SQUARED else None
         processes = tuple(
-            GaussianProcess.fit(z[seen], own[:, [j]], noise="learned")
+            GaussianProcess.fit(
+                z[seen],
+                own[:, [j]],
+                noise="learned",
+                settings=ProcessSettings(degree=degree),
+            )
             for j in range(own.shape[1])
         )
         left_out = np.concatenate([p.left_out for p in processes], 1)
@@ -316,8 +336,22 @@ def repeated(
     return mean, np.sqrt(alone + common)
 
 
+def _that_tell(statistic: Statistic, own: Array, z: Array) -> tuple[Statistic, Array]:
+    """Return the statistics that tell of their parameter, at least the best."""
+    if statistic.weight is None:  # few numbers, which stay as they are
+        return statistic, own
+    told = 1 - ((z - own) ** 2).mean(0) / z.var(0)
+    keep = told >= min(LEAST_TOLD, told.max())
+    fewer = replace(
+        statistic, weight=statistic.weight[:, keep], offset=statistic.offset[keep]
+    )
+    return fewer, own[:, keep]
+
+
 def _quadratic(z: Array) -> Array:
-    """Return linear and quadratic terms, (n, d) -> (n, p)."""
+    """Return linear and, of few parameters, quadratic terms, (n, d) -> (n, p)."""
+    if z.shape[1] > MOST_SQUARED:
+        return z
     row, column = np.triu_indices(z.shape[1])
     return np.concatenate([z, z[:, row] * z[:, column]], 1)
 

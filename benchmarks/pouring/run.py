@@ -27,7 +27,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import torch
 
-from benchmarks.pouring.campaign import TEMPERED, rounds
+from benchmarks.pouring.campaign import TEMPERED, GridBelief, rounds
 from benchmarks.pouring.learned import ByAction, learn
 from benchmarks.pouring.network import ByNetwork, learn_networks
 from benchmarks.rounds import (
@@ -146,8 +146,8 @@ def run_trial(
     """Return one row a round of one campaign."""
     rows: list[dict[str, object]] = []
     for found in rounds(
-        task,
-        learned,
+        *(task, learned, lambda log_p: GridBelief(torch.from_numpy(log_p))),
+        GridBelief.middles().double().numpy(),
         num=num,
         seed=seed,
         is_active=is_active,

@@ -40,11 +40,18 @@ TABLES = {
         "numerical.methods --summary --setting default",
     ),
     "Expected information gain": ("table information_gain/result.csv",),
+    "Continuous and mixed actions": (
+        "search --summary",
+        "search --summary --seeds 40 80",
+    ),
+    "Trials for a controller": ("target --summary",),
+    "Source location finding": ("location_finding --summary",),
     "What an adversary found": (
         "robustness --summary",
         "robustness.exact --summary",
         "robustness.health --summary",
     ),
+    "Campaigns on disk": ("table cost/directory.json --only tell* load,* *near*",),
     "Box collision": (
         "box_collision --summary",
         "box_collision --summary --table coverage --rounds 3",
@@ -85,12 +92,14 @@ TABLES = {
     "The cost of a round": (
         "table cost/result.json",
         "table cost/network.json",
+        "table cost/training.json",
+        "table cost/walls.json",
     ),
     "Robust updates": ("chain.robust --summary",),
     "sbi's own tests with the class swapped": (
         "table sbi_suite/result.json --only date sbi original* swapped*",
     ),
-    "Pouring": ("pouring --summary",),
+    "Pouring": ("pouring --summary", "pouring.material --summary"),
 }
 
 

@@ -21,6 +21,8 @@ from benchmarks.misfit import cases as misfit_cases
 from benchmarks.misfit import run as misfit_run
 from benchmarks.misfit.summary import summary
 from benchmarks.robustness.run import by_tests
+from benchmarks.search import run as search
+from benchmarks.target import run as target
 from sbi_active.tasks import cascaded_tanks
 from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR, trials
 
@@ -142,3 +144,17 @@ def test_a_test_that_fails_was_not_survived():
     rows = [*by_tests(("tests/test_seeding.py",))]
     assert rows
     assert all(row["survived"] and "seeding" in row["attack"] for row in rows)
+
+
+def test_a_search_comes_near_the_best_of_known_functions():
+    row = search.run("mixed 1-D x 3", "gradient", 40)
+    assert row["regret"] <= search.FOUND
+
+
+def test_the_regulator_s_gains_cost_least():
+    theta = torch.zeros(1, 8)
+    best = target.gains(theta)
+    others = best * (1 + 0.1 * torch.eye(4).double())
+    least = target.cost(theta, best)
+    assert (target.cost(theta.expand(4, -1), others) > least).all()
+    assert float(least) < 100

@@ -60,6 +60,16 @@ def test_the_first_trial_alone_leaves_the_prior_marked():
     assert c.ask().index == 1
 
 
+def test_a_number_beyond_all_simulations_but_near_stays_and_is_named():
+    c = campaign()
+    c.tell(2.5, action=[1.0])
+    with pytest.warns(UserWarning, match="trial 0"):
+        belief = c.update()
+    assert belief.diagnostics.trustworthy is False
+    assert "leaves it out" not in belief.diagnostics.warnings[0]
+    assert float(belief.mean) > 0.9
+
+
 @pytest.mark.parametrize("least", [1.1, 0.985])
 def test_a_measurement_where_the_simulator_hardly_gives_one(least):
     def lost(theta, action):

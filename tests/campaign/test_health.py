@@ -88,6 +88,13 @@ def test_a_belief_that_is_off_for_want_of_simulations_is_no_test():
         assert assess(made) == expected
 
 
+def test_health_from_misfit():
+    assert assess(state([0.5, 0.5], [0.5, 0.05])) == "ok"
+    assert assess(state([0.5, 0.5], [0.5, 0.01])) == "watch"
+    assert assess(state([0.5, 0.5], [0.5, 1e-3])) == "alarm"
+    assert assess(state([0.5], [0.5], misfit=1e-3)) == "alarm"
+
+
 @pytest.mark.parametrize("effect", [0.0, 1.5])
 def test_alarms_are_rare_unless_predictions_fail(effect):
     """Predictions with standard normal errors, and with a shift in them."""

@@ -72,3 +72,20 @@ def test_a_faulty_simulator_completes_a_campaign(tmp_path, dies):
     assert 0.05 < diagnostics.share_invalid < 0.15
     assert diagnostics.num_missing > 0
     assert float(c.belief.mean) == pytest.approx(0.6, abs=0.1)
+
+
+def test_infinite_numbers_count_as_not_measured():
+    def three(theta, action):
+        return theta + 0.1 * torch.randn(len(theta), 3)
+
+    c = campaign(simulator=three)
+    with pytest.warns(UserWarning, match="2 of 3 told numbers are infinite"):
+        trial = c.tell([0.6, torch.inf, -torch.inf], action=[2.0])
+    assert trial.status == "ok"
+    assert torch.equal(trial.x.isnan(), torch.tensor([False, True, True]))
+    with pytest.warns(UserWarning, match="infinite"):
+        assert c.tell([0.6, torch.inf, -torch.inf], trial=0, action=[2.0]) is trial
+    assert float(c.update().mean) == pytest.approx(0.6, abs=0.1)
+    assert c.history[0].surprise > 0.01
+    with pytest.warns(UserWarning, match="3 of 3"):
+        assert c.tell([torch.inf] * 3, action=[2.0]).status == "invalid"

@@ -63,6 +63,28 @@ def test_equal_actions_with_other_inputs_are_other_rows():
     assert mean.tolist() == [[4.0, 9.0, 6.0]]
 
 
+def test_a_function_of_one_row_gets_its_own_inputs():
+    shapes = []
+
+    def one(theta, action, *, inputs, times, input_times, start):
+        shapes.append((inputs["u"].shape, times.shape, input_times.shape, start.shape))
+        return theta * inputs["u"].sum() + start[0]
+
+    model = SimulatorModel(one, noise=GaussianNoise(0.1), batched=False)
+    trials = Trials(
+        None,
+        torch.zeros(2, 1),
+        sample_times=[0.5],
+        inputs={"u": torch.tensor([[1.0, 2.0, 0.0], [3.0, 4.0, 0.0]])},
+        input_times=[0.0, 0.5, 1.0],
+        start=torch.tensor([[1.0, 0.0], [2.0, 0.0]]),
+    )
+    simulator = TrialSimulator(AugmentedSimulator(model, []), trials)
+    mean, _, _ = simulator.predict(torch.ones(1, 1), {})
+    assert mean.tolist() == [[4.0, 9.0]]
+    assert {*shapes} == {((3,), (1,), (3,), (2,))}
+
+
 def falling(theta, action, *, times):  # which cannot do without them
     return action - 0.5 * theta * times**2
 
@@ -89,3 +111,23 @@ def test_a_simulator_may_require_times(by_model):
         model, prior, trials, effects=effects, evaluate=False, plan=False
     )
     assert report.verdict == "bias"
+
+
+def test_what_was_found_can_be_simulated_on():
+    trials = measured(0, {"dead zone": 0.25})
+    loop = Criticism(MODEL, PRIOR, trials, effects=LIBRARY)
+    model, prior = loop.add()
+    assert prior.event_shape == (3,)
+    run = {
+        "inputs": trials.inputs,
+        "input_times": trials.input_times,
+        "times": trials.sample_times.expand(len(trials), -1),
+        "start": trials.start,
+    }
+    z = torch.tensor([[3.0, 0.3, 0.25]]).double().expand(len(trials), -1)
+    x = model.mean(z, trials.action, **run)
+    assert float((x - trials.x).square().mean().sqrt()) < 0.06
+    without = model.mean(
+        torch.cat([z[:, :2], torch.zeros(len(z), 1)], 1), trials.action, **run
+    )
+    assert float((without - trials.x).square().mean().sqrt()) > 0.1

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
@@ -14,6 +15,7 @@ from sbi_active.criticism import (
     Effect,
     Trials,
     close_loop,
+    generic_effects,
 )
 from tests.effects import BIAS, normal, on_outcomes
 
@@ -77,6 +79,13 @@ def test_two_hidden_effects():
     assert tracing.inclusion["drift"] < 0.2
 
 
+@pytest.mark.slow
+def test_what_the_library_lacks_is_not_traced_to_it():
+    trials = measured(3, {"ripple": 1.0}, num=16)
+    tracing = Criticism(MODEL, PRIOR, trials, effects=LIBRARY, actions=ACTIONS).trace()
+    assert tracing.verdict in ("unexplained", "scatter")
+
+
 def test_a_removed_effect_is_guessed_by_its_formula():
     trials = measured(4, {"bias": 0.9}, num=14)
     declared = [GAIN, DRIFT]
@@ -108,6 +117,17 @@ def test_effects_that_no_action_separates():
     assert len(tracing.equivalent) == 2
 
 
+def test_drift_is_bias_and_slope_where_actions_run_in_order():
+    action = torch.linspace(-2, 2, 9)
+    line = SimulatorModel(
+        lambda theta, xi: theta[:, :1] + theta[:, 1:] * xi, noise=GaussianNoise(NOISE)
+    )
+    trials = Trials(action, action)
+    tracing = Criticism(line, PRIOR, trials, effects=[DRIFT], actions=ACTIONS).trace()
+    assert tracing.near == (frozenset({"none", "drift"}),)
+    assert tracing.equivalent == ()
+
+
 def test_the_error_falls_on_held_out_trials():
     trials = measured(1, {"cubic": -0.5}, held_out=10)
     criticism = Criticism(MODEL, PRIOR, trials, effects=LIBRARY, actions=ACTIONS)
@@ -118,6 +138,14 @@ def test_the_error_falls_on_held_out_trials():
     assert table.loc["rmse", "high"] < 1
     # RMSE of 10 numbers with noise of 0.1: standard error 0.1 / sqrt(20).
     assert table.loc["rmse", "after"] < NOISE * (1.2 + 4 / math.sqrt(20))
+
+
+def test_leaving_one_out_repeats_the_selection():
+    trials = measured(1, {"cubic": -0.5}, num=6)
+    evaluation = Criticism(MODEL, PRIOR, trials, effects=[BIAS, CUBIC]).evaluate()
+    assert evaluation.scheme == "leave one out"
+    assert len(evaluation.selected) == 6
+    assert np.isnan(evaluation.table["low"]).all()  # below 8 trials there is none
 
 
 def test_nothing_is_added_to_a_right_model():
@@ -140,6 +168,18 @@ def test_the_augmented_simulator_and_its_prior_go_on():
     assert report.simulator(z, ACTIONS.sample((7,), seed=0)).shape == (7, 1)
     again = Criticism(report.simulator, report.prior, trials, effects=[DRIFT, CUBIC])
     assert not again.detect().alarm
+
+
+@pytest.mark.slow
+def test_a_stochastic_simulator_has_a_synthetic_likelihood():
+    def draw(theta, action):
+        return response(theta, action) + NOISE * torch.randn(len(theta), 1)
+
+    model = SimulatorModel(draw)
+    for phi, verdict in (({}, "none"), ({"bias": 0.9}, "bias")):
+        criticism = Criticism(model, PRIOR, measured(1, phi), effects=[BIAS, DRIFT])
+        assert criticism.trace().verdict == verdict
+    assert criticism.residuals().noise == "stochastic"
 
 
 def test_trajectories_with_their_own_stamps_and_correlated_errors():
@@ -173,6 +213,24 @@ def test_trajectories_with_their_own_stamps_and_correlated_errors():
     assert hidden.trace().verdict == "bias"
 
 
+def test_a_nuisance_of_each_trial_is_no_effect():
+    start = Effect(
+        "start",
+        hook="observation",
+        prior=normal(0.5),
+        null=0.0,
+        scope="trial",
+        apply=lambda x, phi, action, context: x + phi,
+    )
+    trials = measured(7, {}, num=8)
+    shifts = 0.5 * torch.randn(8, 1, generator=torch.Generator().manual_seed(1))
+    moved = Trials(trials.action, trials.x + shifts)
+    assert Criticism(MODEL, PRIOR, moved, effects=[CUBIC]).detect().alarm
+    criticism = Criticism(MODEL, PRIOR, moved, effects=[CUBIC, start])
+    assert not criticism.detect().alarm
+    assert "start" not in criticism.trace().probabilities
+
+
 def test_outcomes_that_disagree_are_a_residual():
     def falls(theta, action):
         x = response(theta, action)
@@ -192,6 +250,15 @@ def test_outcomes_that_disagree_are_a_residual():
     agree = Criticism(MODEL, PRIOR, trials, effects=[edge])
     lost = criticism.rivals.fit().evidence.log_evidence
     assert lost < agree.rivals.fit().evidence.log_evidence - 3
+
+
+def test_generic_effects_find_an_offset_of_the_actuator():
+    trials = measured(11, {}, num=16)
+    shifted = Trials(trials.action - 0.4, trials.x)  # executed 0.4 above commanded
+    effects = generic_effects(MODEL, ACTIONS, prior=PRIOR)
+    tracing = Criticism(MODEL, PRIOR, shifted, effects=effects).trace()
+    assert frozenset({"action offset", "bias"}) in tracing.near
+    assert tracing.verdict in ("action offset", "bias")
 
 
 def test_noise_from_repeats_is_summed_out():
@@ -239,6 +306,15 @@ SCATTER = Effect(
         (
             "expected trials of the simulator's shape",
             {"trials": Trials(ONES, torch.ones(3, 4))},
+        ),
+        (
+            "at least one valid trial; got 2 trials",
+            {"trials": Trials(ONES, LOST, role=["fit", "fit", "held out"])},
+        ),
+        ("expected effects not named none", {"effects": [SCATTER]}),
+        (
+            "expected actions of dimension 1",
+            {"actions": DiscreteActions([[1.0, 2.0]])},
         ),
     ],
 )

@@ -6,14 +6,18 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import norm
-from torch.distributions import Independent, MultivariateNormal, Normal
+from torch.distributions import HalfNormal, Independent, MultivariateNormal, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import AugmentedSimulator, Criticism, Trials, close_loop
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.trial_simulator import NUM_REPLICATES, TrialSimulator
-from sbi_active.criticism.rivals.validity import DISAGREEMENT
+from sbi_active.criticism.rivals.validity import (
+    DISAGREEMENT,
+    UNKNOWN_RATES,
+    log_outcomes,
+)
 from sbi_active.criticism.steps.predictive import predict
 from tests.effects import effect
 
@@ -31,6 +35,14 @@ def ending(theta, action, reach=0.0):
     """A line that gives nothing beyond actions of 1."""
     reach = torch.as_tensor(reach).reshape(-1, 1)
     return torch.where(action > 1 + reach, torch.nan, line(theta, action))
+
+
+REACH = effect(
+    "reach",
+    hook="dynamics",
+    prior=Independent(HalfNormal(torch.ones(1)), 1),
+    apply=lambda value, phi, action, context: {**value, "reach": phi[:, 0]},
+)
 
 
 START = effect("start", prior=Normal(0.0, 0.8), scope="trial")
@@ -76,6 +88,36 @@ def test_a_measurement_where_there_should_be_none_has_the_prior_predictive():
     assert found.log_evidence == pytest.approx(expected, abs=4 * found.standard_error)
 
 
+@pytest.mark.slow
+def test_flags_alone_point_to_an_effect():
+    x = line(torch.tensor([[1.0, -0.5]]), ACTION)
+    x = x + NOISE * torch.randn(x.shape, generator=torch.Generator().manual_seed(0))
+    model = SimulatorModel(ending, noise=GaussianNoise(NOISE))
+    action, x = ACTION.repeat(2, 1), torch.cat([x, x.flip(1) + 0.1])
+    bias = effect("bias")
+    tracing = Criticism(model, PRIOR, Trials(action, x), effects=[REACH, bias]).trace()
+    assert tracing.verdict == "reach"
+
+
+@pytest.mark.slow
+def test_flags_that_nothing_explains_are_unexplained_and_named():
+    x = X.clone()
+    x[[0, 2, 3, 5]] = torch.nan
+    model = SimulatorModel(line, noise=GaussianNoise(NOISE))
+    action, x = ACTION.repeat(2, 1), torch.cat([x, x + 0.1])
+    report = close_loop(
+        model,
+        PRIOR,
+        Trials(action, x),
+        effects=[effect("bias")],
+        evaluate=False,
+        plan=False,
+    )
+    assert report.verdict == "unexplained"
+    assert (report.residuals.probability_valid == 1).all()
+    assert any("trials 0, 2, 3, 5, 8" in w for w in report.warnings)
+
+
 def test_a_random_simulator_gives_its_own_probability_of_an_outcome():
     def draw(theta, action):
         x = line(theta, action) + torch.randn(len(theta), 1)
@@ -96,6 +138,17 @@ def test_a_random_simulator_gives_its_own_probability_of_an_outcome():
 
 
 # Nuisances of each trial
+
+
+def test_masked_numbers_are_left_out():
+    def two(theta, action):
+        return line(theta, action).repeat(1, 2)
+
+    x = torch.cat([X, torch.full_like(X, torch.nan)], 1)
+    x[3] = x[3].flip(0)
+    found = rivals(two, Trials(ACTION, x)).fit().evidence
+    expected = exact(ACTION, X[:, 0])
+    assert found.log_evidence == pytest.approx(expected, abs=4 * found.standard_error)
 
 
 def test_a_nuisance_of_each_trial_is_integrated_out():
@@ -172,6 +225,18 @@ def test_ragged_and_masked_trajectories_go_through_the_whole_loop():
     assert report.simulator(report.prior.sample((3,)), torch.ones(3, 1)).shape == (3, 5)
 
 
+def test_times_beyond_those_of_the_simulator():
+    times = torch.linspace(0, 1, 5)
+    model = SimulatorModel(
+        lambda theta, action: theta[:, :1] * times.to(theta),
+        noise=GaussianNoise(0.1),
+        sample_times=times,
+    )
+    trials = Trials([1.0, 2.0], torch.ones(2, 3), sample_times=[0.0, 0.5, 1.5])
+    with pytest.raises(ValueError, match="times within those of the simulator, 0 to 1"):
+        Criticism(model, PRIOR, trials)
+
+
 def test_actions_that_are_not_permitted_are_simulated_where_they_were():
     model = SimulatorModel(line, noise=GaussianNoise(NOISE))
     trials = Trials(ACTION, X)
@@ -225,3 +290,17 @@ def test_summaries_of_a_linear_model_are_sufficient():
 
 
 # Random simulators without declared noise
+
+
+def test_flags_have_the_probability_of_the_rates():
+    p = np.array([[1.0, 1.0, 0.0], [1.0, 0.5, 0.25]])
+    valid = np.array([True, False, False])
+    e = DISAGREEMENT
+    got = np.exp(log_outcomes(p, valid)) * (1 - e) ** 3
+    assert got[0] == pytest.approx((1 - e) * e * (1 - e))
+    assert got[1] == pytest.approx((1 - e) * 0.5 * (0.75 * (1 - e) + 0.25 * e))
+    assert log_outcomes(p[:1], p[0] == 1)[0] == pytest.approx(0.0)
+    each = [np.exp(log_outcomes(p, valid, (rate,))) for rate in UNKNOWN_RATES]
+    np.testing.assert_allclose(
+        np.exp(log_outcomes(p, valid, UNKNOWN_RATES)), np.mean(each, 0)
+    )

@@ -5,8 +5,8 @@ import torch
 from sbi.utils import BoxUniform
 from torch.distributions import Independent, Normal
 
-from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
-from sbi_active.criticism import Criticism, Effect, Trials
+from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel, StudentTNoise
+from sbi_active.criticism import Criticism, Effect, Trials, close_loop
 from sbi_active.criticism.report.summary import suspects
 from tests.criticism.report.reports import flat, report
 
@@ -79,6 +79,18 @@ def test_a_slip_along_a_trajectory_is_an_outlier_and_no_process(num, wrong):
     assert suspects(found) == (float(wrong),)
 
 
+@pytest.mark.parametrize("wrong", [-1e30, "unit"])
+def test_what_nothing_explains_ends_no_loop(wrong):
+    x = measured()
+    x[2] = 100 * x[2] if wrong == "unit" else wrong
+    trials = Trials(XI, x)
+    made = close_loop(
+        MODEL, PRIOR, trials, effects=[QUADRATIC], evaluate=False, plan=False
+    )
+    assert made.verdict == "outlier"
+    assert suspects(made.tracing) == (2.0,)
+
+
 def test_a_true_effect_stays_named_beside_the_outlier():
     xi = XI.clone()
     xi[1] = 4.0
@@ -120,6 +132,20 @@ def test_noise_declared_too_large_is_said():
     right = criticism(x).detect()
     assert right.lower_p_value > 0.01
     assert "SA523" not in [w.code for w in report(detection=right).warnings]
+
+
+def test_large_t_noise_and_trajectories_are_looked_at_as_well():
+    student = SimulatorModel(response, noise=StudentTNoise(100.0, 4.0))
+    assert criticism(measured(), model=student).detect().lower_p_value < 1e-4
+    times = torch.linspace(0, 1, 12)
+    noise = GaussianNoise(10.0)
+    line = SimulatorModel(
+        lambda theta, xi: theta[:, :1] * times, noise=noise, sample_times=times
+    )
+    prior = BoxUniform(-torch.ones(1), torch.ones(1))
+    x = 0.5 * times + 0.1 * torch.randn(4, 12, generator=torch.manual_seed(0))
+    trials = Trials(torch.arange(4.0), x, sample_times=times)
+    assert Criticism(line, prior, trials).detect().lower_p_value < 1e-4
 
 
 def test_held_out_trials_refute_an_alias():

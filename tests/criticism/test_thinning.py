@@ -63,6 +63,14 @@ def test_what_is_smooth_is_thinned_with_a_sentence():
     assert np.isfinite(drawn).sum() == 240 // every
 
 
+@pytest.mark.slow
+def test_what_the_sensor_alone_gets_wrong_is_kept():
+    criticism = loop(0.0)
+    assert criticism.sampling.every == 1
+    assert criticism.trials.mask.all()
+    assert "samples a second" not in flat(criticism.report(evaluate=False, plan=False))
+
+
 @pytest.mark.parametrize("options", [{"thin": False}, {"measurement_sd": None}])
 def test_nobody_looks_where_it_is_not_asked_for_or_no_sensor_is_declared(options):
     CALLS.clear()

@@ -69,6 +69,13 @@ def test_a_constraint_and_actions_not_to_repeat():
         select(exclude=torch.zeros(2, 2))
 
 
+def test_a_constraint_and_actions_not_to_repeat_in_a_box():
+    design = select(BOX, 150, constraint=lambda action: action[:, 0] < 1.5)
+    assert 1.3 < float(design.action) < 1.5
+    again = select(BOX, 150, exclude=torch.tensor([[2.0]]))
+    assert 1.7 < float(again.action) < 1.98  # 1% of the width
+
+
 def rows(num, actions, seed=0):
     with torch.random.fork_rng():
         torch.manual_seed(seed)

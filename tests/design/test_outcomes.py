@@ -10,7 +10,7 @@ import torch
 
 from sbi_active import ASBI, DiscreteActions, InformationGainDesigner, MixtureDensity
 from sbi_active.design import EntropyGain, NestedGain, PosteriorGain
-from sbi_active.design.estimators.base import standard_error
+from sbi_active.design.estimators.base import CandidateSimulations, standard_error
 from sbi_active.simulation import SimulatorModel
 from tests.design.fragile import ACTIONS, NOISE, PRIOR, Fragile
 
@@ -21,6 +21,22 @@ ESTIMATORS = [PosteriorGain(), EntropyGain(), NestedGain()]
 def estimate(world, estimator, simulations):
     gain = estimator(world, simulations, PRIOR)
     return gain.nanmean(1), torch.stack([standard_error(row) for row in gain])
+
+
+def lose_rows(simulations, share, seed=0):
+    """Faults that have nothing to do with the parameters."""
+    generator = torch.Generator().manual_seed(seed)
+    missing = torch.rand(simulations.x.shape[:2], generator=generator) < share
+
+    def lose(part):
+        if part is None:
+            return None
+        return part.masked_fill(missing[..., None], torch.nan)
+
+    return CandidateSimulations(
+        simulations.theta, simulations.action, lose(simulations.x),
+        lose(simulations.mean), simulations.noise, lose(simulations.replicate), missing,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("world", [CERTAIN, LUCKIER], ids=["certain", "lucky"])
@@ -70,6 +86,22 @@ def test_dropping_invalid_rows_reverses_the_choice(world):
     assert ((dropped - exact["dropped"]).abs() < 4 * error).all()
     assert int(dropped.argmax()) == 3
     assert dropped[3] > dropped[2] + 1.0
+
+
+def test_missing_rows_are_dropped_and_not_invalid():
+    for world in (CERTAIN, LUCKY):
+        rows = lose_rows(world.simulations(1_000, 3), 0.4)
+        for estimator in ESTIMATORS:
+            gain = estimator(world, rows, PRIOR)
+            assert torch.equal(gain.isnan(), rows.missing)
+            mean, error = estimate(world, estimator, rows)
+            assert ((mean - world.exact()["counted"]).abs() < 4 * error).all()
+        # negative control: counted as invalid they mislead
+        wrong = CandidateSimulations(
+            rows.theta, rows.action, rows.x, rows.mean, rows.noise, rows.replicate
+        )
+        mean, error = estimate(world, EntropyGain(), wrong)
+        assert ((mean - world.exact()["counted"]).abs() > 6 * error).any()
 
 
 def test_the_designer_tells_luck_from_a_function_of_the_parameters():

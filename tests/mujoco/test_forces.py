@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from sbi_active.criticism import Trials
+from sbi_active.criticism import AugmentedSimulator, Trials
 from sbi_active.criticism.forces.library import trajectories
-from sbi_active.mujoco import from_mjcf
+from sbi_active.mujoco import force_effects, from_mjcf
 
 CART = """<mujoco><option timestep=".002"/><worldbody>
 <body name="cart"><joint name="rail" type="slide" axis="1 0 0" damping=".5"/>
@@ -38,3 +38,17 @@ def test_the_force_of_nominal_motion_is_inertia_times_acceleration(cart):
     rail = np.gradient(found.v, found.time, axis=1)[..., 0]
     inertia = found.force[0] / np.sqrt(np.mean(rail**2))
     assert 2.0 < inertia < 2.4  # with the pole free to turn, between the two masses
+
+
+def test_a_force_moves_the_robot_and_none_does_not(cart):
+    robot, trials = cart
+    effects = force_effects(
+        robot.simulator, robot.prior, trials, include="v|v| of hinge"
+    )
+    model = AugmentedSimulator(robot.simulator, effects)
+    theta, action = torch.full((2, 1), 0.5), torch.zeros(2, 1)
+    phi = torch.tensor([[0.0], [1.0]])
+    x = model.evaluate(theta, {"v|v| of hinge": phi}, action)
+    bare = robot.simulator.mean(theta, action)
+    assert torch.allclose(x[0], bare[0], atol=1e-9)
+    assert (x[1] - bare[1]).abs().max() > 1e-3

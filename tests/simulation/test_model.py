@@ -130,6 +130,26 @@ def test_rows_that_raise_do_not_hide_whether_the_others_are_random(sd):
         SimulatorModel(unstable, batched=False).is_deterministic(THETA[1:2], ACTION[:1])
 
 
+NAN = torch.tensor([[1.0, torch.nan], [0, 0], [0, 0]])
+
+
+@pytest.mark.parametrize(
+    ("run", "text"),
+    [
+        (lambda m: m(THETA[:2], ACTION), r"as many rows; got \(2, 2\) and \(3, 1\)"),
+        (lambda m: m(THETA[0], ACTION), "expected theta"),
+        (lambda m: m(NAN, ACTION), r"finite theta; got \[1.0, nan\] in row 0"),
+        (lambda m: m(THETA, ACTION / 0), "expected finite action; got"),
+        (lambda m: m(THETA[:, :1], ACTION), "expected 2 parameters, a, b; got theta"),
+    ],
+)
+def test_bad_input(run, text):
+    for batched, fn in ((True, line), (False, line_row)):
+        model = SimulatorModel(fn, batched=batched, parameter_names=["a", "b"])
+        with pytest.raises(ValueError, match=text):
+            run(model)
+
+
 @pytest.mark.parametrize(
     ("fn", "options", "text"),
     [

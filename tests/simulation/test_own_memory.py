@@ -40,12 +40,24 @@ def one_row(theta, action, rng, *, context):
     return context.qpos
 
 
+def one_number(theta, action, rng, *, context):
+    context.qpos[0] = theta[0]
+    return context.qpos[:1]
+
+
 @pytest.mark.parametrize("options", ENGINE)
 @pytest.mark.parametrize("noise", [None, GaussianNoise(0.0)])
 def test_rows_that_return_a_view_keep_their_own_x(options, noise):
     model = SimulatorModel(one_row, batched=False, setup=State, noise=noise)
     x = simulate(model, THETA, ACTION, seed=0, **options).x
     assert torch.equal(x, torch.cat([THETA, -ACTION], 1))
+
+
+def test_the_mean_of_rows_that_return_a_view():
+    noise = GaussianNoise(0.1)
+    model = SimulatorModel(one_number, batched=False, setup=State, noise=noise)
+    mean = model.mean(THETA, ACTION)
+    assert torch.equal(mean.float(), THETA)
 
 
 class Buffer:
@@ -81,6 +93,16 @@ def test_a_mean_is_not_overwritten_by_the_next():
     mean = model.mean(THETA, ACTION)
     model.mean(5 * THETA, ACTION)
     assert torch.equal(mean, 2 * THETA)
+
+
+def test_a_random_buffer_is_no_noise_free_output():
+    buffer = torch.zeros(8, 1)
+
+    def fn(theta, action):
+        return buffer[: len(theta)].normal_()
+
+    model = SimulatorModel(fn, noise=GaussianNoise(1.0))
+    assert not model.is_deterministic(THETA, ACTION)
 
 
 def change(theta, action, seeds):
@@ -164,6 +186,28 @@ def test_a_model_called_directly_may_change_its_arguments():
     assert torch.equal(action, ACTION)
     assert torch.equal(effect, torch.ones(600, 1))
     assert torch.equal(seeds, torch.arange(600))
+
+
+def test_effects_of_rows_may_be_changed():
+    def fn(theta, action, rng, gain=None):
+        gain += 1
+        return theta + gain
+
+    effect = torch.zeros(4, 1, dtype=torch.float64)
+    model = SimulatorModel(fn, batched=False, noise=GaussianNoise(1.0))
+    for _ in range(2):
+        assert torch.equal(
+            model.mean(THETA[:4], ACTION[:4], gain=effect) - 1, THETA[:4]
+        )
+
+
+def test_simulations_keep_the_theta_that_was_simulated():
+    theta, action = THETA.clone(), ACTION.clone()
+    rows = simulate(changing, theta, action, seed=0)
+    theta.zero_()
+    action.zero_()
+    assert torch.equal(rows.theta, THETA)
+    assert torch.equal(rows.action, ACTION)
 
 
 def test_noise_keeps_the_values_that_were_declared():

@@ -29,6 +29,14 @@ def test_forms_of_x_that_are_taken(function, recwarn):
     assert not recwarn.list
 
 
+def test_masked_numbers_were_not_measured():
+    def function(theta):
+        return np.ma.masked_greater(theta.repeat(1, 2).numpy() * [1, 0], 1.5)
+
+    expected = torch.tensor([[0, 0], [1, 0], [torch.nan, 0], [torch.nan, 0]])
+    assert torch.equal(x_of(function).nan_to_num(-1), expected.nan_to_num(-1))
+
+
 def model_of(function):
     return SimulatorModel(lambda theta, action: function(theta))
 
@@ -92,3 +100,16 @@ def test_a_number_for_each_pair_of_rows_is_refused_at_once(wrap):
     prior = BoxUniform(torch.zeros(2), torch.ones(2))
     with pytest.raises(ValueError, match="index both alike"):
         Campaign(wrap(pairs), prior, DiscreteActions([1.0, 2.0]))
+
+
+def test_one_number_a_row_needs_no_axis():
+    def flat(theta, action):
+        return theta[:, 0] * action[:, 0]
+
+    model = SimulatorModel(flat, noise=0.1)
+    for num_rows in (1, 2, 300):
+        ones = torch.ones(num_rows, 1)
+        assert model.mean(ones, ones).shape == (num_rows, 1)
+    assert Campaign(
+        model, BoxUniform(torch.zeros(1), torch.ones(1)), DiscreteActions([1.0])
+    ).x_shape == (1,)

@@ -56,6 +56,17 @@ def permuted(task, theta, action, order):
     return task.simulator.mean(theta[order], action[order]).nan_to_num()
 
 
+def test_threads_have_a_scene_each(task):
+    from concurrent.futures import ThreadPoolExecutor
+
+    theta, action = rows(40)
+    alone = task.simulator.mean(theta, action).nan_to_num()
+    with ThreadPoolExecutor(2) as pool:
+        parts = [(theta, action)] * 4
+        for x in pool.map(lambda part: task.simulator.mean(*part), parts):
+            assert torch.equal(x.nan_to_num(), alone)
+
+
 def test_the_paper_s_code_for_what_left_the_table():
     task = get_task("box_collision", left_table="paper", noise=0.0, target=2)
     x = task.real_system(torch.tensor([10.0]), seed=0)

@@ -50,6 +50,13 @@ def test_dates_are_seconds_from_the_start_of_each_trial(unit, zone):
     assert times.flatten().tolist() == pytest.approx([0.0, 0.02, 0.0, 0.02])
 
 
+@pytest.mark.parametrize("name", ["time_ns", "time[ns]", "time [ns]"])
+def test_nanoseconds_are_a_unit(name):
+    frame = long(time=[0, 20_000_000, 0, 20_000_000])
+    trials = Trials.from_dataframe(frame.rename(columns={"time": name}))
+    assert trials.sample_times.flatten()[:2].tolist() == pytest.approx([0.0, 0.02])
+
+
 def test_files_of_attributes_are_no_recordings(tmp_path):
     for name in ("run_1", "run_2"):
         (tmp_path / f"{name}.csv").write_text(

@@ -57,6 +57,18 @@ def test_jitter_does_not_move_values():
     assert found.inputs["input"].tolist() == [[*range(11)]] * 2
 
 
+def test_a_selection_is_not_resampled_again():
+    found = trials(
+        [[1.0, 2.0, 3.0], [5.0, 6.0, 7.0, 8.0, 9.0]],
+        [[0.0, 0.5, 1.0], [0.25, 0.5, 0.75, 1.0, 1.25]],
+        role=["fit", "held out"],
+        start=torch.tensor([[1.0, 2.0], [3.0, 4.0]]),
+    )
+    assert torch.equal(found.held_out.inputs["input"], found.inputs["input"][1:])
+    assert torch.equal(found.held_out.input_times, found.input_times)
+    assert found.held_out.start.tolist() == [[3.0, 4.0]]
+
+
 def test_equal_inputs_make_repeats():
     same = trials(torch.zeros(2, 11))
     assert same.repeat_of.tolist() == [-1, 0]

@@ -55,6 +55,12 @@ def test_smooth_errors_are_thinned_to_about_their_width(width, seed):
     assert other.suggested_step == pytest.approx(found.every)
 
 
+def test_the_sensor_s_error_on_top_needs_no_thinning_where_it_is_larger():
+    rng = np.random.default_rng(0)
+    x = 0.3 * smooth(8, 300, 6, rng) + rng.normal(size=(8, 300))
+    assert suggested_sampling(trials_of(x), x).every == 1
+
+
 def test_a_smooth_error_that_the_sensor_s_hides_at_the_full_rate_is_found():
     rng = np.random.default_rng(0)
     x = smooth(8, 2_000, 40, rng) + 0.05 * rng.normal(size=(8, 2_000))
@@ -104,3 +110,25 @@ def test_thinning_masks_and_changes_nothing_else():
     assert torch.equal(thinned(trials, sampling(1)).x, trials.x)
     with pytest.raises(ValueError, match="expected sample times of trajectories"):
         thinned(Trials([1.0, 2.0], x), sampling(3))
+
+
+def test_channels_of_other_rates_and_short_trials_keep_their_own():
+    x = torch.full((2, 12, 2), torch.nan)
+    x[0, :, 0] = 1.0
+    x[0, 1::4, 1] = 2.0  # a slow sensor, between the other's samples
+    x[1, :2] = 3.0  # a trial that ended early
+    trials = Trials([1.0, 2.0], x, sample_times=torch.arange(12.0))
+    few = thinned(trials, sampling(3)).mask
+    assert few[0, :, 0].nonzero()[:, 0].tolist() == [2, 5, 8, 11]
+    assert few[0, :, 1].nonzero()[:, 0].tolist() == [5, 9]
+    assert few[1].nonzero()[:, 0].tolist() == [1, 1]
+
+
+def test_a_slow_channel_beside_a_fast_one_does_not_hide_it():
+    rng = np.random.default_rng(0)
+    x = np.full((6, 600, 2), np.nan)
+    x[:, :, 0] = smooth(6, 600, 10, rng)
+    x[:, 3::50, 1] = rng.normal(size=(6, 12))
+    assert 8 <= suggested_sampling(trials_of(x), x).every <= 25
+    x[:, 3::5, 1] = smooth(6, 600, 10, rng)[:, 3::5]
+    assert 4 <= suggested_sampling(trials_of(x), x).every <= 25

@@ -48,6 +48,15 @@ def test_names_are_one_each(names):
         Trials([1.0, 2.0], [1.0, 2.0], names=names)
 
 
+def test_measurements_skip_gaps_within_a_trajectory_alone():
+    x = torch.tensor([[1.0, torch.nan, 3.0], [4.0, 5.0, 6.0]])
+    trials = Trials([0.0, 1.0], x, sample_times=[0.0, 0.5, 2.0])
+    m = Measurements.of(trials)
+    assert m.x.tolist() == [1, 3, 4, 5, 6]
+    assert m.gap.tolist() == [np.inf, 2.0, np.inf, 0.5, 1.5]
+    assert m.trial.tolist() == [0, 0, 1, 1, 1]
+
+
 def test_measurements_order_channels_before_times():
     x = torch.arange(12.0).reshape(2, 3, 2)  # trial, time, channel
     m = Measurements.of(Trials([0.0, 1.0], x, sample_times=[0.0, 1.0, 2.0]))

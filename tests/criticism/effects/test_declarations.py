@@ -4,11 +4,24 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import HalfNormal, Normal, TransformedDistribution, Uniform
+from torch.distributions import (
+    HalfNormal,
+    LogNormal,
+    Normal,
+    TransformedDistribution,
+    Uniform,
+)
 from torch.distributions.transforms import PowerTransform
 
 from sbi_active import Campaign, DiscreteActions, GaussianNoise, SimulatorModel
-from sbi_active.criticism import AugmentedSimulator, Criticism, Trials, joint_prior
+from sbi_active.criticism import (
+    AugmentedSimulator,
+    Criticism,
+    Trials,
+    generic_effects,
+    joint_prior,
+)
+from sbi_active.criticism.effects.declarations import require_nested
 from tests.effects import effect
 
 NAN = float("nan")
@@ -58,6 +71,24 @@ def test_a_prior_that_excludes_its_null_is_refused_where_it_is_declared(prior, n
         loop(outside)
     with pytest.raises(ValueError, match=message):
         Campaign(MODEL, PRIOR, ACTIONS, effects=[outside])
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [
+        Normal(0.0, 1.0),
+        Uniform(-1.0, 0.0),
+        LogNormal(0.0, 1.0),
+        BoxUniform(torch.zeros(1), torch.ones(1)),
+    ],
+)
+def test_a_null_within_or_on_the_edge_of_the_support_is_taken(prior):
+    require_nested([effect(prior=prior)])
+
+
+def test_infinite_nulls_and_nuisances_need_no_prior_that_allows_them():
+    require_nested(generic_effects(MODEL, ACTIONS, prior=PRIOR))
+    require_nested([effect(prior=Uniform(1.0, 2.0), scope="trial")])
 
 
 def test_a_null_that_is_kept_may_change_afterwards():
@@ -137,6 +168,15 @@ def test_apply_may_change_what_it_gets(hook):
     assert torch.equal(*x.values())
     assert [float(v[0]) for v in given] == pytest.approx([0.5, 2.0, 1.0])
     assert float(phi["bias"][0]) == pytest.approx(0.3)
+
+
+def test_a_wrong_null_shows_where_noise_is_changed_in_place():
+    def apply(sd, phi, action, context):
+        sd *= 1.5 + phi
+        return sd
+
+    with pytest.raises(ValueError, match=r"the noise changed by up to 0\.5"):
+        loop(effect(hook="noise", prior=HalfNormal(1.0), apply=apply))
 
 
 def test_phi_along_the_wrong_axis_shows_where_x_has_as_many_entries_as_rows():

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import HalfNormal, Normal
+from torch.distributions import HalfNormal, Independent, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import (
@@ -74,6 +74,14 @@ def test_at_the_null_it_is_the_simulator(hook):
     )
 
 
+def test_noise_effects_stretch_the_noise():
+    model = AugmentedSimulator(MODEL, [HOOKS["noise"]])
+    theta = torch.tensor([0.0, 0.0, 2.0]).repeat(4_000, 1)
+    x = model(theta, torch.zeros(4_000, 1), seeds=torch.arange(4_000))
+    # Standard error of a standard deviation of 0.3 from 4,000 draws: 0.3 / sqrt(8000).
+    assert float(x.std()) == pytest.approx(0.3, abs=4 * 0.3 / math.sqrt(8_000))
+
+
 @pytest.mark.parametrize(
     ("wrong", "size"),
     [
@@ -85,6 +93,23 @@ def test_an_effect_that_does_not_vanish_is_named_with_its_size(wrong, size):
     check = PRIOR.sample((16,)), ACTIONS.sample((16,), seed=0)
     with pytest.raises(ValueError, match=f"effect 'bias' to vanish.*up to {size}"):
         AugmentedSimulator(MODEL, [wrong], check=check)
+
+
+def test_without_actions_the_first_call_compares():
+    model = AugmentedSimulator(MODEL, [effect(null=0.5)])
+    with pytest.raises(ValueError, match="vanish at its null"):
+        model.mean(torch.zeros(3, 3), torch.ones(3, 1))
+
+
+def test_a_null_at_infinity():
+    saturation = effect(
+        "saturation",
+        null=torch.inf,
+        prior=Independent(HalfNormal(torch.ones(1)), 1),
+        apply=lambda x, phi, a, c: phi * torch.tanh(x / phi),
+    )
+    check = PRIOR.sample((16,)), ACTIONS.sample((16,), seed=0)
+    AugmentedSimulator(MODEL, [saturation], check=check)  # inf * tanh(0) is NaN
 
 
 def test_augmenting_twice_is_augmenting_with_both():

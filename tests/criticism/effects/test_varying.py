@@ -58,3 +58,15 @@ def test_parameters_stay_within_their_prior():
     torch.testing.assert_close(moved, expected)
     kept = effect.apply(theta.clone(), 0 * phi, action, None)
     assert torch.equal(kept, theta)
+
+
+def test_labels_constants_and_an_unknown_order_vary_nothing():
+    x = torch.zeros(4, 2)
+    constant = Trials(torch.ones(4), x, order="unknown")
+    assert varying_parameters(MODEL, PRIOR, constant) == []
+    two = Trials(torch.tensor([[1.0, 2.0], [2.0, 2.0]]), x[:2])
+    names = [e.name for e in varying_parameters(MODEL, PRIOR, two)]
+    assert names == [
+        *("friction by action 1", "friction by trial"),
+        *("delay by action 1", "delay by trial"),
+    ]

@@ -62,6 +62,17 @@ def test_importance_sampling_gives_the_evidence(names):
     )
 
 
+def test_no_parameters_are_simulated_twice():
+    sets = rivals()
+    rival, scattered = sets.rival(ModelKey()), sets.rival(ModelKey(error="scatter"))
+    u = rival.coordinates.sample(7, seed=3)
+    before = sets.simulator.num_simulations
+    first = rival.residual(u)[0]
+    again = scattered.residual(np.concatenate([u[::-1], u[:2]]))[0]
+    assert sets.simulator.num_simulations == before + 7 * len(X)
+    np.testing.assert_array_equal(again, first[[6, 5, 4, 3, 2, 1, 0, 0, 1]])
+
+
 def test_scatter_sums_out_the_inflation():
     evidence = rivals().fit(ModelKey(error="scatter")).evidence
     factors = 1 + 2.5 * np.abs(np.random.default_rng(0).normal(size=4_000))
@@ -124,3 +135,9 @@ def test_the_standard_error_claims_what_repeated_runs_show():
     gap = np.array([f.log_evidence for f in found]) - MODELS[()]
     claimed = np.mean([f.standard_error for f in found])
     assert 0.5 * claimed < np.sqrt((gap**2).mean()) < 1.7 * claimed
+
+
+def test_a_likelihood_of_zero_has_no_evidence():
+    none = inferred(log_likelihood=lambda u, floor=0.0: np.full(len(u), -np.inf))
+    assert none.log_evidence == -np.inf
+    assert none.effective_sample_size == 0

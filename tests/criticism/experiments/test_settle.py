@@ -2,12 +2,14 @@
 
 import json
 
+import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials, close_loop
+from sbi_active.criticism.experiments.choice import limit_of
 from sbi_active.criticism.experiments.settle import NAME, VerdictError, settle
 from tests.effects import on_outcomes
 
@@ -157,6 +159,16 @@ def test_predictions_where_every_model_misses_are_as_wide_as_left_out_errors():
     assert 0.07 < sum(sizes) / len(sizes) < 0.2
 
 
+@pytest.mark.parametrize(("most", "worth"), [(1, 1), (30, 1), (30, 30)])
+def test_nine_of_ten_further_errors_stay_below_the_limit(most, worth):
+    """Whatever the numbers of a trial are worth, and whatever their size."""
+    rng = np.random.default_rng(0)
+    draws = 7 * rng.chisquare(worth, (600, 8)) / worth
+    below = [new <= limit_of(before, most) ** 2 for *before, new in draws]
+    # A prior of what a trial is worth has a share in it where few trials tell of that.
+    assert 0.86 < np.mean(below) < 0.96
+
+
 def comparing(fails_at=()):
     """Return a comparison whose report fails with so many trials."""
 
@@ -204,3 +216,27 @@ def test_a_trial_comes_after_those_that_were_held_out():
     assert report.evaluation.scheme == "held out"
     table = report.before_after.set_index("metric")
     assert table.loc["rmse", "ratio"] < 0.5
+
+
+def test_a_trial_without_a_measurement_neither_holds_nor_fails():
+    robot = Robot(FORMS["lift"])
+    trials, asked = robot.trials(), []
+
+    def lost_first(action):
+        asked.append(action)
+        return torch.full((1,), torch.nan) if len(asked) == 1 else robot(action)
+
+    report = close_loop(
+        MODEL,
+        PRIOR,
+        trials,
+        effects=LIBRARY,
+        actions=BOTH,
+        real_system=lost_first,
+        max_trials=2,
+        evaluate=False,
+    )
+    first = report.tested[0]
+    assert not first.is_measured
+    assert not any("SA531" in str(w) for w in report.warnings)
+    assert "no measurement" in " ".join(str(report).split())

@@ -83,10 +83,39 @@ def test_the_force_of_nominal_motion_is_that_of_newton():
     assert found.force[0] == pytest.approx(expected, rel=0.05)
 
 
+def test_phi_of_one_is_a_fifth_of_the_force_of_nominal_motion(library):
+    found = trajectories(MODEL, PRIOR, measured())
+    for effect in library:
+        if not effect.name.startswith(("q^3", "v|v|", "sin 6 pi t")):
+            continue
+        force, squares = effect.apply.key, []
+        for k, t in enumerate(found.time):
+            q, v = found.q[:, k], found.v[:, k]
+            phi = np.tile([1.0, 0.5], (len(q), 1))
+            squares.append(force(q, v, float(t), phi) ** 2)
+        rms = np.sqrt(np.mean(squares))
+        assert rms == pytest.approx(0.2 * found.force[0], rel=0.02)
+
+
 @pytest.mark.slow
 def test_clean_trials_have_no_force(library):
     tracing = Criticism(MODEL, PRIOR, measured(seed=2), effects=library).trace()
     assert tracing.verdict == "none"
+
+
+def test_patterns_pick_effects():
+    some = force_effects(
+        MODEL,
+        PRIOR,
+        measured(),
+        joints=["hinge"],
+        include=("*v*", "t *"),
+        exclude="free*",
+    )
+    assert "v|v| of hinge" in [e.name for e in some]
+    assert not any(e.name.startswith("free") for e in some)
+    with pytest.raises(ValueError, match="which matches none; correct it"):
+        force_effects(MODEL, PRIOR, measured(), include="friction*")
 
 
 def test_a_simulator_that_never_asks_is_refused():

@@ -60,3 +60,14 @@ def test_presence_has_its_probability():
         assert found.present.mean() == pytest.approx(expected, abs=0.04)
         absent = ~found.present[:, 0]
         assert (found.u[absent, 2] == 0).all()
+
+
+def test_bounds_hold():
+    grams, r, jacobian = linear()
+    best = -(np.linalg.inv(jacobian.T @ jacobian) @ jacobian.T @ r)[0]
+    sd = 1 / np.sqrt(len(r))
+    low = best + sd  # an edge one deviation above the best
+    found = draws(grams, unknowns(low=low, effect=(-1, -1, -1)))
+    assert found.u[:, 0].min() >= low
+    # Of a normal variable above one deviation.
+    assert found.u[:, 0].mean() == pytest.approx(best + 1.5251 * sd, abs=0.1 * sd)

@@ -1,13 +1,14 @@
-"""A library of 24 effects, whose sets are all fitted, and one of 25 say the same."""
+"""A library of 24 effects, all fitted, and one of 25, screened, say the same."""
 
 import numpy as np
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import Normal
+from torch.distributions import HalfNormal, Normal
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
 from sbi_active.criticism.steps.equivalence import MANY
+from sbi_active.criticism.steps.tracing import log_priors
 
 TIMES = torch.linspace(0, 2, 30)
 PRIOR = BoxUniform(torch.tensor([-2.0]), torch.tensor([2.0]))
@@ -29,15 +30,27 @@ def pattern(k):
     )
 
 
-def verdict(number, strength):
+NOISE = Effect(
+    "noise",
+    hook="noise",
+    prior=HalfNormal(1.0),
+    null=0.0,
+    apply=lambda sd, phi, action, context: sd * (1 + phi[:, :1]),
+)
+
+
+def loop_of(number, strength, *more):
     rng = np.random.default_rng(7)
     model = SimulatorModel(series, noise=GaussianNoise(0.05))
     action = torch.tensor([[0.5], [1.0], [1.5]])
     x = series(torch.tensor([[0.7]]), action) + strength * torch.cos(6 * TIMES)
     x = x + 0.05 * torch.from_numpy(rng.standard_normal(x.shape)).float()
-    effects = [pattern(k) for k in range(number)]
-    loop = Criticism(model, PRIOR, Trials(action, x), effects=effects, seed=0)
-    return loop.trace()
+    effects = [*map(pattern, range(number)), *more]
+    return Criticism(model, PRIOR, Trials(action, x), effects=effects, seed=0)
+
+
+def verdict(number, strength):
+    return loop_of(number, strength).trace()
 
 
 def test_clean_trials_of_many_effects_say_none():
@@ -48,3 +61,15 @@ def test_one_effect_more_does_not_change_the_verdict():
     few, many = (verdict(MANY + k, 0.2) for k in (0, 1))
     assert few.verdict == many.verdict == "wave 2"
     assert abs(few.inclusion["wave 2"] - many.inclusion["wave 2"]) < 0.1
+
+
+def test_what_was_set_aside_counts_in_the_prior_and_is_said():
+    loop = loop_of(MANY + 6, 0.2, NOISE)
+    report = " ".join(str(loop.report(evaluate=False, plan=False)).split())
+    fitted, library = len(loop.rivals.effects), loop.effects
+    assert fitted < len(library)
+    assert f"of {len(library)} effects {fitted} were fitted" in report
+    assert log_priors(loop.rivals.library) == log_priors(library)
+    gone = next(iter(loop.screening.behind))
+    assert loop.add([gone])[1].event_shape[0] == 2  # can be added all the same
+    assert "noise" in loop.screening.kept  # of which no column tells

@@ -54,6 +54,11 @@ def test_a_guess_is_the_term_that_is_missing_of_numbers():
     assert min(gain for _, gain in found) > MARGIN
 
 
+def test_what_no_formula_is_of_numbers_has_no_guess():
+    assert guess_residual(searched(2 * torch.sin(9 * ACTION))) == ()
+    assert guess_residual(searched(0 * ACTION)) == ()
+
+
 def test_the_evidence_of_the_residual_process_is_that_of_its_covariances():
     """Against normal densities of what the linear model leaves, all summed out."""
     search = searched(0.8 * ACTION**3)

@@ -50,6 +50,14 @@ def test_what_is_named_does_not_depend_on_the_declared_sensor():
     assert names == [("a",), ("a",)]
 
 
+def test_effects_that_explain_nothing_change_nothing():
+    several = models(none=(0.0, 101.0), a=(20.0, 12.0), b=(-1.0, 101.0))
+    more = several | models(c=(-1.0, 101.0), d=(-1.0, 101.0))
+    few, many = choose(several, "ab"), choose(more, "abcd")
+    assert few.named == many.named == ("a",)
+    assert few.support["a"] == many.support["a"]
+
+
 def test_formulas_in_the_place_of_an_effect_compete_with_it():
     several = models(none=(0.0, 101.0), a=(20.0, 2.0), b=(19.0, 2.1), a_b=(39.0, 1.1))
     asked = []
@@ -90,10 +98,31 @@ def test_errors_below_the_sensor_s_are_all_alike(timed):
     assert choose(above, "ab", timed=timed).key == ModelKey(("b",))
 
 
+def test_an_effect_that_does_not_predict_better_is_dropped():
+    several = models(none=(0.0, 50.0), a=(20.0, 10.0), a_b=(25.0, 9.9), b=(0.0, 50.0))
+    uneven = 10.0 * np.array([0.8, 1.3, 0.9, 1.2, 0.7, 1.1, 1.0, 0.9])
+    several[ModelKey(("a", "b"))] = scored(25.0, uneven)
+    found = choose(several, "ab")
+    assert found.key == ModelKey(("a",))
+    assert found.inclusion["b"] > 0.9
+
+
 def test_nothing_helps_where_left_out_trials_are_predicted_alike():
     found = choose(models(none=(0.0, 50.0), a=(-1.0, 50.0), b=(0.5, 50.0)), "ab")
     assert found.key == ModelKey()
     assert found.support == {}
+
+
+def test_effects_that_nothing_separates_share_their_mass():
+    several = models(none=(0.0, 101.0), a=(60.0, 11.0), b=(60.0, 11.0))
+    apart = choose(several, "ab")
+    assert apart.inclusion["a"] == pytest.approx(0.5)
+    together = choose(several, "ab", [frozenset("ab")])
+    assert len(together.key.effects) == 1
+    (name,) = together.key.effects
+    assert together.named == (name,)
+    assert together.support[name].inclusion == pytest.approx(1.0, abs=1e-6)
+    assert apart.support["a"].inclusion == pytest.approx(0.5, abs=1e-6)
 
 
 def test_what_left_out_trials_do_not_tell_apart_is_listed_in_its_place():
@@ -130,6 +159,14 @@ def test_a_model_that_is_far_more_probable_is_admitted_whatever_its_error():
     near, far = (models(a=(20.0 + gain, 9.0)) for gain in (9.0, 11.0))
     assert choose(several | near, "abc").key == ModelKey(("b", "c"))
     assert choose(several | far, "abc").key == ModelKey(("a",))
+
+
+def test_a_third_effect_needs_decisive_evidence():
+    several = models(none=(0.0, 101.0), a=(5.0, 60.0), b=(5.0, 60.0), c=(5.0, 60.0))
+    several |= models(a_b=(20.0, 10.0), a_c=(10.0, 50.0), b_c=(10.0, 50.0))
+    few, many = (models(a_b_c=(20.0 + gain, 9.5)) for gain in (4.0, 5.0))
+    assert starts(several | few, "abc")[0] == ModelKey(("a", "b"))
+    assert starts(several | many, "abc")[0] == ModelKey(("a", "b", "c"))
 
 
 def test_the_probability_of_a_better_prediction_is_that_of_a_t_test():
@@ -179,3 +216,24 @@ def test_a_model_that_predicts_left_out_trials_worse_is_not_admitted():
     assert found.key == ModelKey(("a", "b"))
     assert found.named == ()  # beside b, a leaves half of the excess
     assert found.support["a"].better > 0.5
+
+
+def test_without_a_time_axis_a_model_within_a_fifth_is_compared_and_no_other():
+    even, far = 4 * WIGGLE, 4 * WIGGLE[::-1].copy()
+    far[0] = 60.0
+    several = models(none=(0.0, 101.0), b=(0.0, 4.0)) | {
+        ModelKey(("b",)): scored(0.0, even),
+        ModelKey(("a",)): scored(8.0, far),
+    }
+    assert choose(several, "ab", timed=False).key == ModelKey(("b",))
+    near = {**several, ModelKey(("a",)): scored(8.0, 1.18**2 * even)}
+    assert choose(near, "ab", timed=False).key == ModelKey(("a",))
+    assert choose(near, "ab").key == ModelKey(("b",))  # surely worse
+
+
+def test_a_second_effect_needs_a_bayes_factor_of_five_without_a_time_axis():
+    several = models(none=(0.0, 101.0), a=(20.0, 10.0), b=(5.0, 60.0))
+    few, many = (several | models(a_b=(20.0 + gain, 9.5)) for gain in (1.5, 1.7))
+    assert starts(few, "ab", timed=False)[0] == ModelKey(("a",))
+    assert starts(many, "ab", timed=False)[0] == ModelKey(("a", "b"))
+    assert starts(few, "ab")[0] == ModelKey(("a", "b"))

@@ -80,3 +80,32 @@ def test_a_held_out_trial_tells_of_its_start_by_its_first_samples(found):
     p = predict(criticism.rivals, held, key=ModelKey(("drag",)))
     assert len(p.position) == 4 * (SAMPLES - 6)
     assert {int(i) % SAMPLES for i in p.position} == {*range(6, SAMPLES)}
+
+
+def test_start_states_are_those_of_least_squares(found):
+    """Drawn given the first samples, against a search over the start alone."""
+    from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
+    from sbi_active.criticism.steps.nuisances import conditioned
+
+    criticism, own, start = found
+    criticism.trace()
+    rivals = criticism.rivals
+    fit = rivals.fit(ModelKey(("drag",)))
+    u = fit.sample.u[:40]
+    simulator = TrialSimulator(rivals.simulator.model, own.held_out)
+    rng = np.random.default_rng(0)
+    theta, phi = conditioned(rivals, fit, u, simulator, rng)
+    drawn = phi["start"][..., 0].numpy()
+    grid = torch.linspace(-2, 2, 2001, dtype=torch.float64)
+    middle, drag = float(theta.mean()), float(phi["drag"].mean())
+    for t in range(4):
+        action = own.held_out.action[t].expand(len(grid), -1)
+        x = level(
+            torch.full((len(grid), 1), middle).double(), action, start=grid, drag=drag
+        )
+        square = ((x - own.held_out.x[t])[:, :6] ** 2).sum(1)
+        best = float(grid[int(square.argmin())])
+        assert drawn[:, t].mean() == pytest.approx(
+            best, abs=4 * drawn[:, t].std() + 0.01
+        )
+        assert drawn[:, t].std() < 0.1

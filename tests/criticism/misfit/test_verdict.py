@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import HalfNormal
+from torch.distributions import HalfNormal, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
@@ -146,6 +146,33 @@ LOUDER = Effect(
     null=0.0,
     apply=lambda sd, phi, action, context: sd * (1 + phi[:, :1] * action.abs()),
 )
+
+
+def test_outcomes_are_told_however_large_the_library():
+    """A ball that flies too far is not seen, without a time axis."""
+
+    def seen(theta, action):
+        x = theta * action
+        return x.where(x.abs() < 3, torch.nan)
+
+    def turned(k):
+        return Effect(
+            f"turned {k}",
+            hook="action",
+            prior=Normal(0.0, 0.5),
+            null=0.0,
+            apply=lambda a, phi, action, context: a + phi * torch.cos(k * a),
+        )
+
+    action = torch.linspace(-2, 2, 20, dtype=torch.float64)[:, None]
+    error = torch.randn(20, 1, generator=torch.manual_seed(0)).double()
+    trials = Trials(action, seen(2.0, action + 0.4 * torch.cos(3 * action)) + error / 9)
+    model = SimulatorModel(seen, noise=GaussianNoise(1 / 9))
+    prior = BoxUniform(torch.zeros(1), 5 * torch.ones(1))
+    loop = Criticism(model, prior, trials, effects=[turned(k) for k in range(25)])
+    tracing = loop.trace()
+    assert loop.rivals.can_fail
+    assert tracing.verdict == "turned 3"
 
 
 @pytest.mark.parametrize(

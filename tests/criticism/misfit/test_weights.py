@@ -31,3 +31,10 @@ def test_no_model_wins_by_one_part_alone():
     of_the_mean = 1 / (1 + (error[ONE].mean() / error[BARE].mean()) ** 3.5)
     found = weights_by_error(error, {BARE: 0.0, ONE: 0.0}, seed=0)
     assert 0.5 < found[ONE] < of_the_mean - 0.05
+
+
+def test_parts_that_do_not_count_change_nothing():
+    error = {BARE: np.array([1.0, 2.0, 3.0]), ONE: np.array([2.0, 1.0, 2.0])}
+    more = {key: np.r_[np.nan, square] for key, square in error.items()}
+    one = weights_by_error(error, EQUAL, seed=0)
+    assert weights_by_error(more, EQUAL, seed=0) == one

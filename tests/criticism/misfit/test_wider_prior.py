@@ -85,6 +85,15 @@ def test_a_cause_that_no_bound_makes_up_for_stays_named():
     assert "SA103" in [w.code for w in report.warnings]
 
 
+def test_a_narrow_prior_without_bounds_names_nothing_either():
+    tight = Independent(Normal(torch.full((1,), 0.5), 0.01), 1)
+    report = criticism(0.1, prior=tight).report(plan=False)
+    assert report.tracing.chosen == ()
+    assert report.verdict in (NONE, UNEXPLAINED)
+    line = str(report).splitlines()[0]
+    assert "gain: no permitted action tells it from the bare model" in line
+
+
 def test_a_bound_of_phi_is_told_and_its_null_is_none():
     prior = BoxUniform(torch.zeros(1), torch.full((1,), 0.1))
     strong = Effect.keyword("drag", prior=prior)
@@ -114,6 +123,12 @@ def test_a_simulator_that_refuses_what_is_beyond_is_asked_no_more():
     (only,) = found.bounds.parameters
     assert np.isnan(only.beyond)
     assert np.isnan(found.bounds.p_value)
+
+
+def test_a_bare_model_that_explains_at_its_bound_says_so():
+    report = criticism(0.403).report(plan=False)
+    assert report.verdict == NONE
+    assert "SA103" in [w.code for w in report.warnings]
 
 
 def test_with_a_prior_that_holds_the_truth_nothing_is_said():

@@ -90,6 +90,12 @@ def test_a_formula_that_does_better_leaves_an_imitation_unnamed():
     assert report.guess == "|xi|^1.5"
 
 
+def test_a_cause_has_no_rival_among_formulas(beside):
+    guessed = beside.trace().misfit.support["quadratic"].guessed
+    # One of about twenty is the effect itself: the mean is log(20) = 3 nats below it.
+    assert -4 < guessed < 0
+
+
 def test_several_effects_are_asked_what_left_out_trials_say_of_them():
     found = loop(trials(quadratic=QUADRATIC, step=1.0))
     tracing = found.trace()
@@ -99,6 +105,14 @@ def test_several_effects_are_asked_what_left_out_trials_say_of_them():
     draws = tracing.evidences["quadratic"].draws  # without the step, which matters
     mean, sd = draws.mean(0), draws.std(0)
     assert (abs(mean - (*THETA, QUADRATIC)) < 2 * sd).all()
+
+
+def test_a_model_that_one_effect_refutes_has_intervals_that_know_of_it():
+    tracing = loop(trials(quadratic=QUADRATIC)).trace()
+    draws = tracing.evidences["none"].draws
+    mean, sd = draws.mean(0), draws.std(0)
+    assert abs(mean[0] - THETA[0]) > 10 * SENSOR  # the quadratic's mean is in it
+    assert (abs(mean - THETA) < 2 * sd).all()
 
 
 def test_a_model_that_fits_is_no_misfit():

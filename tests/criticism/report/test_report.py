@@ -2,6 +2,7 @@
 
 import json
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,10 @@ from sbi_active.criticism import joint_prior
 from sbi_active.criticism.contradictions import SevereTest
 from sbi_active.criticism.report.sections import sentences
 from sbi_active.criticism.report.words import with_error
-from tests.criticism.report.reports import DRAG, report, tracing
+from tests.criticism.report.reports import DRAG, flat, report, tracing
+
+NONE = {"tracing": tracing("none"), "residuals_after": None}
+
 
 TESTS = (
     SevereTest(action=np.array([3.0]), is_permitted=True, difference=1.234),
@@ -26,6 +30,34 @@ def test_a_dictionary_has_no_probabilities_where_they_contradict_the_verdict():
     assert plain["misfit"] is None
     withdrawn = report(tracing=tracing("unexplained", instead_of="drag")).to_dict()
     assert withdrawn["probabilities"] is withdrawn["credible_set"] is None
+
+
+def test_only_a_bare_model_that_holds_is_a_stop():
+    plan = replace(report().next_action, action=None)
+    left, alone = (replace(plan, separates=(name,)) for name in ("none", "drag"))
+    text = flat(report(next_action=plan, **NONE))
+    assert "Stop: no permitted action tells more" in text
+    text = flat(report(next_action=left, **NONE))
+    assert "Stop: of the declared models only none is left." in text
+    text = flat(report(next_action=alone))
+    assert "Of the declared models only drag is left." in text
+
+
+def test_a_deviation_needs_draws_behind_it():
+    made = tracing()
+    estimates = [replace(e, effective_sample_size=49.0) for e in made.estimates]
+    few = replace(
+        made.evidences["none"], effective_sample_size=2.2, draws=np.full((400, 2), 0.1)
+    )
+    evidences = made.evidences | {"none": few}
+    text = flat(
+        report(tracing=replace(made, estimates=(*estimates,), evidences=evidences))
+    )
+    assert "about 0.12 1/m" in text
+    assert "mu_1 about 0.1 " in text
+    assert '"about": below 50 effective samples' in text
+    assert "(more than 1000 of its standard deviations)" in text
+    assert "about" not in flat(report()).split("Parameters")[1].split("Next")[0]
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from html.parser import HTMLParser
 
 from matplotlib import image
 
-from tests.criticism.report.reports import report
+from tests.criticism.report.reports import report, tracing
 
 
 class Page(HTMLParser):
@@ -36,6 +36,16 @@ def test_the_page_is_self_contained():
     assert all(
         source.startswith("data:image/svg+xml;base64,") for source in page.images
     )
+
+
+def test_markdown_tables_have_as_many_cells_as_headings():
+    shares = {"a|b": 0.6, "drag": 0.4}
+    made = report(tracing=tracing(probabilities=shares, credible_set=(*shares,)))
+    text = re.sub(r"\\\|", "", made.to_markdown())
+    blocks = re.findall(r"(?:^\|.*\|$\n?)+", text, flags=re.MULTILINE)
+    assert len(blocks) == 5
+    for block in blocks:
+        assert len({line.count("|") for line in block.splitlines()}) == 1
 
 
 def test_save_writes_the_page_and_every_figure(tmp_path):

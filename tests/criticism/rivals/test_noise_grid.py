@@ -19,6 +19,12 @@ from sbi_active.criticism.rivals.noise_grid import (
 TIMES = np.array([0.0, 0.1, 0.3, 0.6, 1.0])
 
 
+def test_noise_without_size_is_refused():
+    m = Measurements.of(Trials([0.0, 1.0], [0.0, 1.0]))
+    with pytest.raises(ValueError, match="expected measurement noise with a standard"):
+        declared_noise(GaussianNoise(0.0), m)
+
+
 def trajectories():
     x = torch.tensor([[0.1, 0.4, torch.nan, 0.2, -0.3], [1.0, 0.9, 0.5, 0.4, 0.2]])
     return Measurements.of(Trials([0.0, 1.0], x, sample_times=TIMES))
@@ -107,3 +113,12 @@ def test_a_posterior_over_the_size_is_summed_out_by_draws():
     expected = stats.multivariate_t(np.zeros(3), scale, df=59).logpdf(m.x)
     # A size known to 9 % has a density known to .16 nats a draw, here.
     assert grid.log_likelihood(m.x[None])[0] == pytest.approx(expected, abs=0.15)
+
+
+def test_a_posterior_over_one_size_may_be_of_single_numbers():
+    """Its draws have no axis of parameters."""
+    m = Measurements.of(Trials([0.0, 1.0, 2.0], [0.3, -0.4, 0.5]))
+    size = torch.distributions.LogNormal(np.log(0.3), 0.1)
+    grid = declared_noise(GaussianNoise(0.3, posterior=size), m)
+    assert len(grid.cells) == NUM_DRAWS
+    assert all(cell.sd.shape == (3,) for cell in grid.cells)

@@ -1,12 +1,26 @@
 """Sets of several effects, against all sets of a linear world."""
 
 from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
 
 from sbi_active.criticism import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.misfit.record import traced
+from sbi_active.criticism.steps.tracing import log_prior
 from tests.criticism.steps import linear_world
 from tests.criticism.steps.linear_world import ACTION, judged, measured, rivals
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_sets_of_several_effects_have_together_a_third_of_the_next_smaller(size):
+    prior = {"none": 0.5, "unexplained": 0.1, "a": 0.1, "b": 0.2, "c": 0.05, "d": 0.05}
+    log_p = {name: float(np.log(p)) for name, p in prior.items()}
+    sets = combinations("abcd", size)
+    total = sum(np.exp(log_prior(names, log_p)) for names in sets)
+    assert total == pytest.approx(0.4 * 3.0 ** (1 - size))
 
 
 def test_a_name_may_contain_what_joins_names():

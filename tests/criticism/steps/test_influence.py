@@ -1,5 +1,6 @@
 """What a verdict rests on."""
 
+import numpy as np
 import pytest
 
 from sbi_active.criticism.misfit.contrary import unless_refuted
@@ -26,3 +27,13 @@ def test_what_raises_an_error_that_is_printed_does_not_help(left_out, held_out, 
     assert (made.verdict, made.chosen) == ("unexplained", ())
     assert made.misfit.helps == ()
     assert made.refuted_on == where
+
+
+def test_channels_count_in_sensor_deviations():
+    # Position in meters falls by half, a force in newtons rises by a tenth.
+    errors = np.array([0.2, 30.0]), np.array([0.1, 33.0])
+    fine, coarse = (0.001, 10.0), (0.1, 1.0)
+    assert verdict(errors, sensor=fine).chosen
+    made = verdict(errors, sensor=coarse)
+    assert not made.chosen
+    assert made.refuted_on == "left-out trials in sensor deviations"

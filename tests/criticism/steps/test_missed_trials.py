@@ -11,6 +11,7 @@ from torch.distributions import HalfNormal, Independent
 
 from sbi_active import AutocorrelatedNoise, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Effect, Trials, close_loop
+from sbi_active.criticism.misfit.contrary import unless_refuted
 from sbi_active.criticism.misfit.evaluation import evaluate_held_out
 from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.results import NONE
@@ -78,6 +79,14 @@ def test_a_trial_in_another_unit_is_named_first(drag):
     assert "SA514" in [w.code for w in report.warnings]
 
 
+def test_the_level_is_that_of_all_held_out_trials(fitted):
+    some, tracing = fitted
+    trials = Trials(ACTION, measured(curve=0.5, seed=1))
+    named = evaluate_held_out(some, tracing, trials, level=12 * 0.9).missed
+    assert 6 <= len(named) <= 12
+    assert [*named] == sorted(named, key=lambda trial: -trial.size)
+
+
 def test_correlated_errors_are_no_contradiction():
     times = torch.linspace(0.05, 2.0, 40)
     noise = AutocorrelatedNoise(0.05, correlation_time=1.0)
@@ -120,6 +129,18 @@ def test_errors_under_misfit_are_compared_with_those_of_left_out_trials():
         report = close_loop(MODEL, PRIOR, trials, effects=EFFECTS, plan=False)
         assert report.tracing.misfit is not None
         assert [trial.name for trial in report.evaluation.missed] == names
+
+
+def test_what_no_model_predicts_refutes_none(fitted):
+    some, tracing = fitted
+    x = measured(curve=0.5, seed=1)
+    mean, _ = posterior(measured(curve=0.5), ("curve",))
+    x[0] += 1e4 if columns(("curve",))[0, 2] * mean[2] < 0 else -1e4  # nearer the bare
+    evaluation = evaluate_held_out(some, tracing, Trials(ACTION, x))
+    rmse = evaluation.table.set_index("metric").loc["rmse"]
+    assert rmse["after"] > rmse["before"]
+    assert [trial.position for trial in evaluation.missed if trial.by_both] == [0]
+    assert unless_refuted(tracing, evaluation).verdict == "curve"
 
 
 def test_trials_that_agree_are_not_named():

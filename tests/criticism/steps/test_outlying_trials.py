@@ -22,3 +22,7 @@ def test_ordinary_trials_are_rarely_named():
         named += bool(outlying_trials([*spread]))
     # A hundredth, and its standard error at 1,000 sets is .003.
     assert named / 1_000 < 0.02
+
+
+def test_few_trials_do_not_show_how_errors_differ():
+    assert outlying_trials([1.0, 1.0, 1.0, 1e6]) == []

@@ -35,6 +35,14 @@ LATE = {
 }
 
 
+#: Late, and with a second strength that shows nowhere.
+TWO = Effect.keyword(
+    "two",
+    *("delay", "unused"),
+    prior=Independent(HalfNormal(torch.tensor([0.2, 1.0])), 1),
+)
+
+
 def groups(*names):
     model = SimulatorModel(respond, noise=GaussianNoise(0.02), sample_times=TIMES)
     gen = torch.Generator().manual_seed(0)
@@ -58,3 +66,12 @@ def test_a_delay_is_a_lag_near_zero_and_not_beyond():
 def test_a_delay_is_a_clock_of_another_scale_at_any_size():
     """1 - exp(-t) takes the place of a delay t."""
     assert groups("delay", "clock") == (frozenset({"delay", "clock"}),)
+
+
+def test_of_three_the_two_are_left_that_are_alike_everywhere():
+    assert groups("lag", "delay", "clock") == (frozenset({"delay", "clock"}),)
+
+
+def test_effects_may_have_strengths_of_other_numbers():
+    assert groups(TWO, "clock") == (frozenset({"two", "clock"}),)
+    assert groups("lag", TWO) == ()

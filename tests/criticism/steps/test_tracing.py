@@ -1,5 +1,7 @@
 """Probabilities and verdicts, against the exact evidences of a linear world."""
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 import torch
@@ -10,12 +12,34 @@ from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.tracing import log_prior, log_priors
 from tests.criticism.steps import linear_world
-from tests.criticism.steps.linear_world import ACTION, NOISE, judged, measured, rivals
+from tests.criticism.steps.linear_world import (
+    ACTION,
+    NOISE,
+    SHAPES,
+    effect,
+    judged,
+    measured,
+    rivals,
+)
 
 
 def tracing_of(x, **keywords):
     found = judged(rivals(x))
     return traced(found, None, **keywords), found
+
+
+def test_families_share_what_none_and_the_catch_alls_leave():
+    log_p = log_priors([effect(name) for name in SHAPES])
+    p = {name: np.exp(value) for name, value in log_p.items()}
+    assert p == pytest.approx(
+        {
+            **{"none": 0.5, "unexplained": 0.05, "scatter": 0.05, "outlier": 0.05},
+            **{"curve": 0.35 / 4, "wave": 0.35 / 4, "kink": 0.35 / 2},
+        }
+    )
+    two = log_priors([effect("kink")], ("unexplained", "scatter"))
+    assert np.exp(two["kink"]) == pytest.approx(0.4)
+    assert sum(np.exp([*two.values()])) == pytest.approx(1)
 
 
 @pytest.mark.parametrize(
@@ -70,6 +94,16 @@ def test_estimates_are_those_of_each_effect_alone():
     assert tracing.estimates[0].name == "curve"
 
 
+def test_without_an_alarm_there_is_nothing_to_trace():
+    tracing, _ = tracing_of(measured())
+    assert tracing.verdict == "none"
+    assert tracing.chosen == ()
+    assert tracing.needed == ()
+    # No trial is suspected, and no set of several effects is looked for.
+    assert tracing.outliers == {}
+    assert not any(" + " in name for name in tracing.probabilities)
+
+
 def test_what_an_effect_leaves_over_is_unexplained_beside_it():
     x = measured(curve=2.0, further=3 * NOISE * torch.sin(1.7 * ACTION + 1))
     tracing, found = tracing_of(x)
@@ -102,3 +136,17 @@ def test_effects_that_the_trials_do_not_separate_count_as_one():
     assert tracing.equivalent == (group,)
     p = tracing.probabilities
     assert tracing.verdict == max(group, key=p.__getitem__)
+
+
+@pytest.mark.parametrize("kink", [0.2, 0.32])
+def test_inclusion_and_the_credible_set_add_probabilities_up(kink):
+    tracing, _ = tracing_of(measured(curve=0.14, kink=kink))
+    p = tracing.probabilities
+    for name, total in tracing.inclusion.items():
+        parts = [p[k] for k, e in tracing.evidences.items() if name in e.key.effects]
+        assert total == pytest.approx(sum(parts))
+    num = len(tracing.credible_set)
+    sums = [sum(p[n] for n in names) for names in combinations(p, num)]
+    assert sum(p[n] for n in tracing.credible_set) == pytest.approx(max(sums))
+    assert max(sums) >= 0.9
+    assert max(sum(p[n] for n in names) for names in combinations(p, num - 1)) < 0.9

@@ -72,6 +72,13 @@ def test_many_parameters_that_outcomes_are_linear_in_have_the_linear_estimate(
     assert (type(chosen) is LinearGain) == linear
 
 
+def test_a_ratio_beyond_the_reach_of_info_nce_is_averaged():
+    chosen, notes = choose_estimator(ExactRatio(), unusable(FAR))
+    assert type(chosen) is RatioGain
+    assert "not used: InfoNCEGain is near its largest value, log K = 4.9" in notes[-1]
+    assert "at 1 of 2 actions" in notes[-1]
+
+
 @pytest.mark.parametrize(
     ("estimator", "text"),
     [

@@ -93,3 +93,15 @@ def test_missing_rows_are_left_out(name, rows):
     gain = ESTIMATORS[name](Everything(), replace(rows, x=x, missing=missing), PRIOR)
     assert gain[1].isnan().all()
     assert gain[2].isfinite().all()
+
+
+@pytest.mark.parametrize("name", sorted(set(FROM_MODELS) - {"posterior"}))
+def test_a_model_that_cannot_say_is_an_error(name, rows):
+    """A loss that the model does not know is refused, not dropped."""
+    x = rows.x.clone()
+    x[1, 3] = torch.nan
+    with pytest.raises(ValueError, match="outcome without a measurement is, x = NaN"):
+        ESTIMATORS[name](Everything(), replace(rows, x=x), PRIOR)
+    model = object()
+    with pytest.raises(ValueError, match=r"expected a model with log_\w+ for \w+Gain"):
+        ESTIMATORS[name](model, rows, PRIOR)

@@ -8,7 +8,7 @@ from sbi.utils import BoxUniform
 
 from sbi_active.design import EntropyGain, NestedGain
 from sbi_active.design.estimators.base import CandidateSimulations
-from sbi_active.design.estimators.emulator import declare
+from sbi_active.design.estimators.emulator import MeanEmulator, declare
 from sbi_active.simulation import GaussianNoise
 from sbi_active.tasks.oscillator import model
 from sbi_active.tasks.oscillator.reference import OscillatorReference
@@ -75,3 +75,24 @@ def test_noise_that_is_not_declared_is_learned():
     square = declare(pairs).score
     assert square.shape == (2, 6)
     assert 0.9 < float(square.median()) < 1.5
+
+
+def test_outcomes_that_cannot_be_smoothed_are_noticed():
+    torch.manual_seed(0)
+    theta = PRIOR.sample((200,))
+    rough = 1e3 * torch.sin(1e3 * theta).repeat(1, 2)[None]
+    x, again = (rough + torch.randn_like(rough) for _ in "ab")
+    pairs = CandidateSimulations(theta, torch.zeros(1, 1), x, replicate=again)
+    assert "smoothing misses 100%" in NestedGain().problems(pairs)[0]
+    few = pairs.samples(slice(10))
+    assert "fewer than 20 complete" in NestedGain().problems(few)[0]
+
+
+def test_rounding_chooses_no_metric():
+    """Linear outcomes leave errors of rounding alone, which vary with threads."""
+    torch.manual_seed(0)
+    for _ in range(4):
+        theta = torch.randn(100, 2, dtype=torch.float64)
+        noise = 1e-14 * torch.randn_like(theta)
+        fits = [MeanEmulator.fit(theta, 3 * theta + n) for n in (0 * noise, noise)]
+        assert torch.allclose(fits[0].transform, fits[1].transform)

@@ -6,7 +6,9 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from sbi_active.inference.engine import infer, search
+from sbi_active.inference.engine.importance import _largest_power
 from sbi_active.inference.engine.settings import Settings
+from sbi_active.inference.sampling.weights import effective_sample_size
 from tests.inference.engine.potentials import Given
 
 SETTINGS = Settings(num_effective=100, num_draws=200, share_of_plenty=0)
@@ -56,3 +58,16 @@ def test_a_ridge_is_followed_however_thin(seed):
     gain = found.draws(4_000, rng)[:, 1]
     assert gain.std() == pytest.approx(spread(), rel=0.1)
     assert own.num_rows < 30_000
+
+
+def test_the_largest_power_is_found_where_lower_ones_leave_fewer_draws():
+    """A hundred draws at the peak, and those of the prior that outweigh them at .1."""
+    at_peak = np.linspace(-0.5, 0.5, 100)
+    at_peak[:4] += 3.0  # so that at power 1 few are effective
+    log_new = np.concatenate([at_peak, -400.0 - 100.0 * np.arange(200)])
+    log_rest = np.concatenate([np.zeros(100), np.full(200, 60.0)])
+    for power in (0.1, 1.0):
+        assert effective_sample_size(log_rest + power * log_new) < 60
+    power = _largest_power(log_rest, log_new, 60.0)
+    assert 0.4 < power < 1
+    assert effective_sample_size(log_rest + power * log_new) == pytest.approx(60)

@@ -17,6 +17,9 @@ TIMES = torch.linspace(0.1, 1.0, NUM)
 BASIS = torch.stack([TIMES, torch.sin(8 * TIMES)])
 
 
+ALL_ROWS = {"scaling": "action", "whiten": True, "baseline": "best"}
+
+
 def rows(num: int, seed: int):
     with forked_generators(seed):
         theta, action = torch.randn(num, 2), 0.5 + torch.rand(num, 1)

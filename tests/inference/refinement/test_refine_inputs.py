@@ -34,3 +34,13 @@ def test_deterministic_simulator_is_refused():
             torch.ones(1, 1),
             seed=0,
         )
+
+
+def test_a_lack_of_memory_is_said(monkeypatch):
+    def lacking(*_):
+        raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried")
+
+    monkeypatch.setattr("sbi_active.inference.refinement.refining._learned", lacking)
+    one = torch.ones(1, 1)
+    with pytest.raises(MemoryError, match="belief of 2 parameters; got none left"):
+        refine(numerical().__call__, BOX, one, one, seed=0)

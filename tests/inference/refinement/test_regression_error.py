@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 from torch.distributions import MultivariateNormal
 
 from sbi_active.inference.refinement.checks import expected_error
+from sbi_active.inference.regression.histories import Histories
 from sbi_active.inference.regression.regions import whole_space
 from sbi_active.inference.regression.surrogate import (
     LocalRegression,
@@ -51,3 +53,41 @@ def test_expected_error_is_the_mean_divergence(q: int, num: int):
         actual.append(np.log(np.exp(ratio - top).mean()) + top - ratio.mean())
     error = np.std(actual) / len(actual) ** 0.5
     assert np.mean(expected) == pytest.approx(np.mean(actual), rel=0.2, abs=3 * error)
+
+
+def histories_of(curve) -> Histories:
+    """Return histories over the prior and near the truth, and twenty numbers each."""
+    rng = np.random.default_rng(0)
+    coordinates = PriorCoordinates(PRIOR, rng)
+    weight = torch.from_numpy(rng.standard_normal((DIM, 20))).float()
+
+    def simulator(theta: Tensor, action: Tensor) -> Tensor:
+        return curve(theta) @ weight + 0.3 * torch.randn(len(theta), 20)
+
+    x = curve(torch.full((1, DIM), 0.2)) @ weight
+    histories = Histories(
+        simulator, torch.zeros(1, 1), x.double().numpy(), coordinates, 0
+    )
+    histories.add(coordinates.sample_prior(400, rng), 60, is_overview=True)
+    near = coordinates.to_z(torch.full((1, DIM), 0.2))
+    histories.add(near + 0.05 * rng.standard_normal((150, DIM)), 30)
+    return histories
+
+
+def test_histories_that_are_taken_over_keep_their_repetitions():
+    """They tell the noise: without any nothing could be regressed."""
+    histories = histories_of(lambda theta: theta)
+    past = histories.record()
+    again = Histories(
+        histories.simulator,
+        torch.zeros(2, 1),
+        np.zeros((2, 20)),
+        histories.coordinates,
+        1,
+        past,
+    )
+    region = whole_space(DIM)
+    assert again.reuse(region, 120, is_overview=True) == 120
+    assert len(again.pairs[0]) == 60  # of the overview, the first 60 are repeated
+    assert again.reuse(region, 100, is_overview=True) == 100
+    assert len(again.pairs[0]) == 60

@@ -1,6 +1,7 @@
 """ALHI: a surrogate likelihood, and the product of it over the trials."""
 
 import pickle
+import re
 
 import numpy as np
 import pytest
@@ -157,6 +158,10 @@ def test_no_measurement_is_information():
     assert float(belief.variance) == pytest.approx(1 / 3, rel=0.1)
 
 
+def raises(text, error=ValueError):
+    return pytest.raises(error, match=re.escape(text))
+
+
 def test_a_failed_update_leaves_the_trainer_as_it_was():
     inference = trained()
     num, network = len(inference._theta_roundwise), inference._neural_net
@@ -171,3 +176,13 @@ def test_a_failed_update_leaves_the_trainer_as_it_was():
     assert len(inference._theta_roundwise) == num
     assert inference._neural_net is network
     inference.update(torch.zeros(2), action=torch.ones(1), seed=0)
+
+
+def test_outcomes_measured_in_part_are_refused():
+    theta, x, action = rows(50)
+    x[3, 1] = torch.nan
+    inference = ALHI(PRIOR, SETTINGS, show_progress_bars=False)
+    with raises("got 1 of 50 measured in part, the first in row 3; leave out"):
+        inference.append_simulations(theta, x, action=action)
+    with raises("expected outcomes that are measured or NaN throughout"):
+        trained().update(torch.tensor([0.0, torch.nan]), action=torch.ones(1))

@@ -1,11 +1,14 @@
 """Rounds with actions: Algorithm 1."""
 
+import pickle
+
 import pytest
 import torch
 from sbi.neural_nets import posterior_nn
-from sbi.utils import BoxUniform
+from sbi.utils import BoxUniform, RestrictedPrior, get_density_thresholder
+from torch.distributions import Distribution
 
-from sbi_active import ASBI, MixtureDensity
+from sbi_active import ASBI, Belief, MixtureDensity
 from sbi_active.inference import ActionEmbedding, ActionPosterior
 from tests.linear_gaussian import DIM, PRIOR, moments, simulator
 
@@ -139,6 +142,28 @@ def test_images_pass_through_an_embedding():
         assert posterior.at(action[0]).sample((3,), x=image[:1]).shape == (3, 2)
 
 
+def test_belief_is_a_distribution():
+    inference = trained(QUICK, prior=BOX)
+    belief = inference.update(torch.tensor([1.5, -1.5]), action=torch.tensor([1.0]))
+    assert isinstance(belief, Distribution)
+    assert isinstance(belief, Belief)
+    assert belief.batch_shape == ()
+    assert belief.event_shape == (2,)
+    assert belief.sample().shape == (2,)
+    assert belief.sample((3, 4)).shape == (3, 4, 2)
+    assert belief.sample((3,)).dtype == torch.float32
+    assert belief.log_prob(torch.rand(3, 4, 2, dtype=torch.float64)).shape == (3, 4)
+    assert belief.log_prob(torch.tensor([2.1, 0.0])) == -torch.inf
+    assert (belief.sample((2_000,)).abs() <= 2).all()
+    # normalized over the support: the mean of density times volume under uniform draws
+    density = belief.log_prob(BOX.sample((100_000,))).double().exp() * 16
+    error = density.std() / 100_000**0.5
+    assert abs(density.mean() - 1) < 4 * error + 0.02  # .02: the normalizer's own error
+    again = pickle.loads(pickle.dumps(belief))
+    theta = belief.sample((5,))
+    assert torch.equal(again.log_prob(theta), belief.log_prob(theta))
+
+
 @pytest.mark.filterwarnings("ignore")
 def test_action_posterior_offers_what_sbi_s_do():
     posterior = trained(QUICK, prior=BOX).build_posterior()
@@ -155,3 +180,14 @@ def test_action_posterior_offers_what_sbi_s_do():
     best = posterior.map(x=x, action=action, num_iter=20, num_to_optimize=5)
     peak = posterior.log_prob(best.reshape(1, 2), x=x, action=action)
     assert peak >= posterior.log_prob(theta, x=x, action=action).median()
+
+
+def test_truncated_proposals_of_the_belief_pass_and_others_do_not():
+    theta, x, action = rows(200, BOX)
+    inference = trained(QUICK, prior=BOX)
+    packed = inference.build_posterior().packed()
+    packed.set_default_x(torch.tensor([[0.0, 0.0, 1.0]]))
+    restricted = RestrictedPrior(BOX, get_density_thresholder(packed))
+    inference.append_simulations(theta, x, proposal=restricted, action=action)
+    with pytest.raises(ValueError, match="expected proposal to be the belief"):
+        inference.append_simulations(theta, x, proposal=packed, action=action)

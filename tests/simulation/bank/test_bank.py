@@ -91,6 +91,14 @@ def test_rows_by_position_slice_and_mask(bank, monkeypatch):
             bank.read(bad)
 
 
+def test_a_run_of_one_row_goes_on(bank):
+    theta, action = draw(1)
+    first = simulate(simulator, theta, action, seed=3, store=bank)
+    again = simulate(simulator, theta, action, seed=3, store=bank)
+    assert same(first, again)
+    assert len(bank) == 1
+
+
 def test_what_a_writer_that_died_left_is_removed(bank):
     simulate(simulator, *draw(4), seed=0, store=bank)
     bank.close()

@@ -14,6 +14,7 @@ from sbi_active.cli import main
 from sbi_active.simulation import Simulations
 from sbi_active.simulation.bank import CorruptSegmentError
 from sbi_active.simulation.bank.rows import row_type
+from sbi_active.simulation.bank.store import Store
 from tests.simulation.bank.filled import FILE, crafted, execute, filled, simulator
 
 
@@ -54,6 +55,24 @@ def test_files_that_are_no_store(folder, make):
             Bank(folder, **options)
 
 
+ENTRIES = ["version", "simulator", "parameter_names", "shapes", "created"]
+
+
+@pytest.mark.parametrize("name", ENTRIES)
+def test_entries_of_other_types(folder, name):
+    header = Bank(folder).header
+    for value in (-1, 1.5, [1.5], [[[]]], {"theta": 3}):
+        if (name, value) == ("simulator", {"theta": 3}):
+            continue  # any object describes a simulator
+        crafted(folder, "bank rows", 0, {**header, name: value})
+        with pytest.raises(CorruptSegmentError, match=r"store\.db"):
+            Bank(folder)
+    del header[name]
+    crafted(folder, "bank rows", 0, header)
+    with pytest.raises(CorruptSegmentError, match=r"store\.db"):
+        Bank(folder)
+
+
 KNOWN = {"run": "r", "seed": 1, "label": ""}
 ROWS = np.zeros(5, row_type({"theta": [2], "action": [1], "x": [2]}))
 
@@ -72,8 +91,10 @@ X = np.zeros((5, 2), np.float32).tobytes()
 SEGMENTS = {
     "no rows": (b"", X),
     "other rows than x": (head(ROWS[:3]), X),
+    "a seed of a text": (head(seed="1"), X),
     "deep": (b"[" * 100_000 + b"]" * 100_000, X),
     "an outcome of 7": (changed("status", 0, 7), X),
+    "an index of -1": (changed("index", 2, -1), X),
     "a short column": (head(), X[:-16]),
 }
 
@@ -92,9 +113,11 @@ STATEMENTS = {
     "a text": "UPDATE records SET body = 'abc' WHERE kind = 'rows'",
     "another content": f"UPDATE records SET body = {LARGE} WHERE kind = 'rows'",
     "another name": "PRAGMA application_id = 7",
+    "no catalog": "DELETE FROM records WHERE kind = 'catalog'",
     "no header": "UPDATE records SET head = 'a' WHERE kind = 'bank rows'",
     "a trigger": "CREATE TRIGGER t AFTER INSERT ON records BEGIN DELETE FROM records;"
     " END",
+    "another table": "CREATE TABLE t (a)",
     "an index": "CREATE INDEX i ON records (upper(kind))",
 }
 
@@ -104,6 +127,15 @@ def test_what_anybody_can_do_with_sqlite(folder, statement):
     execute(folder, statement)
     with pytest.raises(CorruptSegmentError, match=str(folder)):
         Bank(folder).columns("x")
+
+
+@pytest.mark.parametrize("catalog", [{"rows": "4"}, {"rows": 10**18}, None])
+def test_crafted_catalogs(folder, catalog):
+    content = json.dumps({"bank rows": 0, **catalog} if catalog else catalog).encode()
+    crafted(folder, "catalog", 0, content)
+    with pytest.raises((CorruptSegmentError, ValueError), match=str(folder)):
+        Bank(folder).columns("x")
+    assert Store(folder).problems()
 
 
 def test_a_view_in_place_of_a_table_is_not_read(folder):
@@ -159,6 +191,16 @@ def test_a_flipped_bit_or_a_cut_gives_the_rows_or_the_error(folder, first):
             path.write_bytes(damaged)
             with suppress(CorruptSegmentError):
                 assert torch.equal(Bank(folder).read().x, expected.x)
+
+
+def test_the_log_of_another_file_is_noticed(folder, tmp_path):
+    other = Bank(filled(tmp_path / "other"), simulator=simulator)
+    other.append(Simulations(*[torch.ones(5, k) for k in (2, 1, 2)]), seed=8)
+    log = (other.path / "store.db-wal").read_bytes()
+    assert len(log) > 1000
+    (folder / "store.db-wal").write_bytes(log)
+    with pytest.raises(CorruptSegmentError):
+        Bank(folder).read()
 
 
 def test_numbers_that_float32_cannot_hold(folder):

@@ -11,6 +11,7 @@ from sbi_active import Bank, GaussianNoise, SimulatorModel, simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import Simulations
 from sbi_active.simulation.bank.fingerprint import differences, fingerprint
+from tests.simulation.bank.filled import execute
 
 
 def simulator(theta, action, seeds):
@@ -84,6 +85,20 @@ def test_version_stands_for_the_source(tmp_path):
     assert line == "version '1' there, '2' here"
 
 
+def test_other_formats_and_folders(bank, tmp_path):
+    bank.close()
+    execute(bank.path, "PRAGMA user_version = 99")
+    with pytest.raises(ValueError, match="expected a bank of format 3; got 99"):
+        Bank(bank.path)
+    with pytest.raises(ValueError, match=r"got no .*store.db; give simulator="):
+        Bank(tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").touch()
+    with pytest.raises(ValueError, match=r"an empty folder; got .* with 'thesis.tex'"):
+        Bank(tmp_path / "full", simulator=simulator)
+
+
 def full_disk(folder):
     """Return whether a small file system could be mounted."""
     command = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)]
@@ -143,3 +158,8 @@ def test_a_folder_that_cannot_be_written(small_disk):
         Bank(small_disk / "bank", simulator=simulator).append(rows(), seed=1)
     with pytest.raises(OSError, match="to write to the bank; got 'Read-only file"):
         Bank(small_disk / "new", simulator=simulator)
+
+
+def test_a_bank_that_reads_does_not_write(bank):
+    with pytest.raises(ValueError, match="opened with its simulator, to write to"):
+        Bank(bank.path).append(rows(), seed=5)

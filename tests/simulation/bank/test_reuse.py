@@ -2,6 +2,7 @@ import warnings
 
 import pytest
 import torch
+from sbi.utils import BoxUniform
 from torch.distributions import Independent, Normal
 
 from sbi_active import Bank, simulate
@@ -108,3 +109,19 @@ def test_few_effective_rows_are_told(bank):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         reuse(bank, TARGET, proposals=PROPOSALS)
+
+
+def test_proposals_that_rows_were_not_drawn_from_are_refused(bank):
+    with pytest.raises(ValueError, match=r"got none for \['round 1'\]; give them"):
+        reuse(bank, TARGET, proposals={"prior": PRIOR})
+    with pytest.raises(ValueError, match=r"'prior'\] to be what its rows were drawn"):
+        reuse(bank, TARGET, proposals={"prior": ROUND, "round 1": ROUND})
+
+
+def test_a_target_elsewhere(bank):
+    far = BoxUniform(torch.tensor([50.0]), torch.tensor([51.0]))
+    with pytest.raises(ValueError, match="got 4000 rows, all of density 0; simulate"):
+        reuse(bank, far)
+    empty = Bank(bank.path.parent / "empty", simulator=simulator)
+    with pytest.raises(ValueError, match=r"expected rows in .*; got none"):
+        reuse(empty, TARGET)

@@ -176,6 +176,16 @@ def test_missing_rows_are_tried_again(tmp_path):
     assert torch.equal(twice.x, clean)
 
 
+def test_the_exit_code_is_told():
+    def simulator(theta, action, seeds):
+        if (theta == 1).any():
+            os._exit(3)
+        return theta
+
+    rows = quietly(simulator, *index_rows(3), seed=0, workers=2)
+    assert "ended with code 3 during the call" in rows.tracebacks[1]
+
+
 @pytest.mark.parametrize("num_workers", [1, 2])
 @pytest.mark.parametrize("n", [1, 2_000])
 def test_a_simulator_that_always_raises_is_an_error(n, num_workers):
@@ -191,6 +201,19 @@ def test_a_simulator_that_always_raises_is_an_error(n, num_workers):
     assert len(calls) < 100  # the rest of a long run is not tried
 
 
+def test_a_simulator_that_raises_on_its_first_rows_goes_on():
+    def simulator(theta, action, seeds):
+        if bool((theta < 60).any()):
+            raise RuntimeError("no")
+        return seeded(theta, action, seeds)
+
+    theta, action = index_rows(120)
+    rows = quietly(simulator, theta, action, seed=0, batch_size=4)
+    assert rows.counts == {"ok": 60, "invalid": 0, "missing": 60}
+    clean = simulate(seeded, theta, action, seed=0).x
+    assert torch.equal(rows.x[60:], clean[60:])
+
+
 @pytest.mark.parametrize("num_workers", [1, 2])
 def test_wrong_shapes_are_no_fault_of_a_row(num_workers):
     theta, action = index_rows(30)
@@ -203,6 +226,11 @@ def test_wrong_shapes_are_no_fault_of_a_row(num_workers):
 
     with pytest.raises(ValueError, match="expected x of one shape a row"):
         simulate(ragged, theta, action, seed=0, workers=num_workers, batch_size=10)
+
+
+def test_a_simulator_that_takes_no_action_is_no_fault_of_a_row():
+    with pytest.raises(TypeError, match="positional argument"):
+        simulate(lambda theta: theta, *index_rows(30), seed=0)
 
 
 class Stop(BaseException):

@@ -1,5 +1,6 @@
 """What an interrupt costs in this process: about a second, and what cutting costs."""
 
+import gc
 import pickle
 import signal
 import subprocess
@@ -12,7 +13,7 @@ import torch
 from sbi_active import SimulatorModel, simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import Outcome
-from sbi_active.simulation.workers.pace import Pace
+from sbi_active.simulation.workers.pace import Pace, pace_of
 
 SCRIPT = """
 import pickle, sys, time, torch
@@ -107,6 +108,25 @@ def test_slow_rows_are_cut_into_parts_of_a_second():
     assert max(sizes) <= 4
 
 
+@pytest.mark.parametrize("seconds", [0.05, 3.0])
+def test_a_simulator_as_slow_for_few_rows_is_hardly_cut(seconds):
+    pace = Pace()
+    assert len(sizes_of(lambda n: seconds + 1e-7 * n, 5_000, pace)) <= 5
+    assert sizes_of(lambda n: seconds + 1e-7 * n, 5_000, pace) == [5_000]
+
+
+def test_a_slow_first_call_is_not_taken_for_the_pace():
+    calls = []
+
+    def seconds(n):
+        calls.append(n)
+        return 0.01 * n + (3.0 if len(calls) == 1 else 0.0)
+
+    sizes = sizes_of(seconds, 2_000, Pace())
+    assert max(sizes) <= 150
+    assert len(sizes) <= 30
+
+
 def test_a_simulator_is_timed_once(monkeypatch):
     monkeypatch.setattr(Pace, "SECONDS", 60.0)  # whatever else the machine does
     sizes = []
@@ -130,3 +150,39 @@ def test_x_is_that_of_one_call_where_that_is_short():
         rows = simulate(simulator, theta, theta, seed=0)
         assert torch.equal(rows.x, theta + 500)
         assert rows.counts == {"ok": 500, "invalid": 0, "missing": 0}
+
+
+class Robot:
+    """Equal to all of its kind, which so have no hash."""
+
+    def __eq__(self, other):
+        return isinstance(other, Robot)
+
+    def run(self, theta, action):
+        return theta
+
+    def __call__(self, theta, action):
+        return theta
+
+
+class Arm:
+    def run(self, theta, action):
+        return theta
+
+    def walk(self, theta, action):
+        return theta
+
+
+def test_the_pace_is_known_by_the_simulator():
+    arm = Arm()
+    assert pace_of(arm.run) is pace_of(arm.run)
+    assert pace_of(arm.run) is not pace_of(arm.walk)
+    assert pace_of(arm.run) is not pace_of(Arm().run)
+    assert pace_of(Robot()) is not pace_of(Robot())
+    assert isinstance(pace_of(Robot().run), Pace)
+    assert isinstance(pace_of(torch.add), Pace)
+    before = pace_of(model := SimulatorModel(lambda t, a: t))
+    assert pace_of(model) is before
+    del model
+    gc.collect()
+    assert pace_of(SimulatorModel(lambda t, a: t)) is not before

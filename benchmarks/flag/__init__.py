@@ -1,0 +1,1 @@
+"""Does a belief's flag follow its error?"""
