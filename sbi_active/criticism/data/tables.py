@@ -144,10 +144,10 @@ def _parts(
     told = [TRIAL] if columns is None else as_list(columns.get(TRIAL, ()))
     for file, frame in zip(paths, frames.values(), strict=True):
         parts = [name for name in told if name in frame.columns]
-        name = pd.Series(file.stem, index=frame.index)
+        label: Any = pd.Series(file.stem, index=frame.index)
         for part in parts:
-            name = name + " " + frame[part].str.strip()
-        frames[str(file)] = frame.drop(columns=parts).assign(**{TRIAL: name})
+            label = label + " " + frame[part].str.strip()
+        frames[str(file)] = frame.drop(columns=parts).assign(**{TRIAL: label})
     return frames, columns and {**columns, TRIAL: TRIAL}
 
 

@@ -133,7 +133,8 @@ class Contents:
         interval = [
             (float(a), float(b)) if np.isfinite(a + b) else None for a, b in ends
         ]
-        return table.assign(interval=pd.Series(interval, dtype=object))[columns]
+        table = table.assign(interval=pd.Series(interval, dtype=object))
+        return table.reindex(columns=columns)
 
     @property
     def rmse(self) -> tuple[float, float]:

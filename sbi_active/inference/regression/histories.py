@@ -319,8 +319,8 @@ class Histories:
             return None
         pairs = _nearest(np.where(both, distance[first], np.inf), min_pairs)
         scale = np.abs(self.x[rows] + self.observed).max(0)[self.used]
-        repeated = (self.x[at[pairs]][:, self.used] for at in (first, second))
-        noise = estimate_noise(*repeated, scale)
+        one, other = (self.x[at[pairs]][:, self.used] for at in (first, second))
+        noise = estimate_noise(one, other, scale)
         # Where all trials agree everywhere, or nowhere, there is nothing to compare.
         mixed = np.flatnonzero(agrees.any(0) & ~agrees.all(0))
         near = _nearest(distance, needed)

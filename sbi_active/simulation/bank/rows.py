@@ -115,7 +115,8 @@ class Rows:
                 over all rows. None reads everything into memory.
         """
         names = "theta", "action", "x", "status"
-        return Simulations(*self._gather(names, rows))
+        theta, action, x, status = self._gather(names, rows)
+        return Simulations(theta, action, x, status)
 
     def chunks(self, size: int = 10_000) -> Iterator[Simulations]:
         """Yield all rows in order, at most ``size`` at a time.
