@@ -308,7 +308,7 @@ SCATTER = Effect(
             {"trials": Trials(ONES, torch.ones(3, 4))},
         ),
         (
-            "at least one valid trial; got 2 trials",
+            "at least two valid trials to fit; got 0",
             {"trials": Trials(ONES, LOST, role=["fit", "fit", "held out"])},
         ),
         ("expected effects not named none", {"effects": [SCATTER]}),

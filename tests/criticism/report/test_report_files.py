@@ -43,7 +43,7 @@ def test_markdown_tables_have_as_many_cells_as_headings():
     made = report(tracing=tracing(probabilities=shares, credible_set=(*shares,)))
     text = re.sub(r"\\\|", "", made.to_markdown())
     blocks = re.findall(r"(?:^\|.*\|$\n?)+", text, flags=re.MULTILINE)
-    assert len(blocks) == 5
+    assert len(blocks) == 4
     for block in blocks:
         assert len({line.count("|") for line in block.splitlines()}) == 1
 

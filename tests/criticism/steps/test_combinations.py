@@ -16,7 +16,7 @@ from tests.criticism.steps.linear_world import ACTION, judged, measured, rivals
 
 @pytest.mark.parametrize("size", [2, 3])
 def test_sets_of_several_effects_have_together_a_third_of_the_next_smaller(size):
-    prior = {"none": 0.5, "unexplained": 0.1, "a": 0.1, "b": 0.2, "c": 0.05, "d": 0.05}
+    prior = {"none": 0.6, "a": 0.1, "b": 0.2, "c": 0.05, "d": 0.05}
     log_p = {name: float(np.log(p)) for name, p in prior.items()}
     sets = combinations("abcd", size)
     total = sum(np.exp(log_prior(names, log_p)) for names in sets)

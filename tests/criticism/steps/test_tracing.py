@@ -28,18 +28,12 @@ def tracing_of(x, **keywords):
     return traced(found, None, **keywords), found
 
 
-def test_families_share_what_none_and_the_catch_alls_leave():
+def test_families_share_what_none_leaves():
     log_p = log_priors([effect(name) for name in SHAPES])
     p = {name: np.exp(value) for name, value in log_p.items()}
     assert p == pytest.approx(
-        {
-            **{"none": 0.5, "unexplained": 0.05, "scatter": 0.05, "outlier": 0.05},
-            **{"curve": 0.35 / 4, "wave": 0.35 / 4, "kink": 0.35 / 2},
-        }
+        {"none": 0.5, "curve": 1 / 8, "wave": 1 / 8, "kink": 1 / 4}
     )
-    two = log_priors([effect("kink")], ("unexplained", "scatter"))
-    assert np.exp(two["kink"]) == pytest.approx(0.4)
-    assert sum(np.exp([*two.values()])) == pytest.approx(1)
 
 
 @pytest.mark.parametrize(
