@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import importlib
 import math
+import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -48,6 +49,9 @@ def load_object(name: str, kind: Any = object) -> Any:
     if file is not None:
         sys.path.insert(0, str(file.parent))
         module = file.stem
+    elif (here := os.getcwd()) in sys.path:  # before what is installed
+        sys.path.remove(here)
+        sys.path.insert(0, here)
     try:
         loaded = importlib.import_module(module)
         origin = getattr(loaded, "__file__", None)

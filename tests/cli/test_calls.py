@@ -3,6 +3,7 @@
 import os
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,6 +13,7 @@ import torch
 
 from sbi_active import Campaign
 from sbi_active.cli import main
+from sbi_active.cli.problem import load_object
 from tests.cli.sled import BOX, INIT, SIMULATOR, SMALL, forget, read, run
 
 ODD = """
@@ -234,3 +236,13 @@ def test_interrupted_while_it_simulates():
     _, error = process.communicate(timeout=120)
     assert process.returncode == 130
     assert "Traceback" not in error
+
+
+def test_a_module_of_the_current_folder_comes_before_an_installed_one(
+    tmp_path, monkeypatch
+):
+    (tmp_path / "tabnanny.py").write_text("NUMBER = 3\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
+    monkeypatch.delitem(sys.modules, "tabnanny", raising=False)
+    assert load_object("tabnanny:NUMBER") == 3
