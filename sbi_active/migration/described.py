@@ -12,14 +12,11 @@ from sbi.utils.user_input_checks_utils import MultipleIndependent
 from torch import distributions as td
 
 from sbi_active.actions import ActionSpace, BoxActions, DiscreteActions, MixedActions
-from sbi_active.campaign.options import (
-    GROUPS,
-    CampaignDetails,
-    CampaignOptions,
-    StopRules,
-)
+from sbi_active.campaign import options
+from sbi_active.campaign.options import CampaignDetails, CampaignOptions, StopRules
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.models.lfire import LFIRE
+from sbi_active.inference.networks import mixture_density
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.inference.networks.ratio_network import RatioClassifier
 from sbi_active.renamed import grouped
@@ -33,6 +30,11 @@ _FAMILIES = {
         *(td.LogNormal, td.HalfNormal, td.StudentT, td.Laplace, td.Cauchy, td.Gamma),
         *(td.Beta, td.Exponential),
     )
+}
+#: Settings whose fields stood elsewhere in that release.
+_GROUPS: dict[Any, Any] = {
+    CampaignOptions: options.GROUPS,
+    MixtureDensity: mixture_density.GROUPS,
 }
 _SETTINGS = {
     kind.__name__: kind
@@ -86,6 +88,5 @@ def options_from(described: Any) -> Any:
     kind = _SETTINGS[described["settings"]]
     known = {f.name for f in dataclasses.fields(kind)}
     values = {name: options_from(value) for name, value in described.items()}
-    if kind is CampaignOptions:
-        values = grouped(values, GROUPS)
+    values = grouped(values, _GROUPS.get(kind, {}))
     return kind(**{name: value for name, value in values.items() if name in known})

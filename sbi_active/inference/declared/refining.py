@@ -212,9 +212,7 @@ def refine_declared(problem: Problem, past: object) -> SimulatedBelief | None:
         fit = _gone_on(before.pool, potential, own, rng)
     if fit is None:
         near = _near(problem.hints, coordinates, seed)
-        potential, found, contradiction = _searched(
-            potential, near, own, settings.max_inflations, rng
-        )
+        potential, found, contradiction = _searched(potential, near, own, rng)
         fit = infer(potential, rng, found=found, near=near, settings=own)
     if not len(fit.u):
         raise UnexplainedOutcomeError(NOTHING_EXPLAINS)
@@ -279,9 +277,9 @@ def _searched(
     potential: SimulatedPotential,
     near: Array | None,
     own: Settings,
-    max_inflations: int,
     rng: np.random.Generator,
     *,
+    max_inflations: int = 3,
     num_around: int = 64,
     wide: float = 3.0,
     stable: float = 1.1,
@@ -289,7 +287,8 @@ def _searched(
     """Return the modes, of a noise that is inflated where trials contradict.
 
     Heavy tails have their best fit among ``num_around`` places, ``wide`` times the
-    width of a mode around it; below ``stable`` the inflation is settled.
+    width of a mode around it; below ``stable`` the inflation is settled. It is found at
+    most ``max_inflations`` times: once the noise is wider, a better fit may be found.
     """
     declared, c = potential.likelihood, potential.coordinates
     points = None if near is None else near[:2]

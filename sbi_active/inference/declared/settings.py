@@ -31,8 +31,6 @@ class RefinementOptions:
             by an error of the surrogate: a truth that it misses costs log(1 / share)
             nats and not infinitely many. Moments see the share too: .01 of a wide
             prior outweighs a sharp posterior.
-        max_inflations: Number of times at most that the noise is inflated where trials
-            contradict one another: once it is wider, a better fit may be found.
         workers: Workers that run the simulations; in a campaign, its own are taken. A
             history of which a row stays lost is left out.
     """
@@ -41,7 +39,6 @@ class RefinementOptions:
     num_effective: float = 200
     num_draws: int | None = None
     defensive: float = 1e-5
-    max_inflations: int = 3
     workers: Workers = IN_PROCESS
 
     def effective_of(self, dim: int, *, many: int = 6) -> float:
@@ -58,6 +55,6 @@ class RefinementOptions:
 
     def __post_init__(self) -> None:
         numbers = {"num_histories": 200, "num_effective": 20, "num_draws": 50}
-        require_least(self, "raise it", **numbers, defensive=1e-6, max_inflations=0)
+        require_least(self, "raise it", **numbers, defensive=1e-6)
         share = self.defensive
         require(share <= 0.5, "defensive <= 0.5", share, "use a small share")

@@ -110,11 +110,12 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         self, settings: MixtureDensity, x: Tensor, condition: Tensor, action_dim: int
     ) -> None:
         super().__init__(nn.Identity(), x.shape[1:], condition.shape[1:])
+        details = settings.details
         self._theta_dim = condition.shape[1] - action_dim
         theta, action = condition.double().split([self._theta_dim, action_dim], 1)
         valid = _valid(x)
         self.register_buffer("theta_mean", theta.mean(0))
-        self.register_buffer("theta_factor", covariance_factor(theta, settings.whiten))
+        self.register_buffer("theta_factor", covariance_factor(theta, details.whiten))
         known = x[valid].double()
         if len(known) < 2:
             raise ValueError(
@@ -129,17 +130,18 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         self.response: Response | None = None
         self.x_scaling: ActionScaling | None = None
         few = not can_regress(valid, y.shape[1])
-        if settings.baseline != "none" and not few:
-            kind = settings.baseline
+        if details.baseline != "none" and not few:
+            kind = details.baseline
             self.response = (
                 Response.best(*rows) if kind == "best" else Response(*rows, kind=kind)
             )
-        elif settings.scaling == "action" and not few:
+        elif details.scaling == "action" and not few:
             self.x_scaling = ActionScaling(y, action[valid])
         z, _ = self._standardize(known, condition[valid])
         seen = self._see(condition)
         # The action's place matters to the scaling above alone.
-        plain = replace(settings, scaling="global", whiten=False, baseline="none")
+        how = replace(details, scaling="global", whiten=False, baseline="none")
+        plain = replace(settings, details=how)
         self.mixture = plain(z.float(), seen[valid])
         self.validity = None if bool(valid.all()) else ValidityNetwork(seen, valid)
         self._log_unseen = -math.log(len(x) + 2)

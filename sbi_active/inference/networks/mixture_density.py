@@ -19,9 +19,50 @@ from sbi_active.inference.networks.mixture_network import (
     MixtureDensityNetwork,
 )
 from sbi_active.inference.sampling.adam import Adam
+from sbi_active.renamed import takes_loose
 
 
 @suggests
+@dataclass(frozen=True, kw_only=True)
+class MixtureDetails:
+    """Settings of the mixture density network that few change.
+
+    Attributes:
+        batch_size: Number of rows a step. Half loses .2 nats on 40 outcomes of an
+            oscillator, twice gains .1.
+        learning_rate: Learning rate of Adam. Half and twice lose .1 nats there.
+        activation: Function between layers, "silu" or "relu". The smooth one reaches
+            the same loss in half of the steps.
+        anneal: Whether the learning rate falls to zero along a cosine.
+        scaling: Scaling of x: "action" standardizes it given the action, "global" over
+            all rows; with a baseline, that does the former.
+        whiten: Whether theta is whitened by its full covariance, or number by number.
+        baseline: Gaussian posterior that the network corrects: "linear" or "curved" in
+            theta, "none", or "best" of these on held-out rows, see
+            :class:`.Conditioning`.
+    """
+
+    batch_size: int = 200
+    learning_rate: float = 1.5e-2
+    activation: Literal["silu", "relu"] = "silu"
+    anneal: bool = True
+    scaling: Literal["action", "global"] = "action"
+    whiten: bool = True
+    baseline: Literal["best", "none", "linear", "curved"] = "best"
+
+    def __post_init__(self) -> None:
+        require_least(self, "raise it", batch_size=1)
+        rate = self.learning_rate
+        require(rate > 0, "learning_rate > 0", rate, "use 1e-3")
+        require_one_of(self, activation=ACTIVATIONS, scaling=("action", "global"))
+        require_one_of(self, baseline=("best", "none", "linear", "curved"))
+
+
+#: Settings whose fields were the network's own in the last version.
+GROUPS = {"details": MixtureDetails}
+
+
+@takes_loose(**GROUPS)
 @dataclass(frozen=True, kw_only=True)
 class MixtureDensity:
     """Settings of the mixture density network.
@@ -36,20 +77,10 @@ class MixtureDensity:
             outcomes of an oscillator.
         num_iterations: Number of steps of gradient descent. Half loses .6 nats there,
             twice gains .3.
-        batch_size: Number of rows a step. Half loses .2 nats there, twice gains .1.
-        learning_rate: Learning rate of Adam. Half and twice lose .1 nats there.
-        activation: Function between layers, "silu" or "relu". The smooth one reaches
-            the same loss in half of the steps.
-        anneal: Whether the learning rate falls to zero along a cosine.
-        scaling: Scaling of x: "action" standardizes it given the action, "global" over
-            all rows; with a baseline, that does the former.
-        whiten: Whether theta is whitened by its full covariance, or number by number.
-        baseline: Gaussian posterior that the network corrects: "linear" or "curved" in
-            theta, "none", or "best" of these on held-out rows, see
-            :class:`.Conditioning`.
         embedding_net: Network that maps the packed condition (n, x_dim + action_dim)
             to features, for example an :class:`.ActionEmbedding`. It sees x scaled over
             all rows, and there is no baseline.
+        details: Further settings that few change.
 
     References:
         Bishop, *Mixture density networks*, NCRG/94/004, 1994.
@@ -64,22 +95,12 @@ class MixtureDensity:
     hidden_features: tuple[int, ...] = (128, 128)
     num_components: int = 8
     num_iterations: int = 160
-    batch_size: int = 200
-    learning_rate: float = 1.5e-2
-    activation: Literal["silu", "relu"] = "silu"
-    anneal: bool = True
-    scaling: Literal["action", "global"] = "action"
-    whiten: bool = True
-    baseline: Literal["best", "none", "linear", "curved"] = "best"
-    embedding_net: nn.Module | None = field(default=None)
+    embedding_net: nn.Module | None = None
+    details: MixtureDetails = MixtureDetails()
 
     def __post_init__(self) -> None:
-        names = ("num_components", "num_iterations", "batch_size", "hidden_features")
+        names = ("num_components", "num_iterations", "hidden_features")
         require_least(self, "raise it", **dict.fromkeys(names, 1))
-        rate = self.learning_rate
-        require(rate > 0, "learning_rate > 0", rate, "use 1e-3")
-        require_one_of(self, activation=ACTIVATIONS, scaling=("action", "global"))
-        require_one_of(self, baseline=("best", "none", "linear", "curved"))
 
     @classmethod
     def faithful(cls) -> MixtureDensity:
@@ -92,13 +113,15 @@ class MixtureDensity:
         return cls(
             num_components=5,
             num_iterations=2_000,
-            batch_size=50,
-            learning_rate=1e-3,
-            activation="relu",
-            anneal=False,
-            scaling="global",
-            whiten=False,
-            baseline="none",
+            details=MixtureDetails(
+                batch_size=50,
+                learning_rate=1e-3,
+                activation="relu",
+                anneal=False,
+                scaling="global",
+                whiten=False,
+                baseline="none",
+            ),
         )
 
     def __call__(self, theta: Tensor, x: Tensor) -> MixtureDensityNetwork:

@@ -106,9 +106,10 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         first = [int((columns == k).nonzero()[0]) for k in range(masks.shape[1])]
         masked = lost[first].tolist()
 
-        how: Any = settings.scaling, settings.whiten, settings.baseline
+        details = settings.details
+        how: Any = details.scaling, details.whiten, details.baseline
         if settings.embedding_net is not None:
-            how = "global", settings.whiten, "none"
+            how = "global", details.whiten, "none"
         embedding = settings.embedding_net or nn.Identity()
         conditioning = None
         if action_dim is not None and how != ("global", False, "none"):
@@ -124,7 +125,7 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
             width = embedding(seen).shape[1] + len(masked)
         layers: list[nn.Module] = []
         for hidden in settings.hidden_features:
-            layers += [nn.Linear(width, hidden), ACTIVATIONS[settings.activation]()]
+            layers += [nn.Linear(width, hidden), ACTIVATIONS[details.activation]()]
             width = hidden
         num_upper = dim * dim if dim <= few else 0
         last = nn.Linear(width, num * (1 + 2 * dim + num_upper))

@@ -133,16 +133,23 @@ def refine(
 
 
 def _learned(
-    problem: Problem, own: StageSettings, past: HistoryRecord | None
+    problem: Problem,
+    own: StageSettings,
+    past: HistoryRecord | None,
+    *,
+    max_inflations: int = 3,
 ) -> LearnedBelief:
-    """Return the belief of a regression, of as wide a noise as the trials scatter."""
+    """Return the belief of a regression, of as wide a noise as the trials scatter.
+
+    The noise is inflated at most ``max_inflations`` times.
+    """
     regions = Regions(problem, own, past=past)
     belief, first = regions.run(), regions.contradiction()
     if first is None:
         return belief
     histories, sds = belief.histories, regions.histories.noise_sds
     now, inflation = first, 1.0
-    for number in range(problem.settings.max_inflations):
+    for number in range(max_inflations):
         inflation *= now.inflation
         further_noise = np.sqrt(max(inflation**2 - 1, 0.0)) * sds
         again = replace(problem, seed=derive_seed(problem.seed, "inflated", number))

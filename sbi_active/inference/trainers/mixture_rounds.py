@@ -36,9 +36,10 @@ class MixtureRounds(ActionRounds):
         """Train the network on this round's rows."""
 
     def _training_defaults(self, given: dict[str, Any]) -> dict[str, Any]:
+        details = self._action_estimator.details
         return {
-            "training_batch_size": self._action_estimator.batch_size,
-            "learning_rate": self._action_estimator.learning_rate,
+            "training_batch_size": details.batch_size,
+            "learning_rate": details.learning_rate,
             "stop_after_epochs": NEVER,
         }
 
@@ -94,7 +95,7 @@ class MixtureRounds(ActionRounds):
             num_iterations=min(settings.num_iterations, most),
             batch_size=size,
             clip_max_norm=config.clip_max_norm,
-            anneal=settings.anneal,
+            anneal=settings.details.anneal,
             patience=None if patience == NEVER else patience,
             **rows,
         )

@@ -5,6 +5,7 @@ import torch
 
 from sbi_active.inference import MixtureDensity
 from sbi_active.inference.networks.baseline import Baseline, local, precision_factor
+from sbi_active.inference.networks.mixture_density import MixtureDetails
 from sbi_active.tasks.numerical import NumericalTask
 from tests import linear_gaussian
 
@@ -118,7 +119,8 @@ def gaussian_around(place, draws):
 def test_degenerate_rows(theta, x, action):
     condition = torch.cat([x, action], 1)
     for baseline in ("best", "curved"):
-        settings = MixtureDensity(hidden_features=(8,), baseline=baseline)
+        details = MixtureDetails(baseline=baseline)
+        settings = MixtureDensity(hidden_features=(8,), details=details)
         net = settings.build(theta, condition, action.shape[1])
         assert net.log_prob(theta, condition).isfinite().all()
         assert net.sample(torch.Size([2]), condition).isfinite().all()
