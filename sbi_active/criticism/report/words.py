@@ -75,6 +75,8 @@ def with_error(mean: float, sd: float, draws: float = np.inf) -> str:
         ('0.35992 +- 0.00071', '1234 +- 57')
         >>> with_error(159.873313255, 2.8e-14), with_error(0.35992, 0.00071, 3)
         ('159.873 +- 2.8e-14', 'about 0.36')
+        >>> with_error(-0.003, 1.9)
+        '0.0 +- 1.9'
     """
     if np.isnan(mean):
         return ""
@@ -86,7 +88,8 @@ def with_error(mean: float, sd: float, draws: float = np.inf) -> str:
     places = max(1 - int(f"{sd:.1e}".split("e")[1]), 0)  # after rounding
     most = max(5 - int(f"{mean:.5e}".split("e")[1]), 0)
     error = f"{sd:.{places}f}" if places <= most else f"{sd:.2g}"
-    return f"{mean:.{min(places, most)}f} +- {error}"
+    digits = min(places, most)
+    return f"{round(mean, digits) + 0.0:.{digits}f} +- {error}"  # no "-0.0"
 
 
 def listed(names: Sequence[str], last: str = "and") -> str:
