@@ -97,7 +97,10 @@ def _effects(report: Contents) -> Table:
             phi = f"{', '.join(each)} {e.units}".strip()
         if evidence is not None:
             gain = evidence.log_evidence - null
-            fit = [f"{round(gain, 1) + 0.0:.1f}", f"{evidence.effective_sample_size:.0f}"]
+            fit = [
+                f"{round(gain, 1) + 0.0:.1f}",
+                f"{evidence.effective_sample_size:.0f}",
+            ]
         any_set = probability(tracing.inclusion.get(name, p)) if e else ""
         inside = "yes" if name in tracing.credible_set else ""
         cells = [label(tracing, name), *[probability(p)] * has_p, *[any_set] * has_sets]
