@@ -29,13 +29,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.rows import read
+from benchmarks.rows import read, toml
 from sbi_active.display.table import Table
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 HERE = Path(__file__).parent
 STATED = HERE / "readme.toml"
@@ -176,7 +171,7 @@ def table(stated: Path = STATED) -> tuple[list[str], list[str]]:
         stated: File of the rows and their stated values.
     """
     lines, misses = [*HEADER], []
-    for row in tomllib.loads(stated.read_text(encoding="utf-8"))["row"]:
+    for row in toml(stated)["row"]:
         found = FIGURES[row["figures"]]()
         cells = (without_zero(row[k].format(**found)) for k in ("result", "beside"))
         lines.append(f"| {row['what']} | {' | '.join(cells)} |".replace("|  |", "| |"))

@@ -24,16 +24,15 @@ EMPTY = re.compile(r"nan( (/|\+-) nan)*")
 TABLES = {
     "The paper's numerical model": (
         "numerical --summary",
-        "numerical --summary --trials 60 --settings default --methods asbi",
-        "numerical --summary --truth random --trials 40 "
-        "--settings default --methods asbi",
-        "numerical --summary --task sinh --settings default default_500 --methods asbi",
-        "numerical --summary --task square "
-        "--settings default default_500 --methods asbi",
+        "numerical --summary --seeds 0 60 --setting default --method asbi",
+        "numerical --summary --truth random --seeds 0 40 "
+        "--setting default --method asbi",
+        "numerical --summary --task sinh --setting default default_500 --method asbi",
+        "numerical --summary --task square --setting default default_500 --method asbi",
         "numerical --summary --task oscillator --truth random "
-        "--settings default default_500 --methods asbi",
-        "numerical --summary --task oscillator --truth random "
-        "--jitter 0.1 --settings default --methods asbi",
+        "--setting default default_500 --method asbi",
+        "numerical --summary --task oscillator_jittered --truth random "
+        "--setting default --method asbi",
     ),
     "Table 1 of the paper": (
         "numerical.methods --summary --setting faithful",
