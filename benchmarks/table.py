@@ -83,7 +83,7 @@ def box() -> dict[str, float]:
 def alarms() -> dict[str, int]:
     """Return false alarms in clean sets of the worlds A, B and C."""
     folder = HERE / "criticism/results"
-    rows = [r for world in "ABC" for r in read(folder / f"{world}_clean_8.csv")]
+    rows = [r for world in "ABC" for r in read(folder / f"{world}_clean.csv")]
     return {"false": sum(r["verdict"] != "none" for r in rows), "sets": len(rows)}
 
 
@@ -95,7 +95,7 @@ def causes() -> dict[str, int]:
     found = {"detected": 0, "first": 0, "sets": 0}
     for name in "ABC":
         world = get_world(name)
-        rows = strong(world, read(HERE / f"criticism/results/{name}_library_8.csv"))
+        rows = strong(world, read(HERE / f"criticism/results/{name}_library.csv"))
         places = ranks(world, rows)
         found["sets"] += len(rows)
         found["detected"] += len(places)
@@ -120,7 +120,7 @@ def apart() -> dict[str, float]:
     """Return the chosen trials that put the truth first as often as all random ones."""
     from benchmarks.criticism.active import Curves
 
-    curves = Curves.of(read(HERE / "criticism/results/A_library_8_active.csv"))
+    curves = Curves.of(read(HERE / "criticism/results/A_active.csv"))
     random = curves.trials[-1]
     return {"random": random, "chosen": curves.matched("top-1", random)}
 

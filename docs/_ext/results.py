@@ -58,13 +58,13 @@ TABLES = {
         "--methods asbi nsbi alhi nlhi --trials 10",
     ),
     "The closed loop, on worlds whose truth is known": (
-        *(f"criticism --summary --table loop --world {world}" for world in "ABCD"),
+        *(f"criticism --summary --world {world}" for world in "ABCD"),
         *(
-            f"criticism --summary --table {table} --world {world} --trials 12"
-            for table in ("open", "pairs")
+            f"criticism --summary --kind {kinds} --world {world}"
+            for kinds in ("removed inexpressible outside", "pair")
             for world in "AB"
         ),
-        "criticism --summary --table active --world A",
+        "criticism --summary --kind active --world A",
     ),
     "Verdicts where every model is wrong": (
         "misfit --summary",
