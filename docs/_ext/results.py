@@ -53,9 +53,8 @@ TABLES = {
     "Campaigns on disk": ("table cost/directory.json --only tell* load,* *near*",),
     "Box collision": (
         "box_collision --summary",
-        "box_collision --summary --table coverage --rounds 3",
-        "box_collision --summary --setting learned "
-        "--methods asbi nsbi alhi nlhi --trials 10",
+        "box_collision --summary --setting coverage --target prior --seeds 0 40",
+        "box_collision --summary --setting learned --method asbi nsbi alhi nlhi",
     ),
     "The closed loop, on worlds whose truth is known": (
         *(f"criticism --summary --world {world}" for world in "ABCD"),
