@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.fitting import Fit, batched_fits, effect_bounds, fit_record, run_rows
-from benchmarks.measured.record_stages import Bench, Settings, run_settings, with_error
+from benchmarks.measured.record_stages import Bench, stages_of, with_error
 from sbi_active.criticism import Effect, Trials
 from sbi_active.tasks import cascaded_tanks  # pyright: ignore
 from sbi_active.tasks.cascaded_tanks import FOUND_ON, levels, make_effects, split  # pyright: ignore
@@ -209,6 +209,4 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
     )
 
 
-def main(settings: Settings) -> None:
-    """Run the stages that are missing from the results, and print the tables."""
-    run_settings(settings, cascaded_tanks, make_bench, RESULT)
+main = stages_of(cascaded_tanks, make_bench, RESULT)
