@@ -4,8 +4,8 @@
     python -m benchmarks table cost/network.json --only "*ratio"
     python -m benchmarks table readme    # README's; exits 1 where it misses a value
 
-A file of rows keeps its columns, or those named by ``--columns``. Of nested values each
-number is a row, called by its path; ``--only`` keeps paths that match a pattern.
+A file of rows keeps its columns. Of nested values each number is a row, called by its
+path; ``--only`` keeps paths that match a pattern.
 
 README's table, from committed rows, beside the values that are stated of it.
 
@@ -17,12 +17,10 @@ figures. A figure below its ``least`` or above its ``most`` is a miss.
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -216,40 +214,27 @@ def leaves(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]:
         yield ", ".join(path), shown
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
+def main(file: str, *, only: Sequence[str] = ("*",)) -> int:
+    """Print the table.
 
     Args:
         file: Path of the file below benchmarks/; ``readme`` is README's own table.
         only: Patterns of paths; all by default.
-        columns: Names of columns of a CSV file; all by default.
     """
-
-    file: str
-    only: Sequence[str] = ("*",)
-    columns: Sequence[str] | None = None
-
-
-def main(arguments: Settings) -> int:
-    """Print the table."""
-    if arguments.file == "readme":
+    if file == "readme":
         lines, misses = table()
         print(*lines, sep="\n")
         print(*misses, sep="\n", file=sys.stderr)
         return 1 if misses else 0
-    path = HERE / arguments.file
+    path, header = HERE / file, ["what", "value"]
     if path.suffix == ".csv":
-        with path.open(newline="") as file:
-            rows = [*csv.DictReader(file)]
-        header = arguments.columns or [*rows[0]]
-        cells = [[row[name] for name in header] for row in rows]
+        rows = read(path)
+        header, cells = [*rows[0]], [[*row.values()] for row in rows]
     else:
-        header = ["what", "value"]
         cells = [
             [name, value]
-            for name, value in leaves(json.loads(path.read_text()))
-            if any(fnmatch(name, pattern) for pattern in arguments.only)
+            for name, value in leaves(load(file))
+            if any(fnmatch(name, pattern) for pattern in only)
         ]
     print(Table(header, cells).markdown())
     return 0

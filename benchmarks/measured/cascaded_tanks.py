@@ -111,16 +111,12 @@ def score(
     return {"validation": float(error[known:].square().mean().sqrt())}
 
 
-def fit_pieces(
-    pieces: Pieces, names: Sequence[str] = (), *, starts: int = 6, seed: int = 0
-) -> tuple[Fit, list[Effect]]:
+def fit_pieces(pieces: Pieces, names: Sequence[str]) -> tuple[Fit, list[Effect]]:
     """Return the fit of pieces that run before they are read, and the effects.
 
     Args:
         pieces: To fit.
         names: Names of the effects.
-        starts: Number of local fits.
-        seed: Seed of the starts.
 
     Returns:
         Parameters are theta and the strengths.
@@ -133,19 +129,13 @@ def fit_pieces(
         starts = torch.zeros(len(z), len(pieces), 2, dtype=torch.float64)
         return run_pieces(z, starts, pieces, effects)[:, known]
 
-    found = fit_record(
-        predict,
-        torch.from_numpy(pieces.output)[known],
-        [*PRIOR_LOW, *least],
-        [*PRIOR_HIGH, *most],
-        starts=starts,
-        seed=seed,
-    )
-    return found, effects
+    low, high = [*PRIOR_LOW, *least], [*PRIOR_HIGH, *most]
+    target = torch.from_numpy(pieces.output)[known]
+    return fit_record(predict, target, low, high), effects
 
 
 def fit_tanks(
-    record: Record, names: Sequence[str] = (), *, starts: int = 6, seed: int = 0
+    record: Record, names: Sequence[str] = (), *, starts: int = 6
 ) -> tuple[Fit, list[Effect]]:
     """Return the fit of the whole record with both start levels, and the effects.
 
@@ -153,7 +143,6 @@ def fit_tanks(
         record: Record ``estimation``.
         names: Names of the effects.
         starts: Number of local fits.
-        seed: Seed of the starts.
 
     Returns:
         Parameters are theta, the strengths, and the two start levels beside the first
@@ -168,7 +157,6 @@ def fit_tanks(
         [*PRIOR_LOW, *least, *START_LOW],
         [*PRIOR_HIGH, *most, *START_HIGH],
         starts=starts,
-        seed=seed,
     )
     return found, effects
 
