@@ -2,9 +2,9 @@
 
 A name is a module below ``benchmarks/``, with dots; that of a folder stands for its
 ``run``. Options are the arguments of the module's ``main``, with their types, defaults
-and descriptions; where functions share them, those of a dataclass, ``main``'s only
-argument. ``Literal`` and ``Annotated[str, NAMES]`` are one of the names. Without a
-name, all are listed. Benchmarks run on one thread, and warnings are not shown.
+and descriptions. ``Literal`` and ``Annotated[str, NAMES]`` are one of the names.
+Without a name, all are listed. Benchmarks run on one thread, and warnings are not
+shown.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ import types
 import typing
 import warnings
 from collections.abc import Callable
-from dataclasses import is_dataclass
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
@@ -72,13 +71,6 @@ def module_of(name: str) -> str:
     return f"benchmarks.{name}" + (".run" if path.is_dir() else "")
 
 
-def options_of(main: Callable[..., Any]) -> Callable[..., Any]:
-    """Return what has a benchmark's options as arguments: its main, or a dataclass."""
-    kinds = [*typing.get_type_hints(main).items()]
-    first = kinds[0][1] if kinds and kinds[0][0] != "return" else None
-    return first if is_dataclass(first) and isinstance(first, type) else main
-
-
 def parser_of(main: Callable[..., Any], name: str) -> argparse.ArgumentParser:
     """Return a parser of the arguments of a benchmark's main.
 
@@ -86,21 +78,18 @@ def parser_of(main: Callable[..., Any], name: str) -> argparse.ArgumentParser:
     its place.
 
     Args:
-        main: The function. Its arguments, or those of the dataclass that it takes, are
-            flags, numbers, texts, paths, sequences of these, or None.
+        main: The function. Its arguments are flags, numbers, texts, paths, sequences
+            of these, or None.
         name: Name of the benchmark.
     """
-    owner = options_of(main)
-    described: dict[str, str] = {}
-    for each in (*reversed(getattr(owner, "__mro__", ())), owner):
-        lines = re.findall(ARGUMENT, inspect.getdoc(each) or "", re.M)
-        described |= {key: " ".join(text.split()) for key, text in lines}
+    lines = re.findall(ARGUMENT, inspect.getdoc(main) or "", re.M)
+    described = {key: " ".join(text.split()) for key, text in lines}
     parser = argparse.ArgumentParser(
         prog=f"python -m benchmarks {name}",
         description=(inspect.getdoc(main) or "").split("\n")[0],
     )
-    hints = typing.get_type_hints(owner, include_extras=True)
-    for argument, given in inspect.signature(owner).parameters.items():
+    hints = typing.get_type_hints(main, include_extras=True)
+    for argument, given in inspect.signature(main).parameters.items():
         kind, choices = hints[argument], None
         if typing.get_origin(kind) is typing.Annotated:
             kind, choices = typing.get_args(kind)
@@ -151,12 +140,11 @@ def main(argv: list[str]) -> int:
         return 2
     run = import_module(module).main
     given = vars(parser_of(run, name).parse_args(options))
-    owner = options_of(run)
     from sbi_active.threads import single_thread
 
     with single_thread(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return (run(**given) if owner is run else run(owner(**given))) or 0
+        return run(**given) or 0
 
 
 if __name__ == "__main__":

@@ -224,6 +224,7 @@ def _edges(prior: BoxUniform) -> tuple[Tensor, Tensor]:
 
 
 LARGEST = 3.0  # strengths of effects, in deviations of their priors
+NUM_UNIFORM = 200  # draws in a box, the best of which fits start from
 LOST = 1e3  # reading in place of one that is not finite
 
 
@@ -253,8 +254,6 @@ def best_in_box(
     starts: int,
     evaluations: int,
     difference: float,
-    draws: int = 200,
-    seed: int = 0,
 ) -> tuple[Array, float]:
     """Return the parameters of the smallest sum of squares, and half of that sum.
 
@@ -265,15 +264,13 @@ def best_in_box(
         starts: Number of the best draws that local fits start from.
         evaluations: Largest number of evaluations of a fit, derivatives apart.
         difference: Step of derivatives, as a share of the box's width.
-        draws: Number of uniform draws in the box.
-        seed: Seed of the draws.
     """
     width = high - low
 
     def at(z: Array) -> Array:
         return residual(low + z * width)
 
-    z = np.random.default_rng(seed).uniform(size=(draws, len(low)))
+    z = np.random.default_rng(0).uniform(size=(NUM_UNIFORM, len(low)))
     order = np.argsort((at(z) ** 2).sum(1))[:starts]
     limits: dict[str, Any] = {"low": 0.0, "high": 1.0, "difference": difference}
     found = [
@@ -340,7 +337,6 @@ def fit_record(
     high: Sequence[float],
     *,
     starts: int = 6,
-    seed: int = 0,
 ) -> Fit:
     """Return the best of some local fits, from the best of 200 draws in a box.
 
@@ -350,7 +346,6 @@ def fit_record(
         low: Lower ends of the box, d numbers.
         high: Upper ends.
         starts: Number of local fits.
-        seed: Seed of the draws.
     """
 
     def residual(rows: Array) -> Array:
@@ -364,6 +359,5 @@ def fit_record(
         starts=starts,
         evaluations=60,
         difference=1e-6,
-        seed=seed,
     )
     return Fit(best, float(np.sqrt(2 * cost / len(target))))

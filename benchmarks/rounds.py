@@ -10,13 +10,13 @@ import numpy as np
 from scipy import stats
 from torch import Tensor
 
-from benchmarks.rows import column
+from benchmarks.rows import column, grouped
 from sbi_active import Campaign
 from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed
 
 Rows = Sequence[Mapping[str, str]]
-Cells = Mapping[tuple[str, str], Rows]  # by method and target
+Cells = Mapping[tuple[Any, ...], Rows]  # by method and target
 
 
 def played(
@@ -49,6 +49,11 @@ def played(
         campaign.tell(task.real_system(asked, seed=real), action=action)
         campaign.update()
         yield campaign, time.process_time() - start
+
+
+def cells_of(rows: Rows) -> Cells:
+    """Return the rows of each method and target."""
+    return grouped(rows, "method", "target")
 
 
 def num_rounds(rows: Rows) -> int:

@@ -10,6 +10,7 @@ import inspect
 import io
 import json
 import random
+import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import product
@@ -19,6 +20,11 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 import pandas as pd
 from torch import Tensor
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 T = TypeVar("T")
 Row = Mapping[str, Any]
@@ -69,7 +75,6 @@ def resumed(
     jobs: Iterable[Sequence[Any]],
     make: Callable[..., Row | Sequence[Row]],
     *,
-    others: Sequence[Path] = (),
     may_fail: bool = False,
 ) -> list[dict[str, Any]]:
     """Add the rows of jobs that a file does not have yet, and return all its rows.
@@ -80,11 +85,9 @@ def resumed(
         jobs: Values of these columns, which are the arguments of ``make``.
         make: Function that returns the row, or the rows, of a job; the columns that
             tell jobs apart are added.
-        others: Further files, whose rows are not made again either.
         may_fail: Whether a crash is a result too, in the column "failure".
     """
-    known = [row for own in (path, *others) for row in read(own)]
-    done = {tuple(str(row[key]) for key in keys) for row in known}
+    done = {tuple(str(row[key]) for key in keys) for row in read(path)}
     for job in jobs:
         if tuple(map(str, job)) in done:
             continue
@@ -113,34 +116,60 @@ def benchmark(
     *,
     skip: Callable[..., bool] = lambda *job: False,
     may_fail: bool = False,
+    given: Mapping[str, str] | None = None,
+    default: Mapping[str, Sequence[Any]] | None = None,
     **axes: Iterable[Any],
 ) -> Callable[..., None]:
-    """Return the main of a benchmark: every case a row of one file, and their table.
+    """Return the main of a benchmark: every case a row of a file, and their table.
 
     Args:
-        path: File of the rows.
+        path: File of the rows. Axes in braces, as in ``{method}.csv``, name a file
+            each, and are no columns of it.
         make: Function of a case that returns its row or rows.
-        table: Function that returns the table of the rows that are asked for: of a
-            range all from its first number on.
+        table: Function that returns the table of the rows that are asked for, those
+            axes of files among their keys.
         skip: Function that says which cases are not run.
         may_fail: Whether a crash is a result too.
-        axes: Values of the columns that make a case; ranges vary slowest. Each is an
-            option, a range by its ends and in the plural: ``--seeds 0 10``.
+        given: Further paths that ``make`` takes by keyword, each with what it is.
+        default: Values of an axis that are run where none are asked for; all others.
+        axes: Values of what makes a case; ranges vary slowest. Each is an option, a
+            range by its ends and in the plural: ``--seeds 0 10``.
     """
     ranges = {key: axis for key, axis in axes.items() if isinstance(axis, range)}
     option = {key: key + "s" * (key in ranges) for key in axes}
+    slowest = sorted(axes, key=lambda k: k not in ranges)
 
-    def main(*, summary: bool = False, out: Path = path, **given: Any) -> None:
+    def main(*, summary: bool = False, out: Path = path, **asked: Any) -> None:
         chosen = {
-            k: range(*given[name]) if k in ranges else given[name]
+            k: range(*asked[name]) if k in ranges else asked[name]
             for k, name in option.items()
         }
-        slowest = sorted(axes, key=lambda k: k not in ranges)
-        cases = product(*(chosen[k] for k in slowest))
-        named = (dict(zip(slowest, case, strict=True)) for case in cases)
-        jobs = (job for by in named if not skip(*(job := [by[k] for k in axes])))
-        rows = resumed(out, [*axes], () if summary else jobs, make, may_fail=may_fail)
-        print(table([r for r in rows if all(_is_asked(r[k], chosen[k]) for k in axes)]))
+        further = {name: asked[name] for name in given or {}}
+        of_file = [k for k in axes if f"{{{k}}}" in out.name]
+        columns = [k for k in axes if k not in of_file]
+        found: list[dict[str, Any]] = []
+        for values in product(*(chosen[k] for k in of_file)):
+            fixed = dict(zip(of_file, values, strict=True))
+
+            def whole(*job: Any, fixed: dict[str, Any] = fixed) -> list[Any]:
+                case = fixed | dict(zip(columns, job, strict=True))
+                return [case[k] for k in axes]
+
+            order = [k for k in slowest if k in columns]
+            cases = product(*(chosen[k] for k in order))
+            named = (dict(zip(order, case, strict=True)) for case in cases)
+            jobs = ([by[k] for k in columns] for by in named)
+            rows = resumed(
+                out.with_name(out.name.format(**fixed)),
+                columns,
+                () if summary else (job for job in jobs if not skip(*whole(*job))),
+                lambda *job, whole=whole: make(*whole(*job), **further),
+                may_fail=may_fail,
+            )
+            found += [fixed | row for row in rows]
+        print(
+            table([r for r in found if all(_is_asked(r[k], chosen[k]) for k in axes)])
+        )
 
     hints: dict[str, Any] = {"summary": bool, "out": Path}
     defaults: dict[str, Any] = {"summary": False, "out": path}
@@ -151,15 +180,18 @@ def benchmark(
         kind = tuple[int, int] if key in ranges else Sequence[type(values[0])]
         is_named = key not in ranges and isinstance(values[0], str)
         hints[option[key]] = Annotated[kind, values] if is_named else kind
-        defaults[option[key]] = values
+        defaults[option[key]] = (default or {}).get(key, values)
         what = "First, and one past the last" if key in ranges else "Those that are run"
         lines.append(f"{option[key]}: {what}, of each {key}.")
+    for name, what in (given or {}).items():
+        hints[name], defaults[name] = Path, None
+        lines.append(f"{name}: {what}")
     main.__doc__ = "Run the cases that are missing, and print the table.\n\nArgs:\n"
     main.__doc__ += "\n".join(f"    {line}" for line in lines)
     main.__annotations__ = hints
     parameters = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default)
-        for name, default in defaults.items()
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=value)
+        for name, value in defaults.items()
     ]
     main.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     return main
@@ -167,8 +199,6 @@ def benchmark(
 
 def _is_asked(value: Any, among: Any) -> bool:
     """Return whether a row's value is among an option's."""
-    if isinstance(among, range):
-        return int(value) >= among.start
     return str(value) in map(str, among)
 
 
@@ -194,6 +224,11 @@ def grouped(rows: Iterable[Row], *keys: str) -> dict[tuple[Any, ...], list[Any]]
 def short(value: Any) -> Any:
     """Return a number with six digits."""
     return f"{float(value):.6g}" if isinstance(value, (float, Tensor)) else value
+
+
+def toml(path: Path) -> dict[str, Any]:
+    """Return the tables of a TOML file."""
+    return tomllib.loads(path.read_text(encoding="utf-8"))
 
 
 def stages(path: Path) -> dict[str, Any]:

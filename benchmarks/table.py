@@ -4,8 +4,8 @@
     python -m benchmarks table cost/network.json --only "*ratio"
     python -m benchmarks table readme    # README's; exits 1 where it misses a value
 
-A file of rows keeps its columns, or those named by ``--columns``. Of nested values each
-number is a row, called by its path; ``--only`` keeps paths that match a pattern.
+A file of rows keeps its columns. Of nested values each number is a row, called by its
+path; ``--only`` keeps paths that match a pattern.
 
 README's table, from committed rows, beside the values that are stated of it.
 
@@ -17,25 +17,18 @@ figures. A figure below its ``least`` or above its ``most`` is a miss.
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.rows import read
+from benchmarks.rows import read, toml
 from sbi_active.display.table import Table
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 HERE = Path(__file__).parent
 STATED = HERE / "readme.toml"
@@ -88,7 +81,7 @@ def box() -> dict[str, float]:
 def alarms() -> dict[str, int]:
     """Return false alarms in clean sets of the worlds A, B and C."""
     folder = HERE / "criticism/results"
-    rows = [r for world in "ABC" for r in read(folder / f"{world}_clean_8.csv")]
+    rows = [r for world in "ABC" for r in read(folder / f"{world}_clean.csv")]
     return {"false": sum(r["verdict"] != "none" for r in rows), "sets": len(rows)}
 
 
@@ -100,7 +93,7 @@ def causes() -> dict[str, int]:
     found = {"detected": 0, "first": 0, "sets": 0}
     for name in "ABC":
         world = get_world(name)
-        rows = strong(world, read(HERE / f"criticism/results/{name}_library_8.csv"))
+        rows = strong(world, read(HERE / f"criticism/results/{name}_library.csv"))
         places = ranks(world, rows)
         found["sets"] += len(rows)
         found["detected"] += len(places)
@@ -125,7 +118,7 @@ def apart() -> dict[str, float]:
     """Return the chosen trials that put the truth first as often as all random ones."""
     from benchmarks.criticism.active import Curves
 
-    curves = Curves.of(read(HERE / "criticism/results/A_library_8_active.csv"))
+    curves = Curves.of(read(HERE / "criticism/results/A_active.csv"))
     random = curves.trials[-1]
     return {"random": random, "chosen": curves.matched("top-1", random)}
 
@@ -176,7 +169,7 @@ def table(stated: Path = STATED) -> tuple[list[str], list[str]]:
         stated: File of the rows and their stated values.
     """
     lines, misses = [*HEADER], []
-    for row in tomllib.loads(stated.read_text(encoding="utf-8"))["row"]:
+    for row in toml(stated)["row"]:
         found = FIGURES[row["figures"]]()
         cells = (without_zero(row[k].format(**found)) for k in ("result", "beside"))
         lines.append(f"| {row['what']} | {' | '.join(cells)} |".replace("|  |", "| |"))
@@ -221,40 +214,27 @@ def leaves(value: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]:
         yield ", ".join(path), shown
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
+def main(file: str, *, only: Sequence[str] = ("*",)) -> int:
+    """Print the table.
 
     Args:
         file: Path of the file below benchmarks/; ``readme`` is README's own table.
         only: Patterns of paths; all by default.
-        columns: Names of columns of a CSV file; all by default.
     """
-
-    file: str
-    only: Sequence[str] = ("*",)
-    columns: Sequence[str] | None = None
-
-
-def main(arguments: Settings) -> int:
-    """Print the table."""
-    if arguments.file == "readme":
+    if file == "readme":
         lines, misses = table()
         print(*lines, sep="\n")
         print(*misses, sep="\n", file=sys.stderr)
         return 1 if misses else 0
-    path = HERE / arguments.file
+    path, header = HERE / file, ["what", "value"]
     if path.suffix == ".csv":
-        with path.open(newline="") as file:
-            rows = [*csv.DictReader(file)]
-        header = arguments.columns or [*rows[0]]
-        cells = [[row[name] for name in header] for row in rows]
+        rows = read(path)
+        header, cells = [*rows[0]], [[*row.values()] for row in rows]
     else:
-        header = ["what", "value"]
         cells = [
             [name, value]
-            for name, value in leaves(json.loads(path.read_text()))
-            if any(fnmatch(name, pattern) for pattern in arguments.only)
+            for name, value in leaves(load(file))
+            if any(fnmatch(name, pattern) for pattern in only)
         ]
     print(Table(header, cells).markdown())
     return 0

@@ -1,13 +1,15 @@
 """The paper's box collision: log p(truth), reproduction error, speeds, time a round.
 
-    python -m benchmarks box_collision                  # both targets, 10 trials
-    python -m benchmarks box_collision --trials 50      # the paper's number
-    python -m benchmarks box_collision --table coverage --rounds 3 --reference none
+    python -m benchmarks box_collision                       # both targets, 10 trials
+    python -m benchmarks box_collision --seeds 0 50          # the paper's number
+    python -m benchmarks box_collision --setting learned --method asbi nsbi alhi nlhi
+    python -m benchmarks box_collision --setting coverage --target prior --seeds 0 40
     python -m benchmarks box_collision --summary
 
 Resumable: a trial that stands in the CSV is not run again. One row a round, one file a
 method, target and setting, in ``results``; tables are printed at the end.
 
+"coverage": truths from the prior, three rounds, and how often regions hold them.
 Beside a belief stands the posterior of the same trials by importance sampling
 (``log_p_exact``, with its standard error), which is what the best inference would
 reach with these actions. It needs noise: without any, as in the paper, there is no
@@ -17,10 +19,9 @@ posterior density.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,17 +33,17 @@ from benchmarks.rounds import (
     Rows,
     active_against_random,
     by_round,
+    cells_of,
     coverage_table,
     num_rounds,
     played,
 )
-from benchmarks.rows import column, published, read, resumed
+from benchmarks.rows import benchmark, column, grouped, published
 from sbi_active import Campaign, CampaignOptions
 from sbi_active.campaign.learning.methods import METHODS
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation import Workers
 from sbi_active.tasks import Task, get_task
 from sbi_active.tasks.box_collision import BoxCollisionReference, exact_posterior  # pyright: ignore
 
@@ -65,16 +66,17 @@ LARGEST_ERROR = 0.5
 PAIRS = (("asbi", "nsbi"), ("alhi", "nlhi"))  # chosen and random actions
 
 
-def summarize(cells: Cells) -> str:
-    """Return all tables, the paper's figures beside ours.
-
-    Args:
-        cells: Rows by method and target.
-    """
-    if not cells:
-        return "no trials yet"
-    parts = [errors_table(cells), rounds_table(cells), time_table(cells)]
-    return "\n\n".join([*parts, *active_against_random(cells, PAIRS)])
+def table(rows: Rows) -> str:
+    """Return the tables of each setting, the paper's figures beside ours."""
+    parts: list[str] = []
+    for (setting,), found in grouped(rows, "setting").items():
+        cells = cells_of(found)
+        if setting == "coverage":
+            parts.append(coverage_table(cells, (3,), ("gap", gap)))
+            continue
+        parts += [errors_table(cells), rounds_table(cells), time_table(cells)]
+        parts += active_against_random(cells, PAIRS)
+    return "\n\n".join(parts) or "no trials yet"
 
 
 def errors_table(cells: Cells) -> str:
@@ -170,12 +172,17 @@ def spread(values: Any) -> str:
     return f"{values.mean():.1f} +- {values.std():.1f}" if len(values) else "-"
 
 
-RESULTS = Path(__file__).parent / "results"
 NUM_DRAWS = 2_000  # behind the share of a belief that is denser than the truth
 OPTIONS = CampaignOptions(num_samples=250, details=CampaignDetails(num_scored=500))
 #: "learned" has beliefs and information by the networks alone, which is where the
 #: methods differ: by default the declared noise gives both, whatever was learned.
-SETTINGS = {"default": OPTIONS, "learned": replace(OPTIONS, refine=False)}
+SETTINGS = {
+    "default": OPTIONS,
+    "learned": replace(OPTIONS, refine=False),
+    "coverage": OPTIONS,
+}
+NUM_ROUNDS = {"default": 6, "learned": 6, "coverage": 3}
+NUM_PARTICLES = 100  # effective draws of the reference
 
 
 class Resampled:
@@ -190,75 +197,29 @@ class Resampled:
         return self._posterior.sample(shape[0], seed=seed)
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
-
-    Args:
-        table: Name of the table.
-        target: Target of the paper; both by default.
-        methods: Names of methods; asbi and nsbi by default, asbi for the coverage.
-        setting: Name of the settings.
-        trials: Number of trials; 10 by default, 40 for the coverage.
-        first: Number of the first trial.
-        rounds: Number of rounds.
-        workers: Number of workers.
-        reference: Rounds after which importance sampling is run.
-        particles: Number of effective draws of the reference.
-        results: Folder of the results.
-        summary: Whether to run nothing, and print the table of the rows.
-    """
-
-    table: Literal["paper", "coverage"] = "paper"
-    target: Literal["1", "2"] | None = None
-    methods: Annotated[Sequence[str] | None, METHODS] = None
-    setting: Annotated[str, SETTINGS] = "default"
-    trials: int | None = None
-    first: int = 0
-    rounds: int = 6
-    workers: int = 1
-    reference: Literal["last", "all", "none"] = "last"
-    particles: int = 100
-    results: Path = RESULTS
-    summary: bool = False
-
-    @property
-    def is_coverage(self) -> bool:
-        """Whether truths are drawn from the prior."""
-        return self.table == "coverage"
-
-    @property
-    def num_trials(self) -> int:
-        """Number of trials."""
-        return self.trials or (40 if self.is_coverage else 10)
-
-
-def run_trial(
-    task: Any, method: str, seed: int, arguments: Settings
+def rows_of(
+    setting: str, method: str, target: str, seed: int
 ) -> list[dict[str, object]]:
-    """Return one row a round of one campaign."""
-    workers = Workers(num_workers=arguments.workers)
-    options = replace(options_of(method, arguments.setting), workers=workers)
+    """Return one row a round of one campaign, the reference in the default's last."""
+    task, num = make_task(target, seed), NUM_ROUNDS[setting]
     rows: list[dict[str, object]] = []
-    past = None
-    made = played(task, seed, arguments.rounds, method=method, options=options)
+    options = options_of(method, setting)
+    made = played(task, seed, num, method=method, options=options)
     for index, (campaign, _) in enumerate(made):
-        is_last = index + 1 == arguments.rounds
+        is_last = index + 1 == num
         row = round_row(task, campaign, is_last=is_last)
-        if arguments.reference == "all" or (is_last and arguments.reference == "last"):
+        if is_last and setting == "default":
             start = time.process_time()
-            past = exact_posterior(
+            exact = exact_posterior(
                 task,
                 campaign.history,
-                num_particles=arguments.particles,
+                num_particles=NUM_PARTICLES,
                 seed=derive_seed(seed, "reference"),
-                past=past,
             )
             log_q = float(campaign.belief.log_prob(task.theta_true))
-            row |= reference_row(task, past, log_q)
+            row |= reference_row(task, exact, log_q)
             row["exact_cpu"] = time.process_time() - start
-            if is_last:
-                row |= errors(task, Resampled(past), "exact_rep_err")
+            row |= errors(task, Resampled(exact), "exact_rep_err")
         rows.append({"round": index + 1} | row)
     return rows
 
@@ -331,41 +292,20 @@ def make_task(target: str, seed: int) -> Any:
         return task.with_truth(task.prior.sample(torch.Size([1]))[0])
 
 
-def path_of(method: str, target: str, arguments: Settings) -> Path:
-    """Return the file of a method, target and setting."""
-    name = f"{arguments.setting}_target_{target}_{method}"
-    if arguments.rounds != 6:
-        name += f"_rounds_{arguments.rounds}"
-    return arguments.results / f"{name}.csv"
-
-
-def run_missing(method: str, target: str, arguments: Settings) -> None:
-    """Run the trials that are not in the file yet."""
-
-    def trial(seed: int) -> list[dict[str, object]]:
-        return run_trial(make_task(target, seed), method, seed, arguments)
-
-    seeds = [(seed,) for seed in range(arguments.first, arguments.num_trials)]
-    path = path_of(method, target, arguments)
-    resumed(path, ["seed"], seeds, trial)
-
-
-def main(arguments: Settings) -> None:
-    """Run the trials that are not there yet, and print the table."""
-    is_coverage = arguments.is_coverage
-    methods = arguments.methods or (("asbi",) if is_coverage else ("asbi", "nsbi"))
-    targets = [arguments.target] if arguments.target else ["1", "2"]
-    targets = ["prior"] if is_coverage else targets
-    cells = {}
-    for method in methods:
-        for target in targets:
-            if not arguments.summary:
-                run_missing(method, target, arguments)
-            rows = read(path_of(method, target, arguments))
-            rows = [row for row in rows if int(row["seed"]) < arguments.num_trials]
-            if rows:
-                cells[method, target] = rows
-    if is_coverage:
-        print(coverage_table(cells, (3, 4, 6), ("gap", gap)))
-    else:
-        print(summarize(cells))
+main = benchmark(
+    Path(__file__).parent / "results" / "{setting}_target_{target}_{method}.csv",
+    rows_of,
+    table,
+    skip=lambda setting, method, target, seed: (
+        (setting == "coverage") != (target == "prior")
+    ),
+    default={
+        "setting": ("default",),
+        "target": ("1", "2"),
+        "method": ("asbi", "nsbi"),
+    },
+    setting=SETTINGS,
+    method=METHODS,
+    target=("1", "2", "prior"),
+    seed=range(10),
+)

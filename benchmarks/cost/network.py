@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ from sbi_active.seeding import forked_generators
 from sbi_active.tasks import get_task  # pyright: ignore
 
 MODES = ("each round", "on demand")
+SEEDS, ROUNDS = 8, 3
 
 
 def rounds(
@@ -43,30 +43,16 @@ def rounds(
         return rows, campaign.belief.sample((4_000,)).std(0).tolist()
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
-
-    Args:
-        seeds: Number of seeds.
-        rounds: Number of rounds.
-    """
-
-    seeds: int = 8
-    rounds: int = 3
-
-
-def main(arguments: Settings) -> None:
+def main() -> None:
     """Run both modes in turn, print and write their cost."""
     made: dict[str, list[Any]] = {mode: [] for mode in MODES}
     for mode in MODES:
         rounds(mode, 10_000, 1)
-    for seed in range(arguments.seeds):
+    for seed in range(SEEDS):
         for mode in MODES:
-            made[mode].append(rounds(mode, seed, arguments.rounds))
+            made[mode].append(rounds(mode, seed, ROUNDS))
     result: dict[str, Any] = {
-        "command": "python -m benchmarks cost.network "
-        f"--seeds {arguments.seeds} --rounds {arguments.rounds}",
+        "command": "python -m benchmarks cost.network",
         "date": date.today().isoformat(),
         "machine": f"{os.cpu_count()} cores, no GPU",
         "task": "numerical, declared noise",

@@ -50,10 +50,6 @@ def merged(world: World, probabilities: Mapping[str, float]) -> dict[str, float]
     return dict(sorted(total.items(), key=lambda item: -item[1]))
 
 
-ACTIVE_COLUMNS = [
-    *["case", "effects", "policy", "trials", "action", "verdict", "top", "place"],
-    *["probability", "lambda", "trial_simulations", "cpu_seconds", "failure"],
-]
 START = 2  # trials before the first comparison
 DETECTABLE = 25.0  # lambda with all random trials
 
@@ -75,26 +71,21 @@ def score_active(case: Case, number: int) -> list[dict[str, object]]:
     every = case.truth.action
     rows: list[dict[str, object]] = []
     if case.truth.non_centrality <= DETECTABLE:
-        return [_row(case, number, "random")]
+        return [_row(case, "random")]
     starts = {"random": every[:START], "chosen": first_actions(case.truth.world.name)}
     for policy, action in starts.items():
         grown = Case(case.problem, replace(case.truth, action=action[:-1]))
         grown = extend(grown, action[-1])
         for num in range(START, len(every) + 1):
-            rows.append(_row(grown, number, policy))
+            rows.append(_row(grown, policy))
             start = time.process_time()
-            following = None
-            try:
-                criticism, scores = _verdict(grown, number)
-                if policy == "chosen" and num < len(every):
-                    following = criticism.next_action(beyond=False).action
-            except Exception as error:  # a crash is a result of the benchmark
-                rows[-1]["failure"] = f"{type(error).__name__}: {error}"[:300]
-                break
+            criticism, scores = _verdict(grown, number)
+            action = every[num : num + 1]
+            if policy == "chosen" and len(action):
+                following = criticism.next_action(beyond=False).action
+                action = action if following is None else torch.as_tensor(following)
             rows[-1] |= {"cpu_seconds": time.process_time() - start, **scores}
             if num < len(every):
-                random = every[num]
-                action = random if following is None else torch.as_tensor(following)
                 grown = extend(grown, action.float())
     return rows
 
@@ -110,11 +101,9 @@ def first_actions(world: str) -> Tensor:
     return design.action
 
 
-def _row(case: Case, number: int, policy: str) -> dict[str, object]:
+def _row(case: Case, policy: str) -> dict[str, object]:
     action = case.truth.action
-    blank: dict[str, object] = dict.fromkeys(ACTIVE_COLUMNS, "")
-    return blank | {
-        "case": number,
+    return {
         "effects": " + ".join(case.truth.names),
         "policy": policy,
         "trials": len(action),
@@ -164,7 +153,7 @@ class Curves:
     @classmethod
     def of(cls, rows: Sequence[Mapping[str, str]]) -> Curves:
         """Take the cases that are detectable and ran through with both policies."""
-        trials = sorted({int(r["trials"]) for r in rows if r["verdict"]})
+        trials = sorted({int(r["trials"]) for r in rows if r.get("verdict")})
         found = {(r["case"], r["policy"], int(r["trials"])): r for r in rows}
         cases = []
         for case in dict.fromkeys(r["case"] for r in rows):

@@ -75,15 +75,6 @@ def oracle_rmse(case: Case) -> float:
     return float((mean - held_out.x).square().mean().sqrt())
 
 
-COLUMNS = [
-    *["case", "effects", "strengths", "theta", "correlation", "lambda", "support"],
-    *["verdict", "probabilities", "credible_set", "equivalent", "formula"],
-    "undeclared",
-    *["rmse_before", "rmse_after", "rmse_oracle", "coverage_before", "coverage_after"],
-    *["engine", "warnings", "trial_simulations", "cpu_seconds", "failure"],
-]
-
-
 def score_case(case: Case, number: int, *, oracle: bool = False) -> dict[str, object]:
     """Run the loop on a case and return its row of the results.
 
@@ -93,9 +84,7 @@ def score_case(case: Case, number: int, *, oracle: bool = False) -> dict[str, ob
         oracle: Also score the model that is given the true effect.
     """
     problem, truth = case.problem, case.truth
-    row: dict[str, object] = dict.fromkeys(COLUMNS, "")
-    row |= {
-        "case": number,
+    row: dict[str, object] = {
         "effects": " + ".join(truth.names) or "none",
         "strengths": " ".join(f"{float(s):.6g}" for s in truth.strengths),
         "theta": " ".join(f"{v:.6g}" for v in truth.theta[0].tolist()),
@@ -104,13 +93,9 @@ def score_case(case: Case, number: int, *, oracle: bool = False) -> dict[str, ob
         "support": _support(case),
     }
     # No table needs a plan but that of active choice.
-    report, cost = problem.attempt(number, plan=False)
-    row |= cost
-    if report is None:
-        return row
-    if oracle and problem.trials.held_out is not None:
-        row["rmse_oracle"] = oracle_rmse(case)
-    return row | read_report(report)
+    report, cost = problem.counted_report(number, plan=False)
+    row["rmse_oracle"] = oracle_rmse(case) if oracle else ""
+    return row | read_report(report) | cost
 
 
 def _support(case: Case) -> float | str:

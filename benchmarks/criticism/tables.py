@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from benchmarks.criticism.active import DETECTABLE, SCORES, Curves, merged, true_name
 from benchmarks.criticism.cases import SUPPORTED
 from benchmarks.criticism.intervals import brier_score, rate, reliability
-from benchmarks.criticism.worlds import World
+from benchmarks.criticism.worlds import World, get_world
+from benchmarks.rows import column, grouped
 from sbi_active.criticism.under_misfit import UNDECLARED
 
 Row = Mapping[str, str]
@@ -19,34 +20,29 @@ Row = Mapping[str, str]
 BINS = ((0.0, 10.0), (10.0, 25.0), (25.0, np.inf))
 
 
-def summary(table: str, world: World, found: Mapping[str, Sequence[Row]]) -> list[str]:
-    """Return the lines of a table.
-
-    Args:
-        table: Name of the table.
-        world: World of the rows.
-        found: Rows by kind.
-    """
+def summary(rows: Sequence[Row]) -> str:
+    """Return the lines of each world and kind, and what both sets of a world tell."""
     lines: list[str] = []
-    for kind, rows in found.items():
-        lines += ["", f"## world {world.name}, {kind}: {len(rows)} cases"]
-        failed = [r for r in rows if r["failure"]]
-        lines += [f"failed {r['case']}: {r['failure']}" for r in failed]
-        rows = [r for r in rows if not r["failure"]]
-        if not rows:
-            continue
-        lines += SUMMARIES[table, kind](world, rows)
-        lines += _cost(rows)
-    if table == "loop" and len(found) == 2:
-        # As many of each, as the prior has it: "none" is right in half of the sets.
-        num = min(map(len, found.values()))
-        first = [
-            sorted(rows, key=lambda r: int(r["case"]))[:num] for rows in found.values()
-        ]
-        every = [r for rows in first for r in rows if not r["failure"]]
-        lines += ["", f"## calibration, {num} clean and {num} library sets"]
-        lines += _calibration(world, every) if every else []
-    return lines
+    for (name,), every in grouped(rows, "world").items():
+        world = get_world(name)
+        found = {kind: own for (kind,), own in grouped(every, "kind").items()}
+        for kind, own in found.items():
+            drawn = "library" if kind == "active" else kind
+            lines += ["", f"## world {name}, {drawn}: {len(own)} cases"]
+            failed = [r for r in own if r.get("failure")]
+            lines += [f"failed {r['case']}: {r['failure']}" for r in failed]
+            ended = [r for r in own if not r.get("failure")]
+            if ended:
+                lines += [*SUMMARIES[kind](world, ended), *_cost(ended)]
+        if {"clean", "library"} <= {*found}:
+            # As many of each, as the prior has it: "none" is right in half of the sets.
+            both = found["clean"], found["library"]
+            num = min(map(len, both))
+            first = [sorted(own, key=lambda r: int(r["case"]))[:num] for own in both]
+            ended = [r for own in first for r in own if not r.get("failure")]
+            lines += ["", f"## calibration, {num} clean and {num} library sets"]
+            lines += _calibration(world, ended) if ended else []
+    return "\n".join(lines)
 
 
 def _clean(world: World, rows: Sequence[Row]) -> list[str]:
@@ -141,7 +137,7 @@ def _errors(rows: Sequence[Row]) -> list[str]:
             f"RMSE after/oracle: median {np.median(best):.3f}, "
             f"90th percentile {np.percentile(best, 90):.3f}"
         )
-    before, after = _column(rows, "coverage_before"), _column(rows, "coverage_after")
+    before, after = column(rows, "coverage_before"), column(rows, "coverage_after")
     return [*lines, f"90 % coverage: {before.mean():.2f} -> {after.mean():.2f}"]
 
 
@@ -236,10 +232,10 @@ def _calibration(world: World, rows: Sequence[Row]) -> list[str]:
 
 
 def _cost(rows: Sequence[Row]) -> list[str]:
-    rows = [r for r in rows if r["cpu_seconds"]]  # others were left out
+    rows = [r for r in rows if r.get("cpu_seconds")]  # others were left out
     if not rows:
         return []
-    seconds, sims = _column(rows, "cpu_seconds"), _column(rows, "trial_simulations")
+    seconds, sims = column(rows, "cpu_seconds"), column(rows, "trial_simulations")
     return [
         f"CPU s: median {np.median(seconds):.1f}, 95th percentile "
         f"{np.percentile(seconds, 95):.1f}; trial simulations: median "
@@ -288,24 +284,20 @@ def _key(world: World, effects: str) -> str:
     return next(iter(merged(world, {true_name(world, effects): 1.0})))
 
 
-def _column(rows: Iterable[Row], key: str) -> np.ndarray:
-    return np.array([float(r[key]) if r[key] else np.nan for r in rows])
-
-
 def _ratio(rows: Sequence[Row], key: str, to: str) -> np.ndarray:
-    return _column(rows, key) / _column(rows, to)
+    return column(rows, key) / column(rows, to)
 
 
 def _range(values: np.ndarray) -> str:
     return f"{values.min():.2f}-{values.max():.2f}"
 
 
-SUMMARIES: dict[tuple[str, str], Callable[[World, Sequence[Row]], list[str]]] = {
-    ("loop", "clean"): _clean,
-    ("loop", "library"): _library,
-    ("open", "removed"): _removed,
-    ("open", "inexpressible"): _removed,
-    ("open", "outside"): _outside,
-    ("pairs", "pair"): _pair,
-    ("active", "library"): _active,
+SUMMARIES: dict[str, Callable[[World, Sequence[Row]], list[str]]] = {
+    "clean": _clean,
+    "library": _library,
+    "removed": _removed,
+    "inexpressible": _removed,
+    "outside": _outside,
+    "pair": _pair,
+    "active": _active,
 }

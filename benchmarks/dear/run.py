@@ -198,6 +198,6 @@ main = benchmark(
     skip=lambda task, size, seed, method: size == DEFAULT and method != "campaign",
     task=TASKS,
     per_round=("500", "250", "1000", DEFAULT),
-    seed=range(2400, 2404),
+    seed=range(2400, 2405),
     method=("campaign", "TSNPE", "SNPE-C"),
 )

@@ -248,5 +248,5 @@ main = benchmark(
     skip=lambda machine, kind, case: kind == "magnet" and machine != "pendulum",
     machine=MACHINES,
     kind=("single", "outside", "clean", "magnet"),
-    case=range(2_000, 2_010),
+    case=range(2_000, 2_040),
 )

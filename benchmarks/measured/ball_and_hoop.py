@@ -33,7 +33,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.fitting import Fit, effect_bounds, fit_record, run_rows
-from benchmarks.measured.record_stages import Bench, Settings, run_settings, with_error
+from benchmarks.measured.record_stages import Bench, stages_of, with_error
 from sbi_active.criticism import Effect, Trials
 from sbi_active.tasks import ball_and_hoop  # pyright: ignore
 from sbi_active.tasks.ball_and_hoop import make_effects, spin, split  # pyright: ignore
@@ -54,8 +54,6 @@ REMOVALS = (
     ("compression", "cubic drag"),
     ("compression", "quadratic drag", "cubic drag"),
 )
-#: Of the offset, V, where it is fitted: far beyond an amplifier's.
-OFFSET = 0.5
 
 
 def run_pieces(
@@ -92,9 +90,7 @@ def fit_hoop(
     record: Record,
     names: Sequence[str] = (),
     *,
-    offset: float | None = None,
-    starts: int = 6,
-    seed: int = 0,
+    offset: float,
 ) -> tuple[Fit, list[Effect]]:
     """Return the fit of the first 3,000 samples in ten pieces, and the effects.
 
@@ -104,30 +100,21 @@ def fit_hoop(
     Args:
         record: Record ``random_steps``.
         names: Names of the effects.
-        offset: Offset of the input, V; None fits it too.
-        starts: Number of local fits.
-        seed: Seed of the starts.
+        offset: Offset of the input, V.
     """
     whole = cut(record.part(0, FITTED + 1), LENGTH)
     effects = [effect for effect in make_effects() if effect.name in names]
     least, most = effect_bounds(effects)
-    edge = (-OFFSET, OFFSET) if offset is None else (offset, offset)
-    low = [DRIVE[0], DAMPING[0], *([edge[0]] if offset is None else []), *least]
-    high = [DRIVE[1], DAMPING[1], *([edge[1]] if offset is None else []), *most]
 
     def complete(z: Tensor) -> Tensor:
-        if offset is None:
-            return z
         held = torch.full((len(z), 1), offset, dtype=z.dtype)
         return torch.cat([z[:, :2], held, z[:, 2:]], 1)
 
     found = fit_record(
         lambda z: run_pieces(complete(z), whole, effects).flatten(1),
         torch.from_numpy(whole.output).flatten(),
-        low,
-        high,
-        starts=starts,
-        seed=seed,
+        [DRIVE[0], DAMPING[0], *least],
+        [DRIVE[1], DAMPING[1], *most],
     )
     z = complete(torch.from_numpy(found.parameters)[None])[0].numpy()
     return Fit(z, found.rmse), effects
@@ -167,6 +154,4 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
     )
 
 
-def main(settings: Settings) -> None:
-    """Run the stages that are missing from the results, and print the tables."""
-    run_settings(settings, ball_and_hoop, make_bench, RESULT)
+main = stages_of(ball_and_hoop, make_bench, RESULT)

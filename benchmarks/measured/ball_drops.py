@@ -52,15 +52,14 @@ WHEN = ("before", "after")
 COLUMNS = (*WHEN, *KINDS)
 
 
-def judge(drops: Sequence[Drop], *, seed: int = 0) -> Row:
+def judge(drops: Sequence[Drop]) -> Row:
     """Return what the drops of one ball say of it.
 
     Args:
         drops: Drops of one ball.
-        seed: Seed of all draws.
     """
     begin = time.process_time()
-    loop = criticism(trials_of([*drops]), seed)
+    loop = criticism(trials_of([*drops]))
     detection, tracing = loop.detect(), loop.trace()
     power, linear, quadratic = (
         loop.rivals.fit(ModelKey((f"{form} drag",))).evidence
@@ -78,24 +77,21 @@ def judge(drops: Sequence[Drop], *, seed: int = 0) -> Row:
     }
 
 
-def score(
-    fitted: Drop, tested: Drop, *, seed: int = 0
-) -> tuple[Row, dict[str, Forecast]]:
+def score(fitted: Drop, tested: Drop) -> tuple[Row, dict[str, Forecast]]:
     """Return the errors on the rest of a drop, and the forecasts.
 
     Args:
         fitted: Drop that is fitted whole.
         tested: Drop that is fitted in its first 0.8 s.
-        seed: Seed of all draws.
     """
     begin = time.process_time()
     pair = [fitted, tested]
-    loop = criticism(trials_of(pair, until={1: UNTIL}), seed)
+    loop = criticism(trials_of(pair, until={1: UNTIL}))
     tracing, whole = loop.trace(), trials_of(pair)
     verdicts = {"before": NONE, "after": tracing.verdict}
     averaged = {"before": {NONE: 1.0}, "after": tracing.probabilities}
     forecasts = {
-        when: forecast(loop.rivals, whole, probabilities=p, trial=1, seed=seed)
+        when: forecast(loop.rivals, whole, probabilities=p, trial=1)
         for when, p in averaged.items()
     }
     row: Row = {"ball": tested.ball, "tested": tested.drop, **found(tracing)}
@@ -112,10 +108,10 @@ def score(
     return row | {"cpu_seconds": time.process_time() - begin}, forecasts
 
 
-def criticism(trials: Any, seed: int) -> Criticism:
+def criticism(trials: Any) -> Criticism:
     """Return the closed loop on some drops."""
     return Criticism(
-        make_simulator(), make_prior(), trials, effects=make_effects(), seed=seed
+        make_simulator(), make_prior(), trials, effects=make_effects(), seed=0
     )
 
 
@@ -133,43 +129,28 @@ def found(tracing: Tracing) -> Row:
     }
 
 
-def main(
-    *,
-    data: Path = DATA,
-    out: Path = RESULT,
-    figures: Path | None = None,
-    balls: Sequence[str] | None = None,
-    seed: int = 0,
-) -> None:
+def main(*, data: Path = DATA, figures: Path | None = None) -> None:
     """Run what is missing from the results, and print the tables.
 
     Args:
         data: Folder of the measured set.
-        out: File of the results.
         figures: Folder for the figures.
-        balls: Names of balls; all by default.
-        seed: Seed of the engine.
     """
-    rows, by_ball = stages(out), {}
+    rows, by_ball = stages(RESULT), {}
     for drop in measured(read_drops, data):
         by_ball.setdefault(drop.ball, []).append(drop)
-    wanted = {
-        ball: pair for ball, pair in by_ball.items() if ball in (balls or by_ball)
-    }
-    for ball, pair in wanted.items():
+    for ball, pair in by_ball.items():
         if ball not in rows:
-            add(out, rows, ball, judge(pair, seed=seed))
+            add(RESULT, rows, ball, judge(pair))
         for k in (0, 1):
             if (key := f"{ball} {k + 1}") not in rows:
-                add(out, rows, key, score(pair[1 - k], pair[k], seed=seed)[0])
+                add(RESULT, rows, key, score(pair[1 - k], pair[k])[0])
     print(tables([*rows.values()]))
     if figures is not None:
-        _draw(rows, by_ball, figures, seed=seed)
+        _draw(rows, by_ball, figures)
 
 
-def _draw(
-    rows: dict[str, Row], by_ball: dict[str, list[Drop]], folder: Path, *, seed: int
-) -> None:
+def _draw(rows: dict[str, Row], by_ball: dict[str, list[Drop]], folder: Path) -> None:
     from benchmarks.measured.ball_forecast import draw_exponents, draw_forecasts
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -178,7 +159,7 @@ def _draw(
     draw_exponents(shown, folder / "exponents.png")
     pairs = {ball.replace("_", " "): by_ball[ball] for ball in DRAWN if ball in by_ball}
     draw_forecasts(
-        {name: score(one, two, seed=seed)[1] for name, (one, two) in pairs.items()},
+        {name: score(one, two)[1] for name, (one, two) in pairs.items()},
         {name: two for name, (_, two) in pairs.items()},
         folder / "forecasts.png",
         until=UNTIL,

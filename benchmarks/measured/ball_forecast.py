@@ -65,7 +65,6 @@ def forecast(
     *,
     probabilities: Mapping[str, float],
     trial: int,
-    seed: int = 0,
 ) -> Forecast:
     """Return the rest of a trial given its beginning and the other trials.
 
@@ -78,9 +77,8 @@ def forecast(
         whole: The same trials, this one in full.
         probabilities: By names of the effects joined by " + ", or a catch-all.
         trial: Position of the one that was cut.
-        seed: Of the draws.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     names, p = [*probabilities], np.array([*probabilities.values()])
     counts = np.round(NUM_DRAWS * p / p.sum()).astype(int)
     parts = [

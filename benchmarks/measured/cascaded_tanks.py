@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.fitting import Fit, batched_fits, effect_bounds, fit_record, run_rows
-from benchmarks.measured.record_stages import Bench, Settings, run_settings, with_error
+from benchmarks.measured.record_stages import Bench, stages_of, with_error
 from sbi_active.criticism import Effect, Trials
 from sbi_active.tasks import cascaded_tanks  # pyright: ignore
 from sbi_active.tasks.cascaded_tanks import FOUND_ON, levels, make_effects, split  # pyright: ignore
@@ -111,16 +111,12 @@ def score(
     return {"validation": float(error[known:].square().mean().sqrt())}
 
 
-def fit_pieces(
-    pieces: Pieces, names: Sequence[str] = (), *, starts: int = 6, seed: int = 0
-) -> tuple[Fit, list[Effect]]:
+def fit_pieces(pieces: Pieces, names: Sequence[str]) -> tuple[Fit, list[Effect]]:
     """Return the fit of pieces that run before they are read, and the effects.
 
     Args:
         pieces: To fit.
         names: Names of the effects.
-        starts: Number of local fits.
-        seed: Seed of the starts.
 
     Returns:
         Parameters are theta and the strengths.
@@ -133,19 +129,13 @@ def fit_pieces(
         starts = torch.zeros(len(z), len(pieces), 2, dtype=torch.float64)
         return run_pieces(z, starts, pieces, effects)[:, known]
 
-    found = fit_record(
-        predict,
-        torch.from_numpy(pieces.output)[known],
-        [*PRIOR_LOW, *least],
-        [*PRIOR_HIGH, *most],
-        starts=starts,
-        seed=seed,
-    )
-    return found, effects
+    low, high = [*PRIOR_LOW, *least], [*PRIOR_HIGH, *most]
+    target = torch.from_numpy(pieces.output)[known]
+    return fit_record(predict, target, low, high), effects
 
 
 def fit_tanks(
-    record: Record, names: Sequence[str] = (), *, starts: int = 6, seed: int = 0
+    record: Record, names: Sequence[str] = (), *, starts: int = 6
 ) -> tuple[Fit, list[Effect]]:
     """Return the fit of the whole record with both start levels, and the effects.
 
@@ -153,7 +143,6 @@ def fit_tanks(
         record: Record ``estimation``.
         names: Names of the effects.
         starts: Number of local fits.
-        seed: Seed of the starts.
 
     Returns:
         Parameters are theta, the strengths, and the two start levels beside the first
@@ -168,7 +157,6 @@ def fit_tanks(
         [*PRIOR_LOW, *least, *START_LOW],
         [*PRIOR_HIGH, *most, *START_HIGH],
         starts=starts,
-        seed=seed,
     )
     return found, effects
 
@@ -209,6 +197,4 @@ def make_bench(records: dict[str, Record], *, every: int = EVERY) -> Bench:
     )
 
 
-def main(settings: Settings) -> None:
-    """Run the stages that are missing from the results, and print the tables."""
-    run_settings(settings, cascaded_tanks, make_bench, RESULT)
+main = stages_of(cascaded_tanks, make_bench, RESULT)

@@ -19,8 +19,7 @@ Beside the verdicts plain least squares, given the same effects.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,7 +29,14 @@ from numpy.typing import NDArray
 
 from benchmarks.criticism.problem import counted
 from benchmarks.fitting import local_fit
-from benchmarks.measured.go2_leg import DATA, LEGS, Leg, read_leg, usual_parameters
+from benchmarks.measured.go2_leg import (
+    DATA,
+    LEGS,
+    Leg,
+    draw,
+    read_leg,
+    usual_parameters,
+)
 from benchmarks.measured.record_stages import causes, center, row_of, said
 from benchmarks.rows import add, measured, stages
 from sbi_active.criticism import Criticism, Effect
@@ -67,15 +73,12 @@ def line_of(tracing: Tracing) -> str:
     return f"Verdict: {misfit_line(tracing.verdict, tracing.misfit)}"
 
 
-def judge(
-    leg: Leg, library: Callable[[Robot], Sequence[Effect]], *, seed: int = 0
-) -> dict[str, Any]:
+def judge(leg: Leg, library: Callable[[Robot], Sequence[Effect]]) -> dict[str, Any]:
     """Return the row of one verdict.
 
     Args:
         leg: Leg that is fitted.
         library: Function from a robot to the effects that are declared.
-        seed: Seed of all draws.
     """
     parameters = usual_parameters(leg)
     robot = leg.robot(parameters, leg.triangles())
@@ -89,7 +92,7 @@ def judge(
         *(model, robot.prior, robot.trials),
         effects=effects,
         thin=False,  # readings are chosen by hand
-        seed=seed,
+        seed=0,
     ).trace()
     helps = [e for n in tracing.chosen for e in effects if e.name == n]
     values = center(tracing.evidences[str(ModelKey(tracing.chosen))])
@@ -105,40 +108,27 @@ def judge(
     }
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
+def main(
+    *,
+    data: Path = DATA,
+    legs: Annotated[Sequence[str], LEGS] = (*LEGS,),
+    figures: Path | None = None,
+) -> None:
+    """Run the stages that are missing from the results, and print the tables.
 
     Args:
         data: Folder of the measured set.
         legs: Names of legs.
-        stages: Names of the stages, as in 'removed'; all by default.
-        out: File of the results.
         figures: Folder for the figures.
-        seed: Seed of the engine.
     """
-
-    data: Path = DATA
-    legs: Annotated[Sequence[str], LEGS] = (*LEGS,)
-    stages: Sequence[str] | None = None
-    out: Path = RESULT
-    figures: Path | None = None
-    seed: int = 0
-
-
-def main(arguments: Settings) -> None:
-    """Run the stages that are missing from the results, and print the tables."""
-    legs = [measured(read_leg, arguments.data, name) for name in arguments.legs]
-    rows = stages(arguments.out)
-    for leg in legs:
-        for name, row in _stages(leg, rows, arguments):
-            add(arguments.out, rows, name, row)
+    every, rows = [measured(read_leg, data, name) for name in legs], stages(RESULT)
+    for leg in every:
+        for name, row in _stages(leg, rows):
+            add(RESULT, rows, name, row)
     print(tables(rows))
-    if arguments.figures is not None:
-        from benchmarks.measured.go2_leg import draw
-
-        for leg in legs:
-            draw(rows[leg.name], leg, arguments.figures)
+    if figures is not None:
+        for leg in every:
+            draw(rows[leg.name], leg, figures)
 
 
 def _library(
@@ -156,24 +146,17 @@ def _library(
     return lambda robot: mjcf_effects(robot, include=wanted, exclude=removed)
 
 
-def _stages(leg: Leg, rows: dict[str, Any], arguments: Any) -> Any:
+def _stages(leg: Leg, rows: dict[str, Any]) -> Iterator[tuple[str, Any]]:
     """Yield the name and the row of each stage that is missing."""
-    seed, own = arguments.seed, leg.name
-
-    def wanted(stage: str) -> bool:
-        name = f"{own}, {stage}" if stage else own
-        chosen = arguments.stages is None or stage in arguments.stages
-        return name not in rows and (chosen or not stage)
-
-    if wanted(""):
-        yield own, judge(leg, _library(leg, few=own != LEGS[0]), seed=seed)
+    own = leg.name
+    if own not in rows:
+        yield own, judge(leg, _library(leg, few=own != LEGS[0]))
     helps = rows[own]["helps"]
-    if wanted("least squares"):
+    if (name := f"{own}, least squares") not in rows:
         given = dict.fromkeys([(), (*helps,)])
-        yield f"{own}, least squares", _least_squares(leg, [*given])
-    if wanted("removed"):
-        library = _library(leg, helps, few=True)
-        yield f"{own}, removed", judge(leg, library, seed=seed)
+        yield name, _least_squares(leg, [*given])
+    if (name := f"{own}, removed") not in rows:
+        yield name, judge(leg, _library(leg, helps, few=True))
 
 
 def _least_squares(leg: Leg, sets: Sequence[tuple[str, ...]]) -> dict[str, Any]:

@@ -40,19 +40,18 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
     return Table((*header, held_out, "CPU s"), lines).markdown()
 
 
-def main(*, data: Path = DATA, out: Path = RESULT) -> None:
+def main(*, data: Path = DATA) -> None:
     """Run what is missing from the results, and print the table.
 
     Args:
         data: Folder of the measured set.
-        out: File of the results.
     """
-    rows = stages(out)
+    rows = stages(RESULT)
     wanted = {f"{sd:g} {every}": (sd, every) for sd in SDS for every in EVERY}
     missing = {name: pair for name, pair in wanted.items() if name not in rows}
     records = measured(read_recordings, data) if missing else {}
     for name, (sd, every) in missing.items():
         bench = make_bench(records, every=every)
         row = judge(replace(bench, prior=make_prior(offset_sd=sd)))
-        add(out, rows, name, {"offset_sd": sd, "every": every, **row})
+        add(RESULT, rows, name, {"offset_sd": sd, "every": every, **row})
     print(table({name: rows[name] for name in wanted}))

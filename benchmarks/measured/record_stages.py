@@ -150,54 +150,37 @@ class Bench:
         )
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run of a task with records.
+def stages_of(
+    task: Any, make_bench: Callable[..., Bench], path: Path
+) -> Callable[..., None]:
+    """Return the main of a benchmark of records.
 
     Args:
-        data: Folder of the measured set; the task's by default.
-        clean: Number of clean sets.
-        out: File of the results; the task's by default.
-        seed: Seed of the engine.
-    """
-
-    data: Path | None = None
-    clean: int = 10
-    out: Path | None = None
-    seed: int = 0
-
-
-def run_settings(
-    settings: Settings, task: Any, make_bench: Callable[..., Bench], out: Path
-) -> None:
-    """Run the stages that are missing from a file of results, and print the tables.
-
-    Args:
-        settings: What is run.
         task: Package with records.
         make_bench: Function ``make_bench(records)``.
-        out: File of the results, unless one is given.
+        path: File of the results.
     """
-    records = measured(task.read_recordings, settings.data or task.DATA)
-    rows = run_stages(
-        make_bench(records),
-        settings.out or out,
-        clean=settings.clean,
-        seed=settings.seed,
-    )
-    print(table(rows, "V"))
+
+    def main(*, data: Path = task.DATA, clean: int = 10) -> None:
+        """Run the stages that are missing from the results, and print the tables.
+
+        Args:
+            data: Folder of the measured set.
+            clean: Number of clean sets.
+        """
+        records = measured(task.read_recordings, data)
+        print(table(run_stages(make_bench(records), path, clean), "V"))
+
+    return main
 
 
-def run_stages(
-    bench: Bench, path: Path, *, clean: int = 10, seed: int = 0
-) -> dict[str, Any]:
+def run_stages(bench: Bench, path: Path, clean: int) -> dict[str, Any]:
     """Run the stages that a file lacks, and return all of them.
 
     Args:
         bench: The machine.
         path: JSON file of the results.
         clean: Number of clean sets.
-        seed: Seed of all draws.
     """
     rows = stages(path)
     judged: dict[str, tuple[str, ...]] = {"recorded": ()}
@@ -207,7 +190,7 @@ def run_stages(
     for name in [name for name in names if name not in rows]:
         is_clean = name not in judged
         trials = bench.replay(int(name.split(" ")[1])) if is_clean else None
-        row = judge(bench, gone=judged.get(name, ()), trials=trials, seed=seed)
+        row = judge(bench, gone=judged.get(name, ()), trials=trials)
         add(path, rows, name, row)
     fits = rows.setdefault("least squares", {})
     wanted = {(), *[(*rows[name]["helps"],) for name in judged]}
@@ -224,7 +207,6 @@ def judge(
     *,
     gone: Sequence[str] = (),
     trials: Trials | None = None,
-    seed: int = 0,
 ) -> dict[str, Any]:
     """Return the row of one verdict.
 
@@ -232,7 +214,6 @@ def judge(
         bench: The machine.
         gone: Names of effects that are not declared.
         trials: Trials in place of the recorded ones.
-        seed: Seed of all draws.
     """
     effects = [effect for effect in bench.effects if effect.name not in gone]
     model, count = counted(bench.model)
@@ -242,7 +223,7 @@ def judge(
         bench.prior,
         bench.trials if trials is None else trials,
         effects=effects,
-        seed=seed,
+        seed=0,
         evaluate=False,  # held-out records are scored in free run, below
         plan=False,
     )

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Any, Literal
@@ -54,7 +53,7 @@ Job = tuple[str, str, Any, Any, Any, list[Effect]]
 
 
 def removed(
-    model: Any, prior: Any, trials: Any, effects: Sequence[Effect], *, seed: int = 0
+    model: Any, prior: Any, trials: Any, effects: Sequence[Effect]
 ) -> dict[str, Any]:
     """Return what is said of trials with a part of the library.
 
@@ -63,10 +62,9 @@ def removed(
         prior: Of its parameters.
         trials: To fit.
         effects: What is left of the library, with nuisances.
-        seed: Of all draws.
     """
     begin = time.process_time()
-    loop = Criticism(model, prior, trials, effects=effects, seed=seed)
+    loop = Criticism(model, prior, trials, effects=effects, seed=0)
     report = loop.report(evaluate=False, plan=False)
     row = read_report(report)
     return row | {
@@ -131,33 +129,18 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
     return "\n\n".join(parts)
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
+def main(
+    *, set: Literal["servo", "balls"] | None = None, summary: bool = False
+) -> None:
+    """Run the removals that are missing from the results, and print the tables.
 
     Args:
         set: Name of the measured set.
-        data: Folder of the measured set.
-        out: File of the results.
         summary: Whether to run nothing, and print the table of the rows.
-        seed: Seed of the engine.
     """
-
-    set: Literal["servo", "balls"] | None = None
-    data: Path | None = None
-    out: Path = RESULT
-    summary: bool = False
-    seed: int = 0
-
-
-def main(arguments: Settings) -> None:
-    """Run the removals that are missing from the results, and print the tables."""
-    rows = stages(arguments.out)
-    if arguments.set and not arguments.summary:
-        jobs, data = (_servo, SERVO) if arguments.set == "servo" else (_balls, BALLS)
-        for which, name, *parts in measured(lambda: [*jobs(arguments.data or data)]):
-            key = f"{which}: {name}"
-            if key not in rows:
-                row = removed(*parts, seed=arguments.seed)
-                add(arguments.out, rows, key, row)
+    rows = stages(RESULT)
+    jobs = {"servo": lambda: [*_servo(SERVO)], "balls": lambda: [*_balls(BALLS)]}
+    for which, name, *parts in measured(jobs[set]) if set and not summary else ():
+        if (key := f"{which}: {name}") not in rows:
+            add(RESULT, rows, key, removed(*parts))
     print(table(rows))

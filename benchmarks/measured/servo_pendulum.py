@@ -74,8 +74,6 @@ def fit(
     task: ServoPendulumTask,
     trials: Sequence[int],
     names: Sequence[str] = (),
-    *,
-    seed: int = 0,
 ) -> Fit:
     """Return the least-squares fit of the simulator with some effects.
 
@@ -83,7 +81,6 @@ def fit(
         task: Task that holds the recordings.
         trials: Numbers of the trials that are fitted.
         names: Names of the effects.
-        seed: Seed of the starts.
     """
     r, num = task.recordings, len(task.recordings)
 
@@ -105,7 +102,6 @@ def fit(
         starts=4,
         evaluations=30,
         difference=1e-5,
-        seed=seed,
     )
     return Fit(z, residual(z[None], range(num))[0])
 
@@ -114,8 +110,6 @@ def judge(
     task: ServoPendulumTask,
     fitted: Sequence[int],
     held_out: Sequence[int] = (),
-    *,
-    seed: int = 0,
 ) -> Row:
     """Return what some recorded trials say.
 
@@ -123,7 +117,6 @@ def judge(
         task: Task that holds the recordings.
         fitted: Numbers of the trials that are fitted.
         held_out: Numbers of the trials that are only scored.
-        seed: Seed of all draws.
     """
     begin = time.process_time()
     loop = Criticism(
@@ -132,7 +125,7 @@ def judge(
         task.trials(fitted, held_out),
         effects=task.effects(),
         actions=task.actions,
-        seed=seed,
+        seed=0,
     )
     report = loop.report(evaluate=len(held_out) > 0)
     evidences, model = report.tracing.evidences, report.tracing.model
@@ -189,12 +182,12 @@ def simulated(
     return ServoPendulumTask(data=replace(r, angle=angle), noise=task.noise)
 
 
-def least_squares(task: ServoPendulumTask, row: Row, seed: int) -> Row:
+def least_squares(task: ServoPendulumTask, row: Row) -> Row:
     """Return training and held-out RMSE of plain fits on the split of a stage."""
     sets = [(), *((name,) for name in FRICTIONS), named(row)]
     found = {}
     for names in dict.fromkeys(sets):
-        one = fit(task, row["fitted"], names, seed=seed)
+        one = fit(task, row["fitted"], names)
         found[" + ".join(names) or NONE] = {
             "parameters": one.parameters.tolist(),
             "train": one.rmse(row["fitted"]),
@@ -216,57 +209,43 @@ def next_of(row: Row, off: Sequence[int]) -> int:
     return int(off[int(np.argmax(np.array(row["gain"])[[*off]]))])
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
-
-    Args:
-        data: Folder of the measured set.
-        replay: Kind of the sets.
-        clean: Number of clean sets.
-        out: File of the results.
-        seed: Seed of the engine.
-    """
-
-    data: Path = DATA
-    replay: Literal["recorded", "clean"] = "recorded"
-    clean: int = NUM_CLEAN
-    out: Path = RESULT
-    seed: int = 0
-
-
 def missing(
-    task: ServoPendulumTask, rows: dict[str, Row], chosen: Settings
+    task: ServoPendulumTask, rows: dict[str, Row], num_clean: int
 ) -> Iterator[tuple[str, Row]]:
     """Yield the name and the row of each stage that is missing."""
-    seed = chosen.seed
     off = np.flatnonzero(task.recordings.motor_off).tolist()
     on = [i for i in range(len(task.recordings)) if i not in off]
 
     if "powered" not in rows:
-        yield "powered", judge(task, on, seed=seed)
+        yield "powered", judge(task, on)
     extra = next_of(rows["powered"], off)
     split, held = [*on, extra], [i for i in off if i != extra]
     if "motor off" not in rows:
-        yield "motor off", judge(task, split, held, seed=seed)
+        yield "motor off", judge(task, split, held)
     row = rows["motor off"]
     if "least squares" not in row:
-        yield "motor off", row | {"least squares": least_squares(task, row, seed)}
-    wanted = range(chosen.clean if chosen.replay == "clean" else 0)
-    wanted = [i for i in wanted if f"clean {i}" not in rows]
+        yield "motor off", row | {"least squares": least_squares(task, row)}
+    wanted = [i for i in range(num_clean) if f"clean {i}" not in rows]
     if wanted:
-        bare, full = (fit(task, split, n, seed=seed) for n in ((), named(row)))
+        bare, full = (fit(task, split, n) for n in ((), named(row)))
         for i in wanted:
             clean = simulated(task, bare, full, split, seed=i)
-            yield f"clean {i}", judge(clean, split, held, seed=seed)
+            yield f"clean {i}", judge(clean, split, held)
 
 
-def main(arguments: Settings) -> None:
-    """Run the stages that are missing from the results, and print the tables."""
-    task = measured(lambda: ServoPendulumTask(data=arguments.data))
-    rows = stages(arguments.out)
-    for name, row in missing(task, rows, arguments):
-        add(arguments.out, rows, name, row)
+def main(
+    *, data: Path = DATA, replay: Literal["recorded", "clean"] = "recorded"
+) -> None:
+    """Run the stages that are missing from the results, and print the tables.
+
+    Args:
+        data: Folder of the measured set.
+        replay: Kind of the sets.
+    """
+    task = measured(lambda: ServoPendulumTask(data=data))
+    rows = stages(RESULT)
+    for name, row in missing(task, rows, NUM_CLEAN if replay == "clean" else 0):
+        add(RESULT, rows, name, row)
     print(tables(rows, task.recordings))
 
 

@@ -1,8 +1,8 @@
 """The closed loop where every model is wrong, on worlds whose truth is known.
 
-    python -m benchmarks misfit --group own --kind E --first 1000 --cases 40
-    python -m benchmarks misfit --group letters --first 1000 --cases 40
-    python -m benchmarks misfit --summary --first 1000
+    python -m benchmarks misfit --group own --kind E --cases 2580 2612
+    python -m benchmarks misfit --group letters --kind E --cases 2680 2718
+    python -m benchmarks misfit --summary
 
 Machines have a declared sensor, wide priors, about nine declared effects, and a smooth
 discrepancy of 2 to 10 sensor deviations that nobody declared. Kinds: E, an effect
@@ -17,7 +17,7 @@ be tuned on them.
 
 Resumable: a case that stands in the CSV is not run again. One row a case, one file a
 group and kind, in benchmarks/misfit/results. Give each command a core of its own
-(OMP_NUM_THREADS=1) and another --first, which writes its own file.
+(OMP_NUM_THREADS=1).
 
 Scores of one case, from the public report and the truth alone.
 """
@@ -26,32 +26,23 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 
 from benchmarks.criticism.problem import named
-from benchmarks.misfit.cases import FIRST_JUDGED, KINDS, Case, Kind, draw_case
+from benchmarks.misfit.cases import FIRST_JUDGED, KINDS, Kind, draw_case
 from benchmarks.misfit.machines import GROUPS
 from benchmarks.misfit.summary import summary
 from benchmarks.misfit.truth import Truth
-from benchmarks.rows import read, resumed
+from benchmarks.rows import benchmark, grouped
 from sbi_active.criticism import Effect
 from sbi_active.criticism.results import NONE, Tracing
 
 LEVEL = 0.9  # of intervals
-COLUMNS = [
-    *["case", "machine", "trials", "kind", "true", "equivalent", "sizes", "strengths"],
-    *["discrepancy", "detail", "size", "excess", "theta"],
-    *["held_bare", "held_true", "held_single", "held_verdict"],
-    *["verdict", "alarm", "named", "helps", "instead", "support"],
-    *["theta_covered", "phi_covered", "trial_simulations", "cpu_seconds", "failure"],
-]
 
 
-def score_case(case: Case, number: int) -> dict[str, object]:
+def row_of(group: str, kind: Kind, number: int) -> dict[str, object]:
     """Run the loop on a case and return its row of the results.
 
     Held-out trials have no part in the verdict. Their errors are those of plain
@@ -59,21 +50,20 @@ def score_case(case: Case, number: int) -> dict[str, object]:
     the verdict says help, against readings without the sensor's error.
 
     Args:
-        case: The case.
+        group: Of worlds.
+        kind: Kind of the case.
         number: Its number, also the loop's seed.
     """
-    problem, truth = case.problem, case.truth
-    row = dict.fromkeys(COLUMNS, "") | _known(truth) | {"case": number}
+    case = draw_case(group, kind, number)
+    truth = case.truth
     # The truth has the held-out trials.
-    report, cost = problem.attempt(number, evaluate=False, plan=False)
-    row |= cost
-    if report is None:
-        return row
+    report, cost = case.problem.counted_report(number, evaluate=False, plan=False)
     tracing, misfit = report.tracing, report.tracing.misfit
     support = {} if misfit is None else misfit.support
     instead = {} if misfit is None else misfit.instead
     found = [truth.machine.effect(name) for name in tracing.chosen]
-    return row | {
+    return {
+        **_known(truth),
         "held_verdict": truth.held_out_error(found),
         "verdict": str(report).splitlines()[0],
         "alarm": bool(report.detection.alarm),
@@ -87,6 +77,7 @@ def score_case(case: Case, number: int) -> dict[str, object]:
             }
         ),
         **_covered(truth, tracing),
+        **cost,
     }
 
 
@@ -148,61 +139,25 @@ def _covered(truth: Truth, tracing: Tracing) -> dict[str, object]:
     return covered | ({"phi_covered": share(phi)} if phi else {})
 
 
-RESULTS = Path(__file__).parent / "results"
+def table(rows: list[dict[str, str]]) -> str:
+    """Return the measures of each group, and of all together."""
+    parts = {group: own for (group,), own in grouped(rows, "group").items()}
+    if len(parts) > 1:
+        parts[" and ".join(parts)] = rows
+    lines: list[str] = []
+    for name, own in parts.items():
+        is_judged = all(int(row["case"]) >= FIRST_JUDGED for row in own)
+        seeds = "judging" if is_judged else "tuning"
+        lines += ["", f"## {name}, {seeds} seeds", *summary(own)]
+    return "\n".join(lines)
 
 
-def run_kind(group: str, kind: Kind, first: int, cases: int) -> None:
-    """Run the cases that are in none of the files yet."""
-    path = RESULTS / f"{group}_{kind}_from_{first}.csv"
-
-    def made(number: int) -> dict[str, object]:
-        return score_case(draw_case(group, kind, number), number)
-
-    numbers = [(number,) for number in range(first, first + cases)]
-    others = [*RESULTS.glob(f"{group}_{kind}_from_*.csv")]
-    resumed(path, ["case"], numbers, made, others=others)
-
-
-def rows_of(group: str, kind: str) -> list[dict[str, str]]:
-    """Return the rows of all files of a group and kind."""
-    files = sorted(RESULTS.glob(f"{group}_{kind}_from_*.csv"))
-    return [row for file in files for row in read(file)]
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
-
-    Args:
-        group: Group of worlds; all by default.
-        kind: Kind of cases; all by default.
-        first: Number of the first case.
-        cases: Number of cases.
-        summary: Whether to run nothing, and print the table of the rows.
-    """
-
-    group: Annotated[str | None, GROUPS] = None
-    kind: Kind | None = None
-    first: int = FIRST_JUDGED
-    cases: int = 40
-    summary: bool = False
-
-
-def main(arguments: Settings) -> None:
-    """Run what is asked for and print the summary."""
-    groups = (arguments.group,) if arguments.group else (*GROUPS,)
-    kinds = (arguments.kind,) if arguments.kind else KINDS
-    is_judged = arguments.first >= FIRST_JUDGED
-    seeds, pooled = "judging" if is_judged else "tuning", []
-    for group in groups:
-        rows = []
-        for kind in kinds:
-            if not arguments.summary:
-                run_kind(group, kind, arguments.first, arguments.cases)
-            every = rows_of(group, kind)
-            rows += [r for r in every if (int(r["case"]) >= FIRST_JUDGED) == is_judged]
-        pooled += rows
-        if rows:
-            print(f"\n## {group}, {seeds} seeds", *summary(rows), sep="\n")
-    if len(groups) > 1 and pooled:
-        print(f"\n## {' and '.join(groups)}, {seeds} seeds", *summary(pooled), sep="\n")
+main = benchmark(
+    Path(__file__).parent / "results" / "{group}_{kind}.csv",
+    row_of,
+    table,
+    may_fail=True,
+    group=GROUPS,
+    kind=KINDS,
+    case=range(2_580, 2_718),
+)

@@ -26,8 +26,8 @@ def summary(rows: Sequence[Row]) -> list[str]:
     Args:
         rows: Of all kinds, as the CSV files have them.
     """
-    failed = [r for r in rows if r["failure"]]
-    rows = [r for r in rows if not r["failure"]]
+    failed = [r for r in rows if r.get("failure")]
+    rows = [r for r in rows if not r.get("failure")]
     lines = [f"{len(rows)} cases, {len(failed)} failed"]
     lines += [f"failed {r['kind']} {r['case']}: {r['failure']}" for r in failed]
     if not rows:

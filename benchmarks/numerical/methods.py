@@ -1,7 +1,7 @@
 """Table 1 of the paper: five methods on the numerical model, at equal simulations.
 
-    python -m benchmarks numerical.methods --setting faithful --trials 10
-    python -m benchmarks numerical.methods --setting default --methods asbi alhi
+    python -m benchmarks numerical.methods --setting faithful
+    python -m benchmarks numerical.methods --setting default --method asbi alhi
 
 Every simulation counts: to train on, for the information gain, to refine a belief and
 to score a trial. "faithful" has each method as its authors do, 54,000 simulations a
@@ -20,9 +20,8 @@ method and setting, in benchmarks/numerical/results.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,6 +29,7 @@ from sbi.utils.metrics import c2st
 from torch import Tensor
 
 from benchmarks.numerical.run import (
+    NUM_ROUNDS,
     REPORTED,
     RESULTS,
     STAGES,
@@ -40,7 +40,7 @@ from benchmarks.numerical.run import (
     reference,
 )
 from benchmarks.numerical.run import run_trial as by_round
-from benchmarks.rows import column, published, resumed
+from benchmarks.rows import benchmark, column, grouped, published
 from sbi_active import Campaign, CampaignOptions, RefinementOptions
 from sbi_active.campaign.learning.methods import METHODS
 from sbi_active.campaign.options import CampaignDetails
@@ -49,7 +49,6 @@ from sbi_active.inference import LFIRE
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import Task
 
-NUM_ROUNDS = 4
 NUM_COMPARED = 1_000  # draws of each in the classifier test
 #: Of a round in the faithful setting, and in the default one for designing alone.
 NUM_FAITHFUL, NUM_DESIGN = 52_000, 15_700
@@ -78,21 +77,16 @@ FAITHFUL: dict[str, dict[str, Any]] = {
 }
 
 
-def faithful_options(method: str) -> CampaignOptions:
-    """Return the setting of a method's authors, for the numerical experiment.
-
-    This is :meth:`.CampaignOptions.faithful` for ASBI and NSBI; ALHI and NLHI have the
-    same network on x given (theta, action), beliefs by kernel density estimation and
-    nested Monte Carlo for the gain; SeqBED has LFIRE, at the same total of simulations.
-    """
-    return replace(CampaignOptions.faithful(), **FAITHFUL[method])
-
-
 def options_of(setting: str, method: str) -> CampaignOptions:
-    """Return a method's options, such that totals of simulations are alike."""
+    """Return a method's options, such that totals of simulations are alike.
+
+    Faithful is :meth:`.CampaignOptions.faithful` for ASBI and NSBI; ALHI and NLHI have
+    the same network on x given (theta, action), beliefs by kernel density estimation
+    and nested Monte Carlo for the gain; SeqBED has LFIRE, at the same total.
+    """
     designs = METHODS[method].designs
     if setting == "faithful":
-        options = faithful_options(method)
+        options = replace(CampaignOptions.faithful(), **FAITHFUL[method])
         return options if designs else replace(options, num_simulations=NUM_FAITHFUL)
     options = CampaignOptions()
     if method not in ("asbi", "nsbi"):
@@ -103,9 +97,10 @@ def options_of(setting: str, method: str) -> CampaignOptions:
     return options
 
 
-def run_trial(task: Task, method: str, setting: str, seed: int) -> list[dict[str, Any]]:
+def rows_of(setting: str, method: str, seed: int) -> list[dict[str, Any]]:
     """Return one row a round of one campaign."""
-    made = by_round(task, method, options_of(setting, method), seed, rounds=NUM_ROUNDS)
+    task = make_task("linear", "fixed", seed)
+    made = by_round(task, method, options_of(setting, method), seed)
     return [
         row | {"c2st": compared(task, campaign, index)}
         for index, (row, campaign) in enumerate(made)
@@ -128,20 +123,6 @@ def compared(task: Task, campaign: Campaign, index: int) -> Tensor | str:
     return c2st(*pair, seed=1)
 
 
-def run_method(
-    setting: str, method: str, trials: int, *, is_summary: bool = False
-) -> list[dict[str, str]]:
-    """Run the trials that are not in the file yet and return all its rows."""
-
-    def trial(seed: int) -> list[dict[str, Any]]:
-        return run_trial(make_task("linear", "fixed", seed), method, setting, seed)
-
-    path = RESULTS / f"methods_{setting}_{method}.csv"
-    seeds = [(seed,) for seed in range(trials) if not is_summary]
-    rows = resumed(path, ["seed"], seeds, trial)
-    return [row for row in rows if int(row["seed"]) < trials]
-
-
 def summary(name: str, rows: list[dict[str, str]]) -> list[str]:
     """Return the table's row of a method."""
     last = NUM_ROUNDS
@@ -160,35 +141,26 @@ def summary(name: str, rows: list[dict[str, str]]) -> list[str]:
     ]
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
-
-    Args:
-        methods: Names of methods.
-        setting: Name of the settings.
-        trials: Number of trials.
-        summary: Whether to run nothing, and print the table of the rows.
-    """
-
-    methods: Annotated[Sequence[str], METHODS] = (*METHODS,)
-    setting: Literal["faithful", "default"] = "default"
-    trials: int = 10
-    summary: bool = False
+def table(rows: list[dict[str, str]]) -> str:
+    """Return a table of each setting."""
+    parts, beside = [], published("numerical") | exact_limits()
+    for (setting,), found in grouped(rows, "setting").items():
+        lines = [summary(m, own) for (m,), own in grouped(found, "method").items()]
+        lines += [[k, *v, *[""] * 5] for k, v in beside.items()]
+        header = [f"{setting} (trials)", "median log p(truth), round 1 / 2 / .."]
+        header += [f"RepErr({a:g})" for a in REPORTED]
+        header += ["gap: median mean", "mean regret, round 1 / 2 / ..", "C2ST"]
+        header += ["simulations a round", "CPU s a round"]
+        parts.append(Table(header, lines).text())
+    return "\n\n".join(parts)
 
 
-def main(arguments: Settings) -> None:
-    """Run what is asked for and is not there yet, and print the table."""
-    table = []
-    for method in arguments.methods:
-        rows = run_method(
-            arguments.setting, method, arguments.trials, is_summary=arguments.summary
-        )
-        table.append(summary(method, rows))
-    beside = published("numerical") | exact_limits()
-    table += [[k, *v, *[""] * 5] for k, v in beside.items()]
-    header = [f"{arguments.setting} (trials)", "median log p(truth), round 1 / 2 / .."]
-    header += [f"RepErr({a:g})" for a in REPORTED]
-    header += ["gap: median mean", "mean regret, round 1 / 2 / ..", "C2ST"]
-    header += ["simulations a round", "CPU s a round"]
-    print(Table(header, table).text())
+main = benchmark(
+    RESULTS / "methods_{setting}_{method}.csv",
+    rows_of,
+    table,
+    default={"setting": ("default",)},
+    setting=("faithful", "default"),
+    method=METHODS,
+    seed=range(10),
+)

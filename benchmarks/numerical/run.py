@@ -1,9 +1,9 @@
 """Campaigns on tasks with exact inference, beside the paper and the exact limit.
 
     python -m benchmarks numerical                       # theta_true = (-3, 1)
-    python -m benchmarks numerical --truth random --trials 40 --settings default
-    python -m benchmarks numerical --task sinh --settings default --methods asbi
-    python -m benchmarks numerical --task oscillator --settings default default_500
+    python -m benchmarks numerical --truth random --seeds 0 40 --setting default
+    python -m benchmarks numerical --task sinh --setting default --method asbi
+    python -m benchmarks numerical --task oscillator --setting default default_500
 
 Resumable: a trial that stands in the CSV is not run again. One row a round, one file a
 setting, in benchmarks/numerical/results; the table is printed at the end.
@@ -12,16 +12,16 @@ setting, in benchmarks/numerical/results; the table is printed at the end.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from benchmarks.rounds import played
-from benchmarks.rows import column, published, read, resumed
+from benchmarks.rows import benchmark, column, grouped, published, read
 from sbi_active import Campaign, CampaignOptions, RefinementOptions
 from sbi_active.campaign import Trial
 from sbi_active.display.table import Table
@@ -40,6 +40,9 @@ SETTINGS: dict[str, CampaignOptions] = {
 }
 NUMERICAL = ("linear", "sinh", "square")
 STAGES = ("simulation", "training", "design", "update")
+NUM_ROUNDS = 4
+#: Relative error of executed actions, and the end of the names of tasks that have it.
+JITTER, JITTERED = 0.1, "_jittered"
 
 
 def make_task(name: str, truth: str, seed: int) -> Task:
@@ -60,38 +63,12 @@ def reference(task: Task, trials: Sequence[Trial]) -> Any:
     return task.reference(torch.stack([t.action for t in trials]), x)
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
-
-    Args:
-        task: Name of the task.
-        truth: Truth of every campaign, the paper's or a draw of the prior.
-        trials: Number of trials.
-        rounds: Number of rounds.
-        methods: Names of methods.
-        settings: Names of the settings.
-        jitter: Relative error of executed actions.
-        summary: Whether to run nothing, and print the table of the rows.
-    """
-
-    task: Annotated[str, [*NUMERICAL, "oscillator"]] = "linear"
-    truth: Literal["fixed", "random"] = "fixed"
-    trials: int = 20
-    rounds: int = 4
-    methods: Sequence[str] = ("asbi", "nsbi")
-    settings: Sequence[str] = ("faithful", "default")
-    jitter: float = 0.0
-    summary: bool = False
-
-
 def run_trial(
     task: Task,
     method: str,
     options: CampaignOptions,
     seed: int,
     *,
-    rounds: int,
     jitter: float = 0.0,
 ) -> Iterator[tuple[dict[str, object], Campaign]]:
     """Yield the row of each round of one campaign, and the campaign.
@@ -101,7 +78,6 @@ def run_trial(
         method: Name of the method.
         options: Of the campaign.
         seed: Its seed.
-        rounds: How many.
         jitter: Relative error of executed actions.
     """
 
@@ -113,7 +89,7 @@ def run_trial(
         return action * (1 + jitter * torch.randn(action.shape, generator=generator))
 
     own = {"method": method, "options": options, "executed": executed}
-    for index, (campaign, _) in enumerate(played(task, seed, rounds, **own)):
+    for index, (campaign, _) in enumerate(played(task, seed, NUM_ROUNDS, **own)):
         gain = None
         if task.name == "numerical":
             before = reference(task, campaign.history[:-1])
@@ -166,20 +142,14 @@ def round_row(
     return row
 
 
-def run_setting(arguments: Settings, method: str, setting: str) -> list[dict]:
-    """Run the trials that are not in the file yet and return all its rows."""
-    name = f"{arguments.task}_{arguments.truth}_{setting}_{method}"
-    name += f"_jitter_{arguments.jitter:g}" if arguments.jitter else ""
-
-    def trial(seed: int) -> list[dict[str, object]]:
-        task = make_task(arguments.task, arguments.truth, seed)
-        given = {"rounds": arguments.rounds, "jitter": arguments.jitter}
-        return [r for r, _ in run_trial(task, method, SETTINGS[setting], seed, **given)]
-
-    seeds = [(s,) for s in range(arguments.trials) if not arguments.summary]
-    path = RESULTS / f"{name}.csv"
-    rows = resumed(path, ["seed"], seeds, trial)
-    return [row for row in rows if int(row["seed"]) < arguments.trials]
+def rows_of(
+    name: str, truth: str, setting: str, method: str, seed: int
+) -> list[dict[str, object]]:
+    """Return one row a round of one campaign."""
+    task = make_task(name.removesuffix(JITTERED), truth, seed)
+    jitter = JITTER if name.endswith(JITTERED) else 0.0
+    made = run_trial(task, method, SETTINGS[setting], seed, jitter=jitter)
+    return [row for row, _ in made]
 
 
 def exact_limits() -> dict[str, tuple[str, ...]]:
@@ -228,19 +198,39 @@ def summary(name: str, rows: list[dict[str, str]]) -> list[str]:
     ]
 
 
-def main(arguments: Settings) -> None:
-    """Run what is asked for and is not there yet, and print the table."""
-    table = []
-    for setting in arguments.settings:
-        for method in arguments.methods:
-            rows = run_setting(arguments, method, setting)
-            table.append(summary(f"{setting}, {method.upper()}", rows))
-    header = [f"{arguments.task}, truth {arguments.truth} (trials)"]
-    header += ["median log p(truth), round 1 / 2 / ..", "gap: median mean 95 %"]
-    header += ["median KL", "regret r1 / r2", "in 50, 90 % region", "(exact's own)"]
-    header += [f"RepErr({a:g})" for a in REPORTED]
-    header += ["simulations, CPU s a round"]
-    if arguments.truth == "fixed" and arguments.task == "linear":
-        beside = published("numerical") | exact_limits()
-        table += [[k, v[0], *[""] * 5, *v[1:], ""] for k, v in beside.items()]
-    print(Table(header, table).text())
+def table(rows: list[dict[str, str]]) -> str:
+    """Return a table of each task and truth."""
+    parts = []
+    for (name, truth), found in grouped(rows, "task", "truth").items():
+        task = name.removesuffix(JITTERED)
+        lines = [
+            summary(f"{setting}, {method.upper()}", own)
+            for (setting, method), own in grouped(found, "setting", "method").items()
+        ]
+        header = [f"{task}, truth {truth} (trials)"]
+        header += ["median log p(truth), round 1 / 2 / ..", "gap: median mean 95 %"]
+        header += ["median KL", "regret r1 / r2", "in 50, 90 % region", "(exact's own)"]
+        header += [f"RepErr({a:g})" for a in REPORTED]
+        header += ["simulations, CPU s a round"]
+        if truth == "fixed" and task == "linear":
+            beside = published("numerical") | exact_limits()
+            lines += [[k, v[0], *[""] * 5, *v[1:], ""] for k, v in beside.items()]
+        parts.append(Table(header, lines).text())
+    return "\n\n".join(parts)
+
+
+main = benchmark(
+    RESULTS / "{task}_{truth}_{setting}_{method}.csv",
+    rows_of,
+    table,
+    default={
+        "task": ("linear",),
+        "truth": ("fixed",),
+        "setting": ("faithful", "default"),
+    },
+    task=(*NUMERICAL, "oscillator", "oscillator" + JITTERED),
+    truth=("fixed", "random"),
+    setting=SETTINGS,
+    method=("asbi", "nsbi"),
+    seed=range(20),
+)

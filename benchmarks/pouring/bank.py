@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -71,50 +71,60 @@ def draw(task: Any, part: str, number: int) -> tuple[Tensor, Tensor, Tensor]:
     return theta, action, row_seeds(seed, ROWS_A_FILE)
 
 
-@dataclass(frozen=True)
-class Filling:
-    """What is poured.
+def filling(
+    name: str, draw: Draw, parts: Sequence[str], num: int
+) -> Callable[..., None]:
+    """Return the main of a bank.
 
     Args:
-        folder: Folder of the pours.
-        part: Name of the part.
-        rows: Number of rows.
-        share: Share of the files that is poured, as in 0/2 and 1/2.
-        report: Whether to simulate nothing, and print what the folder holds.
+        name: Name of the task.
+        draw: Function of the task, a part and the number of a file.
+        parts: Names of the parts.
+        num: Number of rows by default.
     """
 
-    folder: Path
-    part: Annotated[str, PARTS] = PARTS[0]
-    rows: int = 6_000
-    share: str = "0/1"
-    report: bool = False
+    def main(
+        folder: Path,
+        *,
+        part: str = parts[0],
+        rows: int = num,
+        share: str = "0/1",
+        report: bool = False,
+    ) -> None:
+        """Simulate the files that are missing, and print what the folder holds.
+
+        Args:
+            folder: Folder of the pours.
+            part: Name of the part.
+            rows: Number of rows.
+            share: Share of the files that is poured, as in 0/2 and 1/2.
+            report: Whether to simulate nothing, and print what the folder holds.
+        """
+        own, (mine, of) = folder / part, map(int, share.split("/"))
+        own.mkdir(parents=True, exist_ok=True)
+        for number in () if report else range(mine, -(-rows // ROWS_A_FILE), of):
+            path = own / f"{number:05d}.npz"
+            if not path.exists():
+                _pour(path, get_task(name), *draw(get_task(name), part, number))
+        known = read(folder, part)
+        seconds = known.cpu_seconds / len(known)
+        print(f"{part}: {len(known)} pours, {seconds:.3f} CPU s each at the mean")
+
+    main.__annotations__["part"] = Annotated[str, parts]
+    return main
 
 
-def fill(filling: Filling, task: Any, draw: Draw) -> None:
-    """Simulate the files that are missing, and print what the folder holds."""
-    folder = filling.folder / filling.part
-    folder.mkdir(parents=True, exist_ok=True)
-    mine, of = map(int, filling.share.split("/"))
-    numbers = range(mine, -(-filling.rows // ROWS_A_FILE), of)
-    for number in () if filling.report else numbers:
-        path = folder / f"{number:05d}.npz"
-        if path.exists():
-            continue
-        theta, action, seeds = draw(task, filling.part, number)
-        start = time.process_time()
-        poses = task.pours.poses(theta, action, seeds)
-        spent = time.process_time() - start
-        whole = path.with_suffix(f".{os.getpid()}.part")
-        with whole.open("wb") as file:
-            np.savez(
-                file,
-                theta=theta.numpy(),
-                action=action.numpy(),
-                poses=poses,
-                cpu_seconds=spent,
-            )
-        whole.replace(path)
-    print(report(filling.folder, filling.part))
+def _pour(path: Path, task: Any, theta: Tensor, action: Tensor, seeds: Tensor) -> None:
+    """Write a file of pours, whole."""
+    start = time.process_time()
+    poses = task.pours.poses(theta, action, seeds)
+    spent = time.process_time() - start
+    known: dict[str, Any] = {"theta": theta.numpy(), "action": action.numpy()}
+    known |= {"poses": poses, "cpu_seconds": spent}
+    whole = path.with_suffix(f".{os.getpid()}.part")
+    with whole.open("wb") as file:
+        np.savez(file, **known)
+    whole.replace(path)
 
 
 def read(folder: Path, part: str) -> Rows:
@@ -150,13 +160,4 @@ def read_parts(folder: Path, parts: tuple[str, ...]) -> Rows:
     )
 
 
-def report(folder: Path, part: str) -> str:
-    """Return what a part holds and what it cost."""
-    rows = read(folder, part)
-    seconds = rows.cpu_seconds / len(rows)
-    return f"{part}: {len(rows)} pours, {seconds:.3f} CPU s each at the mean"
-
-
-def main(filling: Filling) -> None:
-    """Pour from the prior, as poses."""
-    fill(filling, get_task("pouring"), draw)
+main = filling("pouring", draw, PARTS, 6_000)

@@ -1,7 +1,7 @@
 """The paper's Figures 11 and 12: log p(truth) and selected actions by round.
 
     python -m benchmarks pouring --bank FOLDER                  # both targets
-    python -m benchmarks pouring --bank FOLDER --table coverage --rounds 3
+    python -m benchmarks pouring --bank FOLDER --target prior --method asbi
     python -m benchmarks pouring --summary
 
 Resumable: a trial that stands in the CSV is not run again. One row a round, one file a
@@ -19,10 +19,10 @@ The paper's Figure 12 and the selected actions from the rows of a run.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,9 +35,11 @@ from benchmarks.rounds import (
     Rows,
     active_against_random,
     by_round,
+    cells_of,
     coverage_table,
+    num_rounds,
 )
-from benchmarks.rows import column, read, resumed
+from benchmarks.rows import benchmark, column
 from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import get_task
@@ -59,8 +61,6 @@ def summarize(cells: Cells) -> str:
     Args:
         cells: Rows by method and target.
     """
-    if not cells:
-        return "no trials yet"
     log_p, chosen = [], []
     for (method, target), rows in cells.items():
         log_probs = by_round(rows, "log_prob_true")
@@ -134,23 +134,23 @@ def mean_log_p(rows: Rows, number: int) -> str:
     return f"{column(rows, 'log_prob_true', number).mean():.2f}"
 
 
-RESULTS = Path(__file__).parent / "results"
 METHODS = ("asbi", "nsbi", "alhi", "nlhi")
 ACTIVE, BY_NETWORK = ("asbi", "alhi"), ("alhi", "nlhi")
 NUM_DRAWS = 2_000  # behind the share of a belief that is denser than the truth
 
 
-def run_trial(
-    task: Any, learned: ByAction | ByNetwork, is_active: bool, seed: int, num: int
+def rows_of(
+    method: str, target: str, seed: int, *, bank: Path | None
 ) -> list[dict[str, object]]:
     """Return one row a round of one campaign."""
+    task, learned = make_task(target, seed), known(method in BY_NETWORK, bank)
     rows: list[dict[str, object]] = []
     for found in rounds(
         *(task, learned, lambda log_p: GridBelief(torch.from_numpy(log_p))),
         GridBelief.middles().double().numpy(),
-        num=num,
+        num=3 if target == "prior" else 6,
         seed=seed,
-        is_active=is_active,
+        is_active=method in ACTIVE,
         tempered=TEMPERED if isinstance(learned, ByAction) else 0.0,
     ):
         log_p = float(found.belief.log_prob(task.theta_true))
@@ -173,40 +173,11 @@ def run_trial(
     return rows
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
-
-    Args:
-        table: Name of the table.
-        bank: Folder of pours; needed for all but the summary.
-        target: Target of the paper; both by default.
-        methods: Names of methods.
-        trials: Number of trials.
-        first: Seed of the first trial.
-        rounds: Number of rounds.
-        results: Folder of the results.
-        summary: Whether to run nothing, and print the table of the rows.
-    """
-
-    table: Literal["paper", "coverage"] = "paper"
-    bank: Path = Path()
-    target: Literal["1", "2"] | None = None
-    methods: Annotated[Sequence[str], METHODS] = (*METHODS,)
-    trials: int = 5
-    first: int = 2_200
-    rounds: int = 6
-    results: Path = RESULTS
-    summary: bool = False
-
-    def __post_init__(self) -> None:
-        if self.bank == Path() and not self.summary:
-            raise SystemExit("expected --bank FOLDER; got none; make one, see bank.py")
-
-
-def known(method: str, bank: Path) -> ByAction | ByNetwork:
-    """Return what a method learns of the bank."""
-    is_network = method in BY_NETWORK
+@cache
+def known(is_network: bool, bank: Path | None) -> ByAction | ByNetwork:
+    """Return what is learned of the bank."""
+    if bank is None:
+        raise SystemExit("expected --bank FOLDER; got none; make one, see bank.py")
     return learn_networks(bank) if is_network else learn(bank, get_task("pouring"))
 
 
@@ -219,44 +190,24 @@ def make_task(target: str, seed: int) -> Any:
         return task.with_truth(task.prior.sample(torch.Size([1]))[0])
 
 
-def path_of(method: str, target: str, arguments: Settings) -> Path:
-    """Return the file of a method and target."""
-    return arguments.results / f"target_{target}_{method}.csv"
+def table(rows: Rows) -> str:
+    """Return the tables of the paper's targets, or how often regions hold truths."""
+    drawn = cells_of([row for row in rows if row["target"] == "prior"])
+    cells = cells_of([row for row in rows if row["target"] != "prior"])
+    parts = [summarize(cells)] if cells else []
+    if drawn:
+        numbers = range(1, 1 + max(map(num_rounds, drawn.values())))
+        parts.append(coverage_table(drawn, numbers, ("mean log p", mean_log_p)))
+    return "\n\n".join(parts) or "no trials yet"
 
 
-def run_missing(
-    method: str, target: str, learned: ByAction | ByNetwork, arguments: Settings
-) -> None:
-    """Run the trials that are not in the file yet."""
-
-    def trial(seed: int) -> list[dict[str, object]]:
-        task = make_task(target, seed)
-        return run_trial(task, learned, method in ACTIVE, seed, arguments.rounds)
-
-    last = arguments.first + arguments.trials
-    seeds = [(seed,) for seed in range(arguments.first, last)]
-    path = path_of(method, target, arguments)
-    resumed(path, ["seed"], seeds, trial)
-
-
-def main(arguments: Settings) -> None:
-    """Run the trials that are not there yet, and print the table."""
-    is_coverage = arguments.table == "coverage"
-    targets = [arguments.target] if arguments.target else ["1", "2"]
-    targets = ["prior"] if is_coverage else targets
-    if not arguments.summary:
-        for method in arguments.methods:
-            learned = known(method, arguments.bank)
-            for target in targets:
-                run_missing(method, target, learned, arguments)
-    cells = {}
-    for method in arguments.methods:
-        for target in targets:
-            rows = read(path_of(method, target, arguments))
-            if rows:
-                cells[method, target] = rows
-    if is_coverage:
-        last = ("mean log p", mean_log_p)
-        print(coverage_table(cells, range(1, arguments.rounds + 1), last))
-    else:
-        print(summarize(cells))
+main = benchmark(
+    Path(__file__).parent / "results" / "target_{target}_{method}.csv",
+    rows_of,
+    table,
+    given={"bank": "Folder of pours; needed for all but the summary."},
+    default={"target": ("1", "2")},
+    method=METHODS,
+    target=("1", "2", "prior"),
+    seed=range(2_200, 2_205),
+)

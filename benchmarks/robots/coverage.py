@@ -145,6 +145,6 @@ main = benchmark(
     ),
     machine=MACHINES,
     condition=CONDITIONS,
-    seed=range(2000, 2200),
+    seed=range(2000, 2240),
     way=WAYS,
 )

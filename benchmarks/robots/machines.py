@@ -9,9 +9,8 @@ is fitted does not have.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.robots.models import ARM, CART_POLE, SPRING_MASS
+from benchmarks.robots.models import MJCF
+from benchmarks.rows import toml
 from sbi_active.mujoco.models.spec import mujoco_of
 
 Array = NDArray[Any]
@@ -36,17 +36,35 @@ CONDITIONS = {
 GO2 = Path(__file__).parents[2] / "../shared/data/go2_in_air/go2_in_air.xml"
 #: Sines of a control, and the frequencies that they may have, Hz.
 NUM_SINES, FREQUENCIES = 3, (0.3, 2.0)
+NUM_LOGS = 4  # of a set
 
 
 @dataclass(frozen=True)
 class Unknown:
-    """A parameter: the box of its prior, where truths are drawn, and how it is set."""
+    """A parameter.
 
-    low: float
-    high: float
-    inner: tuple[float, float]
-    edit: Callable[[Any, str, float], None]
+    Attributes:
+        field: What it is: damping or armature of a joint, mass of a body, gear.
+        name: Name of the joint, the body or the actuator.
+        box: Ends of its prior.
+        inner: Ends between which truths are drawn.
+    """
+
+    field: str
     name: str
+    box: tuple[float, float]
+    inner: tuple[float, float]
+
+    def edit(self, spec: Any, value: float) -> None:
+        """Set it."""
+        if self.field == "gear":
+            spec.actuator(self.name).gear[0] = value
+        elif self.field == "mass":
+            spec.body(self.name).first_geom().mass = value
+        else:
+            joint = spec.joint(self.name)
+            shape = 0.0 * np.asarray(getattr(joint, self.field))
+            setattr(joint, self.field, value + shape)
 
 
 @dataclass(frozen=True)
@@ -54,26 +72,33 @@ class Machine:
     """A robot that is driven by sines.
 
     Attributes:
-        spec: Makes an ``MjSpec``.
+        mjcf: Its MJCF, as :func:`spec_of` takes it.
         unknown: Parameters by name.
         drive: Amplitude and center of each actuator's control.
         start: Half width of the uniform start of each joint.
         noise: Standard deviation of each sensor.
-        rough: Joints that have dry friction, and its unit, N or N m.
-        num: Logs of a set.
+        rough: Joints that have dry friction.
+        friction: Its unit, N or N m.
         seconds: Length of a log.
         every: Steps from sample to sample.
     """
 
-    spec: Callable[[], Any]
+    mjcf: str
     unknown: dict[str, Unknown]
-    drive: tuple[tuple[float, float], ...]
-    start: tuple[float, ...]
-    noise: tuple[float, ...]
-    rough: tuple[tuple[str, ...], float]
-    num: int = 4
-    seconds: float = 3.0
-    every: int = 1
+    drive: Sequence[tuple[float, float]]
+    start: Sequence[float]
+    noise: Sequence[float]
+    rough: Sequence[str]
+    friction: float
+    seconds: float
+    every: int
+
+    def spec(self) -> Any:
+        """Return an ``MjSpec`` with sensors, of the joints where it has none."""
+        spec = spec_of(self.mjcf)
+        if not spec.sensors:
+            _read_joints(spec)
+        return spec
 
 
 @dataclass(frozen=True)
@@ -109,22 +134,21 @@ def recorded(machine: Machine, condition: str, seed: int) -> Set:
     truth, params = [], sysid.ParameterDict()
     for name, own in machine.unknown.items():
         truth.append(rng.uniform(*own.inner))
-        own.edit(true, own.name, truth[-1])
+        own.edit(true, truth[-1])
 
         def modifier(spec: Any, given: Any, own: Unknown = own) -> None:
-            own.edit(spec, own.name, float(given.value[0]))
+            own.edit(spec, float(given.value[0]))
 
-        middle = 0.5 * (own.low + own.high)
-        params.add(sysid.Parameter(name, middle, own.low, own.high, modifier=modifier))
-    joints, unit = machine.rough
-    for joint in joints:
-        true.joint(joint).frictionloss = friction * unit
+        middle = 0.5 * sum(own.box)
+        params.add(sysid.Parameter(name, middle, *own.box, modifier=modifier))
+    for joint in machine.rough:
+        true.joint(joint).frictionloss = friction * machine.friction
     model = true.compile()
     data = mujoco.MjData(model)
     home = data.qpos.copy()
     times = np.arange(0.0, machine.seconds, model.opt.timestep)
     parts: tuple[list[Any], ...] = ([], [], [])
-    for _ in range(machine.num):
+    for _ in range(NUM_LOGS):
         control = sines(times, machine.drive, rng)
         data.qpos[:] = home + np.array(machine.start) * rng.uniform(-1, 1, model.nq)
         start = sysid.create_initial_state(model, data.qpos, 0 * data.qvel, data.act)
@@ -138,7 +162,7 @@ def recorded(machine: Machine, condition: str, seed: int) -> Set:
         parts[0].append(start)
         parts[1].append(sysid.TimeSeries(times, control))
         parts[2].append(sysid.TimeSeries.from_names(stamps, read, model, None))
-    names = [f"log {k}" for k in range(machine.num)]
+    names = [f"log {k}" for k in range(NUM_LOGS)]
     sequences = sysid.ModelSequences("robot", spec, names, *parts)
     return Set(sequences, params, np.array(truth))
 
@@ -168,32 +192,14 @@ def _errors(
     return errors
 
 
-# What is written.
-
-
-def _from(text: str) -> Any:
-    return mujoco_of().MjSpec.from_string(text)
-
-
-def _damping(spec: Any, name: str, value: float) -> None:
-    joint = spec.joint(name)
-    joint.damping = value + 0.0 * np.asarray(joint.damping)
-
-
-def _armature(spec: Any, name: str, value: float) -> None:
-    spec.joint(name).armature = value
-
-
-def _mass(spec: Any, name: str, value: float) -> None:
-    spec.body(name).first_geom().mass = value
-
-
-def _gear(spec: Any, name: str, value: float) -> None:
-    spec.actuator(name).gear[0] = value
-
-
-READ_ARM = """<sensor><jointpos name="shoulder" joint="shoulder"/>
-<jointpos name="elbow" joint="elbow"/></sensor></mujoco>"""
+def spec_of(mjcf: str) -> Any:
+    """Return a spec: of a package and a path in it, of ``mjcf``, or the Go2's leg."""
+    package, _, path = mjcf.partition(" ")
+    if path:
+        return shipped(package, path)
+    if mjcf == "go2":
+        return go2_leg()
+    return mujoco_of().MjSpec.from_file(str(MJCF / f"{mjcf}.xml"))
 
 
 def shipped(package: str, path: str) -> Any:
@@ -210,20 +216,6 @@ def shipped(package: str, path: str) -> Any:
     for number, actuator in enumerate(spec.actuators):
         if not actuator.name:
             actuator.name = f"motor {number + 1}"
-    return spec
-
-
-def swimmer() -> Any:
-    """Return gymnasium's swimmer, three links that float in a viscous medium."""
-    spec = shipped("gymnasium", "envs/mujoco/assets/swimmer.xml")
-    _read_joints(spec)
-    return spec
-
-
-def reacher() -> Any:
-    """Return dm_control's reacher, two links in a horizontal plane."""
-    spec = shipped("dm_control", "suite/reacher.xml")
-    _read_joints(spec)
     return spec
 
 
@@ -257,81 +249,10 @@ def _read_joints(spec: Any) -> None:
         )
 
 
-MACHINES = {
-    "spring-mass": Machine(
-        partial(_from, SPRING_MASS),
-        {
-            "mass": Unknown(0.3, 3.0, (0.7, 1.6), _mass, "cart"),
-            "damping": Unknown(0.0, 5.0, (0.4, 2.0), _damping, "slide"),
-        },
-        drive=((5.0, 0.0),),
-        start=(0.2,),
-        noise=(0.005, 0.02),
-        rough=(("slide",), 1.0),
-    ),
-    "cart-pole": Machine(
-        partial(_from, CART_POLE),
-        {
-            "mass": Unknown(0.3, 3.0, (0.7, 1.6), _mass, "cart"),
-            "damping": Unknown(0.0, 5.0, (0.4, 2.0), _damping, "slide"),
-            "pole damping": Unknown(0.0, 0.05, (0.002, 0.02), _damping, "hinge"),
-        },
-        drive=((2.5, 0.0),),
-        start=(0.1, 0.5),
-        noise=(0.005, 0.01),
-        rough=(("slide",), 1.0),
-    ),
-    "two-link arm": Machine(
-        partial(_from, ARM.replace("</mujoco>", READ_ARM)),
-        {
-            "lower mass": Unknown(0.1, 2.0, (0.3, 0.9), _mass, "lower"),
-            "elbow damping": Unknown(0.0, 3.0, (0.2, 1.2), _damping, "elbow"),
-            "elbow armature": Unknown(0.0, 0.2, (0.01, 0.08), _armature, "elbow"),
-        },
-        drive=((0.6, 0.4), (0.8, 0.5)),
-        start=(0.2, 0.2),
-        noise=(0.003, 0.003),
-        rough=(("shoulder", "elbow"), 0.5),
-        every=2,
-    ),
-    "Go2 leg": Machine(
-        go2_leg,
-        {
-            "thigh damping": Unknown(0.0, 4.0, (0.2, 1.5), _damping, "FL_thigh_joint"),
-            "calf damping": Unknown(0.0, 4.0, (0.2, 1.5), _damping, "FL_calf_joint"),
-            "calf armature": Unknown(0.0, 0.3, (0.01, 0.1), _armature, "FL_calf_joint"),
-        },
-        drive=((0.4, 0.0), (0.4, 0.9), (0.6, -1.8)),
-        start=(0.0, 0.0, 0.0),
-        noise=(0.002, 0.002, 0.002),
-        rough=(("FL_hip_joint", "FL_thigh_joint", "FL_calf_joint"), 1.0),
-        num=4,
-        seconds=2.0,
-        every=5,
-    ),
-    "swimmer": Machine(
-        swimmer,
-        {
-            "gear": Unknown(75.0, 300.0, (100.0, 200.0), _gear, "motor 1"),
-            "damping": Unknown(0.0, 40.0, (2.0, 12.0), _damping, "motor1_rot"),
-            "armature": Unknown(0.0, 10.0, (0.2, 3.0), _armature, "motor1_rot"),
-        },
-        drive=((0.3, 0.0), (0.3, 0.0)),
-        start=(0.0, 0.0, 0.0, 0.1, 0.1),
-        noise=(0.005, 0.005, 0.005, 0.005, 0.005),
-        rough=(("motor1_rot", "motor2_rot"), 10.0),
-        every=2,
-    ),
-    "reacher": Machine(
-        reacher,
-        {
-            "shoulder damping": Unknown(0.0, 0.05, (0.005, 0.02), _damping, "shoulder"),
-            "hand mass": Unknown(0.01, 0.2, (0.02, 0.08), _mass, "hand"),
-            "wrist armature": Unknown(0.0, 1e-3, (1e-4, 5e-4), _armature, "wrist"),
-        },
-        drive=((0.6, 0.0), (0.4, 0.0)),
-        start=(0.5, 0.5),
-        noise=(0.005, 0.005),
-        rough=(("shoulder", "wrist"), 0.006),
-    ),
-}
+def _machine(*, unknown: dict[str, Any], **row: Any) -> Machine:
+    each = {name: Unknown(**own) for name, own in unknown.items()}
+    return Machine(unknown=each, **row)
+
+
+ROWS = toml(Path(__file__).with_suffix(".toml"))
+MACHINES = {name: _machine(**row) for name, row in ROWS.items()}

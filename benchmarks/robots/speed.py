@@ -32,6 +32,7 @@ from sbi_active.mujoco.models.spec import mujoco_of
 
 RESULT = Path(__file__).with_suffix(".json")
 SECONDS = 1.0
+NUM_ROWS, REPEATS = 64, 5
 MODELS = {
     "pendulum": (PENDULUM, "hinge", 0.0, 0.1),
     "spring-mass": (SPRING_MASS, "slide", 0.0, 1.0),
@@ -81,21 +82,21 @@ def ways(xml: Any, joint: str, low: float, high: float, num: int) -> dict[str, A
     return {"run": run, "steps": steps, "difference": difference}
 
 
-def measured(models: dict[str, Any], num: int, repeats: int) -> dict[str, Any]:
+def measured(models: dict[str, Any]) -> dict[str, Any]:
     """Return rows a CPU second, by model and way."""
     result = {}
     for name, given in models.items():
         xml, joint, low, high = given
-        own = ways(xml, joint, low, high, num)
-        spent = in_turn(own["run"], repeats, time.process_time)
+        own = ways(xml, joint, low, high, NUM_ROWS)
+        spent = in_turn(own["run"], REPEATS, time.process_time)
         result[name] = {
             "steps": own["steps"],
             "largest_difference_from_bare": own["difference"],
             "rows_per_cpu_second": {
                 way: {
-                    "median": round(num / float(np.median(each)), 1),
-                    "lowest": round(num / max(each), 1),
-                    "highest": round(num / min(each), 1),
+                    "median": round(NUM_ROWS / float(np.median(each)), 1),
+                    "lowest": round(NUM_ROWS / max(each), 1),
+                    "highest": round(NUM_ROWS / min(each), 1),
                 }
                 for way, each in spent.items()
             },
@@ -104,28 +105,22 @@ def measured(models: dict[str, Any], num: int, repeats: int) -> dict[str, Any]:
     return result
 
 
-def main(
-    *, rows: int = 64, repeats: int = 5, go2: Path | None = None, out: Path = RESULT
-) -> None:
+def main(*, go2: Path | None = None) -> None:
     """Run from a shell.
 
     Args:
-        rows: Number of rows.
-        repeats: Number of repeats.
         go2: File of the Go2's model.
-        out: File of the results.
     """
     mujoco = mujoco_of()
     models: dict[str, Any] = dict(MODELS)
     if go2 is not None:
         spec = mujoco.MjSpec.from_file(str(go2))
         models["quadruped, 12 joints"] = (spec, "FL_calf_joint", 0.0, 1.0)
-    found = measured(models, rows, repeats)
     record = {
         "date": date.today().isoformat(),
         "mujoco": mujoco.__version__,
-        "rows": rows,
-        "repeats": repeats,
-        "models": found,
+        "rows": NUM_ROWS,
+        "repeats": REPEATS,
+        "models": measured(models),
     }
-    keep(out, record)
+    keep(RESULT, record)

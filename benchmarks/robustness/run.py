@@ -17,7 +17,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 from xml.etree import ElementTree
@@ -93,7 +92,7 @@ def run(area: str, *, fresh: bool) -> None:
         print(f"{area}: {row['attack']} [{row['case']}]: {word}", flush=True)
 
 
-def summary() -> Iterator[str]:
+def table() -> Iterator[str]:
     """Yield the table: tried and survived by area, then what was not survived."""
     lost: list[str] = []
     total = [0, 0]
@@ -109,24 +108,20 @@ def summary() -> Iterator[str]:
     yield from lost
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
+def main(
+    *,
+    area: Annotated[str | None, AREAS] = None,
+    fresh: bool = False,
+    summary: bool = False,
+) -> None:
+    """Run what is missing and print the table.
 
     Args:
         area: Name of the area; all by default.
         fresh: Whether to run all cases again.
         summary: Whether to run nothing, and print the table of the rows.
     """
-
-    area: Annotated[str | None, AREAS] = None
-    fresh: bool = False
-    summary: bool = False
-
-
-def main(arguments: Settings) -> None:
-    """Run what is missing and print the table."""
-    areas = (arguments.area,) if arguments.area else AREAS
-    for area in () if arguments.summary else areas:
-        run(area, fresh=arguments.fresh)
-    print("\n".join(summary()))
+    areas = (area,) if area else (*AREAS,)
+    for name in () if summary else areas:
+        run(name, fresh=fresh)
+    print("\n".join(table()))

@@ -21,7 +21,6 @@ import tempfile
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
@@ -45,7 +44,7 @@ def fetch_tests(folder: Path) -> Path:
     return root
 
 
-def run_tests(root: Path, files: list[str], *, swap: bool) -> dict[str, str]:
+def run_tests(root: Path, files: Sequence[str], *, swap: bool) -> dict[str, str]:
     """Return the outcome of every test by its name."""
     report = root / f"report_{'swapped' if swap else 'original'}.xml"
     command = [sys.executable, "-m", "pytest", "-q", *files, f"--junitxml={report}"]
@@ -62,33 +61,22 @@ def run_tests(root: Path, files: list[str], *, swap: bool) -> dict[str, str]:
     return outcomes
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
+def main(*, files: Sequence[str] | None = None) -> None:
+    """Run what is asked for and is not there yet, and print the table.
 
     Args:
         files: Names of the test files; all by default.
     """
-
-    files: Sequence[str] | None = None
-
-
-def main(arguments: Settings) -> None:
-    """Run what is asked for and is not there yet, and print the table."""
     with tempfile.TemporaryDirectory() as folder:
         root = fetch_tests(Path(folder))
-        files = (
-            [*arguments.files]
-            if arguments.files
-            else sorted(
-                f"tests/{path.name}"
-                for path in (root / "tests").glob("*_test.py")
-                if USES_NPE.search(path.read_text())
-                and path.name != "tutorials_test.py"
-            )
-        )
-        original = run_tests(root, files, swap=False)
-        swapped = run_tests(root, files, swap=True)
+        every = sorted((root / "tests").glob("*_test.py"))
+        chosen = files or [
+            f"tests/{path.name}"
+            for path in every
+            if USES_NPE.search(path.read_text()) and path.name != "tutorials_test.py"
+        ]
+        original = run_tests(root, chosen, swap=False)
+        swapped = run_tests(root, chosen, swap=True)
     differ = {
         name: [original.get(name, "absent"), swapped.get(name, "absent")]
         for name in sorted(original.keys() | swapped.keys())
@@ -98,7 +86,7 @@ def main(arguments: Settings) -> None:
         "command": "python -m benchmarks sbi_suite",
         "date": date.today().isoformat(),
         "sbi": version("sbi"),
-        "files": files,
+        "files": [*chosen],
         "original": Counter(original.values()),
         "swapped": Counter(swapped.values()),
         "differ": differ,

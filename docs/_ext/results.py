@@ -24,16 +24,15 @@ EMPTY = re.compile(r"nan( (/|\+-) nan)*")
 TABLES = {
     "The paper's numerical model": (
         "numerical --summary",
-        "numerical --summary --trials 60 --settings default --methods asbi",
-        "numerical --summary --truth random --trials 40 "
-        "--settings default --methods asbi",
-        "numerical --summary --task sinh --settings default default_500 --methods asbi",
-        "numerical --summary --task square "
-        "--settings default default_500 --methods asbi",
+        "numerical --summary --seeds 0 60 --setting default --method asbi",
+        "numerical --summary --truth random --seeds 0 40 "
+        "--setting default --method asbi",
+        "numerical --summary --task sinh --setting default default_500 --method asbi",
+        "numerical --summary --task square --setting default default_500 --method asbi",
         "numerical --summary --task oscillator --truth random "
-        "--settings default default_500 --methods asbi",
-        "numerical --summary --task oscillator --truth random "
-        "--jitter 0.1 --settings default --methods asbi",
+        "--setting default default_500 --method asbi",
+        "numerical --summary --task oscillator_jittered --truth random "
+        "--setting default --method asbi",
     ),
     "Table 1 of the paper": (
         "numerical.methods --summary --setting faithful",
@@ -54,18 +53,17 @@ TABLES = {
     "Campaigns on disk": ("table cost/directory.json --only tell* load,* *near*",),
     "Box collision": (
         "box_collision --summary",
-        "box_collision --summary --table coverage --rounds 3",
-        "box_collision --summary --setting learned "
-        "--methods asbi nsbi alhi nlhi --trials 10",
+        "box_collision --summary --setting coverage --target prior --seeds 0 40",
+        "box_collision --summary --setting learned --method asbi nsbi alhi nlhi",
     ),
     "The closed loop, on worlds whose truth is known": (
-        *(f"criticism --summary --table loop --world {world}" for world in "ABCD"),
+        *(f"criticism --summary --world {world}" for world in "ABCD"),
         *(
-            f"criticism --summary --table {table} --world {world} --trials 12"
-            for table in ("open", "pairs")
+            f"criticism --summary --kind {kinds} --world {world}"
+            for kinds in ("removed inexpressible outside", "pair")
             for world in "AB"
         ),
-        "criticism --summary --table active --world A",
+        "criticism --summary --kind active --world A",
     ),
     "Verdicts where every model is wrong": (
         "misfit --summary",

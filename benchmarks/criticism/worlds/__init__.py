@@ -3,7 +3,7 @@
 from benchmarks.criticism.worlds import box, numerical, sliding_block
 from benchmarks.criticism.worlds.world import World
 
-__all__ = ["World", "get_world"]
+__all__ = ["WORLDS", "World", "get_world"]
 
 WORLDS = {
     "A": numerical.make_world,

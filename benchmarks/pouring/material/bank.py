@@ -13,16 +13,14 @@ One bank serves beads and gravel: where all particles have one density it cancel
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.pouring.bank import ROWS_A_FILE, Filling, fill
+from benchmarks.pouring.bank import ROWS_A_FILE, filling
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
-from sbi_active.tasks import get_task
 from sbi_active.tasks.pouring.real import COMPARED_AT, HEIGHTS, RATES
 
 PARTS = ("prior", "compared")
@@ -49,14 +47,4 @@ def draw(task: Any, part: str, number: int) -> tuple[Tensor, Tensor, Tensor]:
     return theta, torch.tensor(action).float(), row_seeds(seed, ROWS_A_FILE)
 
 
-@dataclass(frozen=True)
-class MaterialFilling(Filling):
-    """What is poured of the eight-parameter model."""
-
-    part: Annotated[str, PARTS] = PARTS[0]
-    rows: int = 300
-
-
-def main(filling: MaterialFilling) -> None:
-    """Pour from the prior of the eight-parameter model."""
-    fill(filling, get_task("pouring_real"), draw)
+main = filling("pouring_real", draw, PARTS, 300)

@@ -19,7 +19,6 @@ Figure 16 of the paper, from the rows of a run.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -113,7 +112,7 @@ def checks_table(rows: Rows) -> str:
     )
 
 
-RESULTS = Path(__file__).parents[1] / "results"
+RESULTS, FILE = Path(__file__).parents[1] / "results", "intervol.csv"
 METHODS = ("asbi", "nsbi")
 MATERIALS = ("beads", "gravel")
 NUM_ROUNDS = 4
@@ -159,30 +158,9 @@ def poured(belief: PointBelief, material: str, num: int, seed: int) -> np.ndarra
     return torch.stack(each).mean(0).double().numpy()
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What is run.
-
-    Args:
-        bank: Folder of pours.
-        trials: Number of trials.
-        first: Number of the first case.
-        check: Number of pours of each belief; none by default.
-        results: Folder of the results.
-        summary: Whether to run nothing, and print the table of the rows.
-    """
-
-    bank: Path | None = None
-    trials: int = 3
-    first: int = 2_300
-    check: int = 0
-    results: Path = RESULTS
-    summary: bool = False
-
-
-def run_missing(bank: Path, learned: ByAction, arguments: Settings) -> None:
+def run_missing(bank: Path, seeds: range, num_poured: int) -> None:
     """Run the trials, or the checks, that are not in the files yet."""
-    last = arguments.first + arguments.trials
+    learned = learn(bank)
     for material in MATERIALS:
         task: Any = get_task("pouring_real", material=material)
         overlap = compared_pours(bank, compared_images(material))
@@ -200,24 +178,34 @@ def run_missing(bank: Path, learned: ByAction, arguments: Settings) -> None:
             seed: int, material: str, method: str, trial: Any = trial
         ) -> dict[str, object]:
             made, belief = trial(method, seed)
-            volume = poured(belief, material, arguments.check, seed)
+            volume = poured(belief, material, num_poured, seed)
             error = volume.std(ddof=1) / np.sqrt(len(volume))
             told = {"num": len(volume), "poured": volume.mean(), "poured_se": error}
             return told | {"learned": made[-1]["intervol"]}
 
-        jobs = [(s, material, m) for s in range(arguments.first, last) for m in METHODS]
-        is_check = arguments.check > 0
-        name = "intervol_poured.csv" if is_check else "intervol.csv"
-        path = arguments.results / name
-        keys = ("seed", "material", "method")
-        resumed(path, keys, jobs, check if is_check else rows)
+        jobs = [(seed, material, m) for seed in seeds for m in METHODS]
+        path, make = ("intervol_poured.csv", check) if num_poured else (FILE, rows)
+        resumed(RESULTS / path, ("seed", "material", "method"), jobs, make)
 
 
-def main(arguments: Settings) -> None:
-    """Run what is asked for and is not there yet, and print the table."""
-    if not arguments.summary:
-        if arguments.bank is None:
+def main(
+    *,
+    bank: Path | None = None,
+    seeds: tuple[int, int] = (2_300, 2_303),
+    check: int = 0,
+    summary: bool = False,
+) -> None:
+    """Run what is asked for and is not there yet, and print the table.
+
+    Args:
+        bank: Folder of pours.
+        seeds: First, and one past the last.
+        check: Number of pours of each belief; none by default.
+        summary: Whether to run nothing, and print the table of the rows.
+    """
+    if not summary:
+        if bank is None:
             raise SystemExit("expected --bank FOLDER; got none; make one, see bank.py")
-        run_missing(arguments.bank, learn(arguments.bank), arguments)
-    print(summarize(read(arguments.results / "intervol.csv")))
-    print(checks_table(read(arguments.results / "intervol_poured.csv")))
+        run_missing(bank, range(*seeds), check)
+    print(summarize(read(RESULTS / FILE)))
+    print(checks_table(read(RESULTS / "intervol_poured.csv")))
