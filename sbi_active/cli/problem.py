@@ -47,6 +47,7 @@ def load_object(name: str, kind: Any = object) -> Any:
     module, _, attribute = name.partition(":")
     file = Path(module).resolve() if module.endswith(".py") else None
     if file is not None:
+        require(file.is_file(), "a file", f"none at {file}", "check the path")
         sys.path.insert(0, str(file.parent))
         module = file.stem
     elif (here := os.getcwd()) in sys.path:  # before what is installed

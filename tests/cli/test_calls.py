@@ -126,6 +126,7 @@ CALLS = [
         (2, text, [*OF, name, *ASK])
         for text, name in (
             ("expected MODULE:NAME", "sled"),
+            ("expected a file; got none at", "torch.py:nn"),
             ("has no attribute 'none'", "sled.py:none"),
             ("expected a function", "odd.py:NUMBER"),
             ("got ZeroDivisionError", "divides.py:f"),

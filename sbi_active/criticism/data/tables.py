@@ -89,8 +89,9 @@ def read_trials(
     is_long = bool(found[TRIAL] or found[TIME] or own_inputs)
     set_by = ["action"] * (not (own_inputs or beside))
     require_columns(found, [*[TRIAL, TIME] * is_long, *set_by, "x"], source)
-    num = sum(map(len, parts.values()))
-    require(num > 0, "a header, and one row a trial or sample", source, "write them")
+    for file, frame in parts.items():
+        expected = "a header, and one row a trial or sample"
+        require(len(frame) > 0, expected, f"no rows in {file}", "write them")
     used = [column for group in found.values() for column in group]
     converted = [c for c in used if c.factor != 1 and c not in found[TIME]]
     if converted:  # the last version left them in their unit
@@ -245,6 +246,13 @@ def _trials(cells: Cells, beside: Cells | None) -> dict[str, Any]:
         found["sample_times"] = [s[:, 0] for s in samples]
     for column in columns["role"]:
         roles = cells.constant(column, cells.words(column))
+        for row, role in zip(first, roles, strict=True):
+            require(
+                role.replace("_", " ") in ("", "fit", "held out"),
+                f"a role 'fit' or 'held out' in column {column.header}",
+                f"{role!r} in {cells.place(row)} of {cells.file(row)}",
+                "write one of them, or leave it empty for fit",
+            )
         found["role"] = [role or "fit" for role in roles]
     for column in columns["repeat_of"]:
         cells.constant(column, cells.words(column))

@@ -73,6 +73,9 @@ def test_recordings_with_other_columns_or_the_same_numbers_are_refused():
     write("b.csv", "0,1,5", "100,1,6")
     with pytest.raises(ValueError, match="same numbers in trials a and b of runs"):
         Trials.from_csv("runs")
+    write("b.csv")
+    with pytest.raises(ValueError, match=r"a header, and .* no rows in runs/b\.csv"):
+        Trials.from_csv("runs")
     Path("empty").mkdir()
     with pytest.raises(ValueError, match="expected recordings in empty; got no"):
         Trials.from_csv("empty")

@@ -123,6 +123,11 @@ SHORT = "trial,time,action_v,x_y"
         ),
         (["1,0,1,5", "2,0,1,5"], SHORT, "the same numbers in trials 1 and 2 of trials"),
         (["1,0,1,5,fit", "1,1,1,4,held out"], f"{SHORT},role", "value of role in each"),
+        (
+            ["1,0,1,5,", "2,0,1,4,held_out", "3,0,1,6,test"],
+            f"{SHORT},role",
+            r"'held out' in column role; got 'test' in row 3 \(trial 3\) of trials",
+        ),
         (["1,0,1,5,3", "2,0,1,4,3"], f"{SHORT},index", "got index 3 in rows 1 and 2"),
         (["1\t0\t1\t5"], "trial\ttime\taction_v\tx_y", r"by commas.*sep='\\t'\)\)"),
         (
