@@ -34,16 +34,15 @@ from sbi_active import (
     MixtureDensity,
     simulate,
 )
+from sbi_active.inference.networks.mixture_density import MixtureDetails
 from sbi_active.seeding import forked_generators
 from sbi_active.tasks import get_task  # pyright: ignore
 
 BEFORE = MixtureDensity(
     hidden_features=(128, 128),
     num_components=5,
-    activation="relu",
     num_iterations=400,
-    batch_size=100,
-    learning_rate=5e-3,
+    details=MixtureDetails(activation="relu", batch_size=100, learning_rate=5e-3),
 )
 WAYS = {"before": BEFORE, "now": MixtureDensity()}
 NUM_ROWS, NUM_FRESH = 5_000, 10_000

@@ -107,11 +107,12 @@ def learn_networks(folder: Path) -> ByNetwork:
     rows = read_parts(folder, PARTS)
     mesh, small = summaries_of(rows, task)
     mean, axes = components(small, NUM_COMPONENTS)
+    faithful = MixtureDensity.faithful()
     settings = replace(
-        MixtureDensity.faithful(),
+        faithful,
         hidden_features=HIDDEN,
         num_iterations=NUM_ITERATIONS,
-        batch_size=BATCH,
+        details=replace(faithful.details, batch_size=BATCH),
     )
     networks = []
     for summary in ((small - mean) @ axes, np.sqrt(mesh)):

@@ -36,6 +36,7 @@ from sbi_active import (
 from sbi_active.campaign.health import is_off
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.diagnostics.calibration import clopper_pearson
+from sbi_active.inference.networks.mixture_density import MixtureDetails
 from sbi_active.seeding import derive_seed, forked_generators
 
 RESULTS = Path(__file__).parent / "results" / "health.csv"
@@ -48,7 +49,10 @@ NUM_TRIALS = 3
 PRIOR = MultivariateNormal(torch.zeros(2), torch.eye(2))
 ACTIONS = BoxActions([0.5], [2.0])
 NETWORK = MixtureDensity(
-    hidden_features=(8,), num_components=1, num_iterations=5, baseline="none"
+    hidden_features=(8,),
+    num_components=1,
+    num_iterations=5,
+    details=MixtureDetails(baseline="none"),
 )
 CHEAP = CampaignOptions(
     num_simulations=100,
