@@ -112,19 +112,29 @@ class Page:
 @cache
 def templates() -> Any:
     """Return the templates of this room."""
+    made = environment("sbi_active", "display", autoescape=True, finalize=_with_signs)
+    made.filters["svg"] = svg
+    return made
+
+
+def environment(package: str, folder: str, **options: Any) -> Any:
+    """Return the templates of a folder, in which a missing value is an error.
+
+    Args:
+        package: Package that has the folder.
+        folder: Folder of the templates.
+        **options: Further options of Jinja's environment.
+    """
     # Not at import: most who import the package make no page.
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    environment = Environment(
-        loader=PackageLoader("sbi_active", "display"),
-        autoescape=True,
+    return Environment(
+        loader=PackageLoader(package, folder),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        finalize=_with_signs,
+        **options,
     )
-    environment.filters["svg"] = svg
-    return environment
 
 
 def _with_signs(value: Any) -> Any:

@@ -55,9 +55,10 @@ def kept(mask: Any, x: Tensor) -> Tensor:
         keep = keep[:, None]
     expected, got = f"a mask of shape {tuple(x.shape)}, that of x", tuple(keep.shape)
     require(keep.shape == x.shape, expected, got, "give one an entry of x")
-    for value in keep[(keep != 0) & (keep != 1) & ~keep.isnan()].tolist():
-        advice = "pass True where x is a measurement"
-        require(False, "a mask of True and False, or 1 and 0", f"{value:g}", advice)
+    others = keep[(keep != 0) & (keep != 1) & ~keep.isnan()].tolist()
+    got = ", ".join(f"{value:g}" for value in others[:1])
+    advice = "pass True where x is a measurement"
+    require(not others, "a mask of True and False, or 1 and 0", got, advice)
     return keep == 1
 
 

@@ -106,8 +106,10 @@ def _named_series(inputs: Any, names: Sequence[str]) -> dict[str, Tensor]:
             "pass what does not vary in time as the action",
         )
         for i, k in own.isinf().nonzero().tolist():
-            got = f"inf in trial {names[i]}, value {k}"
-            require(False, f"finite values of input {name!r}", got, "correct it")
+            raise ValueError(
+                f"expected finite values of input {name!r}; got inf in trial "
+                f"{names[i]}, value {k}; correct it"
+            )
         found[name] = own
     return found
 
@@ -227,8 +229,11 @@ def _piece(what: str, values: Tensor, times: Tensor) -> Piece:
     length, last = int(times.isfinite().sum()), int(values.isfinite().sum())
     for name, given, num in (("time", times, length), ("value", values, last)):
         for (k,) in (~given[:num].isfinite()).nonzero().tolist():  # else it is padding
-            got = f"{float(given[k])} for {what}, value {k}".replace("nan", "NaN")
-            require(False, f"a {name} of each value", got, "fill it in")
+            got = str(float(given[k])).replace("nan", "NaN")
+            raise ValueError(
+                f"expected a {name} of each value; got {got} for {what}, value {k}; "
+                "fill it in"
+            )
     steps = times[:length].diff()
     middle = float(steps.median()) if len(steps) else 0.0
     for (k,) in (steps <= 0).nonzero().tolist():

@@ -224,8 +224,10 @@ def _trials(cells: Cells, beside: Cells | None) -> dict[str, Any]:
         _require_distinct(cells, action, samples)
     for t in np.flatnonzero(pd.Series(index).duplicated()):
         one = first[np.flatnonzero(index == index[t])[0]]
-        got = f"index {index[t]:g} in rows {one + 1} and {first[t] + 1} of "
-        require(False, "each trial once", got + cells.source, AGAIN)
+        raise ValueError(
+            f"expected each trial once; got index {index[t]:g} in rows {one + 1} and "
+            f"{first[t] + 1} of {cells.source}; {AGAIN}"
+        )
     found |= {
         "action": action if columns["action"] else None,
         "x": x,

@@ -34,7 +34,7 @@ from sbi_active.criticism.report.words import (
 )
 from sbi_active.criticism.results import NONE, ModelKey
 from sbi_active.criticism.steps.detection import LEVEL
-from sbi_active.display.page import Page, Section
+from sbi_active.display.page import Page, Section, environment
 from sbi_active.messages import Message, place
 
 
@@ -92,14 +92,7 @@ def _blocks(prose: str) -> list[str]:
 
 @cache
 def _template() -> Any:
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    made = Environment(
-        loader=PackageLoader("sbi_active.criticism", "report"),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    made = environment("sbi_active.criticism", "report")
     for form in (number, probability, stated, listed, counted):
         made.filters[form.__name__] = form
     return made.get_template("report.jinja")
@@ -164,6 +157,7 @@ def _prose(report: Contents, *, sections: bool = True) -> str:
         "several": by_channel(report.residuals.x, report.residuals).shape[2] > 1,
         "whole": tracing.model if is_misfit else report.verdict,
         "pairs": _pairs(report),
+        "fewest": f"{FEW_DRAWS:.0f}",
         "few_draws": any(e.effective_sample_size < FEW_DRAWS for e in models),
         "moves": _moves(report),
         "most_told": float(np.nanmax(gain, initial=0.0)),

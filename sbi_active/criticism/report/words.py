@@ -13,7 +13,8 @@ import numpy as np
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.units import split
 
-#: Effective draws below which a deviation is none to print.
+#: Effective draws below which a deviation is none to print: of 50 it is off by a tenth,
+#: of half as many by 14 %, of twice as many by 7 %.
 FEW_DRAWS = 50.0
 
 
