@@ -15,7 +15,7 @@ from sbi_active.criticism.linear.mixture import Mixture
 from sbi_active.criticism.linear.model import LinearModel, reweighted_at
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.verdict import Verdict
-from sbi_active.criticism.results import OUTLIER, Evidence, ModelKey
+from sbi_active.criticism.results import FEW_DRAWS, OUTLIER, Evidence, ModelKey
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.inference.engine import WeightedDraws
@@ -27,7 +27,7 @@ def recorded(found: Verdict, key: ModelKey) -> Evidence:
     """Return the record of a model, and keep its draws.
 
     The bare model and those that are likely have samples of the simulator's own
-    posterior where they bend and no model misses; of less than fifty effective draws
+    posterior where they bend and no model misses; of few effective draws
     a linear model's, since a few would claim to know what is open.
 
     Args:
@@ -42,7 +42,7 @@ def recorded(found: Verdict, key: ModelKey) -> Evidence:
             fit = models.sampled(key, near)
             log_z = found.states.log_evidence(key)
             fit = replace(fit, evidence=replace(fit.evidence, log_evidence=log_z))
-        if fit is None or fit.evidence.effective_sample_size < 50:
+        if fit is None or fit.evidence.effective_sample_size < FEW_DRAWS:
             fit = _linear(found, key)
         models.fits[key] = fit
     return models.fits[key].evidence

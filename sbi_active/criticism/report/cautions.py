@@ -20,8 +20,9 @@ from sbi_active.criticism.report.summary import (
     rests,
     suspects_in_words,
 )
-from sbi_active.criticism.report.words import FEW_DRAWS, caution, number
+from sbi_active.criticism.report.words import caution, number
 from sbi_active.criticism.results import (
+    FEW_DRAWS,
     NONE,
     OUTLIER,
     SCATTER,

@@ -25,14 +25,13 @@ from sbi_active.criticism.report.summary import (
 )
 from sbi_active.criticism.report.tables import shown, small_sets, tables_of
 from sbi_active.criticism.report.words import (
-    FEW_DRAWS,
     counted,
     listed,
     number,
     probability,
     stated,
 )
-from sbi_active.criticism.results import NONE, ModelKey
+from sbi_active.criticism.results import FEW_DRAWS, NONE, ModelKey
 from sbi_active.criticism.steps.detection import LEVEL
 from sbi_active.display.page import Page, Section, environment
 from sbi_active.messages import Message, place

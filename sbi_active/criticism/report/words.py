@@ -12,10 +12,7 @@ import numpy as np
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.units import split
-
-#: Effective draws below which a deviation is none to print: of 50 it is off by a tenth,
-#: of half as many by 14 %, of twice as many by 7 %.
-FEW_DRAWS = 50.0
+from sbi_active.criticism.results import FEW_DRAWS
 
 
 @cache
