@@ -200,7 +200,7 @@ def refine_declared(problem: Problem, past: object) -> SimulatedBelief | None:
         coordinates = NormalCoordinates(PriorCoordinates(prior, rng), rng)
         table = MeanTable(simulator, settings.workers)
     own = Settings(
-        num_effective=settings.effective_of(coordinates.dim),
+        num_effective=settings.num_effective,
         num_simulations=3 * settings.num_histories * len(action),
         num_draws=settings.num_draws or max(settings.num_histories // 6, 100),
     )

@@ -21,9 +21,9 @@ class RefinementOptions:
             A simulated likelihood may take three times as many.
         num_effective: Number of effective draws that end the sampling of a simulated
             likelihood. The log density of the belief is off by about their number to
-            the power -1/2, in nats. More are taken beyond six parameters, in
-            proportion, and of a learned likelihood, whose draws cost no simulations,
-            16 times as many.
+            the power -1/2, in nats. Six times as many are taken while they are cheap,
+            more of 12 parameters and more, and of a learned likelihood, whose draws
+            cost no simulations, 16 times as many.
         num_draws: Number of draws of each proposal of a simulated likelihood; None
             takes a sixth of ``num_histories``, at least 100. Fewer reach a narrow
             posterior in fewer simulations.
@@ -40,18 +40,6 @@ class RefinementOptions:
     num_draws: int | None = None
     defensive: float = 1e-5
     workers: Workers = IN_PROCESS
-
-    def effective_of(self, dim: int, *, many: int = 6) -> float:
-        """Return the number of effective draws of so many parameters.
-
-        Args:
-            dim: Number of parameters.
-            many: Number beyond which draws are more in proportion: a covariance of d
-                parameters is off by about d (d + 3) / (4 n) nats for n effective draws.
-                At ten, half as many (no more than at six) gives a divergence of .07 in
-                place of .05 nats for three quarters of the simulations.
-        """
-        return self.num_effective * max(1.0, dim / many)
 
     def __post_init__(self) -> None:
         numbers = {"num_histories": 200, "num_effective": 20, "num_draws": 50}

@@ -40,6 +40,7 @@ from sbi_active.inference.sampling.mixtures import (
     Proposal,
     StudentMixture,
     fitted_normals,
+    wider,
 )
 from sbi_active.inference.sampling.weights import (
     effective_sample_size,
@@ -94,39 +95,49 @@ class ImportanceSampling:
         """Draw until enough are effective, or the budget is spent."""
         pool, potential, own = self.pool, self.potential, self.settings
         budget, start = own.budget(potential.dim), potential.num_simulations
-        proposal = pool.proposals[-1][1] if pool.num_final else None
-        best, latched, heavy = 0.0, 0.0, 0
+        proposal, best, latched, heavy, least = pool.final, 0.0, 0.0, 0, 0.0
         kept: Proposal | None = None  # the best
+        most = pool.rest
         for _ in range(own.max_rounds):
-            spent = potential.num_simulations - start
+            left = budget - (potential.num_simulations - start)
             power = _largest_power(*self._logs(), own.fewest)
             effective = pool.effective_sample_size
-            is_cheap = spent < own.share_of_plenty * budget and not self.is_rough
-            wanted = own.asked(potential.dim, is_cheap=is_cheap)
-            if not len(pool.u) or spent >= budget:
+            is_cheap = left > (1 - own.share_of_plenty) * budget and not self.is_rough
+            wanted = own.asked(effective, pool.divergence, is_cheap=is_cheap)
+            wanted = max(wanted, least)
+            if not len(pool.u) or left <= 0:
                 break
             is_heavy = False
             if power == 1 and effective >= wanted:
                 shape = pareto_shape(pool.log_weight[pool.is_final])
                 is_heavy = shape > own.largest_shape
                 if not is_heavy or heavy == own.max_heavy:
-                    break
+                    return
                 heavy += 1  # draws that outweigh others show where to draw more
-            efficiency = effective / max(pool.num_final, 1)
+                least = effective
+            elif effective > most.effective:
+                most = pool.rest
+            efficiency = max(effective, 1e-9) / max(pool.num_final, 1)
+            is_known = proposal is not None and effective >= own.seen
+            missing = (wanted - effective) / efficiency  # draws
             is_good = power == 1 and efficiency >= own.efficient
-            is_good |= own.affords(effective, pool.num_final, wanted)
+            is_good |= is_known and own.affords(missing, potential.dim)
             # It no longer gets better by being fitted again.
             is_good |= self.num_full >= own.max_fits and efficiency >= 0.5 * best
             is_good |= efficiency >= 0.5 * latched > 0  # what was drawn is not lost
+            few = min(wanted, own.few_for_fit(potential.dim))
+            to_fit = (few - effective) / efficiency
+            draws_on = is_known and power == 1 and to_fit > 0  # it would be a poor fit
+            draws_on &= own.affords(to_fit, potential.dim)
             size = own.draws_of_fit(potential.dim)
-            if proposal is not None and is_good and efficiency > 0 and not is_heavy:
+            if proposal is not None and (is_good or draws_on) and not is_heavy:
                 rows = (own.num_effective - effective) / efficiency * pool.num_trials
-                if pool.num_past and rows > budget - spent:
+                if pool.num_past and rows > left:
                     break  # modes serve better than draws of fewer trials
-                latched = latched or efficiency
-                lacking = 1.1 * (wanted - effective) / efficiency
-                size = int(np.clip(lacking, 0.2 * own.num_draws, 4 * own.num_draws))
-            elif kept is not None and self.num_full >= own.max_fits:
+                latched = latched or is_good * efficiency
+                size = 1.1 * (missing if is_good else to_fit)
+                size = int(np.clip(size, 0.2 * own.num_draws, 4 * own.num_draws))
+            elif kept is not None and self._returns(efficiency, best, wanted, left):
                 pool.restart()  # what was fitted since is worse
                 proposal, latched, kept = kept, best, None
             else:
@@ -139,6 +150,25 @@ class ImportanceSampling:
                 proposal = self._fitted(power, efficiency)
             floor = float(pool.log_likelihood.max()) - own.negligible / power
             pool.add(proposal, proposal.sample(size, self.rng), potential, floor)
+        if most.effective > pool.effective_sample_size:
+            pool.rest_on(most)
+
+    def _returns(
+        self, efficiency: float, best: float, wanted: float, left: float
+    ) -> bool:
+        """Return whether the best proposal goes on in place of another fit.
+
+        Args:
+            efficiency: Share of the last proposal's draws that were effective.
+            best: Share of those of the best proposal.
+            wanted: Effective draws to end with.
+            left: Rows that are left to spend.
+        """
+        own, num = self.settings, wanted / best
+        is_affordable = own.affords(num / 4, self.potential.dim)
+        is_affordable &= num * self.pool.num_trials <= left
+        is_lost = efficiency < own.lost * best
+        return self.num_full >= own.max_fits or (is_lost and is_affordable)
 
     def _fitted(self, power: float, efficiency: float) -> Proposal:
         """Return a proposal for a power of the likelihood, fitted to all draws.
@@ -218,11 +248,6 @@ def fitted(
         factors=wider(settings.wider, dim) * fit.factors,
         freedom=max(settings.freedom, float(dim)),
     )
-
-
-def wider(factor: float, dim: int) -> float:
-    """Return the factor of widths in more dimensions that costs as many draws."""
-    return (1 + (factor**2 - 1) / dim**0.5) ** 0.5
 
 
 def pareto_shape(log_weight: Array) -> float:

@@ -22,13 +22,17 @@ from sbi_active.inference.engine.importance import (
     ImportanceSampling,
     fitted,
     pareto_shape,
-    wider,
 )
 from sbi_active.inference.engine.pool import Fit, Pool, PriorDraws
 from sbi_active.inference.engine.potential import Density, Potential
 from sbi_active.inference.engine.search import Found
 from sbi_active.inference.engine.settings import Settings
-from sbi_active.inference.sampling.mixtures import Defended, Proposal, StudentMixture
+from sbi_active.inference.sampling.mixtures import (
+    Defended,
+    Proposal,
+    StudentMixture,
+    wider,
+)
 from sbi_active.inference.sampling.smc import Bridged, bridge
 from sbi_active.inference.sampling.weights import log_sum_exp, normalized
 
@@ -77,7 +81,8 @@ def infer(
     )
     sampling.run()
     final, effective = pool.is_final, pool.effective_sample_size
-    wanted = settings.asked(potential.dim, is_cheap=False)
+    # Particles are led where normal draws would have to be more.
+    wanted = settings.asked(1.0, (potential.dim + 3) / 4, is_cheap=False)
     if modes is not None and past is None and effective < wanted:
         moved = modes.led_particles(none)
         if moved is not None and moved.effective_sample_size > effective:
@@ -114,14 +119,19 @@ def _begin(
         first = modes.around()
         pool.add(first, first.sample(own.num_draws, rng), potential)
         effective = pool.effective_sample_size
-        affords = own.affords(effective, pool.num_final, own.num_effective)
-        if effective >= own.fewest or affords:
+        missing = (own.num_effective - effective) * pool.num_final / (effective + 1e-9)
+        is_known = effective >= own.seen
+        if effective >= own.fewest or (
+            is_known and own.affords(missing, potential.dim)
+        ):
             return
     if near is not None and len(near) > 2 * potential.dim:
         weight = np.full(len(near), 1 / len(near))
         guess = fitted(near, weight, own.num_components, own, rng)
-        pool.add(guess, guess.sample(own.num_draws, rng), potential)
-    pool.add(prior, prior.sample(int(1.5 * own.num_draws), rng), potential)
+        drawn = guess.sample(own.num_draws, rng)
+        pool.add(guess, drawn, potential, is_final=modes is None)
+    drawn = prior.sample(int(1.5 * own.num_draws), rng)
+    pool.add(prior, drawn, potential, is_final=modes is None)
 
 
 def share_cut(potential: Potential, found: Found, *, num: int = 500) -> float:

@@ -30,6 +30,7 @@ CHEAP = Settings(
     fewest=200.0,
     max_fits=6,
     efficient=0.4,
+    affordable=0.0,  # a fit takes as long as many draws
     jitter=0.0,
     fitted=0.25,
 )
@@ -161,12 +162,13 @@ def learned_fit(
     own = replace(CHEAP, num_effective=num_effective)
     places = None if near is None else potential.coordinates.from_z(near)
     fit = infer(potential, rng, near=places, settings=own)
-    if not np.isfinite(fit.log_evidence):
+    final = fit.pool.final
+    if final is None or not np.isfinite(fit.log_evidence):
         raise UnexplainedOutcomeError(NOTHING_EXPLAINS)
     effective = fit.effective_sample_size
     return LearnedFit(
         potential,
-        fit.pool.proposals[-1][1],
+        final,
         efficiency=effective / max(fit.pool.num_final, 1),
         effective_sample_size=effective,
         log_evidence=fit.log_evidence,

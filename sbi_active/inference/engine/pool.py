@@ -14,7 +14,7 @@ from sbi_active.inference.engine.search import Found
 from sbi_active.inference.engine.settings import Settings
 from sbi_active.inference.sampling.mixtures import Proposal
 from sbi_active.inference.sampling.smc import Bridged
-from sbi_active.inference.sampling.weights import effective_sample_size
+from sbi_active.inference.sampling.weights import effective_sample_size, normalized
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,23 @@ class PriorDraws(Proposal):
         return self.potential.log_prior(z)
 
 
+@dataclass(frozen=True)
+class Rest:
+    """Draws that a posterior rests on.
+
+    Attributes:
+        effective: Number of effective draws.
+        is_final: Mask of the draws at that time, shape (n,).
+        num_final: Draws of their proposal, also those that do not count.
+        final: Their proposal.
+    """
+
+    effective: float
+    is_final: NDArray[np.bool_]
+    num_final: int
+    final: Proposal | None
+
+
 @dataclass
 class Pool:
     """Draws of all proposals so far that may still count.
@@ -52,6 +69,7 @@ class Pool:
         num_trials: Number of trials in the likelihood.
         log_past: Log likelihood of the first trials, which is not tempered, shape (n,).
         num_past: Number of these, for which there were draws before.
+        final: Proposal of the final draws; None if it is not one.
     """
 
     u: Array
@@ -65,6 +83,7 @@ class Pool:
     num_trials: int = 0
     log_past: Array = field(default_factory=lambda: np.zeros(0))
     num_past: int = 0
+    final: Proposal | None = None
 
     @staticmethod
     def empty(dim: int, num_trials: int) -> Pool:
@@ -97,6 +116,31 @@ class Pool:
         return effective_sample_size(self.log_weight)
 
     @property
+    def divergence(self) -> float:
+        r"""Divergence of a normal fit to the posterior's draws, in nats a parameter.
+
+        Draws z without mean, of unit covariance, and of weights w err by
+
+        .. math::
+            \frac{1}{d} \sum_i w_i^2 \Bigl(\frac{|z_i|^2}{2} +
+            \frac{|z_i|^4 - 2 |z_i|^2 + d}{4}\Bigr)
+
+        on average: by (d + 3) / 4 n if they are n and normal, and by more where tails
+        are heavy or draws in the tails have large weights. Few draws hide them, so that
+        it is no less than this.
+        """
+        dim, effective = self.u.shape[1], max(self.effective_sample_size, 1e-9)
+        least = (dim + 3) / (4 * effective)
+        if effective <= 2 * dim:
+            return least
+        weight = normalized(self.log_weight[self.is_final])
+        off = self.u[self.is_final] - weight @ self.u[self.is_final]
+        cov = (off * weight[:, None]).T @ off
+        square = (off * np.linalg.lstsq(cov, off.T, rcond=None)[0].T).sum(1)
+        terms = square / 2 + (square**2 - 2 * square + dim) / 4
+        return max(least, float(weight**2 @ terms) / dim)
+
+    @property
     def standard_error(self) -> float:
         """Standard error of log_evidence."""
         effective, num = self.effective_sample_size, max(self.num_final, 1)
@@ -104,7 +148,19 @@ class Pool:
 
     def restart(self) -> None:
         """Rest the posterior on draws to come."""
-        self.is_final, self.num_final = np.zeros_like(self.is_final), 0
+        self.rest_on(Rest(0.0, np.zeros_like(self.is_final), 0, None))
+
+    @property
+    def rest(self) -> Rest:
+        """What the posterior rests on."""
+        effective = self.effective_sample_size
+        return Rest(effective, self.is_final, self.num_final, self.final)
+
+    def rest_on(self, rest: Rest) -> None:
+        """Rest the posterior on draws that it rested on before."""
+        later = np.zeros(len(self.u) - len(rest.is_final), dtype=bool)
+        self.is_final = np.concatenate([rest.is_final, later])
+        self.num_final, self.final = rest.num_final, rest.final
 
     def add(
         self,
@@ -112,6 +168,8 @@ class Pool:
         drawn: Array,
         potential: Density,
         floor: float = -np.inf,
+        *,
+        is_final: bool = True,
     ) -> None:
         """Simulate draws of a proposal, shape (n, d), and weigh all.
 
@@ -120,6 +178,7 @@ class Pool:
             drawn: The draws.
             potential: Potential of all trials.
             floor: Log likelihood below which a draw is given up.
+            is_final: Whether the posterior rests on them.
         """
         u = potential.simulated(drawn)
         log_likelihood = potential.log_likelihood(u, floor=floor)
@@ -146,8 +205,9 @@ class Pool:
             # Every trial of draws that count has been simulated; this only looks it up.
             log_past = potential.log_likelihood(u, last=self.num_past)
         self.log_past = np.concatenate([self.log_past, log_past])
-        self.is_final = np.concatenate([self.is_final, np.ones(len(u), dtype=bool)])
-        self.num_final += len(drawn)
+        self.is_final = np.concatenate([self.is_final, np.full(len(u), is_final)])
+        if is_final:
+            self.num_final, self.final = self.num_final + len(drawn), proposal
 
     def with_trials(self, potential: SimulatedPotential, settings: Settings) -> Pool:
         """Return the draws that count with the likelihood of further trials.

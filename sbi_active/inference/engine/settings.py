@@ -16,9 +16,10 @@ class Settings:
             a belief is off by about their number to the power -1/2, in nats.
         plenty: Times as many are drawn while they are cheap: with half of it heavy
             tails are cut by a tenth.
-        divergence: Divergence of a normal fit to the draws, in nats, that is asked
-            while they are cheap, and twice that always: n draws of d parameters are d
-            (d + 3) / 4 n off. Half asks for twice as many of 10 parameters and more.
+        divergence: Divergence of a normal fit to the draws, in nats a parameter, that
+            is asked while they are cheap, and three times that always. n normal draws
+            of d parameters are (d + 3) / 4 n off. Half asks for twice as many from ten
+            parameters on; with twice every second belief of ten is off by .05 nats.
         num_simulations: Simulated rows to spend, each at one action; None is no bound.
             More of more than ``few`` parameters, in proportion.
         share_of_plenty: Share of these within which draws are cheap, unless the
@@ -39,7 +40,13 @@ class Settings:
         efficient: Share of a proposal's draws that are effective, with which it is good
             enough: more is drawn from it in place of fitting another.
         seen: Effective draws from which a proposal's efficiency is believed.
-        affordable: Draws, in ``num_draws``, that are not worth another fit.
+        affordable: Draws that are not worth another fit, in draws of a fit. With eight,
+            modes of ten parameters are drawn from to the end, and tails are missed.
+        per_number: Effective draws that a proposal is fitted to, for each of the d (d +
+            3) / 2 numbers of a normal density, if they are affordable. Without it, fits
+            of ten parameters lose nine tenths of the efficiency before.
+        lost: Share of the best efficiency below which a proposal is given up for the
+            best one, if that is affordable: with half of it or twice, few are.
         max_fits: Fits to the whole likelihood at most, unless the last is half as
             efficient as the best.
         wider: Factor of the draws' widths in a proposal of one parameter; less of more.
@@ -84,7 +91,7 @@ class Settings:
 
     num_effective: float = 200.0
     plenty: float = 6.0
-    divergence: float = 0.05
+    divergence: float = 0.002
     num_simulations: int | None = None
     share_of_plenty: float = 0.6
     num_draws: int = 500
@@ -99,7 +106,9 @@ class Settings:
     num_components: int = 8
     efficient: float = 0.3
     seen: float = 8.0
-    affordable: float = 0.0
+    affordable: float = 3.0
+    per_number: float = 4.0
+    lost: float = 0.25
     max_fits: int = 4
     wider: float = 1.4
     jitter: float = 0.1
@@ -124,17 +133,26 @@ class Settings:
     num_near: int = 5
     search: SearchSettings = field(default_factory=SearchSettings)
 
-    def asked(self, dim: int, *, is_cheap: bool) -> float:
-        """Return the effective draws that so many parameters ask for."""
-        num = dim * (dim + 3) / (4 * self.divergence)
-        if is_cheap:
-            return max(self.plenty * self.num_effective, num)
-        return max(self.num_effective, num / 2)
+    def asked(self, effective: float, divergence: float, *, is_cheap: bool) -> float:
+        """Return the effective draws to end with.
 
-    def affords(self, effective: float, num: int, wanted: float) -> bool:
-        """Return whether a proposal, of whose draws so many count, needs few more."""
-        lacking = (wanted - effective) * num / max(effective, 1e-9)
-        return effective >= self.seen and lacking <= self.affordable * self.num_draws
+        Args:
+            effective: Effective draws so far.
+            divergence: Divergence of a normal fit to these, in nats a parameter.
+            is_cheap: Whether draws are cheap.
+        """
+        most, times = self.divergence, self.plenty
+        if not is_cheap:
+            most, times = 3 * most, 1.0
+        return max(times * self.num_effective, effective * divergence / most)
+
+    def affords(self, num: float, dim: int) -> bool:
+        """Return whether so many draws are not worth another fit."""
+        return num <= self.affordable * self.draws_of_fit(dim)
+
+    def few_for_fit(self, dim: int) -> float:
+        """Return the effective draws below which a fit to them is poor."""
+        return self.per_number * dim * (dim + 3) / 2
 
     def num_fitted(self, dim: int) -> int:
         """Return the repeated draws that a proposal is fitted to."""

@@ -280,7 +280,7 @@ class Stages(ABC):
 
     def sample(self, surrogate: LearnedLikelihood, near: Array | None) -> Stage:
         """Return the stage of a likelihood, its density sampled."""
-        num = self.own.oversampling * self.settings.effective_of(self.coordinates.dim)
+        num = self.own.oversampling * self.settings.num_effective
         fit = learned_fit(surrogate, self.rng, near=near, num_effective=num)
         draws = fit.draws(1_000, self.rng)
         judged = self.judged(surrogate, draws)

@@ -268,3 +268,8 @@ def _positive(covariance: Array) -> Array:
     """Return the nearest positive semi-definite matrices; rounding leaves -1e-16."""
     value, vector = eigh(covariance)
     return (vector * np.maximum(value, 0.0)[:, None]) @ np.swapaxes(vector, -1, -2)
+
+
+def wider(factor: float, dim: int) -> float:
+    """Return the factor of widths in more dimensions that costs as many draws."""
+    return (1 + (factor**2 - 1) / dim**0.5) ** 0.5
