@@ -55,10 +55,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         error = failure(raised)
     if error["type"] != "BrokenPipeError":  # as in "| head": nobody reads on
         say(error["message"])
+    shown = f"{as_line({'error': error})}\n" if is_json else ""
     try:
-        print(
-            as_line({"error": error}) if is_json else "", end="\n" * is_json, flush=True
-        )
+        print(shown, end="", flush=True)
     except OSError:  # the end of the process has then nothing to complain of
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     return error["status"]

@@ -118,7 +118,10 @@ def run(task: str, out: Path, method: str, seed: int, **given: Any) -> Answer:
     from sbi_active.display.figures import save
     from sbi_active.seeding import derive_seed, forked_generators
 
-    found, folder = task_of(task, given["option"]), out / "campaign"
+    found = task_of(task, given["option"])
+    # Campaigns of earlier runs stay as they are.
+    paths = (out / f"campaign{f'-{k}' * (k > 1)}" for k in itertools.count(1))
+    folder = next(path for path in paths if not path.exists())
     real = (derive_seed(seed, "real", index) for index in itertools.count())
     problem = found.simulator, found.prior, found.actions
     how: Any = {"options": campaign_options(given["set"]), "method": method}
@@ -138,8 +141,7 @@ def run(task: str, out: Path, method: str, seed: int, **given: Any) -> Answer:
     data, text, _ = answer_of(campaign)
     truth = dict(zip(found.parameter_names, found.theta_true.tolist(), strict=True))
     lines = [text, f"the truth: {', '.join(f'{k} = {v:g}' for k, v in truth.items())}"]
-    lines += [f"saved: {out / 'loop.png'}, {out / 'trials.csv'}"]
-    lines += [f"to go on with it: sbi-active ask {folder}"]
+    lines += [f"saved: {out / 'loop.png'}, trials.csv; next: sbi-active ask {folder}"]
     return Answer({**data, "truth": truth}, "\n".join(lines))
 
 
