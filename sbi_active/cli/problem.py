@@ -39,8 +39,12 @@ from sbi_active.tasks import Task, get_task  # pyright: ignore
 MOST_ACTIONS = 100_000
 
 
-def load_module(place: str) -> tuple[Any, str]:
+def load_module(place: str, here: str | None = None) -> tuple[Any, str]:
     """Import what ``module:name`` or ``path/file.py:name`` names.
+
+    Args:
+        place: Place of an object.
+        here: Folder where a module is looked for first; None is the current one.
 
     Returns:
         The module, and the name.
@@ -53,8 +57,8 @@ def load_module(place: str) -> tuple[Any, str]:
     require(bool(name), expected, repr(place), "add its name behind a colon")
     file = Path(module).resolve() if module.endswith(".py") else None
     require(file is None or file.is_file(), "a file", f"none at {file}", "check it")
-    folder, module = (str(file.parent), file.stem) if file else (os.getcwd(), module)
-    # Before what is installed.
+    module, folder = (file.stem, str(file.parent)) if file else (module, here)
+    folder = folder or os.getcwd()  # before what is installed
     sys.path[:] = [folder, *(p for p in sys.path if p != folder)]
     try:
         loaded = importlib.import_module(module)
@@ -112,7 +116,7 @@ def problem_of(
 
     Args:
         given: Values of the options ``SIMULATOR``, ``SPACE``, "names" and "units" by
-            their names, as far as there are any.
+            their names, as far as there are any, and the folder of a module.
         needs: Parts without which nothing can be done.
 
     Raises:
@@ -120,7 +124,7 @@ def problem_of(
     """
     advice = "name it, as in --simulator my_robot.py:fn"
     require(bool(given.get("simulator")), "--simulator", "none", advice)
-    module, name = load_module(given["simulator"])
+    module, name = load_module(given["simulator"], given.get("folder"))
     model = with_noise(getattr(module, name), given.get("noise"))
     prior = _prior_of(given) or getattr(module, "prior", None)
     specs, names, units = map(given.get, ("actions", "names", "units"))
@@ -236,7 +240,7 @@ def open_campaign(
     return campaign
 
 
-def remember(folder: Path, **options: Any) -> None:
+def remember(folder: Path, /, **options: Any) -> None:
     """Write down which program somebody here named for a campaign."""
     place, colon, name = (options.get("simulator") or "").partition(":")
     if place.endswith(".py"):
@@ -251,7 +255,6 @@ def _remembered(folder: Path) -> dict[str, Any]:
     found: Any = {}
     with suppress(OSError, ValueError):
         found = json.loads(_path_of(folder).read_text())
-    sys.path += filter(None, [found.pop("folder", "")])  # where modules were found
     return found
 
 

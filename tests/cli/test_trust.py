@@ -77,6 +77,16 @@ def test_what_was_named_is_remembered_wherever_one_stands(mine, tmp_path, monkey
     assert mine.exists()  # it was imported
 
 
+def test_a_module_is_looked_for_where_it_was_named(mine, tmp_path, monkeypatch):
+    assert main(["init", "new", "--simulator", "mine:slide", *SMALL]) == 0
+    forget(mine)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "mine.py").write_text("raise SystemExit('another one')")
+    monkeypatch.chdir("other")
+    assert main(["ask", str(tmp_path / "new"), "--target", "weather"]) == 2
+    assert mine.exists()
+
+
 @pytest.mark.parametrize("command", ["ask", "update", "criticize", "adopt"])
 def test_nothing_that_a_folder_says_is_imported(mine, tmp_path, capsys, command):
     Path("camp").rename("other")  # as one that was sent
