@@ -17,9 +17,8 @@ from pathlib import Path
 from click.exceptions import Exit
 from click.shell_completion import shell_complete
 
-from sbi_active.cli.declare import NAME, program
-from sbi_active.cli.output import Answer, as_line, failure, output_to_errors, say
-from sbi_active.cli.trusted import in_campaign
+from sbi_active.cli import declare as cli
+from sbi_active.cli.declare import NAME, Answer, as_line, failure, program, say
 
 __all__ = ["main"]
 
@@ -37,11 +36,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         be changed, 10 to 14 where a gate is closed, 130 after an interrupt.
     """
     words = sys.argv[1:] if argv is None else [*argv]
-    if in_campaign(here := Path.cwd()):  # nothing is imported because it lies there
-        sys.path[:] = [p for p in sys.path if p and Path(p).resolve() != here]
-    elif str(here) not in sys.path:
-        sys.path.append(str(here))
-    from sbi_active.cli import campaign, criticize, simulators, watch  # noqa: F401
+    here = Path.cwd()  # nothing is imported because it lies there
+    sys.path[:] = [p for p in sys.path if p and Path(p).resolve() != here]
+    from sbi_active.cli import campaign, simulators  # noqa: F401
 
     if shell := os.environ.get(COMPLETE):
         return shell_complete(program, {}, NAME, COMPLETE, shell)
@@ -51,36 +48,30 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore
     try:
         answer = _answer(words, is_json)
-        status = answer if isinstance(answer, int) else 0
-        if isinstance(answer, Answer):
-            status = answer.status
-            print(as_line(answer.data) if is_json else answer.text)
-        print(end="", flush=True)
+        if answer.text:
+            print(as_line(answer.data) if is_json else answer.text, flush=True)
+        return answer.status
     except (Exception, KeyboardInterrupt) as raised:
         error = failure(raised)
-        status = error["status"]
-        if not isinstance(raised, BrokenPipeError):  # as in "| head": nobody reads on
-            say(error["message"])
-        try:
-            if is_json:
-                print(as_line({"error": error}))
-            print(end="", flush=True)
-        except OSError:  # the end of the process has then nothing to complain of
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    return status
+    if error["type"] != "BrokenPipeError":  # as in "| head": nobody reads on
+        say(error["message"])
+    shown = f"{as_line({'error': error})}\n" if is_json else ""
+    try:
+        print(shown, end="", flush=True)
+    except OSError:  # the end of the process has then nothing to complain of
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    return error["status"]
 
 
-def _answer(words: list[str], is_json: bool) -> object:
+def _answer(words: list[str], is_json: bool) -> Answer:
     """Run a command; the answer for programs has standard output for itself."""
     # Words are UTF-8, whatever the locale.
     words = [word.encode(errors="surrogateescape").decode() for word in words]
-    with (
-        output_to_errors() if is_json else contextlib.nullcontext(),
-        warnings.catch_warnings(),
-    ):
+    apart = cli.output_to_errors() if is_json else contextlib.nullcontext()
+    with apart, warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: say(f"note: {message}")
         try:
             with program.make_context(NAME, words) as context:
-                return program.invoke(context)
+                return program.invoke(context) or Answer({}, "")
         except Exit as ended:  # of help and version
-            return ended.exit_code
+            return Answer({}, "", ended.exit_code)

@@ -11,54 +11,47 @@ import json
 import math
 import os
 import sys
+import time
 from collections.abc import Callable, Sequence
 from functools import wraps
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import click
 
 from sbi_active.campaign.telling import flat, shaped
 from sbi_active.cli import declare as cli
-from sbi_active.cli.output import Answer, as_line, failure, output_to_errors, say
-from sbi_active.cli.record import (
-    Record,
-    Unsure,
-    answer_of,
-    digest,
-    numbers_of,
-    place_of,
-    sum_up_campaign,
-    trial_of,
-)
-from sbi_active.cli.trusted import read_declared, write_declared
+from sbi_active.cli import record
+from sbi_active.cli.declare import Answer, as_line, failure, output_to_errors
+from sbi_active.expected import require
 
-#: What a command works on: trials without torch where these suffice; the campaign as it
-#: is read; one that simulates; one that is mended.
-Need = Literal["record", "reader", "simulator", "repair"]
+AGAIN = '<meta http-equiv="refresh" content="5">'
 #: Commands on a campaign by name, which a request may call too.
 ON_CAMPAIGN: dict[str, click.Command] = {}
 
 
 def on_campaign(
-    *params: click.Parameter, need: Need
+    *params: click.Parameter, need: str = "reader"
 ) -> Callable[[Callable[..., Answer]], click.Command]:
     """Make a function of a campaign and options a command on a folder.
 
     Args:
         *params: Arguments and options of the command.
-        need: Kind of campaign that it works on.
+        need: Kind of campaign that it works on: "record", trials without torch where
+            these suffice; "reader", the campaign as it is read, with its simulator
+            where that is named; "simulator", one that simulates.
     """
 
     def decorate(function: Callable[..., Answer]) -> click.Command:
         @wraps(function)
-        def call(folder: Path, **options: Any) -> Answer:
-            session = click.get_current_context().obj or Session(folder)
-            return session.call(function, need, **options)
+        def call(folder: Path, simulator: Any = None, noise: Any = None, **how: Any):
+            session = click.get_current_context().obj
+            session = session or Session(folder, simulator, noise)
+            return session.call(function, need, **how)
 
-        # Numbers may begin with a minus.
-        settings: Any = {"ignore_unknown_options": need == "record"}
-        made = cli.command(cli.DIR, *params, cli.JSON, cli.TRUST, **settings)(call)
+        more: Any = {"ignore_unknown_options": need == "record"}  # as a minus is one
+        shared = [] if need == "record" else [cli.SIMULATOR, cli.NOISE]
+        made = cli.command(cli.DIR, *params, *shared, cli.JSON, **more)(call)
         return ON_CAMPAIGN.setdefault(function.__name__, made)
 
     return decorate
@@ -69,64 +62,58 @@ class Session:
 
     Args:
         folder: Folder of the campaign.
+        simulator: Place of the simulator; None is the one that was named before.
+        noise: Standard deviation of x, with a simulator that lacks it.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self._campaign: Any = None
-        self._opened: tuple[str | None, str] = (None, "")
+    def __init__(self, folder: Path, simulator: str | None, noise: Any) -> None:
+        self.folder, self._place = folder, (folder, simulator, noise)
+        self._campaign, self._digest = None, ""
 
     def call(
-        self,
-        function: Callable[..., Answer],
-        need: Need,
-        *,
-        trust: bool = False,
-        simulator: str | None = None,
-        simulator_changed: bool = False,
-        **options: Any,
+        self, function: Any, need: str, simulator_changed: bool = False, **options: Any
     ) -> Answer:
         """Return the answer of a command.
 
         Args:
             function: Function of the command.
-            need: Kind of campaign that it works on.
-            trust: Whether to import what the folder names.
-            simulator: Place of the simulator; None if the folder says it.
+            need: Kind of campaign that it works on, see :func:`on_campaign`.
             simulator_changed: Whether to take another simulator than before.
             **options: Options of the command.
         """
-        is_known = self._opened == (simulator, digest(self.folder))
-        campaign, self._campaign = self._campaign if is_known else None, None
+        is_known = self._digest == record.digest(self.folder)
+        campaign: Any = self._campaign if is_known else None
+        self._campaign = None  # after an error, too: another process may have written
         if need == "record" and campaign is None:
-            with contextlib.suppress(Unsure):
-                return function(Record(self.folder), **options)
-        # A report or an export shows more with a simulator.
-        simulates = need == "simulator" or need == "reader" and (trust or simulator)
+            with contextlib.suppress(record.Unsure):
+                return function(record.Record(self.folder), **options)
+        simulates = need == "simulator" or need == "reader" and self._place[1]
         lacks = simulates and getattr(campaign, "simulator", None) is None
         if lacks or simulator_changed:
             from sbi_active.cli.problem import open_campaign
 
-            how = {"trust": trust, "simulator_changed": simulator_changed}
-            campaign = open_campaign(self.folder, simulator=simulator, **how)
-        elif campaign is None or need == "repair":
+            campaign = open_campaign(*self._place, simulator_changed)
+        elif campaign is None:
             from sbi_active import Campaign
 
-            campaign = Campaign.load(self.folder, repair=need == "repair")
+            campaign = Campaign.load(self.folder)
         with campaign:  # then others may write
             answer = function(campaign, **options)
             if need == "simulator":
-                sum_up_campaign(campaign)
-        # Not after an error, which may be that another process wrote.
-        self._campaign, self._opened = campaign, (simulator, digest(self.folder))
+                record.sum_up_campaign(campaign)
+        self._campaign, self._digest = campaign, record.digest(self.folder)
         return answer
 
 
-MANY = 5  # numbers, more than somebody types
+TARGET = cli.option("--target", "theta, model or a parameter", default="auto")
+CHANGED = cli.option("--simulator-changed", "take another, compute all again", None)
+PAGE = cli.option("--out", "where to", cli.FILE, "PAGE.html")
+NETCDF = cli.option("--netcdf", "where to", cli.FILE, "FILE.nc", required=True)
+AT = cli.option("--trial", "None is the pending one, or a new one", int, "K")
 TRIAL = cli.argument("trial", "TRIAL", int)
 REASON = cli.option("--reason", "kept with the trial", default="")
 OUTCOME = [
-    cli.argument("x", "[X]...", cli.TEXT, nargs=-1, required=False),
+    cli.argument("x", "[X]...", str, nargs=-1, required=False),
     cli.option("--file", "with the numbers", cli.FILE, "X.csv"),
     cli.option("--invalid", "it ran and gave no measurement", None),
     cli.option("--missing", "a fault that tells nothing hit it", None),
@@ -135,55 +122,44 @@ OUTCOME = [
 
 
 @cli.command(
-    *(cli.DIR, cli.CONFIG, *cli.PROBLEM, cli.EFFECTS),
+    *(cli.DIR, cli.SIMULATOR, *cli.SPACE),
     cli.option("--names", "of the action's entries", metavar="A,B,..."),
     cli.option("--units", "of the action's entries", metavar="A,B,..."),
-    *(cli.METHOD, cli.SEED, *cli.OF_CAMPAIGN),
+    *(cli.METHOD, cli.SEED, cli.SETTINGS),
 )
-def init(folder: Path, method: str, seed: int, **given: Any) -> None:
-    """Make a campaign in a new folder, also by --config."""
+def init(folder: Path, method: str, seed: int, **given: Any) -> Answer:
+    """Make a campaign in a new folder."""
     from sbi_active import Campaign
-    from sbi_active.cli.problem import campaign_options, problem_of
+    from sbi_active.cli.problem import campaign_options, problem_of, remember
 
-    options = campaign_options(given)
+    options = campaign_options(given.pop("set"))
     *problem, effects = problem_of(given)
     how: Any = {"method": method, "seed": seed, "options": options, "effects": effects}
     with Campaign(*problem, directory=folder, **how) as campaign:
-        write_declared(folder, **given)
-        sum_up_campaign(campaign)
-    print(f"{folder}: a campaign of {campaign.actions}\nnext: sbi-active ask {folder}")
+        remember(folder, simulator=given["simulator"], noise=given["noise"])
+        record.sum_up_campaign(campaign)
+    text = f"{folder}: a campaign of {campaign.actions}\nnext: sbi-active ask {folder}"
+    return Answer({}, text)
 
 
-@on_campaign(
-    cli.SIMULATOR,
-    cli.option("--target", "theta, model or a parameter's name", default="auto"),
-    need="simulator",
-)
+@on_campaign(TARGET, need="simulator")
 def ask(campaign: Any, target: str) -> Answer:
     """Design the next trial, or show the pending one."""
     trial = campaign.ask(target=target)
     gain, error = trial.expected_gain
-    found = {"expected_information_gain": gain, "standard_error": error}
-    data = {**trial_of(campaign, trial), **found}
-    lines = [f"trial {trial.index}: {place_of(data)}"]
-    if not math.isnan(gain):
-        lines += [f"it is expected to tell {gain:.2f} nats about {trial.target}"]
-    num = math.prod(campaign.x_shape)
-    numbers = "--file X.csv" if num > MANY else " ".join("X" * num)
-    lines += [f"then: sbi-active tell {campaign.directory} {numbers}"]
-    return Answer(data, "\n".join(lines))
+    data = record.trial_of(campaign, trial)
+    data |= {"expected_information_gain": gain, "standard_error": error}
+    tells = "" if math.isnan(gain) else f", expected to tell {gain:.2f} nats"
+    text = f"trial {trial.index}: {record.place_of(data)}{tells}"
+    return Answer(data, f"{text}\nthen: sbi-active tell {campaign.directory}")
 
 
-@on_campaign(
-    *OUTCOME,
-    cli.option("--trial", "None is the pending one, or a new one", int, "K"),
-    need="record",
-)
+@on_campaign(*OUTCOME, AT, need="record")
 def tell(campaign: Any, trial: int | None, action: Any, **outcome: Any) -> Answer:
     """Record what a trial gave. X are the numbers, nan for one not measured."""
     x, status = _outcome(campaign, **outcome)
     told = campaign.tell(x, trial=trial, action=action, status=status)
-    return _confirmed(campaign, told)
+    return record.confirmed(campaign, told)
 
 
 @on_campaign(TRIAL, *OUTCOME, REASON, need="record")
@@ -194,86 +170,57 @@ def correct(
     is_of_action = action is not None and not any(outcome.values())
     x, status = (None, "ok") if is_of_action else _outcome(campaign, **outcome)
     what = {"action": action, "status": status, "reason": reason}
-    return _confirmed(campaign, campaign.correct(trial, x, **what))
+    return record.confirmed(campaign, campaign.correct(trial, x, **what))
 
 
 @on_campaign(TRIAL, REASON, need="record")
 def withdraw(campaign: Any, trial: int, reason: str) -> Answer:
     """Take a trial out of the belief."""
-    return _confirmed(campaign, campaign.withdraw(trial, reason=reason))
+    return record.confirmed(campaign, campaign.withdraw(trial, reason=reason))
 
 
 def _outcome(
-    campaign: Any, *, x: Sequence[str], file: Path | None, **flags: bool
+    campaign: Any, x: Sequence[str], file: Path | None, **flags: bool
 ) -> tuple[Any, str]:
     """Return what was measured, in the shape of the simulator's x, and its status."""
     said = [name for name, value in flags.items() if value]
-    if len(said) + bool(x) + (file is not None) > 1:
-        raise ValueError(
-            "expected numbers, --file, --invalid or --missing; got several; write one"
-        )
+    is_one = len(said) + bool(x) + (file is not None) < 2
+    require(is_one, "numbers, --file, --invalid or --missing", "several", "write one")
     if said:
         return None, said[0]
-    typed = [cli.number_of(text, is_outcome=True) for text in x]
-    numbers = typed if file is None else cli.numbers_in(file)
-    shape = [*campaign.x_shape]
-    if len(numbers) != math.prod(shape) or all(map(math.isnan, numbers)):
-        raise ValueError(
-            f"expected {math.prod(shape)} numbers, as the simulator gives, and one of "
-            f"them measured; got {len(numbers)} ({numbers!s:.80}); write nan for one "
-            "that was not measured, --invalid where the trial ran and gave none, which "
-            "tells about the parameters, or --missing where it failed"
-        )
-    return shaped(numbers, shape), "ok"
-
-
-def _confirmed(campaign: Any, trial: Any) -> Answer:
-    data = trial_of(campaign, trial)
-    what = f"{data['status']} at {place_of(data)}{numbers_of(data, ', x = ')}"
-    text = f"trial {data['trial']}: {what}\nnext: sbi-active ask {campaign.directory}"
-    return Answer(data, text)
+    if file is not None:
+        x = file.read_text("utf-8-sig", "replace").replace(",", " ").split()
+    numbers = [cli.number_of(text, is_outcome=True) for text in x]
+    num, got = math.prod(campaign.x_shape), f"{len(numbers)} ({numbers!s:.80})"
+    is_right = len(numbers) == num and not all(map(math.isnan, numbers))
+    advice = "write nan for others; --invalid where it gave none, --missing for a fault"
+    require(is_right, f"{num} numbers, one of them measured", got, advice)
+    return shaped(numbers, [*campaign.x_shape]), "ok"
 
 
 @on_campaign(need="record")
 def status(campaign: Any) -> Answer:
     """Show the trials, the belief and the health."""
-    return answer_of(campaign)
+    return record.answer_of(campaign)
 
 
-@on_campaign(need="repair")
-def repair(campaign: Any) -> Answer:
-    """Give up what is damaged, and say what that is."""
-    return answer_of(campaign)
-
-
-@on_campaign(
-    cli.SIMULATOR,
-    cli.option("--simulator-changed", "take another, compute all again", None),
-    need="simulator",
-)
+@on_campaign(CHANGED, need="simulator")
 def update(campaign: Any) -> Answer:
     """Bring the belief up to date."""
     campaign.update()
-    return answer_of(campaign)
+    return record.answer_of(campaign)
 
 
-@on_campaign(cli.SIMULATOR, cli.EFFECTS, need="simulator")
-def adopt(campaign: Any, effects: Sequence[str]) -> Answer:
+@on_campaign(need="simulator")
+def adopt(campaign: Any) -> Answer:
     """Go on with the effects that a verdict names."""
     from sbi_active.cli.problem import library_of
 
-    report = campaign.criticize(library_of(campaign, effects), evaluate=False)
-    campaign.adopt(report)
-    if effects:  # let the commands to come find them
-        options = read_declared(campaign.directory)
-        named = [*options.get("effects", ()), *cli.beside(Path.cwd(), effects)]
-        options["effects"] = [*dict.fromkeys(named)]
-        write_declared(campaign.directory, **options)
-    say(f"adopted: {report.verdict}")
-    return answer_of(campaign)
+    campaign.adopt(campaign.criticize(library_of(campaign), evaluate=False))
+    return record.answer_of(campaign)
 
 
-@on_campaign(cli.option("--out", "where to", cli.FILE, "PAGE.html"), need="reader")
+@on_campaign(PAGE)
 def report(campaign: Any, out: Path | None) -> Answer:
     """Write one page that shows the campaign."""
     from sbi_active.campaign.display.page import write_page
@@ -282,66 +229,72 @@ def report(campaign: Any, out: Path | None) -> Answer:
     return Answer({"saved": str(path)}, f"saved: {path}")
 
 
-@on_campaign(
-    *(cli.SIMULATOR, cli.SEED),
-    cli.option("--netcdf", "where to", cli.FILE, "FILE.nc", required=True),
-    need="reader",
-)
+@on_campaign(cli.SEED, NETCDF)
 def export(campaign: Any, netcdf: Path, seed: int) -> Answer:
-    """Write belief and trials for ArviZ."""
+    """Write belief and trials for ArviZ; predictions too, with --simulator."""
     from sbi_active import to_inference_data
 
-    if campaign.simulator is None:
-        say("note: without predictions and likelihoods; add --simulator, or --trust")
     to_inference_data(campaign, seed=seed).to_netcdf(str(netcdf))
     return Answer({"saved": str(netcdf)}, f"saved: {netcdf}")
 
 
-@cli.command(cli.DIR, cli.SIMULATOR, cli.TRUST)
-def serve(folder: Path, **given: Any) -> None:
+@cli.command(cli.DIR, PAGE)
+def watch(folder: Path, out: Path | None) -> None:
+    """Write a page that follows a campaign while another process runs it.
+
+    A browser loads the page again every five seconds; the folder is only read.
+    """
+    from sbi_active import Campaign
+    from sbi_active.campaign.display.page import page
+
+    out, seen = out or Path("watch.html"), None
+    while True:
+        if (now := record.digest(folder)) != seen:
+            with Campaign.load(folder) as campaign:
+                text = page(campaign).replace("<head>", f"<head>\n{AGAIN}", 1)
+            part = out.with_suffix(".part")  # no browser sees half of it
+            part.write_text(text, encoding="utf-8")
+            part.replace(out)
+            if seen is None:
+                print(f"open {out.resolve().as_uri()}, until Ctrl-C", flush=True)
+            seen = now
+        time.sleep(1)
+
+
+@cli.command(cli.DIR, cli.SIMULATOR, cli.NOISE)
+def serve(folder: Path, simulator: str | None, noise: Any) -> None:
     """Answer requests of a program, a JSON object a line, as {"command": "ask"}.
 
     They end with standard input. What simulators print goes to standard error.
     """
-    session = Session(folder)
+    session = Session(folder, simulator, noise)
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     with answers, output_to_errors():
         for line in filter(bytes.strip, sys.stdin.buffer):
-            print(as_line(_answer(line, session, given)), file=answers, flush=True)
+            name: dict[str, Any] = {}
+            try:
+                request, got = json.loads(line), f"{line.strip()!a:.80}"
+                advice = 'write one, as {"command": "ask"}'
+                require(isinstance(request, dict), "a JSON object a line", got, advice)
+                name = {key: request.pop(key) for key in request.keys() & {"id"}}
+                answer = {"answer": _called(session, **request).data}
+            except Exception as error:
+                answer = {"error": failure(error)}
+            print(as_line({**name, **answer}), file=answers, flush=True)
 
 
-def _answer(line: bytes, session: Session, given: dict[str, Any]) -> dict[str, Any]:
-    """Return the answer to a request, or its error; both with the id that it has."""
-    name: dict[str, Any] = {}
-    try:
-        request: Any = None
-        with contextlib.suppress(ValueError, RecursionError):
-            request = json.loads(line)
-        if not isinstance(request, dict):
-            raise ValueError(
-                f'expected a request as {{"command": "ask"}}; got {line.strip()!a:.80};'
-                " write one JSON object a line"
-            )
-        name = {"id": request.pop("id")} if "id" in request else {}
-        return {**name, "answer": _called(request, session, given)}
-    except Exception as error:
-        return {**name, "error": failure(error)}
-
-
-def _called(
-    request: dict[str, Any], session: Session, given: dict[str, Any]
-) -> dict[str, Any]:
-    name = request.pop("command", None)
-    if not isinstance(name, str) or name not in ON_CAMPAIGN:
-        raise ValueError(
-            f"expected a command among {', '.join(sorted(ON_CAMPAIGN))}; got "
-            f'{name!r:.80}; write one of these, as in {{"command": "ask"}}'
-        )
-    command = ON_CAMPAIGN[name]
-    written = cli.named(command, request, "the request")
-    if "x" in written:  # numbers of any shape, null for one not measured
-        written["x"] = ["nan" if v is None else v for v in flat(written["x"])]
-    held = {"default_map": {**given, **written, "folder": session.folder}}
-    root = click.get_current_context().find_root()
-    with command.make_context(name, [], parent=root, obj=session, **held) as context:
-        return command.invoke(context).data
+def _called(session: Session, command: Any = None, **given: Any) -> Answer:
+    expected = f"a command among {', '.join(sorted(ON_CAMPAIGN))}"
+    got, advice = f"{command!r:.80}", "write one of these"
+    require(command in [*ON_CAMPAIGN], expected, got, advice)
+    found = ON_CAMPAIGN[command]
+    names = {param.name for param in found.params} - {"folder", "simulator", "noise"}
+    wrong = ", ".join(given.keys() - names)
+    require(not wrong, f"options among {', '.join(sorted(names))}", wrong, "correct it")
+    if given.get("x") is not None:  # numbers of any shape, null for one not measured
+        given["x"] = ["nan" if v is None else v for v in flat(given["x"])]
+    values = {name: value for name, value in given.items() if value is not None}
+    root: Any = click.get_current_context().find_root()
+    how: Any = {"parent": root, "default_map": {**values, "folder": session.folder}}
+    with found.make_context(command, [], obj=session, **how) as context:
+        return found.invoke(context)

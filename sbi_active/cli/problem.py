@@ -1,13 +1,20 @@
-"""Objects that options name: simulators, priors, action spaces, tasks, effects."""
+"""Problems that options name: simulators, priors, action spaces, tasks, effects.
+
+A campaign's folder may come from an untrusted source, so nothing in it says what is
+imported. What was named by ``init``, ``run`` or ``--simulator`` is remembered for the
+folder, outside of it.
+"""
 
 from __future__ import annotations
 
 import copy
+import hashlib
 import importlib
-import math
+import json
 import os
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from operator import lt
 from pathlib import Path
@@ -15,13 +22,12 @@ from typing import Any
 
 import torch
 from sbi.utils import BoxUniform
+from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.actions import ActionSpace, BoxActions, DiscreteActions, MixedActions
-from sbi_active.campaign import Campaign, CampaignOptions
-from sbi_active.cli.declare import FORMER, as_json, number_of, pairs_of
-from sbi_active.cli.output import located
-from sbi_active.cli.trusted import names_object, read_declared, require_trust
+from sbi_active import BoxActions, Campaign, CampaignOptions, DiscreteActions
+from sbi_active.actions import ActionSpace
+from sbi_active.cli.declare import located, misuse, number_of, pairs_of
 from sbi_active.criticism import Effect, generic_effects
 from sbi_active.expected import require
 from sbi_active.simulation import GaussianNoise, SimulatorModel
@@ -33,71 +39,52 @@ from sbi_active.tasks import Task, get_task  # pyright: ignore
 MOST_ACTIONS = 100_000
 
 
-def load_object(name: str, kind: Any = object) -> Any:
-    """Import what a user names.
+def load_module(place: str, here: str | None = None) -> tuple[Any, str]:
+    """Import what ``module:name`` or ``path/file.py:name`` names.
 
     Args:
-        name: ``module:attribute``, or ``path/file.py:attribute``.
-        kind: Class that it has to be of.
+        place: Place of an object.
+        here: Folder where a module is looked for first; None is the current one.
+
+    Returns:
+        The module, and the name.
 
     Raises:
-        ValueError: If there is no such module or attribute, it cannot be imported, or
-            it is of another class.
+        ValueError: If there is no such module or name, or it cannot be imported.
     """
-    module, _, attribute = name.partition(":")
+    module, _, name = place.partition(":")
+    expected = "MODULE:NAME or file.py:NAME, such as my_robot.py:simulator"
+    require(bool(name), expected, repr(place), "add its name behind a colon")
     file = Path(module).resolve() if module.endswith(".py") else None
-    if file is not None:
-        require(file.is_file(), "a file", f"none at {file}", "check the path")
-        sys.path.insert(0, str(file.parent))
-        module = file.stem
-    elif (here := os.getcwd()) in sys.path:  # before what is installed
-        sys.path.remove(here)
-        sys.path.insert(0, here)
+    require(file is None or file.is_file(), "a file", f"none at {file}", "check it")
+    module, folder = (file.stem, str(file.parent)) if file else (module, here)
+    folder = folder or os.getcwd()  # before what is installed
+    sys.path[:] = [folder, *(p for p in sys.path if p != folder)]
     try:
         loaded = importlib.import_module(module)
-        origin = getattr(loaded, "__file__", None)
-        is_own = file is None or origin is not None and Path(origin).resolve() == file
-        found = getattr(loaded, attribute) if is_own else None
+        origin = Path(getattr(loaded, "__file__", None) or "built in").resolve()
+        alone = "a file whose name no other module has"
+        require(file in (None, origin), alone, f"one called as {origin}", "rename it")
+        getattr(loaded, name)
     except (Exception, SystemExit) as error:
-        raise ValueError(
-            "expected MODULE:NAME, such as my_robot:simulator, to be imported; got "
-            f"{located(error)} from {name}; correct it"
-        ) from error
-    if not is_own:
-        raise ValueError(
-            f"expected a file whose name no other module has; got {module}.py, which "
-            f"is also {origin or 'built in'}; rename the file"
-        )
-    if not isinstance(found, kind):
-        raise ValueError(
-            f"expected a {kind.__name__} under {name}; got {type(found).__name__}; "
-            "name another object"
-        )
-    return found
+        got = f"{located(error)} from {place}"
+        raise ValueError(f"expected {expected}; got {got}; correct it") from error
+    return loaded, name
 
 
-def campaign_options(given: dict[str, Any]) -> CampaignOptions:
-    """Return the options of a campaign that --set gives, which are taken from these."""
-    former = {FORMER[name]: given.pop(name) for name in {*FORMER} & {*given}}
-    texts = {name: text for name, text in former.items() if text is not None}
+def campaign_options(texts: Sequence[str]) -> CampaignOptions:
+    """Return the options of a campaign, each text ``NAME=VALUE``, or a field of one."""
     options = CampaignOptions()
-    for name, text in (texts | pairs_of(given.pop("set"))).items():
-        try:
-            options = _changed(options, name, as_json(text))
-        except (TypeError, AttributeError) as error:
-            raise ValueError(
-                f"expected a setting of a campaign; got {name}={text} ({error}); "
-                "correct it"
-            ) from error
+    for name, value in pairs_of(texts).items():
+        with misuse("a setting of a campaign"):
+            options = _changed(options, name.split("."), value)
     return options
 
 
-def _changed(settings: Any, name: str, value: Any) -> Any:
-    """Return settings with a field of another value, or with a field of a field."""
-    field, point, rest = name.partition(".")
-    if point:
-        value = _changed(getattr(settings, field), rest, value)
-    return replace(settings, **{field: value})
+def _changed(settings: Any, names: Sequence[str], value: Any) -> Any:
+    name, *rest = names
+    value = _changed(getattr(settings, name), rest, value) if rest else value
+    return replace(settings, **{name: value})
 
 
 def task_of(name: str, texts: Sequence[str]) -> Task:
@@ -108,21 +95,15 @@ def task_of(name: str, texts: Sequence[str]) -> Task:
         texts: Options, each ``NAME=VALUE``.
 
     Raises:
-        ValueError: If an option has no value, the task has none of that name, or what
-            the task needs is not installed or its data are elsewhere.
+        ValueError: If the task has no such option, or what it needs is not installed
+            or its data are elsewhere.
 
     Example:
         >>> task_of("numerical", ["variant=sinh"]).variant
         'sinh'
     """
-    values = {key: as_json(text) for key, text in pairs_of(texts).items()}
-    try:
-        return get_task(name, **values)
-    except (ImportError, FileNotFoundError, TypeError) as error:
-        raise ValueError(
-            f"expected what {name!r} needs; got {values} ({error}); install it, or "
-            "correct --option"
-        ) from error
+    with misuse(f"what {name!r} needs"):
+        return get_task(name, **pairs_of(texts))
 
 
 def problem_of(
@@ -130,42 +111,36 @@ def problem_of(
 ) -> tuple[Any, Any, Any, list[Effect]]:
     """Return simulator, prior, actions and effects that options give.
 
-    A prior or actions that are not declared are None.
+    What they leave out is taken from the simulator's module. A prior or actions that
+    are not declared are None.
 
     Args:
-        given: Values of the options ``PROBLEM``, ``EFFECTS``, "names" and "units" by
-            their names, as far as there are any. They count before what a task has.
+        given: Values of the options ``SIMULATOR``, ``SPACE``, "names" and "units" by
+            their names, as far as there are any, and the folder of a module.
         needs: Parts without which nothing can be done.
 
     Raises:
-        ValueError: If too much or too little is given, or it is not what it has to be.
+        ValueError: If too little is given, or it is not what it has to be.
     """
-    simulator, task = given.get("simulator"), given.get("task")
-    if (task is None) == (simulator is None):
-        raise ValueError(
-            "expected --simulator or --task; got both or neither; name one, as in "
-            "--simulator my_robot.py:fn"
-        )
-    whole: Any = None if task is None else task_of(task, given.get("option", ()))
-    model = load_object(str(simulator)) if whole is None else whole.simulator
-    prior = prior_of(given) or getattr(whole, "prior", None)
-    if prior is None and "prior" in needs:
-        raise ValueError(
-            "expected --theta-low and --theta-high, or --prior; got none; give bounds "
-            "as in --theta-low=0,-1 --theta-high=1,1"
-        )
-    actions, names, units = map(given.get, ("actions", "names", "units"))
-    space: Any = actions_of(actions) if actions else getattr(whole, "actions", None)
-    if space is None and "actions" in needs:
-        raise ValueError("expected --actions; got none; write, say, --actions 0:5:11")
+    advice = "name it, as in --simulator my_robot.py:fn"
+    require(bool(given.get("simulator")), "--simulator", "none", advice)
+    module, name = load_module(given["simulator"], given.get("folder"))
+    model = with_noise(getattr(module, name), given.get("noise"))
+    prior = _prior_of(given) or getattr(module, "prior", None)
+    specs, names, units = map(given.get, ("actions", "names", "units"))
+    space: Any = actions_of(specs) if specs else getattr(module, "actions", None)
+    effects = [*getattr(module, "effects", ())]
+    for part, value, kind, said in (
+        ("prior", prior, Distribution, "--theta-low and --theta-high, or a prior"),
+        ("actions", space, ActionSpace, "--actions, or actions"),
+    ):
+        is_right = isinstance(value, kind) or value is None and part not in needs
+        got = f"{type(value).__name__} in {module.__name__}"
+        require(is_right, f"{said} of class {kind.__name__}", got, "declare one")
     if space is not None and (names or units):
         labels = names.split(",") if names else space.names
         space._label(labels, units.split(",") if units else space.units)
-    effects = [
-        *getattr(whole, "effects", list)(),
-        *effects_of(given.get("effects", ())),
-    ]
-    return with_noise(model, given.get("noise")), prior, space, effects
+    return model, prior, space, effects
 
 
 def with_noise(simulator: Any, sd: Sequence[float] | None) -> Any:
@@ -174,11 +149,8 @@ def with_noise(simulator: Any, sd: Sequence[float] | None) -> Any:
     Raises:
         ValueError: If it is no function, or the noise is not positive.
     """
-    if not callable(simulator):
-        raise ValueError(
-            f"expected a function or SimulatorModel; got {type(simulator).__name__}; "
-            "name what takes (theta, action)"
-        )
+    got, advice = type(simulator).__name__, "name what takes (theta, action)"
+    require(callable(simulator), "a function or SimulatorModel", got, advice)
     if sd is None:
         return simulator
     require(min(sd) > 0, "--noise > 0", sd, "give the standard deviation of x")
@@ -188,80 +160,34 @@ def with_noise(simulator: Any, sd: Sequence[float] | None) -> Any:
     return noisy
 
 
-def prior_of(given: Mapping[str, Any]) -> Distribution | None:
-    """Return the prior that --prior, or --theta-low and --theta-high, name."""
-    prior, low, high = map(given.get, ("prior", "theta_low", "theta_high"))
-    if prior is not None:
-        return load_object(prior, kind=Distribution)
-    if low is None and high is None:
-        return None
-    expected = "--theta-low below --theta-high, one of each a parameter"
-    low, high = low or [], high or []
+def _prior_of(given: Mapping[str, Any]) -> Distribution | None:
+    low, high = given.get("theta_low") or [], given.get("theta_high") or []
     is_box = len(low) == len(high) and all(map(lt, low, high))
+    expected = "--theta-low below --theta-high, one of each a parameter"
     require(is_box, expected, f"{low} and {high}", "give both")
-    return BoxUniform(torch.tensor(low), torch.tensor(high))
+    return BoxUniform(torch.tensor(low), torch.tensor(high)) if low else None
 
 
 def actions_of(specs: Sequence[str]) -> ActionSpace:
     """Return the action space that --actions names."""
-    if len(specs) == 1 and names_object(specs[0]):
-        return load_object(specs[0], kind=ActionSpace)
-    entries = [_entry(spec) for spec in specs]
-    values = [entry for entry in entries if isinstance(entry, list)]
-    if len(values) == len(entries):
-        _require_few(math.prod(map(len, values)))
-        return DiscreteActions(torch.cartesian_prod(*map(torch.tensor, values)))
-    if not values:
-        low, high = zip(*entries, strict=True)
+    if all(spec.count(":") == 1 for spec in specs):
+        low, high = zip(*(map(number_of, s.split(":")) for s in specs), strict=True)
         return BoxActions([*low], [*high])
-    parts: list[ActionSpace] = []
-    for k, entry in enumerate(entries):
-        names = [f"action_{k}"]
-        if isinstance(entry, list):
-            parts.append(DiscreteActions(entry, names=names))
-        else:
-            parts.append(BoxActions(*entry, names=names))
-    return MixedActions(*parts)
+    return DiscreteActions(torch.cartesian_prod(*map(_values_of, specs)))
 
 
-def _entry(spec: str) -> tuple[float, float] | list[float]:
-    """Return the limits that LOW:HIGH writes, or the values that anything else does."""
-    parts = spec.split(":")
-    if len(parts) == 1:
-        return [number_of(part) for part in spec.split(",")]
-    low, high = map(number_of, parts[:2])
-    if len(parts) == 2:
-        return low, high
-    count = int(parts[2]) if len(parts) == 3 and parts[2].isdecimal() else 0
-    require(count > 0, "LOW:HIGH:COUNT or A,B,...", repr(spec), "write, say, 0:5:11")
-    _require_few(count)
-    return torch.linspace(low, high, count).tolist()
+def _values_of(spec: str) -> Tensor:
+    low, *rest = spec.split(":")
+    if not rest:
+        return torch.tensor([*map(number_of, spec.split(","))])
+    count = int(rest[1]) if len(rest) == 2 and rest[1].isdecimal() else 0
+    expected = f"LOW:HIGH:COUNT of at most {MOST_ACTIONS} actions, or A,B,..."
+    advice = "write, say, 0:5:11; declare a mix of limits and values as actions"
+    require(0 < count <= MOST_ACTIONS, expected, repr(spec), advice)
+    return torch.linspace(number_of(low), number_of(rest[0]), count)
 
 
-def _require_few(count: int) -> None:
-    advice = "write LOW:HIGH for any number between, or a smaller COUNT"
-    require(count <= MOST_ACTIONS, f"at most {MOST_ACTIONS} actions", count, advice)
-
-
-def effects_of(names: Sequence[str]) -> list[Effect]:
-    """Return effects, each name that of a list or of a function that returns one."""
-    effects: list[Effect] = []
-    for name in names:
-        listed: Any = load_object(name)
-        listed = listed() if callable(listed) else listed
-        listed = [*listed] if isinstance(listed, Iterable) else [listed]
-        if not all(isinstance(effect, Effect) for effect in listed):
-            raise ValueError(
-                f"expected a list of Effect under {name}; got {listed!r:.80}; declare "
-                "sbi_active.criticism.Effect"
-            )
-        effects += listed
-    return effects
-
-
-def with_generic(
-    own: Sequence[Effect], simulator: Any, space: Any, prior: Distribution
-) -> list[Effect]:
+def with_generic(own: Any, simulator: Any, space: Any, prior: Any) -> list[Effect]:
     """Return effects and the generic ones, each name once.
 
     Args:
@@ -272,59 +198,67 @@ def with_generic(
     """
     if not isinstance(simulator, SimulatorModel):
         simulator = SimulatorModel(simulator)
+    named = {effect.name for effect in own}
     generic = generic_effects(simulator, space, prior=prior)
-    found: dict[str, Effect] = {}
-    for effect in [*own, *generic]:
-        found.setdefault(effect.name, effect)
-    return [*found.values()]
+    return [*own, *(effect for effect in generic if effect.name not in named)]
 
 
-def library_of(campaign: Campaign, effects: Sequence[str]) -> list[Effect]:
-    """Return the effects to compare a campaign's simulator with.
-
-    Args:
-        campaign: Campaign whose own effects follow, and then the usual ones.
-        effects: Names of further effects, which come first.
-    """
+def library_of(campaign: Campaign) -> list[Effect]:
+    """Return the effects to compare a campaign's simulator with."""
     # An adopted effect is declared for the simulator without it.
     base = getattr(campaign.simulator, "base", campaign.simulator)
-    own = [*effects_of(effects), *campaign.effects]
-    return with_generic(own, base, campaign.actions, campaign.first_prior)
+    return with_generic(campaign.effects, base, campaign.actions, campaign.first_prior)
 
 
 def open_campaign(
-    folder: Path,
-    *,
-    simulator: str | None = None,
-    trust: bool = False,
-    simulator_changed: bool = False,
+    folder: Path, simulator: str | None, noise: Any, simulator_changed: bool
 ) -> Campaign:
     """Return the campaign of a folder, with its simulator.
 
     Args:
         folder: Folder of the campaign.
-        simulator: Place of the simulator; None if the folder says it.
-        trust: Whether to import what the folder names.
+        simulator: Place of the simulator; None is the one that was named before.
+        noise: Standard deviation of x; None is what was given before.
         simulator_changed: Whether to take another simulator than before.
 
     Raises:
-        ValueError: If there is no campaign, or its simulator is not known, or
-            only the folder says so.
+        ValueError: If there is no campaign, or its simulator is not known.
     """
-    reader, declared = Campaign.load(folder), read_declared(folder)
+    reader, known = Campaign.load(folder), _remembered(folder)
+    how: Any = {"simulator_changed": simulator_changed}
+    if simulator is None and "task" in known:
+        task = task_of(known["task"], known["option"])
+        return Campaign.load(folder, simulator=task.simulator, **how)
     if simulator is not None:
-        declared |= {"simulator": None, "task": None, "option": []}
-    require_trust(folder, declared, trusts=trust)
-    sys.path += filter(None, [declared.get("folder")])  # where modules were found
-    own = {} if simulator is None else {"simulator": simulator}
-    model, prior, actions, effects = problem_of({**declared, **own}, needs=())
+        known = {"simulator": simulator, "noise": noise}
+    model, prior, actions, effects = problem_of(known, needs=())
     if reader.state.version.effects:
         effects = with_generic(effects, model, reader.actions, reader.first_prior)
-    return Campaign.load(
-        folder,
-        simulator=model,
-        prior=prior,
-        actions=actions,
-        effects=effects,
-        simulator_changed=simulator_changed,
-    )
+    how |= {"simulator": model, "prior": prior, "actions": actions, "effects": effects}
+    campaign = Campaign.load(folder, **how)
+    remember(folder, **known)
+    return campaign
+
+
+def remember(folder: Path, /, **options: Any) -> None:
+    """Write down which program somebody here named for a campaign."""
+    place, colon, name = (options.get("simulator") or "").partition(":")
+    if place.endswith(".py"):
+        options["simulator"] = f"{Path(place).resolve()}{colon}{name}"
+    path = _path_of(folder)
+    with suppress(OSError):  # as in a home that is read only: --simulator each time
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps({"folder": os.getcwd(), **options}))
+
+
+def _remembered(folder: Path) -> dict[str, Any]:
+    found: Any = {}
+    with suppress(OSError, ValueError):
+        found = json.loads(_path_of(folder).read_text())
+    return found
+
+
+def _path_of(folder: Path) -> Path:
+    home = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
+    name = hashlib.sha256(os.fsencode(folder.resolve())).hexdigest()
+    return Path(home, "sbi-active", f"{name}.json")

@@ -16,17 +16,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from sbi_active.campaign.telling import (
-    LOG,
-    STATE,
-    SUMMARY,
-    Facts,
-    Telling,
-    event_of,
-    facts_in,
-    flat,
-)
-from sbi_active.cli.output import Answer
+from sbi_active.campaign import telling
+from sbi_active.campaign.telling import Facts, Telling, flat
+from sbi_active.cli.declare import Answer
 from sbi_active.simulation.bank.store import Store
 
 
@@ -41,7 +33,7 @@ def digest(folder: Path) -> str:
         folder: Folder of the campaign.
     """
     with contextlib.suppress(OSError, ValueError), _stored(folder) as store:
-        return store.seal(LOG, STATE)
+        return store.seal(telling.LOG, telling.STATE)
     return ""
 
 
@@ -63,14 +55,14 @@ class Record(Telling[Any]):
         self.directory = folder
         try:
             with _stored(folder) as store:
-                self._known = json.loads(store.get(SUMMARY) or b"{}")
+                self._known = json.loads(store.get(telling.SUMMARY) or b"{}")
                 self._kept: list[Any] = [
                     SimpleNamespace(**trial) for trial in self._known["trials"]
                 ]
                 self.actions = SimpleNamespace(**self._known["actions"])
                 self._num: int = self._known["lines"]
-                for number in range(self._num + 1, store.length(LOG) + 1):
-                    self._take(store.json(LOG, number) or {})
+                for number in range(self._num + 1, store.length(telling.LOG) + 1):
+                    self._take(store.json(telling.LOG, number) or {})
         except (OSError, ValueError, RecursionError, LookupError, TypeError) as error:
             raise Unsure from error
 
@@ -111,9 +103,9 @@ class Record(Telling[Any]):
         raise Unsure from error
 
     def _record(self, event: str, facts: Facts) -> Any:
-        line = event_of(event, facts)
+        line = telling.event_of(event, facts)
         with _stored(self.directory) as store, store.writing():
-            if store.append(LOG, line) != self._num + 1:  # another process was faster
+            if store.append(telling.LOG, line) != self._num + 1:  # others were faster
                 raise Unsure
         self._take(line)
         return self._kept[facts.index]
@@ -123,7 +115,7 @@ class Record(Telling[Any]):
         self._num += 1
         if entry["event"] == "refused":
             return
-        facts, summary = facts_in(entry), self._known["summary"]
+        facts, summary = telling.facts_in(entry), self._known["summary"]
         if facts is None or facts.index > len(self._kept):
             raise Unsure
         self._kept[facts.index : facts.index + 1] = [facts]
@@ -147,13 +139,14 @@ def sum_up_campaign(campaign: Any) -> None:
     actions = campaign.actions
     with contextlib.suppress(Exception):  # a belief without moments has no summary
         is_box = type(actions).__name__ == "BoxActions"
-        limits = [actions.low.tolist(), actions.high.tolist()] if is_box else [[], []]
-        labels = {"names": [*actions.names], "units": [*actions.units]}
+        ends = (actions.low.tolist(), actions.high.tolist()) if is_box else ([], [])
+        names, units = [*actions.names], [*actions.units]
+        limits = [*zip(*ends, strict=True)]
         known = {
             "summary": summary_of(campaign),
             "trials": [scored(trial) for trial in campaign.state.trials],
             "x_shape": [*campaign.x_shape],
-            "actions": {**labels, "limits": [*zip(*limits, strict=True)]},
+            "actions": {"names": names, "units": units, "limits": limits},
             "processed": [*campaign.state.processed],
         }
         campaign._storage.sum_up(known)
@@ -164,26 +157,21 @@ def summary_of(campaign: Any) -> dict[str, Any]:
     if isinstance(campaign, Record):
         return campaign.summary
     belief = campaign.belief
-    mean, variance = belief.mean.reshape(-1), belief.variance.reshape(-1)
+    mean, sd = belief.mean.flatten().tolist(), belief.variance.flatten().tolist()
     names = campaign.parameter_names or [f"theta_{k + 1}" for k in range(len(mean))]
+    moments = [{"mean": m, "sd": v**0.5} for m, v in zip(mean, sd, strict=True)]
     diagnostics = getattr(belief, "diagnostics", None)
     said = [*getattr(diagnostics, "warnings", ())]
     together = getattr(diagnostics, "combinations", None)
-    return {
-        "method": campaign.state.method,
-        "belief": {
-            "parameters": {
-                name: {"mean": float(m), "sd": float(v) ** 0.5}
-                for name, m, v in zip(names, mean, variance, strict=True)
-            },
-            "trustworthy": getattr(diagnostics, "trustworthy", None),
-            "warnings": said,
-            "codes": [warning.code for warning in said],
-            "combinations": str(together) if together else None,
-        },
-        "health": campaign.health,
-        "not_in_belief": campaign.not_in_belief,
+    found = {
+        "parameters": dict(zip(names, moments, strict=True)),
+        "trustworthy": getattr(diagnostics, "trustworthy", None),
+        "warnings": said,
+        "codes": [warning.code for warning in said],
+        "combinations": str(together) if together else None,
     }
+    now = {"health": campaign.health, "not_in_belief": campaign.not_in_belief}
+    return {"method": campaign.state.method, "belief": found, **now}
 
 
 def scored(trial: Any) -> dict[str, Any]:
@@ -194,43 +182,36 @@ def scored(trial: Any) -> dict[str, Any]:
 
 def trial_of(campaign: Any, trial: Any) -> dict[str, Any]:
     """Return a trial as JSON, but for NaN."""
-    entries = scored(trial)
-    x = entries.pop("x")
-    return {
-        "trial": entries.pop("index"),
-        **entries,
-        "action": _floats(entries["action"]),
-        "x": None if x is None else _floats(x),
-        "names": [*campaign.actions.names],
-        "units": [*campaign.actions.units],
-    }
-
-
-def _floats(listed: Any) -> list[float]:
-    return [math.nan if value is None else value for value in flat(listed)]
+    found = scored(trial)
+    found = {"trial": found.pop("index"), **found}
+    for name in ("action", "x"):
+        if found[name] is not None:
+            numbers = flat(found[name])
+            found[name] = [math.nan if value is None else value for value in numbers]
+    actions = campaign.actions
+    return {**found, "names": [*actions.names], "units": [*actions.units]}
 
 
 def answer_of(campaign: Any) -> Answer:
     """Return the trials, the belief and the health of a campaign or a record."""
     trials = [trial_of(campaign, trial) for trial in campaign._trials]
     data = {**summary_of(campaign), "trials": trials}
-    belief = data["belief"]
-    pending = sum(trial["status"] == "pending" for trial in trials)
-    head = f"{data['method']}, {len(trials) - pending} trials"
-    head += f"{', one pending' if pending else ''}, health {data['health']}"
-    lines = ["; ".join(filter(None, [head, belief["combinations"]]))]
-    for trial in trials:
-        gained, reason = trial["information_gained"], trial["reason"]
-        gain = "" if gained is None else f"  {gained:.2f} nats"
-        why = f"  ({reason})" if reason else ""
-        shown = f"{place_of(trial)}{numbers_of(trial, '  x = ')}{gain}{why}"
-        lines.append(f"{trial['trial']:>4}  {trial['status']:<9} {shown}")
+    belief, waiting = data["belief"], data["not_in_belief"]
+    lines = [f"{data['method']}, {len(trials)} trials, health {data['health']}"]
+    lines += map(_line_of, trials)
     for name, entry in belief["parameters"].items():
         lines.append(f"{name:>12} = {entry['mean']:.4g} +- {entry['sd']:.2g}")
-    lines += [f"note: {w}" for w in belief["warnings"]]
-    if waiting := data["not_in_belief"]:
+    notes = [belief["combinations"], *belief["warnings"]]
+    lines += [f"note: {said}" for said in notes if said]
+    if waiting:
         lines.append(f"not in the belief yet: {waiting}; run sbi-active update")
     return Answer(data, "\n".join(lines))
+
+
+def confirmed(campaign: Any, trial: Any) -> Answer:
+    """Return a trial that was told."""
+    data = trial_of(campaign, trial)
+    return Answer(data, f"{_line_of(data)}\nnext: sbi-active ask {campaign.directory}")
 
 
 def place_of(trial: Mapping[str, Any]) -> str:
@@ -239,9 +220,8 @@ def place_of(trial: Mapping[str, Any]) -> str:
     return ", ".join(f"{n} = {v:.6g}{f' {u}' if u else ''}" for n, v, u in parts)
 
 
-def numbers_of(trial: Mapping[str, Any], before: str) -> str:
-    """Return the first numbers of a trial's outcome, nothing where there is none."""
-    x: Sequence[float] | None = trial["x"]
-    if x is None:
-        return ""
-    return f"{before}{', '.join(f'{v:.4g}' for v in x[:4])}{', ...' * (len(x) > 4)}"
+def _line_of(trial: Mapping[str, Any]) -> str:
+    x, reason = trial["x"] or [], trial["reason"]
+    numbers = ", ".join(f"{v:.4g}" for v in x[:4]) + ", ..." * (len(x) > 4)
+    line = f"{trial['trial']:>4}  {trial['status']:<9} {place_of(trial)}"
+    return line + f"  x = {numbers}" * bool(x) + f"  ({reason})" * bool(reason)

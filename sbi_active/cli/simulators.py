@@ -1,199 +1,179 @@
-"""Commands on simulators: run a task, check one, fill a bank; and bring files up."""
+"""Commands on simulators: run, check and criticize one; and bring files up to date."""
 
 from __future__ import annotations
 
+import inspect
 import itertools
 import sys
-import time
-import warnings
-from dataclasses import replace
-from datetime import date
 from pathlib import Path
 from typing import Any
 
 import click
 
 from sbi_active.cli import declare as cli
-from sbi_active.cli.output import say
+from sbi_active.cli.campaign import Session
+from sbi_active.cli.declare import Answer
 from sbi_active.cli.record import answer_of, sum_up_campaign
-from sbi_active.cli.trusted import write_declared
+from sbi_active.expected import require
 
-MANY_ACTIONS = 50  # that stand for a space without a list, to count simulations
-LONG = 20.0  # seconds of simulation a round, beside which learning counts little
-#: Rows that are drawn and simulated at once. Part of the definition of a bank's theta
-#: and action given a seed, so it is never a setting.
-BLOCK = 1_000
+#: Arguments and options that say what is compared with what.
+CRITICIZE = [
+    cli.argument("trials", "TRIALS.csv", cli.FILE),
+    *(cli.SIMULATOR, *cli.SPACE, cli.SEED, cli.JSON),
+    cli.repeated("--columns", "as x=height_m", "KEY=NAME[,NAME...]"),
+    cli.option("--inputs", "at times of their own", cli.FILE, "INPUTS.csv"),
+    cli.repeated("--set", "of close_loop, as warm_up=0.5", "NAME=VALUE"),
+    cli.option("--out", "folder for the report", cli.FOLDER, "DIR"),
+]
 
-bank = click.Group(
-    "bank", help="Simulate into a bank, and inspect one.", no_args_is_help=False
-)
-cli.program.add_command(bank)
+
+@cli.command(*CRITICIZE)
+def criticize(trials: Path, **given: Any) -> Answer:
+    """Find what a simulator lacks, from measured trials.
+
+    Find the residual, trace it to an effect that the simulator lacks, add it, and
+    report the error before and after.
+
+    TRIALS.csv has one row a trial, with columns action_* and x_* and optionally role
+    (fit or 'held out'), index and repeat_of; or one row a sample, with columns trial
+    and time besides, and with input_* in place of actions that vary in time. start_* is
+    a measured start state. Units stand in brackets, as in x_height[m], and are those of
+    the simulator. An empty cell is what was not measured. In its place a folder: of a
+    campaign, which knows its simulator and its prior, or of recordings, with trials.csv
+    or one file *.csv a trial.
+    """
+    from sbi_active.campaign.storage.directory import has_manifest
+
+    if given["out"] is not None:  # else all is computed before this fails
+        given["out"].mkdir(parents=True, exist_ok=True)
+    if not (trials.is_dir() and has_manifest(trials)):
+        return _compared(trials, given)
+    own = (*("theta_low", "theta_high", "actions"), "columns", "inputs", "set")
+    wrong = ", ".join(name for name in own if given[name])
+    what = "--simulator, --noise or --out for a campaign, which has its own problem"
+    require(not wrong, what, wrong, "leave it out")
+    session = Session(trials, given["simulator"], given["noise"])
+    return session.call(_criticized, "simulator", out=given["out"])
+
+
+@cli.command(*CRITICIZE)
+def gate(**given: Any) -> Answer:
+    """Say whether a simulator may be used, as criticize finds it from the same trials.
+
+    The exit status is 0 for SHIP, 10 for NO_IMPROVEMENT, 11 for NOT_IDENTIFIABLE, 12
+    for OUT_OF_PRIOR, 13 for WRONG_MODEL and 14 for NOT_ENOUGH_DATA.
+    """
+    found = criticize.callback(**given).data["gate"]
+    text = f"{found['decision']}: {found['reason']}"
+    return Answer(found, text, found["exit_code"])
+
+
+def _criticized(campaign: Any, out: Path | None) -> Answer:
+    from sbi_active.cli.problem import library_of
+
+    data, text, _ = _answer(campaign.criticize(library_of(campaign)), out)
+    text += f"\n\nto go on with what it names: sbi-active adopt {campaign.directory}"
+    return Answer(data, text)
+
+
+def _answer(report: Any, out: Path | None) -> Answer:
+    saved = "" if out is None else f"\n\nsaved: {report.save(out)}"
+    return Answer(report.to_dict(), f"{report}{saved}")
+
+
+def _compared(path: Path, given: dict[str, Any]) -> Answer:
+    """Compare a simulator with the trials of a table, or of a folder of recordings."""
+    from sbi_active import DiscreteActions, SimulatorModel
+    from sbi_active.cli.problem import problem_of, with_generic, with_noise
+    from sbi_active.criticism import Trials, close_loop
+
+    how, columns = cli.pairs_of(given["set"]), cli.pairs_of(given["columns"])
+    with cli.misuse("settings of close_loop"):
+        inspect.signature(close_loop).bind_partial(**how)
+    noise = given.pop("noise")
+    model, prior, actions, effects = problem_of(given, needs=["prior"])
+    named = {key: str(names).split(",") for key, names in columns.items()}
+    trials = Trials.from_csv(path, columns=named or None, inputs=given["inputs"])
+    if not isinstance(model, SimulatorModel):
+        model = SimulatorModel(model, sample_times=trials.template()[1])
+    model = with_noise(model, noise)
+    # Only scales are taken from these where the permitted actions are unknown.
+    space = actions or DiscreteActions(trials.action.unique(dim=0).float())
+    known = space if trials.inputs is None else trials
+    how = {"show_progress": sys.stderr.isatty(), "seed": given["seed"], **how}
+    how |= {"effects": with_generic(effects, model, known, prior), "actions": actions}
+    return _answer(close_loop(model, prior, trials, **how), given["out"])
 
 
 @cli.command(
     cli.argument("task", "TASK", click.Choice(cli.TASKS)),
-    *(cli.METHOD, cli.ROUNDS, cli.SEED, cli.OF_TASK, *cli.OF_CAMPAIGN),
+    *(cli.METHOD, cli.SEED, cli.OF_TASK, cli.SETTINGS, cli.JSON),
+    cli.option("--rounds", "real trials", cli.COUNT, default=4),
     cli.option("--out", "folder for the results", cli.FOLDER, "DIR", required=True),
 )
-def run(
-    task: str, out: Path, method: str, rounds: int, seed: int, option: Any, **given: Any
-) -> None:
+def run(task: str, out: Path, method: str, seed: int, **given: Any) -> Answer:
     """Run a campaign on a task, and save its table and figure."""
     from sbi_active import Campaign
-    from sbi_active.cli.problem import campaign_options, task_of
+    from sbi_active.cli.problem import campaign_options, remember, task_of
     from sbi_active.display.figures import save
     from sbi_active.seeding import derive_seed, forked_generators
 
-    start, found = time.perf_counter(), task_of(task, option)
+    found = task_of(task, given["option"])
     # Campaigns of earlier runs stay as they are.
     paths = (out / f"campaign{f'-{k}' * (k > 1)}" for k in itertools.count(1))
     folder = next(path for path in paths if not path.exists())
     real = (derive_seed(seed, "real", index) for index in itertools.count())
-    with Campaign(
-        *(found.simulator, found.prior, found.actions),
-        method=method,
-        seed=seed,
-        options=campaign_options(given),
-        directory=folder,
-        show_progress=sys.stderr.isatty(),
-    ) as campaign:
-        write_declared(folder, task=task, option=option)
-        campaign.run(
-            lambda action: found.real_system(action, seed=next(real)), num_rounds=rounds
-        )
+    problem = found.simulator, found.prior, found.actions
+    how: Any = {"options": campaign_options(given["set"]), "method": method}
+    how |= {"show_progress": sys.stderr.isatty(), "directory": folder}
+    with Campaign(*problem, seed=seed, **how) as campaign:
+        remember(folder, task=task, option=given["option"])
+
+        def execute(action: Any) -> Any:
+            return found.real_system(action, seed=next(real))
+
+        campaign.run(execute, num_rounds=given["rounds"])
         with forked_generators(seed, "figure"):
             figure = campaign.plot(theta_true=found.theta_true)
         save(figure, str(out / "loop.png"))
         sum_up_campaign(campaign)
     campaign.to_dataframe().to_csv(out / "trials.csv")
-    names = zip(found.parameter_names, found.theta_true, strict=True)
-    print(answer_of(campaign).text)
-    print(f"the truth: {', '.join(f'{name} = {value:g}' for name, value in names)}")
-    wall = time.perf_counter() - start
-    print(f"{wall:.1f} s; figure: {out / 'loop.png'}; trials: {out / 'trials.csv'}")
-    print(f"to go on with it: sbi-active ask {folder}")
+    data, text, _ = answer_of(campaign)
+    truth = dict(zip(found.parameter_names, found.theta_true.tolist(), strict=True))
+    lines = [text, f"the truth: {', '.join(f'{k} = {v:g}' for k, v in truth.items())}"]
+    lines += [f"saved: {out / 'loop.png'}, trials.csv; next: sbi-active ask {folder}"]
+    return Answer({**data, "truth": truth}, "\n".join(lines))
 
 
 @cli.command(
-    cli.argument("simulator", "[MODULE:FUNCTION]", cli.TEXT, required=False),
-    *(cli.A_TASK, cli.OF_TASK, *cli.SPACE, cli.ROUNDS, cli.WORKERS, cli.SEED),
+    *(cli.argument("simulator", "MODULE:FUNCTION", str), *cli.SPACE, cli.SEED),
     cli.option("--rows", "a check", cli.COUNT, default=256),
+    cli.option("--simulations", "of a campaign, to tell its time", cli.COUNT),
+    cli.option("--workers", "that share them", cli.COUNT, default=1),
 )
-def check(rows: int, rounds: int, workers: int, seed: int, **problem: Any) -> int:
+def check(
+    rows: int, simulations: int | None, workers: int, seed: int, **problem: Any
+) -> Answer:
     """Look a simulator over before a campaign.
 
-    Shapes, seeds, noise, lost rows, parameters that change nothing, and the cost of a
-    campaign; exit status 1 where something keeps a campaign from working.
+    Shapes, seeds, noise, lost rows, time, and parameters that change nothing; exit
+    status 1 where something keeps a campaign from working.
     """
-    from sbi_active import CampaignOptions
     from sbi_active.cli.problem import problem_of
     from sbi_active.simulation import check_simulator
 
-    model, prior, actions, _ = problem_of(problem)
-    # The most that the default options allow: a round trains, designs over all actions,
-    # and refines on the trials so far.
-    options: Any = CampaignOptions(workers=workers)  # pyright: ignore
-    num_actions = len(getattr(actions, "values", range(MANY_ACTIONS)))
-    most = rounds * (options.num_simulations + num_actions * options.num_samples)
-    most += sum(range(1, rounds + 1)) * options.refinement.num_histories
-    say("running the simulator")
-    sizes: Any = {"num_rows": rows, "num_simulations": most, "workers": workers}
-    report = check_simulator(model, prior, actions, **sizes, seed=seed)
-    # Where simulations take longer than this, they are what a campaign takes.
-    if report.is_ready and 60 * (report.minutes or 0.0) <= LONG * rounds:
-        say("timing a round")
-        try:
-            seconds = time_round(model, prior, actions, options, seed)
-            report = replace(report, seconds_round=seconds, num_rounds=rounds)
-        except Exception as error:  # whatever a campaign meets is the finding
-            report = replace(report, defects=(f"a round of a campaign fails: {error}",))
-    print(report)
-    return 0 if report.is_ready else 1
-
-
-def time_round(model: Any, prior: Any, actions: Any, options: Any, seed: int) -> float:
-    """Return wall seconds of a round on an outcome that the prior allows."""
-    from sbi_active import Campaign, simulate
-    from sbi_active.seeding import forked_generators
-
-    start = time.perf_counter()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the round is thrown away
-        campaign = Campaign(model, prior, actions, seed=seed, options=options)
-        action = campaign.ask().action[None]
-        with forked_generators(seed, "truth"):
-            theta = prior.sample((1,)).float()
-        campaign.tell(simulate(model, theta, action, seed=seed).x[0])
-        campaign.update()
-    return time.perf_counter() - start
-
-
-@cli.command(
-    *(cli.DIR, *cli.PROBLEM, cli.SEED, cli.WORKERS),
-    cli.option("--rows", "in all, in whole thousands", cli.COUNT, required=True),
-    group=bank,
-)
-def build(folder: Path, rows: int, seed: int, workers: int, **problem: Any) -> None:
-    """Simulate into a bank, from where it ended."""
-    from tqdm import tqdm
-
-    from sbi_active import Bank, simulate
-    from sbi_active.cli.problem import problem_of
-    from sbi_active.seeding import derive_seed, forked_generators
-
-    model, prior, actions, _ = problem_of(problem)
-    missing = 0
-    with Bank(folder, simulator=model, created=date.today().isoformat()) as made:
-        store = made.drawn_from(prior, label="prior")
-        for start in tqdm(range(0, rows, BLOCK), desc="bank", unit_scale=BLOCK):
-            block = derive_seed(seed, "bank", start)
-            with forked_generators(block, "theta"):
-                theta = prior.sample((BLOCK,)).float()
-            action = actions.sample((BLOCK,), seed=derive_seed(block, "action"))
-            done = simulate(
-                model, theta, action, seed=block, workers=workers, store=store
-            )
-            missing += done.counts["missing"]
-    print(f"{folder}: {len(made)} rows, {made.counts}")
-    if missing:
-        print(f"note: {missing} rows are missing; run again to try them once more")
-
-
-@cli.command(cli.DIR, group=bank)
-def inspect(folder: Path) -> int:
-    """Show outcomes, and compare checksums."""
-    from sbi_active import Bank
-
-    made = Bank(folder)
-    if problems := made.verify():
-        print("\n".join(["checksums: NOT ok", *problems]))
-        return 1
-    header = made.header
-    shapes = (header["shapes"] or {}).items()
-    for line in (
-        f"simulator: {shown(made.simulator_name)} {shown(header['version'])}".rstrip(),
-        f"created: {shown(header['created'] or 'not noted')}",
-        *(f"{name}: {' x '.join(map(str, shape))} a row" for name, shape in shapes),
-        f"parameters: {', '.join(map(shown, header['parameter_names'] or ['?']))}",
-        f"rows: {made.counts}; on disk: {made.num_bytes / 2**20:.2f} MiB",
-        f"drawn from: {', '.join(shown(label or '?') for label in made.labels)}",
-        "checksums: ok",
-    ):
-        print(line)
-    return 0
-
-
-def shown(text: str) -> str:
-    """Return a text from a file so that it cannot steer the terminal."""
-    return text if text.isprintable() else ascii(text)
+    *found, _ = problem_of(problem)
+    how: Any = {"num_simulations": simulations, "workers": workers, "seed": seed}
+    report = check_simulator(*found, num_rows=rows, **how)
+    return Answer({}, str(report), 0 if report.is_ready else 1)
 
 
 @cli.command(cli.DIR)
-def migrate(folder: Path) -> None:
+def migrate(folder: Path) -> Answer:
     """Bring a campaign or bank of release 0.1 up to date."""
     from sbi_active.migration import migrate as migrated
 
-    for name, number in migrated(folder).items():
-        is_log = name == "log"
-        print(f"log: {number} events" if is_log else f"bank {name}: {number} rows")
-    print(f"the files of before are in {folder / 'version-1'}")
+    counts = migrated(folder)
+    lines = [f"{name}: {number}" for name, number in counts.items()]
+    lines += [f"the files of before are in {folder / 'version-1'}"]
+    return Answer(counts, "\n".join(lines))

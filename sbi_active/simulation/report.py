@@ -32,8 +32,6 @@ class SimulatorReport:
             tried, and the combinations of them that actions do determine.
         seconds_batch: Time of ``num_rows`` rows at once.
         seconds_row: Time of a call with one row.
-        seconds_round: Measured wall time of a campaign's round; None if it was not.
-        num_rounds: Rounds of that campaign.
         num_simulations: Simulations that a campaign needs.
         num_workers: Workers that share them.
         noiseless: Numbers of x, flattened, that two seeds leave as they are while
@@ -56,8 +54,6 @@ class SimulatorReport:
     undetermined: tuple[Undetermined, ...] = ()
     seconds_batch: float | None = None
     seconds_row: float | None = None
-    seconds_round: float | None = None
-    num_rounds: int = 1
     num_simulations: int | None = None
     num_workers: int = 1
     noiseless: tuple[int, ...] = ()
@@ -75,12 +71,7 @@ class SimulatorReport:
 
     @property
     def minutes(self) -> float | None:
-        """Time of a campaign, as the round that was measured, or of its simulations.
-
-        If no round was measured, simulations are shared evenly by the workers.
-        """
-        if self.seconds_round is not None:
-            return self.num_rounds * self.seconds_round / 60
+        """Time of a campaign's simulations, which workers share evenly."""
         if self.seconds_batch is None or self.num_simulations is None:
             return None
         seconds = self.num_simulations * self.seconds_batch / self.num_rows
@@ -108,11 +99,10 @@ class SimulatorReport:
                 f"once, {1e3 * self.seconds_row:.3g} ms for one"
             )
         if self.minutes is not None:
-            of = "" if self.seconds_round else " for them, and some to learn"
             workers = f"{self.num_workers} worker{'s' * (self.num_workers > 1)}"
             lines.append(
                 f"campaign: at most {self.num_simulations:,} simulations, about "
-                f"{_duration(self.minutes)} on {workers}{of}"
+                f"{_duration(self.minutes)} on {workers} for them, and some to learn"
             )
         lines += [f"warning: {text}" for text in self.warnings]
         lines += [f"defect: {text}" for text in self.defects]

@@ -20,7 +20,7 @@ def slide(theta, action):
 BOX = ["--theta-low=0.2,0", "--theta-high=1,1"]
 SIZES = ["num_simulations=200", "details.num_scored=500", "network=on demand"]
 SIZES += ["refinement.num_histories=200", "refinement.num_effective=25"]
-SMALL = ["--noise", "0.02", "--method", "nsbi", "--set", *SIZES]
+SMALL = ["--noise", "0.02", "--method", "nsbi", *(f"--set={s}" for s in SIZES)]
 INIT = ["init", "camp", *BOX, *SMALL, "--actions", "0.5:3", "--simulator"]
 
 

@@ -9,19 +9,6 @@ import pytest
 from sbi_active.cli import main, problem
 from tests.cli.sled import SMALL, read
 
-CONFIG = """
-simulator = "sled.py:slide"
-theta-low = [0.2, 0.0]
-theta-high = "1,1"
-actions = "0.5:3"
-names = "speed"
-units = "m/s"
-noise = 0.02
-method = "nsbi"
-set = ["num_simulations=200"]
-seed = 4
-"""
-
 
 def answer(capsys, *words):
     """Return what a command prints as JSON."""
@@ -31,7 +18,8 @@ def answer(capsys, *words):
 
 
 def test_asked_told_believed_and_exported(camp, capsys):
-    asked = answer(capsys, "ask", "camp")
+    named = ["--simulator", "sled.py:slide", "--noise", "0.02"]  # of a copy
+    asked = answer(capsys, "ask", "camp", *named)
     assert asked["trial"] == 1
     assert asked["names"] == ["speed"]
     assert 0.5 <= asked["action"][0] <= 3
@@ -45,14 +33,6 @@ def test_asked_told_believed_and_exported(camp, capsys):
     assert after["belief"]["parameters"]["theta_1"]["sd"] < before
     assert main(["export", "camp", "--netcdf", "out.nc"]) == 0
     assert az.from_netcdf("out.nc")["posterior"]["theta"].shape == (4, 500, 2)
-
-
-def test_options_of_a_file(camp, capsys):
-    Path("campaign.toml").write_text(CONFIG)
-    assert main(["init", "new", "--config", "campaign.toml"]) == 0
-    assert "next: sbi-active ask new" in capsys.readouterr().out
-    told = answer(capsys, "tell", "new", "0.7", "--action", "2")
-    assert (told["names"], told["units"]) == (["speed"], ["m/s"])
 
 
 TAPE = """
@@ -69,6 +49,9 @@ offset = Effect(
 own = [offset]
 """
 LINE = """
+from tape import own as effects
+
+
 def line(theta, action):
     return theta * action
 """
@@ -84,12 +67,12 @@ def test_a_missing_effect_is_found_and_adopted(capsys, monkeypatch, tmp_path):
     for index, action in enumerate((1, 2, 3, 1, 2, 3)):
         x = f"{0.5 * action + 0.3 + 0.02 * (-1) ** index:.4f}"
         assert main(["tell", "camp", x, "--action", str(action)]) == 0
-    assert main(["criticize", "camp", "--effects", "tape.py:own"]) == 0
+    assert main(["criticize", "camp"]) == 0
     shown = capsys.readouterr().out
     assert "Verdict: tape slipped" in shown
-    assert "sbi-active adopt camp --effects tape.py:own" in shown
-    assert main(["adopt", "camp", "--effects", "tape.py:own"]) == 0
-    monkeypatch.chdir(tmp_path.parent)  # where tape.py lies is remembered
+    assert "sbi-active adopt camp" in shown
+    assert main(["adopt", "camp"]) == 0
+    monkeypatch.chdir(tmp_path.parent)  # where line.py lies is remembered
     folder = str(tmp_path / "camp")
     assert main(["update", folder]) == 0
     belief = answer(capsys, "status", folder)["belief"]["parameters"]

@@ -3,7 +3,7 @@ from matplotlib import image
 
 from sbi_active.cli import main
 
-SMALL = ["--simulations", "200"]
+SMALL = ["--set", "num_simulations=200"]
 
 
 def test_run_writes_table_and_figure(tmp_path, capsys):

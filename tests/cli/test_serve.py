@@ -31,7 +31,7 @@ def camp(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.delitem(sys.modules, "sled", raising=False)
     words = ["--actions", "0.5:3", "--simulator", "sled.py:loud"]
-    sizes = [*SMALL, "num_samples=200"]
+    sizes = [*SMALL, "--set", "num_samples=200"]
     assert main(["init", "camp", *BOX, *sizes, *words]) == 0
 
 
@@ -95,11 +95,13 @@ def test_a_robot_s_loop(server):
 
 #: Requests, and what their errors say.
 WRONG = [
-    ("\xff", "write one JSON object a line"),
-    ("[1]", "write one JSON object a line"),
+    ("\xff", "decode"),
+    ("{", "Expecting property name"),
+    ("[1]", "expected a JSON object a line"),
     ({}, "expected a command among adopt, ask, correct"),
     ({"command": ["ask"]}, "expected a command among adopt"),
     ({"command": "init"}, "got 'init'"),
+    ({"command": "tell", "x": 1, "trail": 0}, "got trail; correct it"),
     ({"command": "tell", "x": [None], "action": 1}, "one of them measured"),
     ({"command": "tell", "x": 1}, "expected a pending trial; got none"),
     ({"command": "withdraw"}, "Missing argument 'TRIAL'"),

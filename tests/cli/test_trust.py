@@ -1,7 +1,6 @@
-"""What of a folder is executed, and when: nothing that somebody else put there."""
+"""What is executed, and when: nothing that somebody else put into a folder."""
 
 import json
-import shutil
 import sys
 from pathlib import Path
 
@@ -12,9 +11,10 @@ from tests.cli.sled import SIMULATOR, SMALL, run
 
 ROOT = Path(__file__).parents[2]
 
-#: A prior and actions that only a program can make.
-MINE = """
-import torch
+#: A prior and actions that only a program can make, beside its simulator.
+MINE = (
+    SIMULATOR
+    + """
 from pathlib import Path
 from torch.distributions import Independent, Uniform
 from sbi_active import DiscreteActions
@@ -31,8 +31,9 @@ class Speeds(DiscreteActions):
 
 
 prior = Mine(Uniform(torch.tensor([0.2, 0.0]), torch.ones(2)), 1)
-speeds = Speeds([1.0, 2.0], names=["speed"], units=["m/s"])
+actions = Speeds([1.0, 2.0], names=["speed"], units=["m/s"])
 """
+)
 RUN = "Path('{}').write_text('ran')"
 READING = [
     ["status", "camp", "--json"],
@@ -40,8 +41,8 @@ READING = [
     ["correct", "camp", "0", "0.31"],
     ["withdraw", "camp", "0"],
     ["report", "camp"],
-    ["repair", "camp"],
 ]
+NAMED = ["--simulator", "mine.py:slide"]
 
 
 @pytest.fixture
@@ -50,19 +51,16 @@ def mine(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "path", [*sys.path])
     ran = tmp_path / "ran"
     forget(ran)
-    (tmp_path / "sled.py").write_text(SIMULATOR)
     (tmp_path / "mine.py").write_text(MINE.format(run=RUN.format(ran)))
-    words = ["--simulator", "sled.py:slide", "--prior", "mine.py:prior"]
-    assert main(["init", "camp", *words, "--actions", "mine.py:speeds", *SMALL]) == 0
+    assert main(["init", "camp", *NAMED, *SMALL]) == 0
     main(["tell", "camp", "0.3", "--action", "1"])
     forget(ran)
     return ran
 
 
 def forget(ran):
-    """Have the next import of these run again."""
-    for name in ("sled", "mine"):
-        sys.modules.pop(name, None)
+    """Have the next import run again."""
+    sys.modules.pop("mine", None)
     ran.unlink(missing_ok=True)
 
 
@@ -70,70 +68,55 @@ def forget(ran):
 def test_reading_imports_nothing(mine, words):
     assert main(words) == 0
     assert not mine.exists()
-    assert not {"sled", "mine"} & {*sys.modules}
+    assert "mine" not in sys.modules
 
 
-@pytest.mark.parametrize(
-    ("how", "command"),
-    [
-        ("changed", "ask"),
-        ("changed", "criticize"),
-        ("of another account", "ask"),
-        ("within", "ask"),
-    ],
-)
-def test_what_somebody_else_declared_is_not_imported(
-    mine, tmp_path, monkeypatch, capsys, command, how
-):
-    path = tmp_path / "camp" / "command.json"
-    declared = json.loads(path.read_text())
-    if how == "changed":
-        path.write_text(json.dumps(declared))  # one byte is enough
-    elif how == "of another account":
-        monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
-    else:
-        shutil.copy("mine.py", "camp/mine.py")
-        path.write_text(json.dumps({**declared, "folder": str(tmp_path / "camp")}))
-    assert main([command, "camp"]) == 2
-    assert "add --trust to have it executed" in capsys.readouterr().err
-    assert not mine.exists()
-    assert main(["status", "camp"]) == 0
+def test_what_was_named_is_remembered_wherever_one_stands(mine, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path.parent)
+    assert main(["ask", str(tmp_path / "camp"), "--target", "weather"]) == 2
+    assert mine.exists()  # it was imported
+
+
+def test_a_module_is_looked_for_where_it_was_named(mine, tmp_path, monkeypatch):
+    assert main(["init", "new", "--simulator", "mine:slide", *SMALL]) == 0
+    forget(mine)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "mine.py").write_text("raise SystemExit('another one')")
+    monkeypatch.chdir("other")
+    assert main(["ask", str(tmp_path / "new"), "--target", "weather"]) == 2
+    assert mine.exists()
+
+
+@pytest.mark.parametrize("command", ["ask", "update", "criticize", "adopt"])
+def test_nothing_that_a_folder_says_is_imported(mine, tmp_path, capsys, command):
+    Path("camp").rename("other")  # as one that was sent
+    says = {"folder": str(tmp_path), "simulator": "mine.py:slide"}
+    Path("other/command.json").write_text(json.dumps(says))  # of earlier versions
+    assert main([command, "other"]) == 2
+    assert "expected --simulator; got none" in capsys.readouterr().err
     assert not mine.exists()
 
 
-def test_trust_is_remembered_outside_of_the_folder(mine, tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
-    assert main(["export", "camp", "--netcdf", "out.nc", "--trust"]) == 0
+def test_named_once_it_is_known_again(mine):
+    Path("camp").rename("other")
+    words = ["export", "other", "--netcdf", "out.nc"]
+    assert main([*words, *NAMED, "--noise", "0.02"]) == 0
     assert mine.exists()
     forget(mine)
-    assert main(["ask", "camp", "--target", "weather"]) == 2  # but it is imported
+    assert main(["ask", "other", "--target", "weather"]) == 2
     assert mine.exists()
-    # Within the folder it is said each time.
-    forget(mine)
-    for name in ("mine.py", "sled.py"):
-        shutil.copy(name, "camp")
-    path = tmp_path / "camp" / "command.json"
-    declared = json.loads(path.read_text())
-    path.write_text(json.dumps({**declared, "folder": str(tmp_path / "camp")}))
-    assert main(["export", "camp", "--netcdf", "out.nc", "--trust"]) == 0
-    forget(mine)
-    assert main(["ask", "camp"]) == 2
-    assert not mine.exists()
 
 
-@pytest.mark.parametrize(
-    "content", ["", "[]", '{"simulator": 3}', '{"effects": [1]}', "[" * 9999]
-)
-def test_a_file_that_the_command_line_did_not_write(mine, capsys, content):
-    Path("camp/command.json").write_text(content)
-    assert main(["ask", "camp"]) == 2
-    assert "command.json as sbi-active writes it" in capsys.readouterr().err
-    assert main(["status", "camp"]) == 0  # which needs none of it
+def test_a_home_that_cannot_be_written_remembers_nothing(mine, capsys, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", "/dev/null")
+    assert main(["init", "new", *NAMED, *SMALL]) == 0
+    assert main(["ask", "new"]) == 2
+    assert "expected --simulator; got none" in capsys.readouterr().err
 
 
 def test_what_stands_beside_somebody_is_not_imported(mine, tmp_path):
     """A file called as a library, in a folder that somebody has just entered."""
-    for name in ("torch", "sqlite3", "sled"):
+    for name in ("torch", "sqlite3", "mine"):
         text = f"from pathlib import Path\n{RUN.format(tmp_path / 'stood')}"
         (tmp_path / "camp" / f"{name}.py").write_text(text)
     for words in (["status", "."], ["report", "."]):

@@ -78,7 +78,6 @@ def _same_path(monkeypatch):
 @pytest.fixture
 def check(tmp_path, capsys, request, monkeypatch):
     """Return exit status and printed text of the command on a module of this text."""
-    monkeypatch.setattr("sbi_active.cli.simulators.time_round", lambda *_: 1.0)
 
     def run(text, *options):
         name = f"robot_{abs(hash(request.node.name))}"
@@ -93,12 +92,11 @@ def check(tmp_path, capsys, request, monkeypatch):
 
 @pytest.mark.parametrize("text", [CLEAN, ROWS], ids=["batch", "rows"])
 def test_a_clean_simulator_is_ready(check, text):
-    status, printed = check(text, "--rounds", "2", "--workers", "4")
+    status, printed = check(text, "--simulations", "31000", "--workers", "4")
     assert status == 0
     assert printed.strip().endswith("\nready")
     assert "warning" not in printed
     assert "rows: 64 ok, 0 invalid, 0 missing" in printed
-    # 2 rounds of 5000 + 4 actions x 1500, and refinement on 1 and 2 trials
     assert "at most 31,000 simulations, about " in printed
     assert "on 4 workers" in printed
     if text is CLEAN:

@@ -6,7 +6,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -23,9 +23,9 @@ from sbi_active.simulation.simulator import outcome_tensor
 BLOCK = 256
 
 #: Source of the random numbers of a call, see :class:`Call`.
-Draws = Literal["seeds", "blocks", "alone"]
+Draws = Literal["seeds", "block", "row"]
 
-Fault = Literal["raised", "timed out", "worker died", "gone", "misused", "not loaded"]
+Fault = Literal["raised", "timed out", "worker died", "misused", "not loaded"]
 
 #: What is caught in the user's process, where an interrupt means the whole program.
 HERE = (Exception, SystemExit)
@@ -48,9 +48,8 @@ class Call:
         seeds: Seeds, one a row, shape (k,), int64.
         seed: Seed of the whole set.
         draws: Source of the random numbers: "seeds" passes those to the simulator;
-            "blocks" forks the global generators for each block of 256 rows, and the
-            rows are whole blocks; "alone" forks them for the single row.
-        is_probe: Whether it only asks if the simulator works, its x being dropped.
+            "block" and "row" fork the global generators for the rows, a block of 256
+            or a single one.
     """
 
     rows: np.ndarray
@@ -59,19 +58,9 @@ class Call:
     seeds: Tensor
     seed: int
     draws: Draws
-    is_probe: bool = False
 
     def __len__(self) -> int:
         return len(self.rows)
-
-    def parts(self, size: int, **changes: Any) -> list[Call]:
-        """Return calls of so many of the rows each."""
-        rows = [slice(i, i + size) for i in range(0, len(self), size)]
-        names = "rows", "theta", "action", "seeds"
-        return [
-            replace(self, **{n: getattr(self, n)[part] for n in names}, **changes)
-            for part in rows
-        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,26 +72,15 @@ class Reply:
         seconds: Wall time that the simulator took.
         fault: Fault that occurred; None if nothing did.
         traceback: Text that tells it.
-        error: The exception itself, where it was raised in this process.
     """
 
     x: Tensor | None = None
     seconds: float = 0.0
     fault: Fault | None = None
     traceback: str = ""
-    error: BaseException | None = field(default=None, repr=False)
-
-    def __getstate__(self) -> dict[str, Any]:
-        # An exception may be impossible to pickle; its text has been taken.
-        return {**vars(self), "error": None}
 
 
-def answer(
-    simulator: Callable[..., Any],
-    call: Call,
-    *,
-    catches: type[BaseException] | tuple[type[BaseException], ...] = HERE,
-) -> Reply:
+def answer(simulator: Callable[..., Any], call: Call, catches: Any = HERE) -> Reply:
     """Run the simulator over the rows of a call; its exceptions become a reply.
 
     Args:
@@ -116,38 +94,23 @@ def answer(
     try:
         x = _draw(simulator, call)
     except catches as error:
-        fault = "misused" if _is_of_the_interface(error) else "raised"
-        return Reply(None, 0.0, fault, traceback.format_exc(), error)
+        is_misused = _is_of_the_interface(error)
+        if is_misused and catches is HERE:
+            raise
+        fault = "misused" if is_misused else "raised"
+        return Reply(fault=fault, traceback=traceback.format_exc())
     return Reply(x, time.perf_counter() - start)
 
 
 def _draw(simulator: Callable[..., Any], call: Call) -> Tensor:
-    # A simulator may change its arguments in place; those of the call are tried again.
-    theta, action, seeds = call.theta.clone(), call.action.clone(), call.seeds.clone()
+    theta, action, seeds = call.theta, call.action, call.seeds
     if call.draws == "seeds":
         x = simulator(theta, action, seeds=seeds)
         return outcome_tensor(x, len(theta), dtype=torch.float32)
-    kind = "block" if call.draws == "blocks" else "row"
-    x = torch.empty(0)
-    for start in range(0, len(call), BLOCK):
-        rows = slice(start, start + BLOCK)
-        given = theta[rows], action[rows]
-        if isinstance(simulator, SimulatorModel):
-            given = *given, seeds[rows]
-        with _GENERATORS, forked_generators(call.seed, kind, int(call.rows[start])):
-            part = simulator(*given)
-            # Copied before the simulator fills its buffer again.
-            part = outcome_tensor(part, len(theta[rows]), dtype=torch.float32)
-        if not start:
-            x = part.new_empty((len(call), *part.shape[1:]))
-        if part.shape[1:] != x.shape[1:]:
-            raise ValueError(
-                "expected x of one shape a row; got "
-                f"{tuple(x.shape[1:])} and {tuple(part.shape[1:])}; pad trajectories "
-                "with NaN, which masks them"
-            )
-        x[rows] = part
-    return x
+    is_model = isinstance(simulator, SimulatorModel)
+    given = (theta, action, seeds) if is_model else (theta, action)
+    with _GENERATORS, forked_generators(call.seed, call.draws, int(call.rows[0])):
+        return outcome_tensor(simulator(*given), len(theta), dtype=torch.float32)
 
 
 def _is_of_the_interface(error: BaseException) -> bool:

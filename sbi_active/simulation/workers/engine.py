@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from contextlib import closing
 from functools import partial
 from typing import Any
 
 import torch
-from joblib import effective_n_jobs
 from torch import Tensor
 from tqdm.auto import tqdm
 
@@ -16,23 +16,13 @@ from sbi_active.arrays import own_tensor
 from sbi_active.messages import warn
 from sbi_active.renamed import takes_loose
 from sbi_active.seeding import derive_seed
-from sbi_active.simulation.model import takes_seeds
 from sbi_active.simulation.outcomes import (
     MissingRowsWarning,
-    Outcome,
     SimulationInterrupted,
     Simulations,
 )
 from sbi_active.simulation.simulator import require_noise, require_rows
-from sbi_active.simulation.workers.pace import pace_of
-from sbi_active.simulation.workers.pools import (
-    DaskPool,
-    InProcess,
-    Pool,
-    WorkerPool,
-    configured_client,
-)
-from sbi_active.simulation.workers.processes import pickled
+from sbi_active.simulation.workers.pools import InProcess, Pool, pool_of
 from sbi_active.simulation.workers.schedule import Schedule
 from sbi_active.simulation.workers.settings import Workers
 from sbi_active.simulation.workers.store import Recorder, RowStore, find_store, spend
@@ -84,11 +74,9 @@ def simulate(
         seed: Seed of the whole set.
         workers: Workers that run the rows and what one may cost, or the number of calls
             at a time; None is this process.
-        batch_size: Rows a call; None gives workers as many as take a quarter of a
-            second. A simulator in this process is given all at once, or, after its
-            first rows have shown that this would take long, as many as take about a
-            second: an interrupt loses no more. One that takes no seeds is given whole
-            blocks.
+        batch_size: Rows a call; None gives as many as take about a second, and an
+            interrupt loses no more. A simulator in this process is given all at once
+            where that takes no longer, and one that takes no seeds whole blocks.
         show_progress: Show a progress bar.
         store: Keeps finished rows, every half second, and gives those that it has;
             None takes that of the campaign whose directory this is called for, if any.
@@ -122,36 +110,32 @@ def simulate(
         raise ValueError(
             f"expected batch_size >= 1; got {batch_size}; use None to have it chosen"
         )
-    pool = _pool(simulator, workers)
     store = find_store(simulator) if store is None else store
-    pace = None
-    if not isinstance(pool, InProcess):
+    pool = pool_of(simulator, workers)
+    is_here = isinstance(pool, InProcess)
+    if not is_here:
         theta, action = theta.detach().cpu(), action.detach().cpu()
-    elif batch_size is None and not show_progress and store is None:
-        pace = pace_of(simulator)  # nobody looks on
     schedule = partial(
         Schedule,
-        has_seeds=takes_seeds(simulator),
+        simulator,
         workers=workers,
         batch_size=batch_size,
-        pace=pace,
+        starts_over=is_here and store is None and not show_progress,
     )
     with closing(pool):
-        whole = schedule(theta, action, seed=seed)
+        whole = schedule(theta, action, seed)
         _run(whole, pool, store, show_progress)
         if check_noise:
-            few = slice(0, 16)
-            spend(len(theta[few]))
-            other = schedule(theta[few], action[few], seed=derive_seed(seed, "again"))
-            _ = [*other.run(pool)]
-            if whole.x is not None and other.x is not None:
-                require_noise(whole.x[few], other.x)
-    rows = _simulations(whole)
-    if whole.faults:
-        counts = ", ".join(f"{k} {fault}" for fault, k in whole.faults.items())
+            other = schedule(theta[:16], action[:16], derive_seed(seed, "again"))
+            _run(other, pool, None, False)
+            require_noise(whole.rows().x[:16], other.rows().x)
+    rows = whole.rows()
+    if num_lost := len(whole.lost):
+        faults = Counter(reply.fault for reply in whole.lost.values())
+        counts = ", ".join(f"{k} {fault}" for fault, k in faults.items())
         row, text = next(iter(rows.tracebacks.items()))
         warn(
-            f"SA301 {whole.faults.total()} of {len(theta)} rows are missing: {counts}; "
+            f"SA301 {num_lost} of {len(theta)} rows are missing: {counts}; "
             f"the first is row {row}: {text.strip().splitlines()[-1]}. All tracebacks "
             "are in Simulations.tracebacks",
             MissingRowsWarning,
@@ -160,48 +144,21 @@ def simulate(
     return rows
 
 
-def _pool(simulator: Callable[..., Any], workers: Workers) -> Pool:
-    if workers.num_workers == 1 and workers.time_limit is None:
-        return InProcess(simulator)
-    client = configured_client()
-    if client is not None:
-        return DaskPool(pickled(simulator), workers.num_workers, client)
-    return WorkerPool(pickled(simulator), effective_n_jobs(workers.num_workers))
-
-
 def _run(
     schedule: Schedule, pool: Pool, store: RowStore | None, show_progress: bool
 ) -> None:
-    theta, num_restored, recorder = schedule.theta, 0, None
-    if store is not None:
-        recorder = Recorder(store, theta, schedule.action, schedule.seed)
-        stored = recorder.load()
-        if stored is not None:
-            num_restored = schedule.restore(*map(torch.as_tensor, stored))
-    bar = tqdm(
-        total=len(theta), initial=num_restored, unit="row", disable=not show_progress
-    )
-
-    spend(len(theta) - num_restored)
+    recorder, num_rows = Recorder(store, schedule), len(schedule.theta)
+    stored = int((schedule.status >= 0).sum())
+    spend(num_rows - stored)
+    bar = tqdm(total=num_rows, initial=stored, unit="row", disable=not show_progress)
     try:
-        for rows in schedule.run(pool):
-            bar.update(len(rows[0]))
-            if recorder is not None:
-                recorder.add(*rows)
+        with bar:
+            for num_finished in schedule.run(pool):
+                bar.update(num_finished)
+                recorder.save()
     except KeyboardInterrupt:
         if schedule.x is None:
             raise
-        raise SimulationInterrupted(_simulations(schedule)) from None
+        raise SimulationInterrupted(schedule.rows()) from None
     finally:
-        bar.close()
-        if recorder is not None:
-            recorder.flush()
-
-
-def _simulations(schedule: Schedule) -> Simulations:
-    assert schedule.x is not None
-    status = schedule.status.clone()
-    status[status < 0] = Outcome.MISSING  # interrupted
-    lost = [k for k in sorted(schedule.tracebacks) if status[k] == Outcome.MISSING]
-    tracebacks = {row: schedule.tracebacks[row] for row in lost}
-    return Simulations(schedule.theta, schedule.action, schedule.x, status, tracebacks)
+        recorder.save(at_once=True)

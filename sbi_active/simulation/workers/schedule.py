@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from math import inf, nan
+from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -11,16 +14,83 @@ from torch import Tensor
 
 from sbi_active.arrays import all_finite
 from sbi_active.seeding import row_seeds
-from sbi_active.simulation.outcomes import Outcome, SimulationError
+from sbi_active.simulation.model import takes_seeds
+from sbi_active.simulation.outcomes import Outcome, SimulationError, Simulations
 from sbi_active.simulation.workers.calls import BLOCK, Call, Draws, Reply
-from sbi_active.simulation.workers.pace import Pace
 from sbi_active.simulation.workers.pools import Pool
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 _UNFINISHED = -1  # no status of a row that is one
 
-#: Finished rows: index (k,), x (k, *x_shape), status (k,).
-Rows = tuple[Tensor, Tensor, Tensor]
+
+class Pace:
+    """Time that a call of a simulator took, by which the next one is sized.
+
+    A call cannot be interrupted without losing its rows, so a long simulation is cut
+    into parts of a second. A vectorized simulator takes as long for few rows as for
+    many: as long as more rows take hardly more time, the next call has many more.
+
+    Example:
+        >>> pace = Pace()
+        >>> pace.size(2_000)  # nothing is known
+        2
+        >>> pace.observe(2, 0.02)
+        >>> pace.size(1_998)  # not 100 yet, since two rows say little of many
+        32
+        >>> pace.is_short(100)
+        True
+    """
+
+    #: A part is sized to take this long; what takes half as long again is not cut.
+    SECONDS = 1.0
+
+    #: Rows of a call at least. A single one is a shape that simulators may not expect.
+    LEAST = 2
+
+    #: Multiple of its rows that follows a call at most, and at least where more rows
+    #: take hardly more time.
+    GROWTH = 16
+
+    def __init__(self) -> None:
+        self._rows, self._seconds, self._growth = 1, inf, 2  # which compares two calls
+
+    def observe(self, num_rows: int, seconds: float) -> None:
+        """Take the time of a call."""
+        if num_rows >= 2 * self._rows:
+            ratio = seconds / self._seconds
+            # Fewer rows that took longer had something to load or to compile.
+            self._growth = 2 if ratio < 0.8 else self.GROWTH if ratio < 1.5 else 0
+        if 2 * num_rows >= self._rows:
+            self._rows, self._seconds = num_rows, max(seconds, 1e-9)
+
+    def seconds(self, num_rows: int) -> float:
+        """Return the seconds that rows take at most; infinite before any call."""
+        return self._seconds * max(num_rows / self._rows, 1.0)
+
+    def is_short(self, num_rows: int) -> bool:
+        """Return whether rows take too little time to be cut."""
+        return self.seconds(num_rows) <= 1.5 * self.SECONDS
+
+    def size(self, num_left: int) -> int:
+        """Return the rows of the next call, of those that are left."""
+        if self.is_short(num_left):
+            return num_left
+        timely = self.SECONDS * self._rows / self._seconds
+        size = max(min(timely, self.GROWTH * self._rows), self._growth * self._rows)
+        size = max(int(size), self.LEAST)
+        return size if num_left - size >= self.LEAST else num_left
+
+
+# What is known is kept, so that only the first simulation has to find out.
+_PACES: WeakKeyDictionary[Any, Pace] = WeakKeyDictionary()
+
+
+def pace_of(simulator: Callable[..., Any]) -> Pace:
+    """Return the pace of a simulator, or of the object whose method it is."""
+    try:
+        return _PACES.setdefault(getattr(simulator, "__self__", simulator), Pace())
+    except TypeError:  # it has no hash, or takes no weak reference
+        return Pace()
 
 
 class Schedule:
@@ -36,35 +106,26 @@ class Schedule:
     an accident.
 
     Args:
+        simulator: Simulator of the rows, which a pool runs.
         theta: Parameters, shape (n, theta_dim).
         action: Actions, shape (n, action_dim).
         seed: Seed of the whole set.
-        has_seeds: Whether the simulator takes them.
-        batch_size: Rows a call; None measures how many take ``BATCH_SECONDS``.
-        pace: Sizes the calls where no batch size is given, as one worker needs it:
-            a short simulation is one call, a long one is cut.
         workers: The seconds that a row may take, and how often a missing one is tried
             again.
+        batch_size: Rows a call; None takes those of the simulator's pace.
+        starts_over: Whether rows that were timed are simulated again in one call with
+            all others, where that is short. A simulator that rounds otherwise in a
+            batch of another size then has the same x whatever is known of its pace.
 
     Attributes:
         x: Outcomes, shape (n, *x_shape), NaN where there is none; None until a call
             succeeds.
         status: Status of each row, shape (n,), int8, -1 for rows that are not finished.
-        tracebacks: Tracebacks of the rows that have failed, though a later attempt may
-            have succeeded.
-        faults: Numbers of missing rows by fault.
+        lost: Replies to the calls of missing rows, each alone.
     """
 
-    #: A call is sized to take this long, which hides what sending it costs.
-    BATCH_SECONDS = 0.25
-
-    #: Rows lost without a single success before the whole set is probed, and the rows,
-    #: evenly spread, that it is probed with.
-    NUM_PROBES = 16
-
-    #: Calls that may be simulated again, in one with all others, once they have shown
-    #: that the whole takes no longer than a part may.
-    MAX_TIMED = 4
+    #: Rows lost without a single success that show that no row is to blame.
+    NUM_TRIED = 64
 
     #: A call may take this multiple of the time its rows took before, and the limit of
     #: a row on top, until it is divided: a hanging row then costs its own limit.
@@ -72,44 +133,36 @@ class Schedule:
 
     def __init__(
         self,
+        simulator: Callable[..., Any],
         theta: Tensor,
         action: Tensor,
-        *,
         seed: int,
-        has_seeds: bool,
-        batch_size: int | None = None,
-        pace: Pace | None = None,
+        *,
         workers: Workers = IN_PROCESS,
+        batch_size: int | None = None,
+        starts_over: bool = False,
     ) -> None:
         self.theta, self.action, self.seed = theta, action, seed
-        self.seeds, self.has_seeds = row_seeds(seed, len(theta)), has_seeds
-        self.batch_size, self.pace, self.workers = batch_size, pace, workers
         self.x: Tensor | None = None
         self.status = torch.full((len(theta),), _UNFINISHED, dtype=torch.int8)
-        self.tracebacks: dict[int, str] = {}
-        self.faults: Counter[str] = Counter()
+        self.lost: dict[int, Reply] = {}
+        self._workers, self._batch_size = workers, batch_size
+        self._has_seeds, self._pace = takes_seeds(simulator), pace_of(simulator)
+        self._may_start_over = starts_over and self._has_seeds and batch_size is None
+        self._seeds = row_seeds(seed, len(theta))
         self._urgent: deque[Call] = deque()
-        self._attempts: Counter[int] = Counter()
-        self._accidents: set[int] = set()  # first rows of blocks whose worker died
-        self._seconds_a_row: float | None = None
-        self._largest = 16
-        self._num_probes = 0  # that have not failed
-        self._has_succeeded = False
-        self._num_timed = 0  # calls
-        self._to_come, self._next = np.arange(len(theta)), 0
+        self._attempts: Counter[tuple[str, int, int]] = Counter()
 
-    def restore(self, index: Tensor, x: Tensor, status: Tensor) -> int:
-        """Take rows as finished that a store holds; return how many."""
-        known = (status != Outcome.MISSING).nonzero()[:, 0]  # a fault is tried again
-        known = known[index[known].argsort()]  # several workers store them in any order
-        index, x, status = index[known], x[known], status[known]
-        if len(index):
-            self._settle(index, x.to(torch.float32, copy=True), status.to(torch.int8))
-            self._has_succeeded = True
-        return len(index)
+    def restore(self, stored: tuple[Tensor, Tensor, Tensor] | None) -> None:
+        """Take rows as finished, if a store has any: index, x, status, in any order."""
+        index, x, status = stored or (torch.empty(0),) * 3
+        order = index.argsort()
+        known = order[status[order] != Outcome.MISSING]  # a fault is tried again
+        if len(known):
+            self._take(index[known], x[known].float())
 
-    def run(self, pool: Pool) -> Iterator[Rows]:
-        """Simulate what is not finished, and yield rows as they are.
+    def run(self, pool: Pool) -> Iterator[int]:
+        """Simulate what is not finished; yield the numbers of rows that finish.
 
         Args:
             pool: Pool that runs the calls.
@@ -119,10 +172,10 @@ class Schedule:
             ValueError: If the simulator returns another shape than its rows'.
         """
         to_come = (self.status == _UNFINISHED).numpy()
-        if not self.has_seeds:  # whole blocks
+        if not self._has_seeds:  # whole blocks
             of_block = np.arange(len(to_come)) // BLOCK
             to_come = np.isin(of_block, of_block[to_come])
-        self._to_come, self._next = np.flatnonzero(to_come), 0
+        self._to_come = np.flatnonzero(to_come)
         num_running = 0
         while True:
             while num_running < pool.num_slots and (call := self._next_call(pool)):
@@ -132,170 +185,114 @@ class Schedule:
                 return
             for call, reply in pool.finished():
                 num_running -= 1
-                rows = self._receive(call, reply)
-                if rows is not None:
-                    yield rows
+                if reply.x is None:
+                    self._fail(call, reply)
+                elif not self._starts_over(call, reply):
+                    yield self._take(torch.from_numpy(call.rows), reply.x)
+
+    def rows(self) -> Simulations:
+        """Return the rows, those that are not finished as missing."""
+        assert self.x is not None
+        status = self.status.masked_fill(self.status < 0, Outcome.MISSING)
+        tracebacks = {row: self.lost[row].traceback for row in sorted(self.lost)}
+        return Simulations(self.theta, self.action, self.x, status, tracebacks)
 
     def _next_call(self, pool: Pool) -> Call | None:
         while self._urgent:
             call = self._urgent.popleft()
-            if call.is_probe or (self.status[call.rows] == _UNFINISHED).any():
+            if (self.status[call.rows] == _UNFINISHED).any():
                 return call
-        if self._next == len(self._to_come):
+        if not (num_left := len(self._to_come)):
             return None
-        size = self._size(len(self._to_come) - self._next, pool.num_slots)
-        rows = self._to_come[self._next : self._next + size]
-        self._next += len(rows)
-        return self._call(rows, "seeds" if self.has_seeds else "blocks")
+        # With several workers the last calls are small, so that all end together.
+        share = -(-num_left // (2 * pool.num_slots)) if pool.num_slots > 1 else num_left
+        size = self._batch_size or min(self._pace.size(num_left), share)
+        size = size if self._has_seeds else BLOCK
+        rows, self._to_come = self._to_come[:size], self._to_come[size:]
+        return self._call(rows, "seeds" if self._has_seeds else "block")
 
-    def _call(self, rows: np.ndarray, draws: Draws, is_probe: bool = False) -> Call:
-        at: slice | Tensor = torch.from_numpy(rows)
-        if len(rows) == rows[-1] - rows[0] + 1:  # a view costs nothing
-            at = slice(int(rows[0]), int(rows[-1]) + 1)
-        theta, action, seeds = self.theta[at], self.action[at], self.seeds[at]
-        return Call(rows, theta, action, seeds, self.seed, draws, is_probe)
-
-    def _size(self, num_left: int, num_slots: int) -> int:
-        """Return the rows of the next call; this never changes x."""
-        if self.batch_size is not None:
-            size = self.batch_size
-        elif self.pace is not None:
-            size = self.pace.size(num_left)
-        else:
-            # The last calls are small, so that all workers end together.
-            size = min(self._largest, -(-num_left // (2 * num_slots)))
-            if self._seconds_a_row is not None:
-                timely = int(self.BATCH_SECONDS / max(self._seconds_a_row, 1e-9))
-                size = max(min(timely, size), 1)
-        return size if self.has_seeds else -(-size // BLOCK) * BLOCK
+    def _call(self, rows: np.ndarray, draws: Draws) -> Call:
+        # Copies, which a simulator may change.
+        theta, action, seeds = self.theta[rows], self.action[rows], self._seeds[rows]
+        return Call(rows, theta, action, seeds, self.seed, draws)
 
     def _limit(self, call: Call) -> float | None:
-        row_limit = self.workers.time_limit
-        if row_limit is None:
-            return None
-        limit = row_limit * len(call)
-        if call.draws == "seeds" and self._seconds_a_row is not None:
-            usual = self._seconds_a_row * len(call)
-            limit = min(limit, row_limit + self.SLACK * usual)
-        return limit
+        row_limit = self._workers.time_limit
+        if row_limit is None or call.draws != "seeds":
+            return row_limit and row_limit * len(call)
+        usual = self._pace.seconds(len(call))
+        return min(row_limit * len(call), row_limit + self.SLACK * usual)
 
-    def _receive(self, call: Call, reply: Reply) -> Rows | None:
-        """Return the rows that a call has finished, if any."""
-        if reply.fault == "misused":
-            if reply.error is not None:
-                raise reply.error
-            last_line = reply.traceback.strip().splitlines()[-1]
-            raise ValueError(f"{last_line}; in a worker:\n{reply.traceback}")
+    def _starts_over(self, call: Call, reply: Reply) -> bool:
+        """Take the time of a call; drop all rows if they will do in one call."""
+        if call.draws == "seeds":
+            self._pace.observe(len(call), reply.seconds)
+        is_clean = not (self._urgent or self.lost) and len(self._to_come) > 0
+        is_short = self._pace.is_short(len(self.status))
+        starts_over = self._may_start_over and is_clean and is_short
+        if starts_over:
+            self.x, self._to_come = None, np.arange(len(self.status))
+            self.status.fill_(_UNFINISHED)
+        return starts_over
+
+    def _take(self, index: Tensor, x: Tensor) -> int:
+        """Take outcomes of rows; return how many had none before."""
+        fresh = self.status[index] == _UNFINISHED
+        if not bool(fresh.all()):
+            index, x = index[fresh], x[fresh.to(x.device)]
+        status = torch.full((len(x),), Outcome.OK, dtype=torch.int8)
+        if not all_finite(x):
+            finite = x.isfinite()
+            x = x.masked_fill(~finite, nan)
+            status[~finite.flatten(1).any(-1).cpu()] = Outcome.INVALID
+        shape = x.shape if self.x is None else self.x.shape
+        if x.shape[1:] != shape[1:]:
+            raise ValueError(
+                f"expected x of one shape a row; got {tuple(shape[1:])} and "
+                f"{tuple(x.shape[1:])}; pad trajectories with NaN, which masks them"
+            )
+        if self.x is None and len(index) == len(self.status):
+            self.x = x
+        else:
+            if self.x is None:
+                self.x = x.new_full((len(self.status), *x.shape[1:]), nan)
+            self.x[index.to(x.device)] = x
+        self.status[index] = status
+        return len(index)
+
+    def _fail(self, call: Call, reply: Reply) -> None:
+        """Try a call that failed again, divide it, or lose its row."""
         if reply.fault == "not loaded":
             raise SimulationError(
                 "expected a simulator that a worker process can load; got\n"
                 f"{reply.traceback}\nmake its module importable there, or simulate "
                 "without workers="
             )
-        if reply.x is None:
-            self._fail(call, reply)
-            return None
-        self._has_succeeded = True
-        if call.is_probe:
-            return None
-        self._seconds_a_row = reply.seconds / len(call)
-        self._largest = max(self._largest, 8 * len(call))
-        if self.pace is not None and call.draws != "alone":
-            self.pace.observe(len(call), reply.seconds)
-            self._num_timed += 1
-            if self._is_short_after_all(self.pace):
-                # What is known of its pace must make no difference to a simulator that
-                # rounds otherwise in a batch of another size: all rows are one call.
-                self.status[torch.from_numpy(self._to_come[: self._next])] = _UNFINISHED
-                self.x, self._next = None, 0
-                return None
-        return self._take(call, reply.x)
-
-    def _is_short_after_all(self, pace: Pace) -> bool:
-        """Return whether the few rows that were timed show that one call will do."""
-        is_timing = self.has_seeds and self._num_timed <= self.MAX_TIMED
-        is_clean = not (self._urgent or self.tracebacks)
-        is_part = self._next < len(self._to_come)
-        return is_timing and is_clean and is_part and pace.is_short(len(self._to_come))
-
-    def _take(self, call: Call, x: Tensor) -> Rows:
-        index = torch.from_numpy(call.rows)
-        status = torch.full((len(x),), Outcome.OK, dtype=torch.int8)
-        if not all_finite(x):
-            finite = x.isfinite()
-            x = x.masked_fill(~finite, torch.nan)
-            status[~finite.flatten(1).any(-1).cpu()] = Outcome.INVALID
-        fresh = self.status[index] == _UNFINISHED
-        if not bool(fresh.all()):
-            index, x, status = index[fresh], x[fresh.to(x.device)], status[fresh]
-        self._settle(index, x, status)
-        return index, x, status
-
-    def _settle(self, index: Tensor, x: Tensor, status: Tensor) -> None:
-        n = len(self.status)
-        if self.x is not None and x.shape[1:] != self.x.shape[1:]:
-            raise ValueError(
-                "expected x of one shape a row; got "
-                f"{tuple(self.x.shape[1:])} and {tuple(x.shape[1:])}, the latter in "
-                f"rows {index[:3].tolist()}...; pad trajectories with NaN, which "
-                "masks them"
+        if reply.fault == "misused":
+            last_line = reply.traceback.strip().splitlines()[-1]
+            raise ValueError(f"{last_line}; in a worker:\n{reply.traceback}")
+        row, is_block = int(call.rows[0]), call.draws == "block"
+        is_row = len(call) == 1 and not is_block
+        # After an accident x of a block is as without one.
+        is_accident = is_block and reply.fault == "worker died"
+        num_retries = self._workers.num_retries if is_row else int(is_accident)
+        attempt = call.draws, len(call), row
+        self._attempts[attempt] += 1
+        if self._attempts[attempt] <= num_retries:
+            self._urgent.append(self._call(call.rows, call.draws))
+        elif is_row:
+            self.lost[row], self.status[row] = reply, Outcome.MISSING
+        else:
+            num_parts = len(call) if is_block else 2 if reply.fault == "raised" else 16
+            parts = np.array_split(call.rows, min(num_parts, len(call)))
+            draws: Draws = "row" if is_block else "seeds"
+            self._urgent.extendleft(self._call(rows, draws) for rows in reversed(parts))
+        num_lost = len(self.lost)
+        if self.x is None and num_lost in (self.NUM_TRIED, len(self.status)):
+            first = next(iter(self.lost.values())).traceback
+            raise SimulationError(
+                "expected a simulator that can simulate; got a fault in each of the "
+                f"{num_lost} rows tried, so no row is to blame; mend the simulator, or "
+                "wrap a function of one row, SimulatorModel(fn, batched=False). The "
+                f"first of them:\n{first}"
             )
-        if self.x is None and len(index) == n:
-            self.x = x
-        else:
-            if self.x is None:
-                self.x = x.new_full((n, *x.shape[1:]), torch.nan)
-            self.x[index.to(x.device)] = x
-        self.status[index] = status
-
-    def _fail(self, call: Call, reply: Reply) -> None:
-        """Divide a call that failed; a single row is tried again, or lost."""
-        is_block = call.draws == "blocks" and len(call) <= BLOCK
-        has_died = reply.fault == "worker died"
-        if call.is_probe:
-            self._num_probes -= 1
-            if not (self._num_probes or self._has_succeeded):
-                self._give_up(reply)
-            return
-        if is_block and has_died and call.rows[0] not in self._accidents:
-            self._accidents.add(call.rows[0])  # x must be as without one
-            parts = [call]
-        elif is_block:
-            parts = call.parts(1, draws="alone")
-        elif call.draws == "blocks":
-            parts = call.parts(BLOCK)
-        elif len(call) > 1:
-            parts = call.parts(-(-len(call) // (2 if reply.fault == "raised" else 16)))
-        else:
-            self._lose(call, reply)
-            return
-        self._urgent.extendleft(reversed(parts))
-
-    def _lose(self, call: Call, reply: Reply) -> None:
-        row = int(call.rows[0])
-        self.tracebacks.setdefault(row, reply.traceback)
-        self._attempts[row] += 1
-        if self._attempts[row] <= self.workers.num_retries:
-            self._urgent.append(call)
-            return
-        self.status[row] = Outcome.MISSING
-        self.faults[reply.fault or "raised"] += 1
-        if self._has_succeeded:
-            return
-        if not bool((self.status == _UNFINISHED).any()):
-            self._give_up(reply)
-        if not self._num_probes and len(self.tracebacks) >= self.NUM_PROBES:
-            spread = np.linspace(0, len(self.status) - 1, self.NUM_PROBES)
-            rows = np.unique(spread.round().astype(np.int64))
-            draws: Draws = "seeds" if self.has_seeds else "alone"
-            self._num_probes = len(rows)
-            self._urgent.extendleft(self._call(r, draws, True) for r in rows[:, None])
-
-    def _give_up(self, reply: Reply) -> None:
-        first = next(iter(self.tracebacks.values()))
-        raise SimulationError(
-            "expected a simulator that can simulate; got a fault in each of the "
-            f"{len(self.tracebacks)} rows tried, so no row is to blame; mend the "
-            "simulator, or wrap a function of one row, SimulatorModel(fn, "
-            f"batched=False). The first of them:\n{first}"
-        ) from reply.error

@@ -9,12 +9,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-import torch
 from torch import Tensor
 
 from sbi_active.messages import Explained
+from sbi_active.simulation.outcomes import Outcome
+
+if TYPE_CHECKING:
+    from sbi_active.simulation.workers.schedule import Schedule
 
 
 class RowStore(Protocol):
@@ -64,6 +67,7 @@ def run_digest(seed: int, theta: Tensor, action: Tensor) -> str:
     """Return the name of a set of rows: SHA-256 of its seed, theta and action.
 
     Example:
+        >>> import torch
         >>> theta = torch.zeros(2, 1)
         >>> run_digest(0, theta, theta)
         '40e5538b0077201874242ebaea9810a33215466f3dd244238daf0314374e325d'
@@ -76,54 +80,41 @@ def run_digest(seed: int, theta: Tensor, action: Tensor) -> str:
 
 
 class Recorder:
-    """Hands finished rows to a store, every half second or 4,096 rows.
+    """Hands rows that are finished to a store, every half second.
 
     Args:
-        store: Store of the rows.
-        theta: Parameters of the whole set.
-        action: Actions of the whole set.
-        seed: Seed of the whole set.
+        store: Store of the rows, if any; the schedule takes what it has.
+        schedule: Schedule of the rows.
     """
 
     INTERVAL = 0.5  # s
-    CHUNK = 4096  # rows
 
-    def __init__(
-        self, store: RowStore, theta: Tensor, action: Tensor, seed: int
-    ) -> None:
-        self._store, self._seed = store, seed
-        self._theta, self._action = theta.detach().cpu(), action.detach().cpu()
-        self._run = run_digest(seed, theta, action)
-        self._waiting: list[tuple[Tensor, Tensor, Tensor]] = []
-        self._last = time.monotonic()
+    def __init__(self, store: RowStore | None, schedule: Schedule) -> None:
+        self._store, self._schedule = store, schedule
+        if store is not None:
+            self._run = run_digest(schedule.seed, schedule.theta, schedule.action)
+            schedule.restore(store.load(self._run))
+        self._last, self._is_stored = time.monotonic(), schedule.status >= 0
 
-    def load(self) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Return the rows that the store has, as :meth:`RowStore.load` does."""
-        return self._store.load(self._run)
-
-    def add(self, index: Tensor, x: Tensor, status: Tensor) -> None:
-        """Take finished rows: index (k,), x (k, *x_shape), status (k,)."""
-        self._waiting.append((index, x, status))
-        num_waiting = sum(len(part[0]) for part in self._waiting)
-        is_due = time.monotonic() - self._last >= self.INTERVAL
-        if is_due or num_waiting >= self.CHUNK:
-            self.flush()
-
-    def flush(self) -> None:
-        """Store the rows that wait."""
-        if self._waiting:
-            index, x, status = map(torch.cat, zip(*self._waiting, strict=True))
-            self._waiting = []
+    def save(self, *, at_once: bool = False) -> None:
+        """Store the rows that have finished since, if it is time."""
+        is_due = at_once or time.monotonic() - self._last >= self.INTERVAL
+        if self._store is None or not is_due:
+            return
+        rows, self._last = self._schedule, time.monotonic()
+        is_new = (rows.status >= 0) & (rows.status < Outcome.MISSING)
+        is_new &= ~self._is_stored
+        self._is_stored |= is_new
+        if rows.x is not None and bool(is_new.any()):
             self._store.save(
                 self._run,
-                index=index,
-                theta=self._theta[index],
-                action=self._action[index],
-                x=x.detach().cpu(),
-                status=status,
-                seed=self._seed,
+                index=is_new.nonzero()[:, 0],
+                theta=rows.theta[is_new].detach().cpu(),
+                action=rows.action[is_new].detach().cpu(),
+                x=rows.x[is_new].detach().cpu(),
+                status=rows.status[is_new],
+                seed=rows.seed,
             )
-        self._last = time.monotonic()
 
 
 #: Takes a simulator and returns the store of its rows, or None.
@@ -189,11 +180,11 @@ def metering(meter: Meter, find: FindStore = lambda simulator: None) -> Iterator
 
 def spend(num_rows: int) -> None:
     """Count rows by the meter of the block that this is called in, if any."""
-    if num_rows:
-        _METER.get((Meter(), None))[0].spend(num_rows)
+    if block := _METER.get(None):
+        block[0].spend(num_rows)
 
 
 def find_store(simulator: Callable[..., Any]) -> RowStore | None:
     """Return the store of a simulator's rows, if the caller is in :func:`metering`."""
-    _, find = _METER.get((None, lambda simulator: None))
-    return find(simulator)
+    block = _METER.get(None)
+    return block and block[1](simulator)

@@ -43,8 +43,8 @@ def test_what_is_to_be_done_is_said(old, capsys):
         Campaign.load(old)
     assert main(["migrate", str(old)]) == 0
     assert capsys.readouterr().out.splitlines() == [
-        "log: 5 events",
-        f"bank drawn: {ROWS} rows",
+        "log: 5",
+        f"drawn: {ROWS}",
         f"the files of before are in {old / 'version-1'}",
     ]
     names = sorted(path.name for path in old.iterdir())

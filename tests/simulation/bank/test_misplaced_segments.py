@@ -5,7 +5,6 @@ import shutil
 import pytest
 
 from sbi_active import Bank
-from sbi_active.cli import main
 from sbi_active.simulation.bank import CorruptSegmentError
 from tests.simulation.bank.filled import (
     FILE,
@@ -77,13 +76,11 @@ def lose_all(folder):
         lose_all,
     ],
 )
-def test_misplaced_segments_are_named(folder, misplace, capsys):
+def test_misplaced_segments_are_named(folder, misplace):
     misplace(folder)
     with pytest.raises(CorruptSegmentError, match=str(folder / FILE)):
         Bank(folder).read()
     assert Bank(folder).verify()
-    assert main(["bank", "inspect", str(folder)]) == 1
-    assert capsys.readouterr().out.startswith("checksums: NOT ok")
     with pytest.raises(CorruptSegmentError):  # still
         Bank(folder).read()
 

@@ -13,7 +13,7 @@ import torch
 from sbi_active import SimulatorModel, simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import Outcome
-from sbi_active.simulation.workers.pace import Pace, pace_of
+from sbi_active.simulation.workers.schedule import Pace, pace_of
 
 SCRIPT = """
 import pickle, sys, time, torch
@@ -169,14 +169,10 @@ class Arm:
     def run(self, theta, action):
         return theta
 
-    def walk(self, theta, action):
-        return theta
-
 
 def test_the_pace_is_known_by_the_simulator():
     arm = Arm()
     assert pace_of(arm.run) is pace_of(arm.run)
-    assert pace_of(arm.run) is not pace_of(arm.walk)
     assert pace_of(arm.run) is not pace_of(Arm().run)
     assert pace_of(Robot()) is not pace_of(Robot())
     assert isinstance(pace_of(Robot().run), Pace)
