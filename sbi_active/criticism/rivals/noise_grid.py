@@ -13,7 +13,7 @@ from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.rivals.error_models import ChannelNoise, NoiseCell, NoiseGrid
 from sbi_active.seeding import forked_generators
-from sbi_active.simulation.noise.base import NoiseModel, declared_sds
+from sbi_active.simulation.noise.base import NoiseModel
 from sbi_active.simulation.noise.posterior import NoisePosterior, SdGrid
 
 #: Cells of the correlation time, from half a sample step to twice the recording, and
@@ -63,7 +63,7 @@ def declared_noise(
         values = dict(zip(names, row.tolist(), strict=True))
         sds = np.array([v for k, v in values.items() if k.startswith("sd")])
         if not len(sds):  # a noise model of the user's, taken as Gaussian of its size
-            sds = declared_sds(noise).numpy()
+            sds = noise.declared_sds().numpy()
         if (sds <= 0).any():
             raise ValueError(
                 "expected measurement noise with a standard deviation > 0; got "

@@ -51,6 +51,32 @@ class InverseChiSquare:
         log_p = half * torch.log(0.5 * chi_square) - 0.5 * chi_square
         return (log_p - torch.lgamma(half) + math.log(2.0) - torch.log(sd)).sum(-1)
 
+    def log_evidence(self, square: Tensor, count: Tensor, cell: int) -> Tensor:
+        r"""Return the log density of Gaussian numbers with their size integrated out.
+
+        .. math::
+            \int \prod_{j=1}^{m} N(e_j; 0, \sigma^2) \, p(\sigma) \, d\sigma =
+            \frac{\Gamma(\frac{\nu + m}{2})}{\Gamma(\frac{\nu}{2})
+            (\pi \nu s^2)^{m / 2}}
+            \left( 1 + \frac{\sum_j e_j^2}{\nu s^2} \right)^{-\frac{\nu + m}{2}}
+
+        Args:
+            square: Sum of squares, shape (n, channels).
+            count: Number m of the squares, shape (n, channels).
+            cell: Cell of the shared parameter.
+
+        Returns:
+            Shape (n, channels), nats.
+        """
+        freedom = self.freedom.to(square)
+        total = freedom * self.variance[cell].to(square)
+        return (
+            torch.lgamma(0.5 * (freedom + count))
+            - torch.lgamma(0.5 * freedom)
+            - 0.5 * count * torch.log(math.pi * total)
+            - 0.5 * (freedom + count) * torch.log1p(square / total)
+        )
+
 
 @dataclass(frozen=True)
 class Cells:
@@ -63,6 +89,11 @@ class Cells:
 
     edges: Tensor
     log_weight: Tensor
+
+    @property
+    def nodes(self) -> Tensor:
+        """Geometric middle of the cells, shape (..., cells)."""
+        return (self.edges[..., 1:] * self.edges[..., :-1]).sqrt()
 
     def quantile(self, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """Return the cell and the value at levels of the leading shape."""
@@ -110,7 +141,7 @@ class SdGrid:
     @property
     def nodes(self) -> Tensor:
         """Geometric middle of the cells, shape (channels, s)."""
-        return (self.edges[:, 1:] * self.edges[:, :-1]).sqrt()
+        return Cells(self.edges, self.log_weight).nodes
 
     def quantile(self, cell: Tensor, uniform: Tensor) -> Tensor:
         """Return sd at cells (n,) and levels (n, channels)."""
@@ -119,6 +150,18 @@ class SdGrid:
     def log_prob(self, cell: Tensor, sd: Tensor) -> Tensor:
         """Return log densities (n,) of sd (n, channels) at cells (n,)."""
         return self._cells(cell).log_prob(sd.contiguous())[1].sum(-1)
+
+    def log_evidence(self, square: Tensor, count: Tensor, cell: int) -> Tensor:
+        r"""Return the log density of Gaussian numbers with their size summed out.
+
+        .. math::
+            \sum_k P(\sigma_k) \prod_{j=1}^{m} N(e_j; 0, \sigma_k^2)
+
+        Arguments are those of :meth:`.InverseChiSquare.log_evidence`.
+        """
+        nodes, weight = self.nodes.to(square), self.log_weight[cell].to(square)
+        density = -0.5 * square[..., None] / nodes**2 - count[..., None] * nodes.log()
+        return (density + weight).logsumexp(-1) - 0.5 * count * math.log(2 * math.pi)
 
     def _cells(self, cell: Tensor) -> Cells:
         edges = self.edges.expand(len(cell), *self.edges.shape).contiguous()
@@ -146,6 +189,14 @@ class NoisePosterior(Distribution):
         self.sd, self.shared = sd, shared
         num = sd.num_channels + (shared is not None)
         super().__init__(torch.Size(), torch.Size([num]), validate_args=False)
+
+    @property
+    def cells(self) -> list[tuple[float, float]]:
+        """Middle and log weight of each cell of the shared parameter; one without."""
+        if self.shared is None:
+            return [(math.nan, 0.0)]
+        own = self.shared.nodes.tolist(), self.shared.log_weight.tolist()
+        return [*zip(*own, strict=True)]
 
     @property
     def support(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -186,54 +237,3 @@ class NoisePosterior(Distribution):
         return Cells(
             edges.expand(num, -1).contiguous(), weight.expand(num, -1).contiguous()
         )
-
-
-def log_grid_evidence(
-    square: Tensor, count: Tensor, sd: SdGrid, *, cell: int
-) -> Tensor:
-    r"""Sum a Gaussian's standard deviation out over its grid, channel by channel.
-
-    .. math::
-        \log \sum_k P(\sigma_k) \prod_{j=1}^{m} N(e_j; 0, \sigma_k^2)
-
-    Args:
-        square: Sum of squares, shape (n, channels).
-        count: Number m of the squares, shape (n, channels).
-        sd: The grid.
-        cell: Cell of the shared parameter.
-
-    Returns:
-        Shape (n, channels), nats.
-    """
-    nodes, weight = sd.nodes.to(square), sd.log_weight[cell].to(square)
-    density = -0.5 * square[..., None] / nodes**2 - count[..., None] * nodes.log()
-    return (density + weight).logsumexp(-1) - 0.5 * count * math.log(2 * math.pi)
-
-
-def log_student_evidence(
-    square: Tensor, count: Tensor, sd: InverseChiSquare, *, cell: int
-) -> Tensor:
-    r"""Integrate a Gaussian's standard deviation out.
-
-    .. math::
-        \int \prod_{j=1}^{m} N(e_j; 0, \sigma^2) \, p(\sigma) \, d\sigma =
-        \frac{\Gamma(\frac{\nu + m}{2})}{\Gamma(\frac{\nu}{2}) (\pi \nu s^2)^{m / 2}}
-        \left( 1 + \frac{\sum_j e_j^2}{\nu s^2} \right)^{-\frac{\nu + m}{2}}
-
-    Args:
-        square: Sum of squares, shape (n, channels).
-        count: Number m of the squares, shape (n, channels).
-        sd: Posterior of the standard deviations.
-        cell: Cell of the shared parameter.
-
-    Returns:
-        Shape (n, channels), nats.
-    """
-    freedom = sd.freedom.to(square)
-    total = freedom * sd.variance[cell].to(square)
-    return (
-        torch.lgamma(0.5 * (freedom + count))
-        - torch.lgamma(0.5 * freedom)
-        - 0.5 * count * torch.log(math.pi * total)
-        - 0.5 * (freedom + count) * torch.log1p(square / total)
-    )
