@@ -23,14 +23,14 @@ from sbi_active.criticism.evidence.jumps import STEPS, look_for_jumps
 from sbi_active.criticism.evidence.settings import NESTED, ROUGH, THOROUGH, settings_of
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Evidence, ModelKey
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
-from sbi_active.criticism.rivals.error_models import ChannelNoise, NoiseGrid
+from sbi_active.criticism.rivals.error_models import NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import declared_noise, scattered
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.rivals.trial_simulator import NUM_REPLICATES, TrialSimulator
 from sbi_active.inference.engine import Found, WeightedDraws, infer, search
 from sbi_active.seeding import derive_seed
-from sbi_active.simulation import AutocorrelatedNoise, GaussianNoise, SimulatorModel
+from sbi_active.simulation import SimulatorModel
 
 #: Kept of a model, whose means are then known to a 20th of a deviation; and of the
 #: prior, whose deviations are known to 5 % at a simulation of all trials.
@@ -171,8 +171,8 @@ class RivalSet:
     @property
     def has_known_noise(self) -> bool:
         """Whether errors are declared as Gaussian with nothing unknown."""
-        gaussian = isinstance(self.model.noise, GaussianNoise | AutocorrelatedNoise)
-        return gaussian and self.noise.shape == (1, 1)
+        noise = self.model.noise
+        return noise is not None and noise.is_known_gaussian and self.noise.is_known
 
     def within(self, key: ModelKey, z: Array) -> Array:
         """Return draws of a model, (n, d), moved into the bounds of its prior."""
@@ -181,7 +181,7 @@ class RivalSet:
     @cached_property
     def _process(self) -> ResidualProcess:
         noise = self.noise
-        if isinstance(noise, ChannelNoise):
+        if noise.channel is not None:
             best = self.fit().likeliest
             noise = noise.settled(self.rival(ModelKey()).residual(best)[0][0])
         return self.residual_process(noise, np.ones(len(self.measurements), bool))

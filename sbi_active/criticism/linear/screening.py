@@ -20,7 +20,6 @@ from sbi_active.criticism.linear.fits import JUMPING, FitSettings
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.sensor import sensor_of
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.rivals.error_models import ChannelNoise
 from sbi_active.criticism.steps.equivalence import MANY
 
 #: Effects that are kept: the best alone, members of the best pairs, and those whose
@@ -60,7 +59,7 @@ def linear_models(rivals: RivalSet) -> tuple[Search, Screening | None]:
     sensor = sensor_of(rivals)
     settings = JUMPING if rivals.roughness.any() else FitSettings()
     search = Search(rivals, sensor, settings)
-    if isinstance(rivals.noise, ChannelNoise):
+    if rivals.noise.channel is not None:
         # What is missing may be seen in one channel alone, and no error of it.
         search.fit_singles()
         channel = rivals.measurements.channel

@@ -11,7 +11,7 @@ from torch.distributions import Distribution
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.rivals.error_models import ChannelNoise, NoiseCell, NoiseGrid
+from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.noise.base import NoiseModel
 from sbi_active.simulation.noise.posterior import NoisePosterior, SdGrid
@@ -109,7 +109,7 @@ def _product(
     ]
     if sd.num_channels == 1:
         return NoiseGrid(cells, scales=factors[0], log_weights=log_p[0])
-    return ChannelNoise(cells, channel=channel, factors=factors, log_factors=log_p)
+    return NoiseGrid(cells, channel=channel, factors=factors, log_factors=log_p)
 
 
 def measurement_sds(noise: NoiseModel | None, measurements: Measurements) -> Any:

@@ -33,7 +33,7 @@ from sbi_active.criticism.results import NONE, Tracing
 from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import declared_noise, measurement_sds
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
-from sbi_active.criticism.steps.predictive import Prediction, correlated_errors
+from sbi_active.criticism.steps.predictive import Prediction
 from sbi_active.criticism.under_misfit import Misfit
 from sbi_active.seeding import derive_seed
 
@@ -187,7 +187,7 @@ def _beside_process(misfit: Misfit, m: Measurements, num: int, seed: int) -> Arr
     time = 0.0 if np.isnan(misfit.time_scale) else misfit.time_scale
     cell = NoiseCell.of(m, sd=misfit.size * sensor, correlation_time=time)
     cells, ones = np.zeros(num, dtype=np.intp), np.ones((num, len(m)))
-    process, _ = correlated_errors(NoiseGrid([cell]), cells, ones, rng)
+    process, _ = NoiseGrid([cell]).errors(cells, ones, rng)
     return process + sensor * rng.normal(size=process.shape)
 
 

@@ -11,7 +11,7 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import ModelKey, Residuals
-from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell, NoiseGrid
+from sbi_active.criticism.rivals.error_models import LOG_2PI
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.criticism.rivals.validity import log_outcomes
@@ -153,7 +153,7 @@ def predict(
         mean = mean + shift
     cells, sizes = fit.error.noise_posterior(own_residual, rng)
     sizes = noise.by_number(sizes)
-    errors, sd = correlated_errors(noise, cells, sizes, rng)
+    errors, sd = noise.errors(cells, sizes, rng)
     errors, sd = errors * factor, np.sqrt((sd * factor) ** 2 + extra**2)
     errors = errors + extra * rng.normal(size=mean.shape)
     each = np.empty((num_draws, len(target) if scored else 0))
@@ -164,9 +164,9 @@ def predict(
             e, own = residual / sd[:, at], np.log(sd[:, at])
             each[:, t] = (-0.5 * e**2 - own - 0.5 * LOG_2PI).sum(1)
         else:
-            log_scale = np.log(factor[:, at]).sum(1)
-            e = residual / factor[:, at]
-            each[:, t] = _log_density(noise, cells, sizes, e, at) - log_scale
+            e, log_scale = residual / factor[:, at], np.log(factor[:, at]).sum(1)
+            log_p = noise.part(at).log_density(cells, sizes[:, at], e)
+            each[:, t] = log_p - log_scale
         each[:, t] += flags[t]
     return Prediction(
         mean[:, ~drops],
@@ -179,47 +179,6 @@ def predict(
         probability,
         None if at_best is None else at_best[~drops],
     )
-
-
-def correlated_errors(
-    noise: NoiseGrid, cells: Array, sizes: Array, rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """Return errors along each trial, and their deviations, shape (n, N).
-
-    Args:
-        noise: Noise of the numbers.
-        cells: Cell of each draw, shape (n,).
-        sizes: Factors on the cell's deviations, shape (n, N).
-        rng: Source of the errors.
-    """
-    shape = sizes.shape
-    e = rng.normal(size=shape)
-    for i, cell in enumerate(cells):
-        df = noise.cells[cell].df
-        if np.isfinite(df):
-            e[i] = rng.standard_t(df, size=shape[1]) * np.sqrt((df - 2) / df)
-    rho = np.stack([noise.cells[c].rho for c in cells])
-    u = e
-    if rho.any():
-        u = np.empty_like(e)
-        u[:, 0] = e[:, 0]
-        for k in range(1, shape[1]):
-            step = np.sqrt(1 - rho[:, k] ** 2) * e[:, k]
-            u[:, k] = rho[:, k] * u[:, k - 1] + step
-    sd = np.stack([noise.cells[c].sd for c in cells]) * sizes
-    return u * sd, sd
-
-
-def _log_density(
-    noise: NoiseGrid, cells: Array, sizes: Array, residual: Array, at: Array
-) -> Array:
-    """Return log densities of one trial's residuals, each in its cell, shape (n,)."""
-    log_p, own_sizes = np.empty(len(residual)), sizes[:, at]
-    for cell in np.unique(cells):
-        whole, own = noise.cells[cell], cells == cell
-        part = NoiseGrid([NoiseCell(0.0, whole.sd[at], whole.rho[at], whole.df)])
-        log_p[own] = part.log_likelihood(residual[own] / own_sizes[own])
-    return log_p - np.log(own_sizes).sum(1)
 
 
 def find_residuals(
