@@ -199,7 +199,7 @@ def register(
         verdict=report.verdict,
         mean=mean,
         sd=sd,
-        position=prediction.position,
+        position=prediction.measurements.position,
         limit=limit,
         bare=bare.middle,
     )
@@ -234,11 +234,10 @@ def _by_left_out(
     kept = search.errors.is_scored & use[fold]
     square = np.bincount(fold[kept], each[kept], len(use))[use]
     square /= np.bincount(fold[kept], minlength=len(use))[use]
-    channel = np.zeros(int(np.prod(m.shape[1:])), dtype=np.int64)
-    channel[m.position % len(channel)] = m.channel
     own_size = np.bincount(m.channel, (search.unit * rows[:, 0]) ** 2) / count
-    sd = np.sqrt(own_size[channel[prediction.position]] + prediction.mean.var(0))
-    return sd, limit_of(square, len(prediction.position))
+    channel = prediction.measurements.channel
+    sd = np.sqrt(own_size[channel] + prediction.mean.var(0))
+    return sd, limit_of(square, len(channel))
 
 
 def limit_of(square: Array, most: int, num: int = 25) -> float:

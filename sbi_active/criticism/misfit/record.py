@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from sbi_active.actions import ActionSpace
 from sbi_active.arrays import Array
-from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.contrary import is_left_to_chance, withdrawn
@@ -218,11 +217,8 @@ def _scored(misfit: Verdict, key: ModelKey, held_out: Trials | None) -> ModelErr
 def _held_out(misfit: Verdict, key: ModelKey, held_out: Trials) -> Array:
     """Return the root mean square error on held-out trials by channel, (c,)."""
     prediction = predict(misfit.models, held_out, key=key)
-    m = Measurements.of(held_out, is_sequence=True)
-    channel = np.zeros(int(np.prod(m.shape)), dtype=np.int64)
-    channel[m.position] = m.channel
-    error = prediction.of(held_out) - prediction.middle
-    return np.sqrt(_by_channel(error**2, channel[prediction.position]))
+    m = prediction.measurements
+    return np.sqrt(_by_channel((m.x - prediction.middle) ** 2, m.channel))
 
 
 def _by_channel(square: Array, channel: NDArray[np.int64]) -> Array:

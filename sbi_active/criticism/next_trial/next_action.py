@@ -88,13 +88,10 @@ class PredictedRival:
             seed=seed,
             scored=False,
         )
-        num = len(self._trials)
-        x = np.where(prediction.valid[:, prediction.trial], prediction.x, np.nan)
+        trial = prediction.measurements.trial
+        x = np.where(prediction.valid[:, trial], prediction.x, np.nan)
         every = np.stack([x, prediction.mean, prediction.sd])
-        each = np.split(
-            np.arange(len(prediction.trial)),
-            np.cumsum(np.bincount(prediction.trial, minlength=num))[:-1],
-        )
+        each = [np.flatnonzero(trial == t) for t in range(len(self._trials))]
         return torch.from_numpy(np.stack([every[:, :, at] for at in each], 2))
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sbi_active.arrays import Array
+from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.rival_set import RivalSet
@@ -33,8 +34,7 @@ class Prediction:
         x: Draws with errors, shape (n, N).
         log_likelihood: Log likelihood of the measurements of each trial given the draw,
             noise included, shape (n, t), nats.
-        trial: Trial of each number, shape (N,).
-        position: Position of each number in the flattened x, shape (N,).
+        measurements: The measurements that are predicted.
         valid: Whether each trial has an outcome, one draw each, shape (n, t), bool.
         probability_valid: Probability that it has one, given the draw, shape (n, t).
         at_best: Noise-free prediction by the best fit, shape (N,), where every model
@@ -45,8 +45,7 @@ class Prediction:
     sd: Array
     x: Array
     log_likelihood: Array
-    trial: Array
-    position: Array
+    measurements: Measurements
     valid: Array
     probability_valid: Array
     at_best: Array | None = None
@@ -55,10 +54,6 @@ class Prediction:
     def middle(self) -> Array:
         """Prediction that errors refer to: that of the best fit, or the mean, (N,)."""
         return self.mean.mean(0) if self.at_best is None else self.at_best
-
-    def of(self, trials: Trials) -> Array:
-        """Return what was measured in the trials that are predicted, (N,)."""
-        return trials.x.double().numpy().reshape(-1)[self.position]
 
     @property
     def log_density(self) -> Array:
@@ -168,16 +163,16 @@ def predict(
             log_p = noise.part(at).log_density(cells, sizes[:, at], e)
             each[:, t] = log_p - log_scale
         each[:, t] += flags[t]
+    kept = ~drops
     return Prediction(
-        mean[:, ~drops],
-        sd[:, ~drops],
-        (mean + errors)[:, ~drops],
+        mean[:, kept],
+        sd[:, kept],
+        (mean + errors)[:, kept],
         each,
-        m.trial[~drops],
-        m.position[~drops],
+        m.part(kept),
         rng.uniform(size=probability.shape) < probability,
         probability,
-        None if at_best is None else at_best[~drops],
+        None if at_best is None else at_best[kept],
     )
 
 
