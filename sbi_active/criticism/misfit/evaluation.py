@@ -73,6 +73,7 @@ def evaluate_held_out(
 
 def evaluate_left_out(
     found: Verdict,
+    models: RivalSet,
     trials: Trials,
     *,
     num_draws: int = NUM_DRAWS,
@@ -86,6 +87,7 @@ def evaluate_left_out(
 
     Args:
         found: Verdict by all trials.
+        models: Its models, with the posteriors of those that are recorded.
         trials: Trials that were fitted.
         num_draws: Draws from each posterior.
         show_progress: Whether to draw a bar of the trials.
@@ -105,8 +107,8 @@ def evaluate_left_out(
                 model = key
             scored = {}
             for each in dict.fromkeys((ModelKey(), model)):
-                fit = fitted(found, each, ~own)
-                prediction = predict(found.models, one, fit=fit, num_draws=num_draws)
+                fit = fitted(found, models, each, ~own)
+                prediction = predict(models, one, fit=fit, num_draws=num_draws)
                 scored[each] = scores(prediction)
             before.append(scored[ModelKey()])
             after.append(scored[model])
