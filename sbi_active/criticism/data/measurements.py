@@ -108,6 +108,11 @@ class Measurements:
         few = 0 < len(beyond) <= self.valid.sum() / 2
         return replace(self, x=x) if few else self
 
+    def by_channel(self, values: Array) -> Array:
+        """Return the mean of values (N,) in each channel, shape (c,)."""
+        count = np.bincount(self.channel)
+        return np.bincount(self.channel, values) / np.maximum(count, 1)
+
     def part(self, at: NDArray[np.bool_]) -> Measurements:
         """Return some of the numbers, shape (N,), with all of their trials."""
         names = ("x", "position", "trial", "channel", "time")

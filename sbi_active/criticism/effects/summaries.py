@@ -111,20 +111,9 @@ def summarize(
     if isinstance(model, AugmentedSimulator):
         own = [_before_summary(e) for e in model.effects]
         short = AugmentedSimulator(short, own, next_index=model.next_index)
-    return Summarized(
-        short,
-        Trials(
-            trials.action,
-            (x - center) @ weight.T,
-            role=trials.role,
-            index=trials.index,
-            order=trials.order,
-            names=trials.names,
-            repeat_of=trials.repeat_of,
-        ),
-        [_before_summary(e) for e in effects],
-        weight,
-    )
+    own = trials.select(slice(None))
+    own.x, own.channel_labels = (x - center) @ weight.T, None
+    return Summarized(short, own, [_before_summary(e) for e in effects], weight)
 
 
 def obstacle(model: SimulatorModel, trials: Trials, effects: Sequence[Effect]) -> str:

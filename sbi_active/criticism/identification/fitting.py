@@ -283,9 +283,9 @@ def _settled(
 
 def _sizes(rival: Rival, residual: Array, settings: IdentifySettings) -> Array:
     """Return the root mean square of each number's channel, shape (N,)."""
-    channel = rival.simulator.measurements.channel
-    rms = np.sqrt(np.bincount(channel, residual**2) / np.bincount(channel))
-    return np.maximum(rms[channel], settings.smallest * rival.spread)
+    m = rival.simulator.measurements
+    rms = np.sqrt(m.by_channel(residual**2))
+    return np.maximum(rms[m.channel], settings.smallest * rival.spread)
 
 
 def _beside(

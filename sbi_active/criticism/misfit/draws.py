@@ -93,7 +93,7 @@ def bends(search: Search, key: ModelKey) -> bool:
         return False  # its jumps leave any model, and count as noise
     c = search.found[key]
     m, rng = c.model, np.random.default_rng(derive_seed(rivals.seed, "bends"))
-    own = c.posterior.sensor
+    own = c.sensor
     u = m.draws(own.mean, own.cov, 16, rng)
     rival, linear = rivals.rival(key), m.at(u)
     fails = rivals.can_fail and not rivals.measurements.is_sequence
@@ -138,7 +138,7 @@ def _linear(
         return unit * model.at(u)[:, : model.num]
 
     if found.is_missed:
-        log_z, best = search.found[key].posterior.log_process, model.u
+        log_z, best = search.found[key].beside.log_evidence, model.u
         if known is not None:
             best = refitted(search.rival(key), model, search.units, known)
         u = drawn(best, found.covariance(key))
@@ -223,7 +223,7 @@ def by_weights(
     errors = search.errors
     for _ in range(5):  # two agree to some percent of a deviation
         grams = errors.grams(model.rows)
-        own = errors.posterior(model, grams, use).sensor
+        own = errors.mixture(model, grams, use, beside=False)
         u = np.clip(own.mean, model.low, model.high)
         model = reweighted_at(model, u, search.sensor.df)
     return model, own

@@ -7,7 +7,6 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sbi_active.actions import ActionSpace
 from sbi_active.arrays import Array
@@ -123,7 +122,7 @@ def _beside_misfit(
     keys = [*tabled, *singles.values(), *_weights(misfit)]
     models = _with_posteriors(misfit, keys)
     common = _common(misfit, models, ordered)
-    beside = {n: search.found[k].posterior.log_process for n, k in singles.items()}
+    beside = {n: search.found[k].beside.log_evidence for n, k in singles.items()}
     timed = misfit.rivals.measurements.is_sequence
     tracing = Tracing(
         verdict=str(ModelKey(named)) if named else misfit.key.error or UNEXPLAINED,
@@ -185,14 +184,14 @@ def _weights(misfit: Verdict) -> dict[ModelKey, float]:
 def _found(misfit: Verdict, models: Sequence[ModelError]) -> Found:
     choice, search = misfit.choice, misfit.search
     m = search.rivals.measurements
-    size, time_scale = search.errors.process(search.found[choice.key].posterior.beside)
+    size, time_scale = search.errors.process(search.found[choice.key].beside)
     return Found(
         models=(*models,),
         helps=choice.key.effects,
         named=choice.named,
         support=choice.support,
         open_forms=_open_forms(misfit),
-        sensor=np.sqrt(_by_channel(search.unit**2, m.channel)),
+        sensor=np.sqrt(m.by_channel(search.unit**2)),
         passes=misfit.passes(choice.key),
         size=size,
         time_scale=time_scale if m.is_sequence else np.nan,
@@ -222,9 +221,9 @@ def _scored(
     search, rivals = misfit.search, misfit.rivals
     left, bare = (search.found[k].left for k in (key, ModelKey()))
     excess = max(left.mean_square - 1, 0.0) / max(bare.mean_square - 1, 1e-2)
-    m = rivals.measurements
     kept = search.errors.is_scored
-    own = _by_channel((left.error * search.unit)[kept] ** 2, m.channel[kept])
+    square = (left.error * search.unit)[kept] ** 2
+    own = rivals.measurements.part(kept).by_channel(square)
     return ModelError(
         name=str(key),
         probability=misfit.choice.probabilities.get(key, 0.0),
@@ -239,11 +238,7 @@ def _held_out(models: RivalSet, key: ModelKey, held_out: Trials) -> Array:
     """Return the root mean square error on held-out trials by channel, (c,)."""
     prediction = predict(models, held_out, key=key)
     m = prediction.measurements
-    return np.sqrt(_by_channel((m.x - prediction.middle) ** 2, m.channel))
-
-
-def _by_channel(square: Array, channel: NDArray[np.int64]) -> Array:
-    return np.bincount(channel, square) / np.maximum(np.bincount(channel), 1)
+    return np.sqrt(m.by_channel((m.x - prediction.middle) ** 2))
 
 
 def _estimates(found: Verdict, evidences: dict[str, Evidence]) -> tuple[Estimate, ...]:

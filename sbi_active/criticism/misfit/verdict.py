@@ -105,8 +105,7 @@ class Verdict:
         is_declared = noise is not None and noise.posterior is None and spare > 0
         if not is_declared or rivals.roughness.any():
             return found
-        lower = float(chi2.cdf(square, spare))
-        return replace(found, least_chi_square=square, lower_p_value=lower)
+        return replace(found, lower_p_value=float(chi2.cdf(square, spare)))
 
     def _log_bayes_factor(
         self, use: NDArray[np.bool_] | None = None, factor: float = 1.0
@@ -167,12 +166,11 @@ class Verdict:
         joint = self.states.joint(c.model.key, use, factor)
         log_p = c.log_prior + log_sum_exp(np.array([*joint.values()]))
         state = max(joint, key=joint.__getitem__).error
-        beside = c.posterior
+        beside, mixture = c.beside, self.search.errors.mixture
         if use is not None or factor != 1:
-            errors = self.search.errors
-            beside = errors.posterior(c.model, c.grams, use, factor=factor)
+            beside = mixture(c.model, c.grams, use, beside=True, factor=factor)
         square = (standard or self.standard)(c)
-        log_beside = c.log_prior + beside.log_process
+        log_beside = c.log_prior + beside.log_evidence
         return Scored(log_p, square, c.model.rms**2, state, log_beside)
 
     def _settled(

@@ -87,7 +87,7 @@ class NoiseCell:
     @property
     def log_scale(self) -> float:
         """Log determinant of the inverse of :meth:`whiten`."""
-        return float(np.log(self.sd).sum() + 0.5 * np.log1p(-(self.rho**2)).sum())
+        return float(self.log_scales.sum())
 
     def part(self, at: NDArray[np.bool_]) -> NoiseCell:
         """Return this noise of some of the numbers, shape (N,)."""
@@ -137,11 +137,6 @@ class NoiseGrid:
     def is_known(self) -> bool:
         """Whether nothing of it is unknown, so that one transform whitens all."""
         return len(self.cells) == self.factors.size == len(self.scales) == 1
-
-    @property
-    def has_one_size(self) -> bool:
-        """Whether its size is known up to that of the cells."""
-        return len(self.scales) == 1 and self.channel is None
 
     @property
     def typical_sd(self) -> Array:
