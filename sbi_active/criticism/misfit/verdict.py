@@ -27,7 +27,7 @@ from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.states import States
 from sbi_active.criticism.misfit.guesses import gained_by_guesses
 from sbi_active.criticism.misfit.intervals import covariance, widened
-from sbi_active.criticism.misfit.rule import Choice, Rule
+from sbi_active.criticism.misfit.rule import Choice, Compared, Rule
 from sbi_active.criticism.misfit.scored import Scored
 from sbi_active.criticism.results import (
     NONE,
@@ -147,9 +147,8 @@ class Verdict:
     def choice(self) -> Choice:
         """What helps, and what is named; without an alarm nothing."""
         if not self.detection.alarm:
-            names = self.search.names
             scored = {k: self._scored(c) for k, c in self.search.found.items()}
-            return self.rule.nothing(scored, names)
+            return Compared(self.rule, scored, self.search.names).nothing()
         self.search.fit_larger()
         timed = self.rivals.measurements.is_sequence
         guessed = None if timed else partial(gained_by_guesses, self.search)
@@ -191,11 +190,10 @@ class Verdict:
             for key, candidate in search.found.items():
                 if key not in scored:
                     scored[key] = score(candidate)
-            tops = self.rule.starts(scored, search.names, timed=timed)
-            missing = [key for top in tops for key in _missing(search, top)]
+            compared = Compared(self.rule, scored, search.names, timed)
+            missing = [k for top in compared.starts() for k in _missing(search, top)]
             if not missing:
-                given = scored, search.names, self.equivalent
-                choice = self.rule.choose(*given, timed=timed, guessed=guessed)
+                choice = compared.choice(self.equivalent, guessed)
                 bare = scored[ModelKey()]
                 gain = scored[choice.key].gain(bare)
                 # Numbers that scatter each for itself may follow anything a little.
