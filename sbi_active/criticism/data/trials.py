@@ -362,7 +362,8 @@ class Trials:
         both.inputs = rows_joined(self.inputs, further.inputs)
         both.start = rows_joined(self.start, further.start)
         if self._names is not None:
-            both._names = (*self.names, *further.names)
+            new = [f"new {n}" if n in self._names else n for n in further.names]
+            both._names = (*self._names, *new)
         both.repeat_of = repeated(both.settings())
         return both
 
