@@ -120,11 +120,11 @@ def _drawn(
             own, m, rivals.scaled_actions(whole), order=rivals.scaled_order(whole)
         )
         mean = mean + shift
-    cells, scales = rival.error.noise_posterior(own, rng)
+    cells, sizes = rival.error.noise_posterior(own, rng)
     noise = declared_noise(rivals.model.noise, m)
     last, *rest = _rest(rivals, m, trial)
     rho = np.stack([noise.cells[c].rho for c in cells])
-    sd = np.stack([noise.cells[c].sd for c in cells]) * scales[:, None]
+    sd = np.stack([noise.cells[c].sd for c in cells]) * sizes
     r = m.x[last] - mean[:, last]
     x = np.empty((num, len(rest)))
     for j, k in enumerate(rest):

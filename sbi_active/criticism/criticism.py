@@ -201,8 +201,8 @@ class Criticism:
 
     @property
     def rivals(self) -> RivalSet:
-        """The models; after the verdict with the posteriors of those it records."""
-        return self._verdict.models if "_verdict" in vars(self) else self._search.rivals
+        """The models; once traced with the posteriors of those that are recorded."""
+        return self._traced[1] if "_traced" in vars(self) else self._search.rivals
 
     def misfit(self) -> Verdict | None:
         """Return the models where none explains the trials to the sensor's error.
@@ -240,20 +240,20 @@ class Criticism:
 
     def trace(self) -> Tracing:
         """Return the tracing: the effect that the data point to."""
-        return self._tracing
+        return self._traced[0]
 
     @cached_property
-    def _tracing(self) -> Tracing:
+    def _traced(self) -> tuple[Tracing, RivalSet]:
         found, large = self._verdict, self._is_large
         # Each model's held-out errors would take as much as the verdict; and what
         # separates effects of a large library, the next action looks for.
         held_out = None if large else self._parts[1].held_out
         actions = None if large else self.actions
         with stage("verdict, sets of effects fitted", show_progress=self.show_progress):
-            tracing = traced(found, held_out, actions=actions, near=not large)
+            tracing, models = traced(found, held_out, actions=actions, near=not large)
         if tracing.misfit is None:
-            tracing = widened(tracing, self.seed, self.rivals.within)
-        return replace(tracing, set_aside=self.set_aside)
+            tracing = widened(tracing, self.seed, models.within)
+        return replace(tracing, set_aside=self.set_aside), models
 
     def add(
         self, effects: Sequence[str] | None = None
@@ -322,7 +322,9 @@ class Criticism:
             return None
         shown = self.show_progress
         return evaluate_left_out(
-            self._verdict, trials.fit, num_draws=num, show_progress=shown
+            *(self._verdict, self.rivals, trials.fit),
+            num_draws=num,
+            show_progress=shown,
         )
 
     def judged(self, evaluation: Evaluation | None) -> Tracing:

@@ -152,8 +152,6 @@ class Detection:
         level: Level below which it is an alarm; 0 where something is unknown of the
             noise.
         null_log_evidence: Log evidence by least squares, nats.
-        least_chi_square: The smallest of any parameters that were tried; NaN where the
-            size of the noise is not declared.
         lower_p_value: Probability of one as small, all parameters taken as determined;
             1 where the size of the noise is not declared.
     """
@@ -165,7 +163,6 @@ class Detection:
     p_value: float
     level: float
     null_log_evidence: float
-    least_chi_square: float = float("nan")
     lower_p_value: float = 1.0
 
     @property

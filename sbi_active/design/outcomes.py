@@ -24,7 +24,6 @@ from sbi_active.design.estimators.base import (
     InformationGainEstimator,
 )
 from sbi_active.simulation import GaussianNoise, NoiseModel
-from sbi_active.simulation.noise.whitening import whitened
 
 
 def join_outcomes(
@@ -143,6 +142,9 @@ class _JointNoise(NoiseModel):
         flat = self.each.log_prob(*stacked, times=times, parameters=parameters)
         return flat.reshape(x.shape[:2]).sum(1)
 
+    def whiten(self, value: Tensor) -> Tensor:
+        return self.each.whiten(value.flatten(0, 1)).reshape(value.shape)
+
 
 def _joint(noise: NoiseModel) -> NoiseModel:
     """Return the noise of stacked outcomes; a declared Gaussian is the same on any."""
@@ -201,7 +203,7 @@ class LinearSummaries:
         found = torch.full((len(mean), self._num_kept), torch.nan).double()
         key, rest = action.numpy().tobytes(), []
         for rows, summaries in zip(mean.split(block), found.split(block), strict=True):
-            white = whitened(self._noise, rows).flatten(1)
+            white = self._noise.whiten(rows).flatten(1)
             whole = white.isfinite().all(1)
             if not bool(whole.any()):
                 continue

@@ -21,7 +21,6 @@ from sbi_active.simulation import (
     SimulatorModel,
     simulate,
 )
-from sbi_active.simulation.noise.whitening import is_known_gaussian
 from sbi_active.simulation.simulator import require_noise
 from sbi_active.simulation.workers.settings import Workers
 
@@ -66,7 +65,7 @@ class CandidateSampler:
         self.summaries: LinearSummaries | None = None
         noise = getattr(simulator, "noise", None)
         many = self.declared and self._num_numbers > most_numbers
-        if many and noise is not None and is_known_gaussian(noise):
+        if many and noise is not None and noise.is_known_gaussian:
             self.summaries = LinearSummaries(noise)
 
     def draw(

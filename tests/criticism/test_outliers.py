@@ -125,8 +125,8 @@ def test_noise_declared_too_large_is_said():
     (sentence,) = (w for w in said if w.code == "SA523")
     assert "far smaller than the declared noise allows" in sentence
     larger = SimulatorModel(response, noise=GaussianNoise(1e4))
-    ratio = criticism(x, model=larger).detect().least_chi_square
-    ratio /= detection.least_chi_square  # of the same least squares
+    ratio = criticism(x, model=larger).detect().chi_square
+    ratio /= detection.chi_square  # of the same least squares
     assert ratio == pytest.approx(1e-4, rel=1e-2)
     assert "declare the error of the measurement" in sentence
     right = criticism(x).detect()

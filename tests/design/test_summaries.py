@@ -13,7 +13,6 @@ from sbi_active import (
 )
 from sbi_active.design.outcomes import LinearSummaries
 from sbi_active.seeding import forked_generators
-from sbi_active.simulation.noise.whitening import whitened
 
 NUM = 300
 TIMES = torch.linspace(0.1, 1.0, NUM)
@@ -55,7 +54,7 @@ def test_differences_of_outcomes_keep_their_length_in_the_noise(noise):
     mean = line(theta, torch.tensor([[1.5]]))
     summaries = LinearSummaries(noise)
     short = summaries(torch.tensor([1.5]), mean)
-    whole = whitened(noise, mean)
+    whole = noise.whiten(mean)
     assert short.shape == (400, 32)
     torch.testing.assert_close(
         torch.cdist(short, short), torch.cdist(whole, whole), rtol=1e-4, atol=1e-2

@@ -218,6 +218,13 @@ def rows_at(value: Any, at: Any) -> Any:
     return None if value is None else value[at]
 
 
+def rows_joined(own: Any, further: Any) -> Any:
+    """Return rows with further ones behind them, as :func:`rows_at` takes them."""
+    if isinstance(own, Mapping):
+        return {name: torch.cat([part, further[name]]) for name, part in own.items()}
+    return None if own is None else torch.cat([own, further])
+
+
 def roles_of(role: Sequence[Role] | None, n: int) -> list[Role]:
     """Return a role for each of n trials, "fit" where none is given."""
     given = ["fit"] * n if role is None else role

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +24,6 @@ class Measurements:
         channel: Channel of each number, shape (N,).
         time: Sample time of each number; its place along x's first axis where no times
             are given, shape (N,).
-        gap: Time since the measured number before it in the same trial and channel;
-            inf for the first, shape (N,).
         has_time: Whether x has a time axis.
         valid: Trials with any measurement, shape (t,), bool.
         shape: (t, *x_shape).
@@ -35,7 +34,6 @@ class Measurements:
     trial: NDArray[np.int64]
     channel: NDArray[np.int64]
     time: Array
-    gap: Array
     has_time: bool
     valid: Array
     shape: tuple[int, ...]
@@ -73,22 +71,26 @@ class Measurements:
         if not has_time:
             time, channel = np.zeros(channels.shape), places % (x.size // num)
         keep = np.isfinite(channels) & np.isfinite(time)
-        gap = np.full(int(keep.sum()), np.inf)
-        if has_time:
-            a, b, c = trial[keep], channel[keep], time[keep]
-            follows = (a[1:] == a[:-1]) & (b[1:] == b[:-1])
-            gap[1:] = np.where(follows, np.diff(c), np.inf)
         return cls(
             channels[keep],
             places[keep],
             trial[keep].astype(np.int64),
             channel[keep].astype(np.int64),
             time[keep],
-            gap,
             has_time,
             np.asarray(np.isfinite(x.reshape(num, -1)).any(1)),
             x.shape,
         )
+
+    @cached_property
+    def gap(self) -> Array:
+        """Time since the number before in its trial and channel; inf for the first."""
+        gap = np.full(len(self), np.inf)
+        if self.has_time:
+            a, b = self.trial, self.channel
+            follows = (a[1:] == a[:-1]) & (b[1:] == b[:-1])
+            gap[1:] = np.where(follows, np.diff(self.time), np.inf)
+        return gap
 
     def bounded(self, center: Array, reach: Array) -> Measurements:
         """Return the measurements with implausible numbers moved within a reach.
@@ -106,9 +108,14 @@ class Measurements:
         few = 0 < len(beyond) <= self.valid.sum() / 2
         return replace(self, x=x) if few else self
 
+    def by_channel(self, values: Array) -> Array:
+        """Return the mean of values (N,) in each channel, shape (c,)."""
+        count = np.bincount(self.channel)
+        return np.bincount(self.channel, values) / np.maximum(count, 1)
+
     def part(self, at: NDArray[np.bool_]) -> Measurements:
         """Return some of the numbers, shape (N,), with all of their trials."""
-        names = ("x", "position", "trial", "channel", "time", "gap")
+        names = ("x", "position", "trial", "channel", "time")
         return replace(self, **{name: getattr(self, name)[at] for name in names})
 
     def __len__(self) -> int:

@@ -22,6 +22,7 @@ from sbi_active.criticism.data.arrays import (
     roles_of,
     root,
     rows_at,
+    rows_joined,
     sample_times_of,
     start_states,
     without_inf,
@@ -346,6 +347,25 @@ class Trials:
         if self._names is not None:  # of trials that may be there twice now
             some._names = tuple(self._names[i] for i in at)
         return some
+
+    def joined(self, further: Trials) -> Trials:
+        """Return these trials with further ones of the same machine behind them."""
+        both, times = copy.copy(self), self.sample_times
+        both.action = torch.cat([self.action, further.action])
+        both.x = torch.cat([self.x, further.x])
+        both.index = torch.cat([self.index, further.index])
+        both.role = [*self.role, *further.role]
+        if times is not None and times.ndim > 1:
+            assert further.sample_times is not None
+            others = further.sample_times.expand(len(further), -1)
+            both.sample_times = torch.cat([times, others])
+        both.inputs = rows_joined(self.inputs, further.inputs)
+        both.start = rows_joined(self.start, further.start)
+        if self._names is not None:
+            new = [f"new {n}" if n in self._names else n for n in further.names]
+            both._names = (*self._names, *new)
+        both.repeat_of = repeated(both.settings())
+        return both
 
     def _of(self, role: Role) -> Trials:
         positions = [i for i, r in enumerate(self.role) if r == role]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -26,6 +26,15 @@ from sbi_active.simulation.model import NOISE_STREAM
 #: Rows on which an effect is compared with the simulator without it; of those that are
 #: simulated in any case, so many that x of two channels leaves more than one.
 NUM_CHECKED, NUM_FIRST = 16, 3
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """What effects do in rows: phi by effect, actions as commanded, conditions."""
+
+    phi: dict[str, Tensor]
+    action: Tensor
+    context: Context
 
 
 class AugmentedSimulator(SimulatorModel):
@@ -139,7 +148,7 @@ class AugmentedSimulator(SimulatorModel):
         context = self._row_context(action, index, context)
         self._check_first(theta, action, context)
         merge = merge and self.noise is not None  # a draw is another at each call
-        return self._evaluate(theta, phi, action, context, seeds, merge=merge)
+        return self._evaluate(theta, _Rows(phi, action, context), seeds, merge=merge)
 
     def noise_scale(
         self,
@@ -160,7 +169,7 @@ class AugmentedSimulator(SimulatorModel):
             context: Context of the rows, as in :meth:`evaluate`.
         """
         context = self._row_context(action, index, context)
-        return self._through("noise", sd, phi, action, context)
+        return self._through("noise", sd, _Rows(phi, action, context))
 
     def split(self, parameters: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return theta and phi by effect from (theta, phi), shape (n, dim)."""
@@ -209,7 +218,7 @@ class AugmentedSimulator(SimulatorModel):
         if told:
             context = self._row_context(action, given=replace(context, **told))
         self._check_first(theta, action, context)
-        return self._evaluate(theta, phi, action, context, seeds, rest)
+        return self._evaluate(theta, _Rows(phi, action, context), seeds, rest)
 
     def _trial_draws(
         self, num: int, dtype: torch.dtype, seeds: Tensor | None
@@ -251,9 +260,7 @@ class AugmentedSimulator(SimulatorModel):
     def _evaluate(
         self,
         theta: Tensor,
-        phi: dict[str, Tensor],
-        action: Tensor,
-        context: Context,
+        rows: _Rows,
         seeds: Tensor | None,
         keywords: Mapping[str, Any] | None = None,
         *,
@@ -261,51 +268,44 @@ class AugmentedSimulator(SimulatorModel):
     ) -> Tensor:
         if seeds is None and self.noise is not None:
             seeds = torch.zeros(len(theta), dtype=torch.int64)
-        commanded = action
-        theta = self._through("parameter", theta, phi, commanded, context)
-        action = self._through("action", action, phi, commanded, context)
-        if context.inputs is None and self.base.inputs is not None:
+        theta = self._through("parameter", theta, rows)
+        action = self._through("action", rows.action, rows)
+        if rows.context.inputs is None and self.base.inputs is not None:
             signals = played(self.base.inputs, action, action.dtype)
-            context = replace(context, **signals)
-        told = self._told(phi, commanded, context) | dict(keywords or {})
-        told = self._through("dynamics", told, phi, commanded, context)
+            rows = replace(rows, context=replace(rows.context, **signals))
+        told = self._told(rows) | dict(keywords or {})
+        told = self._through("dynamics", told, rows)
         run = self._run_merged if merge else self.base._run
         x = run(theta, action, seeds, told)
-        return self._through("observation", x, phi, commanded, context)
+        return self._through("observation", x, rows)
 
-    def _through(
-        self,
-        hook: str,
-        value: Any,
-        phi: dict[str, Tensor],
-        action: Tensor,
-        context: Context,
-    ) -> Any:
+    def _through(self, hook: str, value: Any, rows: _Rows) -> Any:
         """Return a value as all effects of a hook change it, one after the other."""
-        for effect in self._active(hook, phi):
-            value = applied(effect, value, phi[effect.name], action, context)
+        for effect in self._active(hook, rows.phi):
+            own = rows.phi[effect.name]
+            value = applied(effect, value, own, rows.action, rows.context)
         return value
 
-    def _told(
-        self, phi: dict[str, Tensor], action: Tensor, context: Context
-    ) -> dict[str, Any]:
+    def _told(self, rows: _Rows) -> dict[str, Any]:
         """Return what the simulator's function is told of how its trials are run."""
-        inputs, wanted = context.inputs, self.base.conditions
-        for effect in self._active("input", phi):
-            if inputs is None or "inputs" not in wanted:
+        context, wanted = rows.context, self.base.conditions
+        for effect in self._active("input", rows.phi):
+            if context.inputs is None or "inputs" not in wanted:
+                got = (
+                    "none in the trials"
+                    if context.inputs is None
+                    else "no such argument"
+                )
                 raise ValueError(
                     f"expected inputs over time for effect {effect.name!r}, in the "
-                    "trials and as an argument of the simulator's function; got "
-                    f"{'none in the trials' if inputs is None else 'no such argument'}"
+                    f"trials and as an argument of the simulator's function; got {got}"
                     "; pass Trials(inputs=...), and take fn(theta, action, *, inputs)"
                 )
-        every = {
-            **vars(context),
-            "inputs": self._through("input", inputs, phi, action, context),
-        }
+        inputs = self._through("input", context.inputs, rows)
+        every = {**vars(context), "inputs": inputs}
         if context.times is not None:
             # The simulator is read where the trial was, not on a grid of its own.
-            every["times"] = context.times.expand(len(action), -1)
+            every["times"] = context.times.expand(len(rows.action), -1)
         return {k: every[k] for k in wanted if every[k] is not None}
 
     def _run_merged(
@@ -334,7 +334,8 @@ class AugmentedSimulator(SimulatorModel):
         It may do so by single precision, with room for a formula's rounding.
         """
         tolerance = 1e-4  # in deviations of x over the checked rows
-        x = self._seeded(theta, {}, action, context)
+        rows = _Rows({}, action, context)
+        x = self._seeded(theta, rows)
         shapes = [x.shape, *(u.shape for u in (context.inputs or {}).values())]
         if any(len(x) in shape[1:] for shape in shapes) and len(x) > 1:
             # As many rows as entries hide phi that is spread over the wrong axis.
@@ -351,7 +352,7 @@ class AugmentedSimulator(SimulatorModel):
             def at_null(null: Tensor, e: Effect = effect, x: Tensor = without) -> Any:
                 if e.hook == "noise":
                     return applied(e, x, null, action, context)
-                return self._seeded(theta, {e.name: null}, action, context)
+                return self._seeded(theta, replace(rows, phi={e.name: null}))
 
             difference = change_at_null(without, at_null, effect)
             if difference > allowed:
@@ -364,13 +365,11 @@ class AugmentedSimulator(SimulatorModel):
                 require_positive(effect, torch.ones_like(x), action, context)
         self._unchecked = []
 
-    def _seeded(
-        self, theta: Tensor, phi: dict[str, Tensor], action: Tensor, context: Context
-    ) -> Tensor:
+    def _seeded(self, theta: Tensor, rows: _Rows) -> Tensor:
         """Evaluate under fixed seeds, so that a stochastic simulator repeats itself."""
         seeds = row_seeds(0, len(theta))
         with forked_generators(0, "null"):
-            return self._evaluate(theta, phi, action, context, seeds)
+            return self._evaluate(theta, rows, seeds)
 
 
 def _row_tensors(keywords: Mapping[str, Any], num: int) -> list[Tensor]:

@@ -18,7 +18,6 @@ from sbi_active.criticism.effects.table import rows_of
 from sbi_active.criticism.effects.trial_conditions import conditions_for, has_own_times
 from sbi_active.seeding import forked_generators, row_seeds
 from sbi_active.simulation import SimulatorModel
-from sbi_active.simulation.noise.base import declared_sds
 
 TABLE = Path(__file__).with_name("generic.md")
 NUM_ACTIONS, NUM_PRIOR = 256, 256
@@ -64,7 +63,7 @@ def generic_effects(
             "expected a simulator with declared noise, or its prior; got neither, so "
             "nothing says how large a bias may be; give prior="
         )
-    sd = None if model.noise is None else declared_sds(model.noise)
+    sd = None if model.noise is None else model.noise.declared_sds()
     draws = None if prior is None else _prior_draws(model, actions, prior)
     times, signals, trials = model.sample_times, model.inputs, None
     inputs, grid = None, None

@@ -24,7 +24,6 @@ from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Context, Effect
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, SimulatorModel
-from sbi_active.simulation.noise.base import declared_sds
 
 #: Numbers a trial beyond which summaries are taken unless they are refused.
 MANY = 500
@@ -89,7 +88,7 @@ def summarize(
     x = trials.x.flatten(1)
     base = model.base if isinstance(model, AugmentedSimulator) else model
     assert model.noise is not None
-    sd = declared_sds(model.noise)
+    sd = model.noise.declared_sds()
     sd = sd.repeat(x.shape[1] // len(sd))
     weight, center = _trained(model, prior, trials, effects, sd, num, seed)
 
@@ -112,20 +111,9 @@ def summarize(
     if isinstance(model, AugmentedSimulator):
         own = [_before_summary(e) for e in model.effects]
         short = AugmentedSimulator(short, own, next_index=model.next_index)
-    return Summarized(
-        short,
-        Trials(
-            trials.action,
-            (x - center) @ weight.T,
-            role=trials.role,
-            index=trials.index,
-            order=trials.order,
-            names=trials.names,
-            repeat_of=trials.repeat_of,
-        ),
-        [_before_summary(e) for e in effects],
-        weight,
-    )
+    own = trials.select(slice(None))
+    own.x, own.channel_labels = (x - center) @ weight.T, None
+    return Summarized(short, own, [_before_summary(e) for e in effects], weight)
 
 
 def obstacle(model: SimulatorModel, trials: Trials, effects: Sequence[Effect]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import cached_property
@@ -23,14 +23,14 @@ from sbi_active.criticism.evidence.jumps import STEPS, look_for_jumps
 from sbi_active.criticism.evidence.settings import NESTED, ROUGH, THOROUGH, settings_of
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Evidence, ModelKey
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
-from sbi_active.criticism.rivals.error_models import ChannelNoise, NoiseGrid
+from sbi_active.criticism.rivals.error_models import NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import declared_noise, scattered
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.rivals.trial_simulator import NUM_REPLICATES, TrialSimulator
 from sbi_active.inference.engine import Found, WeightedDraws, infer, search
 from sbi_active.seeding import derive_seed
-from sbi_active.simulation import AutocorrelatedNoise, GaussianNoise, SimulatorModel
+from sbi_active.simulation import SimulatorModel
 
 #: Kept of a model, whose means are then known to a 20th of a deviation; and of the
 #: prior, whose deviations are known to 5 % at a simulation of all trials.
@@ -64,7 +64,7 @@ class RivalSet:
         is_smooth: Whether derivatives mean anything.
         roughness: Deviation of what no smooth function of the parameters follows, which
             ``noise`` has on top of the declared one, shape (N,); 0 where it is smooth.
-        fits: Rivals with their posteriors, of those that were asked for.
+        fits: Posteriors of rivals that are known.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class RivalSet:
         self.noise = self.noise_of(self.measurements)
         self._predictives: dict[tuple[bytes | None, ...], tuple[Array, Array]] = {}
         self._modes: dict[tuple[ModelKey, bytes], Found] = {}
-        self.fits: dict[ModelKey, Fit] = {}
+        self.fits: Mapping[ModelKey, Fit] = {}
         self.center, self.spread = self.prior_predictive(self.simulator)
         # Beyond a thousand deviations of the prior predictive a number is as far.
         reach = 1e3 * np.hypot(self.spread, self.noise.typical_sd)
@@ -108,8 +108,14 @@ class RivalSet:
 
     def with_effects(self, names: Iterable[str]) -> RivalSet:
         """Return these models without other effects; their priors stay."""
+        new = self.with_fits({})
+        new.effects = {name: self.effects[name] for name in names}
+        return new
+
+    def with_fits(self, fits: Mapping[ModelKey, Fit]) -> RivalSet:
+        """Return these models with posteriors of some of them."""
         new = copy(self)
-        new.effects, new.fits = {name: self.effects[name] for name in names}, {}
+        new.fits = fits
         return new
 
     def widened(self, largest: float) -> RivalSet:
@@ -119,10 +125,10 @@ class RivalSet:
             largest: Largest value of their unknown factor, which is log-uniform from
                 one.
         """
-        new = copy(self)
+        new = self.with_fits({})
         factors = np.geomspace(1.0, max(largest, 2.0), 14)
         new._factors = factors, np.full(len(factors), -np.log(len(factors)))
-        new.noise, new.fits, new._modes = self.noise.scaled(*new._factors), {}, {}
+        new.noise, new._modes = self.noise.scaled(*new._factors), {}
         vars(new).pop("_process", None)  # which has that noise
         return new
 
@@ -171,8 +177,8 @@ class RivalSet:
     @property
     def has_known_noise(self) -> bool:
         """Whether errors are declared as Gaussian with nothing unknown."""
-        gaussian = isinstance(self.model.noise, GaussianNoise | AutocorrelatedNoise)
-        return gaussian and self.noise.shape == (1, 1)
+        noise = self.model.noise
+        return noise is not None and noise.is_known_gaussian and self.noise.is_known
 
     def within(self, key: ModelKey, z: Array) -> Array:
         """Return draws of a model, (n, d), moved into the bounds of its prior."""
@@ -181,7 +187,7 @@ class RivalSet:
     @cached_property
     def _process(self) -> ResidualProcess:
         noise = self.noise
-        if isinstance(noise, ChannelNoise):
+        if noise.channel is not None:
             best = self.fit().likeliest
             noise = noise.settled(self.rival(ModelKey()).residual(best)[0][0])
         return self.residual_process(noise, np.ones(len(self.measurements), bool))
@@ -240,24 +246,13 @@ class RivalSet:
             return None
         return (index - own.min()) / span
 
-    def fit(
-        self,
-        key: ModelKey = ModelKey(),  # noqa: B008  (frozen)
-        near: Array | None = None,
-    ) -> Fit:
-        """Return one rival with its posterior and evidence, computed once.
-
-        Args:
-            key: Key of the rival.
-            near: Points from which its modes are searched, shape (k, dim); None
-                searches from many draws of the prior.
-        """
-        if key not in self.fits:
-            self.fits[key] = self.sampled(key, near)
-        return self.fits[key]
+    def fit(self, key: ModelKey = ModelKey()) -> Fit:  # noqa: B008  (frozen)
+        """Return one rival with its posterior: the known one, or a sample of it."""
+        found = self.fits.get(key)
+        return self.sampled(key) if found is None else found
 
     def search(self, key: ModelKey, near: Array | None = None) -> Found:
-        """Return the modes of a rival, computed once, see :meth:`fit`."""
+        """Return the modes of a rival, computed once, see :meth:`sampled`."""
         asked = key, b"" if near is None else near.tobytes()
         if asked not in self._modes:
             rng = np.random.default_rng(derive_seed(self.seed, "search", str(key)))
@@ -269,7 +264,13 @@ class RivalSet:
         return self._modes[asked]
 
     def sampled(self, key: ModelKey, near: Array | None = None) -> Fit:
-        """Return one rival with a sample of its posterior, see :meth:`fit`."""
+        """Return one rival with a sample of its posterior and its evidence.
+
+        Args:
+            key: Key of the rival.
+            near: Points from which its modes are searched, shape (k, dim); None
+                searches from many draws of the prior.
+        """
         rival, seed = self.rival(key), derive_seed(self.seed, "evidence", str(key))
         repeats = NUM_REPLICATES if self.simulator.is_stochastic else 1
         settings = settings_of(len(self.trials) * repeats, is_bare=key == ModelKey())

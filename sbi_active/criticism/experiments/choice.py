@@ -199,7 +199,7 @@ def register(
         verdict=report.verdict,
         mean=mean,
         sd=sd,
-        position=prediction.position,
+        position=prediction.measurements.position,
         limit=limit,
         bare=bare.middle,
     )
@@ -219,26 +219,21 @@ def _by_left_out(
         key: Key of the model that predicts.
         prediction: Its prediction of one trial.
     """
-    search, own, cov = (
-        verdict.search,
-        verdict.search.found[key],
-        verdict.covariance(key),
-    )
+    search, cov = verdict.search, verdict.covariance(key)
+    own = search.found[key]
     m, fold, model = search.errors.measurements, search.errors.fold, own.model
-    count = np.maximum(np.bincount(m.channel), 1)
     rows = model.scale[:, None] * model.rows[: model.num]  # in sensor deviations
-    residual = np.bincount(m.channel, rows[:, 0] ** 2) / count
+    residual = m.by_channel(rows[:, 0] ** 2)
     known = ((rows[:, 1:] @ cov) * rows[:, 1:]).sum(1)
     each = own.left.error**2 / (np.maximum(residual, TINY)[m.channel] + known)
     use = np.isfinite(own.left.square)
     kept = search.errors.is_scored & use[fold]
     square = np.bincount(fold[kept], each[kept], len(use))[use]
     square /= np.bincount(fold[kept], minlength=len(use))[use]
-    channel = np.zeros(int(np.prod(m.shape[1:])), dtype=np.int64)
-    channel[m.position % len(channel)] = m.channel
-    own_size = np.bincount(m.channel, (search.unit * rows[:, 0]) ** 2) / count
-    sd = np.sqrt(own_size[channel[prediction.position]] + prediction.mean.var(0))
-    return sd, limit_of(square, len(prediction.position))
+    own_size = m.by_channel((search.unit * rows[:, 0]) ** 2)
+    channel = prediction.measurements.channel
+    sd = np.sqrt(own_size[channel] + prediction.mean.var(0))
+    return sd, limit_of(square, len(channel))
 
 
 def limit_of(square: Array, most: int, num: int = 25) -> float:

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from sbi_active.criticism.criticism import Criticism
+from sbi_active.criticism.data.arrays import without_inf
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.experiments.choice import (
     Settling,
@@ -26,7 +27,7 @@ from sbi_active.criticism.experiments.choice import (
 from sbi_active.criticism.report.predicted import Registered, TestedTrial
 from sbi_active.criticism.report.report import Report
 from sbi_active.criticism.results import Array
-from sbi_active.criticism.rivals.further_trials import conditions_at, together
+from sbi_active.criticism.rivals.further_trials import unmeasured
 from sbi_active.expected import require
 from sbi_active.messages import Explained, Message
 from sbi_active.simulation import SimulatorModel
@@ -142,34 +143,14 @@ def with_trial(
     Raises:
         ValueError: If x has another shape than that of the trials.
     """
-    template, own_times = trials.template()
+    template, _ = trials.template()
     expected = f"x of shape {tuple(template.shape)} from the real system"
     advice = "return the numbers of one trial, NaN for those missing"
     require(np.size(x) == template.numel(), expected, np.shape(x), advice)
-    new = torch.from_numpy(action)[None].to(trials.action)
-    times = trials.sample_times
-    if times is not None and own_times is not None and times.ndim > 1:
-        times = torch.cat([times, own_times[None]])
-    further = conditions_at(model, trials, new)
-    index = _next_index(trials)
-    names = f"{index:.15g}"
-    joined = Trials(
-        torch.cat([trials.action, new]),
-        torch.cat(
-            [trials.x, torch.from_numpy(x).to(trials.x).reshape(template[None].shape)]
-        ),
-        role=[*trials.role, "fit"],
-        index=torch.cat([trials.index, trials.index.new_tensor([index])]),
-        order=trials.order,
-        sample_times=times,
-        names=[*trials.names, names],
-        action_labels=trials.action_labels,
-        channel_labels=trials.channel_labels,
-        input_labels=trials.input_labels,
-        **together(trials, further),
-    )
-    joined.action_is_label = trials.action_is_label
-    return joined
+    index = torch.tensor([_next_index(trials)], dtype=torch.float64)
+    new = unmeasured(model, trials, torch.from_numpy(action)[None], index)
+    new.x = without_inf(torch.from_numpy(x).to(new.x).reshape(new.x.shape), new.names)
+    return trials.joined(new)
 
 
 def _next_index(trials: Trials) -> float:

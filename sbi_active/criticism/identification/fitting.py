@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,7 @@ from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
-from sbi_active.criticism.identification.posterior import TINY, Draws, Unknowns, sample
+from sbi_active.criticism.identification.posterior import TINY, Draws, Sampler, Unknowns
 from sbi_active.criticism.identification.settings import IdentifySettings
 from sbi_active.criticism.linear.fits import best_fit, polished
 from sbi_active.criticism.linear.model import (
@@ -179,8 +178,8 @@ def fitted(
         if known_sd is not None:
             known = [*(known_sd / linear.sizes)]
         given = filters.grams(linear.rows), errors, linear.unknowns, known, rng
-        draw = partial(sample, *given, settings=own.sampler)
-        draws = draw(sweeps=own.sampler.few)
+        sampler = Sampler(*given, own.sampler)
+        draws = sampler.draws(own.sampler.few)
         before, there = there, draws.present.mean(0) > own.likely
         free = np.append(there, True)[linear.effect]
         u = linear.origin + np.where(free, draws.u.mean(0), 0.0)
@@ -197,7 +196,7 @@ def fitted(
             fit = linearize(some, u[free], linear.unit)
             fit = centered(some, fit, linear.unit)
             linear = linear.around(fit, free, linear.unit)
-    draws = draw(sweeps=own.sampler.many)
+    draws = sampler.draws(own.sampler.many)
     return Fitted(**vars(linear), errors=errors, draws=draws, aliases=aliases)
 
 
@@ -283,9 +282,9 @@ def _settled(
 
 def _sizes(rival: Rival, residual: Array, settings: IdentifySettings) -> Array:
     """Return the root mean square of each number's channel, shape (N,)."""
-    channel = rival.simulator.measurements.channel
-    rms = np.sqrt(np.bincount(channel, residual**2) / np.bincount(channel))
-    return np.maximum(rms[channel], settings.smallest * rival.spread)
+    m = rival.simulator.measurements
+    rms = np.sqrt(m.by_channel(residual**2))
+    return np.maximum(rms[m.channel], settings.smallest * rival.spread)
 
 
 def _beside(

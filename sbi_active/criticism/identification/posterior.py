@@ -17,8 +17,10 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -27,6 +29,7 @@ from numpy.typing import NDArray
 from sbi_active.arrays import Array
 from sbi_active.criticism.identification.settings import SamplerSettings
 from sbi_active.criticism.linear.processes import Grams, Processes
+from sbi_active.criticism.rivals.error_models import drawn
 from sbi_active.inference.sampling.eigen import eigh
 from sbi_active.inference.sampling.truncated import log_inside, truncated_normal
 
@@ -86,82 +89,134 @@ class Draws:
     size: Array
 
 
-def sample(
-    grams: Grams,
-    processes: Processes,
-    unknowns: Unknowns,
-    known_size: list[float | None],
-    rng: np.random.Generator,
-    *,
-    sweeps: int,
-    settings: SamplerSettings = SamplerSettings(),  # noqa: B008  (frozen)
-) -> Draws:
-    """Return posterior draws of all chains.
+@dataclass(frozen=True)
+class Sampler:
+    """Gibbs sampler of a linear model.
 
-    Args:
+    Attributes:
         grams: Gram matrices of (r_0, J), by channel.
         processes: Hypotheses of the errors, white noise first, of size one.
         unknowns: Priors of the unknowns.
         known_size: Deviation of the white part by channel; None if it is unknown.
         rng: Source of the draws.
-        sweeps: Sweeps of each chain, after those that are left out.
         settings: Numbers of draws, and priors.
     """
-    p, num, d = unknowns, settings.chains, len(unknowns.low)
-    ridge = p.precision + settings.flat / (p.high - p.low) ** 2
-    shapes = max(len(processes) - 1, 1)
-    log_prior = np.full(len(processes), np.log((1 - settings.absent) / shapes))
-    log_prior[0] = np.log(settings.absent)
-    u = np.clip(np.zeros((num, d)), p.low, p.high)
-    present = np.ones((num, p.num_effects), dtype=bool)
-    kept: list[tuple[Array, ...]] = []
-    for sweep in range(settings.burnt + sweeps):
-        precision = np.broadcast_to(np.diag(ridge), (num, d, d)).copy()
-        linear = np.broadcast_to(p.precision * p.center, (num, d)).copy()
-        chosen, sizes = [], []
-        for c, size in enumerate(known_size):
-            own = grams.gram[:, c], grams.log_det[:, c], int(grams.count[c])
-            h, variance = _errors(*own, processes, log_prior, size, u, rng)
-            gram = own[0][h] / variance[:, None, None]
-            precision += gram[:, 1:, 1:]
-            linear -= gram[:, 1:, 0]
-            chosen.append(h)
-            sizes.append(np.sqrt(variance))
-        swept = _Swept(precision, linear).turned(np.flatnonzero(p.effect < 0))
-        for e, there in enumerate(present.T):
-            swept[there] = swept[there].turned(np.flatnonzero(p.effect == e))
-        present = _present(swept, p, present, settings.absent, rng)
-        u = _moved(u, precision, swept, p, rng)
-        if sweep >= settings.burnt:
-            parts = (u, present, np.stack(chosen, 1), np.stack(sizes, 1))
-            kept.append(tuple(part.copy() for part in parts))
-    return Draws(*(np.concatenate(part) for part in zip(*kept, strict=True)))
 
+    grams: Grams
+    processes: Processes
+    unknowns: Unknowns
+    known_size: Sequence[float | None]
+    rng: np.random.Generator
+    settings: SamplerSettings = SamplerSettings()
 
-def _errors(
-    gram: Array,
-    log_det: Array,
-    count: int,
-    processes: Processes,
-    log_prior: Array,
-    size: float | None,
-    u: Array,
-    rng: np.random.Generator,
-) -> tuple[NDArray[np.intp], Array]:
-    """Return the shape and the variance of one channel's errors, given u."""
-    one = np.concatenate([np.ones((len(u), 1)), u], 1)
-    square = (one[:, :, None] * one[:, None]).reshape(len(u), -1)
-    square = np.maximum(square @ gram.reshape(len(gram), -1).T, TINY)
-    log_p = log_prior - 0.5 * log_det
-    if size is None:  # with the variance summed out, p(v) = 1 / v
-        log_p = log_p - 0.5 * count * np.log(square)
-    else:
-        every = size**2 / processes.white
-        log_p = log_p - 0.5 * (square / every + count * np.log(every))
-    h = np.argmax(log_p + rng.gumbel(size=log_p.shape), axis=1)  # of softmax
-    if size is not None:
-        return h, size**2 / processes.white[h]
-    return h, square[np.arange(len(u)), h] / (2 * rng.gamma(0.5 * count, size=len(u)))
+    def draws(self, sweeps: int) -> Draws:
+        """Return posterior draws of all chains.
+
+        Args:
+            sweeps: Sweeps of each chain, after those that are left out.
+        """
+        p, own, d = self.unknowns, self.settings, len(self.unknowns.low)
+        ridge = p.precision + own.flat / (p.high - p.low) ** 2
+        u = np.clip(np.zeros((own.chains, d)), p.low, p.high)
+        present = np.ones((own.chains, p.num_effects), dtype=bool)
+        kept: list[tuple[Array, ...]] = []
+        for sweep in range(own.burnt + sweeps):
+            shape = own.chains, d, d
+            precision = np.broadcast_to(np.diag(ridge), shape).copy()
+            linear = np.broadcast_to(p.precision * p.center, u.shape).copy()
+            errors = [self._errors(c, u) for c in range(len(self.known_size))]
+            for c, (h, variance) in enumerate(errors):
+                gram = self.grams.gram[h, c] / variance[:, None, None]
+                precision += gram[:, 1:, 1:]
+                linear -= gram[:, 1:, 0]
+            swept = _Swept(precision, linear).turned(np.flatnonzero(p.effect < 0))
+            for e, there in enumerate(present.T):
+                swept[there] = swept[there].turned(np.flatnonzero(p.effect == e))
+            present = self._present(swept, present)
+            u = self._moved(u, precision, swept)
+            if sweep >= own.burnt:
+                chosen, variances = zip(*errors, strict=True)
+                sizes = np.sqrt(np.stack(variances, 1))
+                kept.append((u.copy(), present.copy(), np.stack(chosen, 1), sizes))
+        return Draws(*(np.concatenate(part) for part in zip(*kept, strict=True)))
+
+    @cached_property
+    def _log_prior(self) -> Array:
+        """Log prior probability of each hypothesis of the errors, shape (h,)."""
+        num, absent = len(self.processes), self.settings.absent
+        log_prior = np.full(num, np.log((1 - absent) / max(num - 1, 1)))
+        log_prior[0] = np.log(absent)
+        return log_prior
+
+    def _errors(self, channel: int, u: Array) -> tuple[NDArray[np.intp], Array]:
+        """Return the shape and the variance of one channel's errors, given u."""
+        gram, size = self.grams.gram[:, channel], self.known_size[channel]
+        count, rng = int(self.grams.count[channel]), self.rng
+        one = np.concatenate([np.ones((len(u), 1)), u], 1)
+        square = (one[:, :, None] * one[:, None]).reshape(len(u), -1)
+        square = np.maximum(square @ gram.reshape(len(gram), -1).T, TINY)
+        log_p = self._log_prior - 0.5 * self.grams.log_det[:, channel]
+        if size is None:  # with the variance summed out, p(v) = 1 / v
+            (h,) = drawn(log_p - 0.5 * count * np.log(square), rng)
+            half = square[np.arange(len(u)), h] / 2
+            return h, half / rng.gamma(0.5 * count, size=len(u))
+        every = size**2 / self.processes.white
+        (h,) = drawn(log_p - 0.5 * (square / every + count * np.log(every)), rng)
+        return h, every[h]
+
+    def _present(self, swept: _Swept, present: Flags) -> Flags:
+        """Return the effects that are there, one after the other given all others.
+
+        Args:
+            swept: Gaussians given the effects that are there; changed in place.
+            present: Mask of the effects that are there so far, shape (n, e).
+        """
+        p, present, absent = self.unknowns, present.copy(), self.settings.absent
+        log_odds = np.log(absent ** (-1 / max(p.num_effects, 1)) - 1) + p.log_density
+        log_z = swept.log_evidence(p)
+        for e in self.rng.permutation(p.num_effects):
+            other = swept.turned(np.flatnonzero(p.effect == e))
+            log_other = other.log_evidence(p)
+            gain = log_other - log_z + np.where(present[:, e], -1, 1) * log_odds[e]
+            flip = self.rng.logistic(size=len(gain)) < gain
+            present[:, e] ^= flip
+            log_z = np.where(flip, log_other, log_z)
+            swept[flip] = other[flip]
+        return present
+
+    def _moved(self, u: Array, precision: Array, swept: _Swept) -> Array:
+        """Return u drawn within its bounds.
+
+        As if there were none, where that is within them; else along the eigenvectors of
+        its precision. The first is exact, and whether it is chosen depends on no
+        earlier u.
+        """
+        p, rng, free = self.unknowns, self.rng, swept.free
+        mean = np.where(free, swept.table[:, :-1, -1], 0.0)
+        full = np.where(free[:, :, None] & free[:, None], precision, np.eye(len(p.low)))
+        upper = np.swapaxes(np.linalg.cholesky(full), 1, 2)
+        new = np.linalg.solve(upper, rng.standard_normal((*u.shape, 1)))[..., 0]
+        new = np.where(free, mean + new, 0.0)
+        out = np.flatnonzero(((new < p.low) | (new > p.high)).any(1))
+        if not len(out):
+            return new
+        u, mean, free = np.where(free, u, 0.0)[out], mean[out], free[out]
+        values, vectors = eigh(full[out])
+        sd = 1 / np.sqrt(values)
+        for j in range(u.shape[1]):
+            is_along = free & (np.abs(vectors[:, :, j]) > 1e-12)
+            e = np.where(is_along, vectors[:, :, j], 0.0)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ends = np.stack([(p.low - u) / e, (p.high - u) / e])
+            ends = np.where(e == 0, np.array([-np.inf, np.inf])[:, None, None], ends)
+            low = np.minimum(ends.min(0).max(1), 0.0)
+            high = np.maximum(ends.max(0).min(1), 0.0)
+            off = (e * (mean - u)).sum(1)  # along it u is independent of all others
+            step = truncated_normal(off, sd[:, j], low, high, rng)
+            moved = u + np.where(e.any(1), step, 0.0)[:, None] * e
+            u = np.clip(moved, p.low, p.high)
+        new[out] = np.where(free, u, 0.0)
+        return new
 
 
 class _Swept:
@@ -216,63 +271,3 @@ class _Swept:
         inside = log_inside(mean, sd, p.low[some], p.high[some])
         log_z = np.where(free, inside, 0.0).sum(1)
         return log_z - 0.5 * (self.table[:, -1, -1] + self.log_det)
-
-
-def _present(
-    swept: _Swept, p: Unknowns, present: Flags, absent: float, rng: np.random.Generator
-) -> Flags:
-    """Return the effects that are there, one after the other given all others.
-
-    Args:
-        swept: Gaussians given the effects that are there; changed in place.
-        p: Priors of the unknowns.
-        present: Mask of the effects that are there so far, shape (n, e).
-        absent: Prior probability that none is there.
-        rng: Source of the draws.
-    """
-    present, num = present.copy(), max(p.num_effects, 1)
-    log_odds = np.log(absent ** (-1 / num) - 1) + p.log_density
-    log_z = swept.log_evidence(p)
-    for e in rng.permutation(p.num_effects):
-        other = swept.turned(np.flatnonzero(p.effect == e))
-        log_other = other.log_evidence(p)
-        gain = log_other - log_z + np.where(present[:, e], -1, 1) * log_odds[e]
-        flip = rng.logistic(size=len(gain)) < gain
-        present[:, e] ^= flip
-        log_z = np.where(flip, log_other, log_z)
-        swept[flip] = other[flip]
-    return present
-
-
-def _moved(
-    u: Array, precision: Array, swept: _Swept, p: Unknowns, rng: np.random.Generator
-) -> Array:
-    """Return u drawn within its bounds.
-
-    As if there were none, where that is within them; else along the eigenvectors of its
-    precision. The first is exact, and whether it is chosen depends on no earlier u.
-    """
-    free = swept.free
-    mean = np.where(free, swept.table[:, :-1, -1], 0.0)
-    full = np.where(free[:, :, None] & free[:, None], precision, np.eye(len(p.low)))
-    upper = np.swapaxes(np.linalg.cholesky(full), 1, 2)
-    new = np.linalg.solve(upper, rng.standard_normal((*u.shape, 1)))[..., 0]
-    new = np.where(free, mean + new, 0.0)
-    out = np.flatnonzero(((new < p.low) | (new > p.high)).any(1))
-    if not len(out):
-        return new
-    u, mean, free = np.where(free, u, 0.0)[out], mean[out], free[out]
-    values, vectors = eigh(full[out])
-    sd = 1 / np.sqrt(values)
-    for j in range(u.shape[1]):
-        e = np.where(free & (np.abs(vectors[:, :, j]) > 1e-12), vectors[:, :, j], 0.0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ends = np.stack([(p.low - u) / e, (p.high - u) / e])
-        ends = np.where(e == 0, np.array([-np.inf, np.inf])[:, None, None], ends)
-        low = np.minimum(ends.min(0).max(1), 0.0)
-        high = np.maximum(ends.max(0).min(1), 0.0)
-        off = (e * (mean - u)).sum(1)  # along it u is independent of all others
-        step = truncated_normal(off, sd[:, j], low, high, rng)
-        u = np.clip(u + np.where(e.any(1), step, 0.0)[:, None] * e, p.low, p.high)
-    new[out] = np.where(free, u, 0.0)
-    return new

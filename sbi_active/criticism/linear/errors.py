@@ -18,7 +18,7 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from itertools import product
 from typing import Any
@@ -48,35 +48,6 @@ SMALLEST, LARGEST, FACTOR = 0.3, 40.0, 1.63
 THINNED = 2
 #: Trajectories below which parts are left out in their place, and how many parts.
 FEWEST, NUM_FOLDS = 6, 8
-
-
-@dataclass(frozen=True)
-class Posterior:
-    """A linear model's posterior given each of the errors.
-
-    Attributes:
-        sensor: Posterior with the sensor's error alone.
-        beside: Posterior with a residual process beside it, or a parameter that differs
-            from trial to trial.
-    """
-
-    sensor: Mixture
-    beside: Mixture
-
-    @property
-    def log_sensor(self) -> float:
-        """Log evidence with the sensor's error alone, nats."""
-        return self.sensor.log_evidence
-
-    @property
-    def log_process(self) -> float:
-        """Log evidence beside a process, nats."""
-        return self.beside.log_evidence
-
-    @property
-    def log_evidence(self) -> float:
-        """Both errors equally likely, nats."""
-        return float(np.logaddexp(self.log_sensor, self.log_process) - np.log(2))
 
 
 class Errors:
@@ -171,10 +142,9 @@ class Errors:
         gram, log_det = np.zeros((num, f, k, k)), np.zeros((num, f))
         for i, cell in enumerate(self.cells):
             white = cell.whiten(rows.T).T
-            scale = np.log(cell.sd) + 0.5 * np.log1p(-(cell.rho**2))
             at = slice(i * len(self.scales), (i + 1) * len(self.scales))
             sizes = 2 * np.log(self.scales)[:, None] * count
-            log_det[at] = 2 * np.bincount(self.fold, scale, f) + sizes
+            log_det[at] = 2 * np.bincount(self.fold, cell.log_scales, f) + sizes
             for j in range(f):
                 own = white[self.fold == j]
                 gram[at, j] = own.T @ own / self.scales[:, None, None] ** 2
@@ -206,32 +176,33 @@ class Errors:
         extra = extra[use[self.fold][: len(extra)]]
         return extra.T @ extra
 
-    def posterior(
+    def mixture(
         self,
         model: LinearModel,
         grams: Grams,
-        folds: Array | None = None,
+        use: NDArray[np.bool_] | None = None,
         *,
+        beside: bool,
         factor: float = 1.0,
-    ) -> Posterior:
+    ) -> Mixture:
         """Return the evidence and the posterior of a model.
 
         Args:
             model: Linear model with its prior.
             grams: Gram matrices of its rows.
-            folds: Parts that count, bool, shape (f,); None takes all.
+            use: Parts of the trials that count, shape (f,); None takes all.
+            beside: Whether there is a residual process beside the sensor's error, or a
+                parameter that differs from trial to trial.
             factor: Factor on the scales of the effects' priors.
         """
-        use = np.ones(self.num_folds, bool) if folds is None else folds
-        gram = grams.gram[:, use].sum(1)
-        log_weight = np.concatenate([self.log_sensor, self.log_prior])
-        log_weight += self.constants(grams, use)
-        log_weight += model.offset[use[self.fold]].sum()
-        n, widths = len(self.log_sensor), [factor * width for width in WIDTHS]
-        return Posterior(
-            summed(gram[:n], log_weight[:n], model, widths),
-            summed(gram[n:], log_weight[n:], model, widths),
-        )
+        n = len(self.log_sensor)
+        some = np.ones(self.num_folds, bool) if use is None else use
+        own = slice(n, None) if beside else slice(n)
+        log_p = self.log_prior if beside else self.log_sensor
+        log_weight = log_p + self.constants(grams, some)[own]
+        log_weight += model.offset[some[self.fold]].sum()
+        widths = [factor * width for width in WIDTHS]
+        return summed(grams.gram[own][:, some].sum(1), log_weight, model, widths)
 
     def process(self, beside: Mixture) -> tuple[float, float]:
         """Return the mean size and the median time scale of a model's process."""
@@ -266,8 +237,7 @@ class Errors:
         for (cell, size), log_p in zip(each, self.log_sensor, strict=True):
             white = cell.whiten(rows.T / (size * factors[:, None]))[..., own]
             grams.append(white @ np.swapaxes(white, 1, 2) + extra)
-            scale = np.log(cell.sd * size * factors) + 0.5 * np.log1p(-(cell.rho**2))
-            log_det = scale[:, own].sum(1)
+            log_det = (np.log(size * factors) + cell.log_scales)[:, own].sum(1)
             log_weight.append(log_p - log_det - 0.5 * own.sum() * LOG_2PI)
         return np.concatenate(grams), np.concatenate(log_weight)
 

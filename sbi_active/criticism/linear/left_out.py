@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.linear.errors import Errors, Grams, Posterior
+from sbi_active.criticism.linear.errors import Errors, Grams
+from sbi_active.criticism.linear.mixture import Mixture, either
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.results import ModelKey
 from sbi_active.inference.sampling.least_squares import within
@@ -64,31 +65,34 @@ class Candidate:
     Attributes:
         model: Linearized at its best fit.
         grams: Gram matrices of its rows.
-        posterior: Posterior under the shared errors.
+        sensor: Posterior with the sensor's error alone.
+        beside: Posterior with a residual process beside it, or a parameter that differs
+            from trial to trial.
         left: Errors of the model on left-out parts of the trials.
         log_prior: Probability of its set of effects, nats.
     """
 
     model: LinearModel
     grams: Grams
-    posterior: Posterior
+    sensor: Mixture
+    beside: Mixture
     left: LeftOut
     log_prior: float
 
     @property
     def log_p(self) -> float:
         """Unnormalized log posterior probability with a residual process, nats."""
-        return self.log_prior + self.posterior.log_process
+        return self.log_prior + self.beside.log_evidence
 
     @property
     def log_p_sensor(self) -> float:
         """Unnormalized log posterior probability with the sensor's error, nats."""
-        return self.log_prior + self.posterior.log_sensor
+        return self.log_prior + self.sensor.log_evidence
 
     @property
     def log_p_either(self) -> float:
         """Unnormalized log posterior probability with either, nats."""
-        return self.log_prior + self.posterior.log_evidence
+        return self.log_prior + either(self.sensor, self.beside)
 
 
 def leave_out(
@@ -161,10 +165,10 @@ def standard_errors(
         use: Parts of the trials that tell of it; None takes all.
     """
     best = max(found.values(), key=lambda c: c.log_p)
-    posterior = best.posterior
+    beside = best.beside
     if use is not None:
-        posterior = errors.posterior(best.model, best.grams, use)
-    weight = errors.weight(posterior.beside)
+        beside = errors.mixture(best.model, best.grams, use, beside=True)
+    weight = errors.weight(beside)
     known: dict[ModelKey, Array] = {}
 
     def standard(c: Candidate) -> Array:

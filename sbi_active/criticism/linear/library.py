@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.linear.errors import Errors, Posterior
+from sbi_active.criticism.linear.errors import Errors
+from sbi_active.criticism.linear.mixture import Mixture, either
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.tracing import log_prior
@@ -46,7 +47,7 @@ class Library:
         each = zip(self.names, ends[:-1], ends[1:], strict=True)
         self._places = {name: np.arange(first, last) for name, first, last in each}
         self._prepared, self._grams = self._own[:0], None
-        self._found: dict[tuple[str, ...], Posterior] = {}
+        self._found: dict[tuple[str, ...], list[Mixture]] = {}
 
     def prepare(self, names: Sequence[str]) -> None:
         """Compute once what all pairs of some effects take, in the library's order."""
@@ -64,12 +65,12 @@ class Library:
     def score(self, names: tuple[str, ...]) -> float:
         """Return the log posterior probability of a set, unnormalized."""
         every = (*self.base.effects, *names)
-        return self._posterior(names).log_evidence + log_prior(every, self.prior)
+        return either(*self._posterior(names)) + log_prior(every, self.prior)
 
     def optimum(self, name: str) -> tuple[ModelKey, Array]:
         """Return the key of a model with one effect, and its linear optimum, (d,)."""
         model, own = self.columns[name]
-        mean, u = self._posterior((name,)).beside.mean, np.where(own, model.u, 0.0)
+        mean, u = self._posterior((name,))[1].mean, np.where(own, model.u, 0.0)
         u[~own] += mean[: len(self._own)]
         u[own] += mean[len(self._own) :]
         return model.key, np.clip(u, model.low, model.high)
@@ -77,7 +78,7 @@ class Library:
     def _at(self, names: Sequence[str]) -> NDArray[np.intp]:
         return np.concatenate([self._own, *[self._places[name] for name in names]])
 
-    def _posterior(self, names: tuple[str, ...]) -> Posterior:
+    def _posterior(self, names: tuple[str, ...]) -> list[Mixture]:
         if names not in self._found:
             at, grams = self._at(names), self._grams
             model = self._every.part(at)
@@ -86,5 +87,7 @@ class Library:
             else:
                 rows = np.append(0, 1 + np.searchsorted(self._prepared, at))
                 grams = replace(grams, gram=grams.gram[..., rows[:, None], rows])
-            self._found[names] = self.errors.posterior(model, grams)
+            self._found[names] = [
+                self.errors.mixture(model, grams, beside=b) for b in (False, True)
+            ]
         return self._found[names]

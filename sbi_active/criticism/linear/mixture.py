@@ -39,6 +39,11 @@ class Mixture:
         return np.exp(self.log_z - self.log_evidence).sum(1)
 
 
+def either(one: Mixture, other: Mixture) -> float:
+    """Return the log evidence of two errors that are equally likely, nats."""
+    return float(np.logaddexp(one.log_evidence, other.log_evidence) - np.log(2))
+
+
 def summed(
     gram: Array, log_weight: Array, model: LinearModel, widths: Sequence[float] = (1.0,)
 ) -> Mixture:

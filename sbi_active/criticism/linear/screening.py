@@ -14,13 +14,13 @@ from itertools import combinations
 import numpy as np
 
 from sbi_active.arrays import Array
+from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.linear.fits import JUMPING, FitSettings
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.sensor import sensor_of
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.rivals.error_models import ChannelNoise
 from sbi_active.criticism.steps.equivalence import MANY
 
 #: Effects that are kept: the best alone, members of the best pairs, and those whose
@@ -60,12 +60,11 @@ def linear_models(rivals: RivalSet) -> tuple[Search, Screening | None]:
     sensor = sensor_of(rivals)
     settings = JUMPING if rivals.roughness.any() else FitSettings()
     search = Search(rivals, sensor, settings)
-    if isinstance(rivals.noise, ChannelNoise):
+    if rivals.noise.channel is not None:
         # What is missing may be seen in one channel alone, and no error of it.
         search.fit_singles()
-        channel = rivals.measurements.channel
-        models = [c.model for c in search.found.values()]
-        best = min(models, key=lambda model: _log_sizes(model.residual, channel))
+        models, m = [c.model for c in search.found.values()], rivals.measurements
+        best = min(models, key=lambda model: _log_sizes(model.residual, m))
         sensor = sensor_of(rivals, [search.model(ModelKey()), best])
         search = Search(rivals, sensor, settings)
     if len(rivals.effects) <= MANY:
@@ -79,11 +78,10 @@ def linear_models(rivals: RivalSet) -> tuple[Search, Screening | None]:
     return search, found if found.behind else None
 
 
-def _log_sizes(residual: Array, channel: Array) -> float:
+def _log_sizes(residual: Array, m: Measurements) -> float:
     """Return the log size of residuals, summed over numbers, by channel."""
-    count = np.bincount(channel)
-    rms = np.sqrt(np.bincount(channel, residual**2) / np.maximum(count, 1))
-    return float(count @ np.log(np.maximum(rms, 1e-300)))
+    rms = np.sqrt(m.by_channel(residual**2))
+    return float(np.bincount(m.channel) @ np.log(np.maximum(rms, 1e-300)))
 
 
 def _with_kin(found: Screening, search: Search) -> Screening:

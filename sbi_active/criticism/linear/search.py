@@ -137,11 +137,13 @@ class Search:
     def keep(self, model: LinearModel) -> Candidate:
         """Record a fitted model with its evidence."""
         grams = self.errors.grams(model.rows)
-        posterior = self.errors.posterior(model, grams)
+        sensor, beside = (
+            self.errors.mixture(model, grams, beside=beside) for beside in (False, True)
+        )
         names = model.key.effects
         prior = log_prior(names, self.prior) if names else self.prior["none"]
         left = leave_out(model, self.errors)
-        self.found[model.key] = Candidate(model, grams, posterior, left, prior)
+        self.found[model.key] = Candidate(model, grams, sensor, beside, left, prior)
         return self.found[model.key]
 
     def restrict(self, names: Iterable[str]) -> None:

@@ -12,7 +12,7 @@ from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.fits import FitSettings, best_fit
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.results import ModelKey
-from sbi_active.criticism.rivals.error_models import ChannelNoise, NoiseCell, NoiseGrid
+from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import measurement_sds
 
 
@@ -64,7 +64,7 @@ def sensor_of(rivals: RivalSet, likely: Sequence[LinearModel] = ()) -> Sensor:
         return Sensor(unit, grid, is_known=True, df=df)
 
     unit = grid.typical_sd
-    if isinstance(grid, ChannelNoise):
+    if grid.channel is not None:
         if not likely:
             bare = rivals.rival(ModelKey())
             likely = [best_fit(bare, rivals.prior_draws, unit, FitSettings())]

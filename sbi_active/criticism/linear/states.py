@@ -190,8 +190,7 @@ class States:
         """Return the probability that each trial has an outcome, by posterior draws."""
         key, rivals = c.model.key, self.search.rivals
         if key not in self._valid:
-            both = c.posterior
-            own = both.beside if both.log_process > both.log_sensor else both.sensor
+            own = max(c.sensor, c.beside, key=lambda m: m.log_evidence)
             rng = np.random.default_rng(derive_seed(rivals.seed, "outcomes", str(key)))
             u = c.model.draws(own.mean, own.cov, self.num_outcomes, rng)
             split = rivals.rival(key).coordinates.split(u)

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.evidence.fit import Fit
-from sbi_active.criticism.evidence.rival_set import NUM_DRAWS
+from sbi_active.criticism.evidence.rival_set import NUM_DRAWS, RivalSet
 from sbi_active.criticism.linear.fits import refitted
 from sbi_active.criticism.linear.mixture import Mixture
 from sbi_active.criticism.linear.model import LinearModel, reweighted_at
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.verdict import Verdict
-from sbi_active.criticism.results import FEW_DRAWS, OUTLIER, Evidence, ModelKey
+from sbi_active.criticism.results import FEW_DRAWS, OUTLIER, ModelKey
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.steps.detection import THRESHOLD
 from sbi_active.inference.engine import WeightedDraws
@@ -23,8 +23,8 @@ from sbi_active.inference.sampling.weights import effective_sample_size, normali
 from sbi_active.seeding import derive_seed
 
 
-def recorded(found: Verdict, key: ModelKey) -> Evidence:
-    """Return the record of a model, and keep its draws.
+def posterior(found: Verdict, models: RivalSet, key: ModelKey) -> Fit:
+    """Return a model with draws of its posterior.
 
     The bare model and those that are likely have samples of the simulator's own
     posterior where they bend and no model misses; of few effective draws
@@ -32,34 +32,33 @@ def recorded(found: Verdict, key: ModelKey) -> Evidence:
 
     Args:
         found: Verdict with the model.
+        models: The verdict's models, with the bare one's posterior where it is known.
         key: Key of the model.
     """
-    models = found.models
-    if key not in models.fits:
-        fit = None
-        if not found.is_missed and _is_sampled(found, key):
-            near = found.search.model(key).u[None] if key.effects else None
-            fit = models.sampled(key, near)
+    if not found.is_missed and _is_sampled(found, key):
+        near = found.search.model(key).u[None] if key.effects else None
+        fit = models.sampled(key, near)
+        if fit.evidence.effective_sample_size >= FEW_DRAWS:
             log_z = found.states.log_evidence(key)
-            fit = replace(fit, evidence=replace(fit.evidence, log_evidence=log_z))
-        if fit is None or fit.evidence.effective_sample_size < FEW_DRAWS:
-            fit = _linear(found, key)
-        models.fits[key] = fit
-    return models.fits[key].evidence
+            return replace(fit, evidence=replace(fit.evidence, log_evidence=log_z))
+    return _linear(found, models, key)
 
 
-def fitted(found: Verdict, key: ModelKey, use: NDArray[np.bool_]) -> Fit:
+def fitted(
+    found: Verdict, models: RivalSet, key: ModelKey, use: NDArray[np.bool_]
+) -> Fit:
     """Return a model with its posterior by some parts of the trials.
 
     Args:
         found: Verdict with the model.
+        models: The verdict's models, with their posteriors.
         key: Key of the model.
         use: Parts of the trials that count, shape (f,).
     """
-    whole = found.models.fits.get(key)
+    whole = models.fits.get(key)
     if not (found.is_missed or whole is None or whole.evidence.engine == "linear"):
         return _left_out(whole, use[found.search.errors.fold])
-    return _linear(found, key, use)
+    return _linear(found, models, key, use)
 
 
 def _is_sampled(found: Verdict, key: ModelKey) -> bool:
@@ -94,7 +93,7 @@ def bends(search: Search, key: ModelKey) -> bool:
         return False  # its jumps leave any model, and count as noise
     c = search.found[key]
     m, rng = c.model, np.random.default_rng(derive_seed(rivals.seed, "bends"))
-    own = c.posterior.sensor
+    own = c.sensor
     u = m.draws(own.mean, own.cov, 16, rng)
     rival, linear = rivals.rival(key), m.at(u)
     fails = rivals.can_fail and not rivals.measurements.is_sequence
@@ -107,7 +106,12 @@ def bends(search: Search, key: ModelKey) -> bool:
     return not ratio.std() < 0.5  # NaN: not simulated
 
 
-def _linear(found: Verdict, key: ModelKey, use: NDArray[np.bool_] | None = None) -> Fit:
+def _linear(
+    found: Verdict,
+    models: RivalSet,
+    key: ModelKey,
+    use: NDArray[np.bool_] | None = None,
+) -> Fit:
     """Return a linear model with its draws as its posterior sample.
 
     Wide draws of what misses leave the valleys of what bends: trials are predicted from
@@ -115,10 +119,11 @@ def _linear(found: Verdict, key: ModelKey, use: NDArray[np.bool_] | None = None)
 
     Args:
         found: Verdict with the model.
+        models: The verdict's models.
         key: Key of the model, with an error or with effects on the noise.
         use: Parts of the trials that count, shape (f,); None takes all.
     """
-    states, search, models = found.states, found.search, found.models
+    states, search = found.states, found.search
     known = None if use is None else use[search.errors.fold]
     rival = models.rival(key, suspect=found.suspect if key.error == OUTLIER else None)
     model = search.model(states.predicting(key))
@@ -133,7 +138,7 @@ def _linear(found: Verdict, key: ModelKey, use: NDArray[np.bool_] | None = None)
         return unit * model.at(u)[:, : model.num]
 
     if found.is_missed:
-        log_z, best = search.found[key].posterior.log_process, model.u
+        log_z, best = search.found[key].beside.log_evidence, model.u
         if known is not None:
             best = refitted(search.rival(key), model, search.units, known)
         u = drawn(best, found.covariance(key))
@@ -218,7 +223,7 @@ def by_weights(
     errors = search.errors
     for _ in range(5):  # two agree to some percent of a deviation
         grams = errors.grams(model.rows)
-        own = errors.posterior(model, grams, use).sensor
+        own = errors.mixture(model, grams, use, beside=False)
         u = np.clip(own.mean, model.low, model.high)
         model = reweighted_at(model, u, search.sensor.df)
     return model, own

@@ -56,8 +56,8 @@ def evaluate_held_out(
     found = summary(
         "held out",
         np.arange(num),
-        scores(before, held_out),
-        scores(after, held_out),
+        scores(before),
+        scores(after),
         (tracing.verdict,) * num,
         held_out.names,
     )
@@ -68,11 +68,12 @@ def evaluate_held_out(
         or len(rivals.noise.scales) > 1
     ):
         return found  # errors have no declared size
-    return replace(found, p_value=tail(after, held_out))
+    return replace(found, p_value=tail(after))
 
 
 def evaluate_left_out(
     found: Verdict,
+    models: RivalSet,
     trials: Trials,
     *,
     num_draws: int = NUM_DRAWS,
@@ -86,6 +87,7 @@ def evaluate_left_out(
 
     Args:
         found: Verdict by all trials.
+        models: Its models, with the posteriors of those that are recorded.
         trials: Trials that were fitted.
         num_draws: Draws from each posterior.
         show_progress: Whether to draw a bar of the trials.
@@ -105,9 +107,9 @@ def evaluate_left_out(
                 model = key
             scored = {}
             for each in dict.fromkeys((ModelKey(), model)):
-                fit = fitted(found, each, ~own)
-                prediction = predict(found.models, one, fit=fit, num_draws=num_draws)
-                scored[each] = scores(prediction, one)
+                fit = fitted(found, models, each, ~own)
+                prediction = predict(models, one, fit=fit, num_draws=num_draws)
+                scored[each] = scores(prediction)
             before.append(scored[ModelKey()])
             after.append(scored[model])
             named = key.effects and key.error != UNEXPLAINED
@@ -122,33 +124,32 @@ def evaluate_left_out(
     return summary("leave one out", places, first, last, (*selected,), names)
 
 
-def tail(prediction: Prediction, trials: Trials) -> float:
+def tail(prediction: Prediction) -> float:
     r"""Return the tail probability of :math:`e^T (S + R)^{-1} e`.
 
     S is the covariance of the predictions over the posterior, and R that of the noise,
     whose errors are taken as independent.
 
     Args:
-        prediction: Prediction of some trials.
-        trials: Trials with what was measured.
+        prediction: Prediction of some trials that were measured.
     """
     off = prediction.mean - prediction.mean.mean(0)
     cov = off.T @ off / (len(off) - 1) + np.diag((prediction.sd**2).mean(0))
-    error = prediction.of(trials) - prediction.middle
+    error = prediction.measurements.x - prediction.middle
     return float(chi2.sf(error @ np.linalg.solve(cov, error), len(error)))
 
 
-def scores(prediction: Prediction, trials: Trials) -> dict[str, Array]:
+def scores(prediction: Prediction) -> dict[str, Array]:
     """Return one value a trial of each metric, and squares and counts for the RMSE.
 
     Coverage is that of the central interval of 90 %.
     """
-    x, middle = prediction.of(trials), prediction.middle
+    m, middle = prediction.measurements, prediction.middle
     low, high = np.quantile(prediction.x, [0.05, 0.95], axis=0)
     rows = []
-    for t in range(len(trials)):
-        at = prediction.trial == t
-        y, own = prediction.x[:, at], x[at]
+    for t in range(m.shape[0]):
+        at = m.trial == t
+        y, own = prediction.x[:, at], m.x[at]
         square = float(((middle[at] - own) ** 2).sum())
         half = len(y) // 2
         distance = np.linalg.norm(y - own, axis=1).mean()

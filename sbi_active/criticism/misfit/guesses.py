@@ -24,7 +24,7 @@ from torch import Tensor
 from sbi_active.arrays import Array
 from sbi_active.criticism.linear.left_out import leave_out
 from sbi_active.criticism.linear.mixture import summed
-from sbi_active.criticism.linear.model import LinearModel
+from sbi_active.criticism.linear.model import COORDINATES, LinearModel
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.scored import predicts_better
 from sbi_active.criticism.results import ModelKey
@@ -77,8 +77,7 @@ def guess_residual(search: Search) -> tuple[tuple[str, float], ...]:
         if predicts_better(left.square, bare.left.square) < least:
             continue
         remains = (left.mean_square - 1) / excess
-        posterior = search.errors.posterior(model, search.errors.grams(model.rows))
-        gain = posterior.log_process - bare.posterior.log_process
+        gain = _log_evidence(search, model) - bare.beside.log_evidence
         if remains <= REMAINS and gain > MARGIN:
             found.append((name, float(gain)))
     return (*sorted(found, key=lambda each: -each[1]),)
@@ -94,7 +93,7 @@ def _guess_of_numbers(search: Search) -> tuple[tuple[str, float], ...]:
     least = summed(*search.smooth(bare, every), bare).log_evidence
     for name, term in _terms(search, of_all=True):
         model = _with_term(bare, term / search.unit)
-        gains[name] = errors.posterior(model, errors.grams(model.rows)).log_sensor
+        gains[name] = _log_evidence(search, model, beside=False)
     gains = {n: float(g - least) for n, g in gains.items() if g - least > MARGIN}
     best = sorted(gains, key=gains.__getitem__)[::-1]
     alike = [n for n in gains if gains[n] > gains[best[0]] - MARGIN]
@@ -115,12 +114,17 @@ def gained_by_guesses(search: Search, key: ModelKey, name: str) -> float:
     without = search.found[key.without(name)].model
     m = search.rivals.measurements
     found = [
-        search.errors.posterior(model, search.errors.grams(model.rows)).log_process
+        _log_evidence(search, _with_term(without, term / search.unit))
         for _, term in _distinct(search, np.ones(len(m), dtype=bool), "", [])
-        for model in [_with_term(without, term / search.unit)]
     ]
     mean = log_sum_exp(np.array(found)) - np.log(len(found))
-    return float(mean - search.found[key].posterior.log_process)
+    return float(mean - search.found[key].beside.log_evidence)
+
+
+def _log_evidence(search: Search, model: LinearModel, *, beside: bool = True) -> float:
+    """Return the log evidence of a model that was not simulated, nats."""
+    grams = search.errors.grams(model.rows)
+    return search.errors.mixture(model, grams, beside=beside).log_evidence
 
 
 def _with_term(model: LinearModel, term: Array) -> LinearModel:
@@ -129,21 +133,11 @@ def _with_term(model: LinearModel, term: Array) -> LinearModel:
     column = np.zeros(len(model.residual))
     column[: model.num] = term / model.scale
 
-    def more(values: Array, value: float) -> Array:
-        return np.append(values, value)
-
-    return replace(
-        model,
-        key=ModelKey(("formula",)),
-        u=more(model.u, 0.0),
-        jacobian=np.concatenate([model.jacobian, -column[:, None]], 1),
-        center=more(model.center, 0.0),
-        sd=more(model.sd, max(model.rms, 1.0) / size),
-        scaled=np.append(model.scaled, True),
-        low=more(model.low, -np.inf),
-        high=more(model.high, np.inf),
-        trial_of=np.append(model.trial_of, -1),
-    )
+    new = {"u": 0.0, "center": 0.0, "sd": max(model.rms, 1.0) / size, "scaled": True}
+    new |= {"low": -np.inf, "high": np.inf, "trial_of": -1}
+    jacobian = np.concatenate([model.jacobian, -column[:, None]], 1)
+    every = {name: np.append(getattr(model, name), new[name]) for name in COORDINATES}
+    return replace(model, key=ModelKey(("formula",)), jacobian=jacobian, **every)
 
 
 def _terms(search: Search, *, of_all: bool = False) -> Iterator[tuple[str, Array]]:

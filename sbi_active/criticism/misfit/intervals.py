@@ -45,7 +45,7 @@ def covariance(own: Candidate, errors: Errors, action: Array) -> Array:
         errors: Errors that all models share.
         action: Action of each trial, shape (t, action_dim).
     """
-    model, given = own.model, own.posterior.beside
+    model, given = own.model, own.beside
     found = shared_process(model, errors, action)
     mean, cov = found or (given.mean, given.cov + own.left.jackknife())
     apart = model.u - np.clip(mean, model.low, model.high)

@@ -7,15 +7,14 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sbi_active.actions import ActionSpace
 from sbi_active.arrays import Array
-from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.misfit.contrary import is_left_to_chance, withdrawn
-from sbi_active.criticism.misfit.draws import recorded
+from sbi_active.criticism.misfit.draws import posterior
 from sbi_active.criticism.misfit.guesses import guess_residual
 from sbi_active.criticism.misfit.scored import weights_by_error
 from sbi_active.criticism.misfit.verdict import Verdict
@@ -49,8 +48,8 @@ def traced(
     *,
     actions: ActionSpace | None = None,
     near: bool = True,
-) -> Tracing:
-    """Return the verdict, and record the models behind it with posterior draws.
+) -> tuple[Tracing, RivalSet]:
+    """Return the verdict, and the models behind it with posterior draws.
 
     Args:
         found: The models and what helps.
@@ -69,7 +68,9 @@ def traced(
     keys += [ModelKey((name,)) for name in rivals.effects]
     keys = [k for k in keys if k.error is None or not k.effects]
     groups = equivalent_effects(rivals, None) if near else ()
-    common = _common(found, keys, {str(k): p for k, p in found.probabilities.items()})
+    probabilities = {str(k): p for k, p in found.probabilities.items()}
+    models = _with_posteriors(found, keys)
+    common = _common(found, models, probabilities)
     aliases: tuple[frozenset[str], ...] = ()
     if found.detection.alarm:
         singles = {n: common["evidences"][n].log_evidence for n in rivals.effects}
@@ -92,10 +93,24 @@ def traced(
         trial_names=dict(zip(trials.index.tolist(), trials.names, strict=True)),
         **common,
     )
-    return withdrawn(tracing) if is_left_to_chance(tracing) else tracing
+    is_withdrawn = is_left_to_chance(tracing)
+    return withdrawn(tracing) if is_withdrawn else tracing, models
 
 
-def _beside_misfit(misfit: Verdict, held_out: Trials | None) -> Tracing:
+def _with_posteriors(found: Verdict, keys: Sequence[ModelKey]) -> RivalSet:
+    """Return the models with the posteriors of some of them.
+
+    The bare model's comes first: what nobody declared is sized by its residual.
+    """
+    models, bare = found.models, ModelKey()
+    models = models.with_fits({bare: posterior(found, models, bare)})
+    fits = {key: posterior(found, models, key) for key in dict.fromkeys(keys)}
+    return models.with_fits(fits)
+
+
+def _beside_misfit(
+    misfit: Verdict, held_out: Trials | None
+) -> tuple[Tracing, RivalSet]:
     """Return the verdict where every model misses, or several effects fit."""
     search, choice = misfit.search, misfit.choice
     singles = {name: ModelKey((name,)) for name in search.names}
@@ -105,27 +120,29 @@ def _beside_misfit(misfit: Verdict, held_out: Trials | None) -> Tracing:
     probabilities |= {n: p.get(k, 0.0) for n, k in singles.items()}
     ordered = dict(sorted(probabilities.items(), key=lambda item: -item[1]))
     keys = [*tabled, *singles.values(), *_weights(misfit)]
-    common = _common(misfit, keys, ordered)
-    beside = {n: search.found[k].posterior.log_process for n, k in singles.items()}
+    models = _with_posteriors(misfit, keys)
+    common = _common(misfit, models, ordered)
+    beside = {n: search.found[k].beside.log_evidence for n, k in singles.items()}
     timed = misfit.rivals.measurements.is_sequence
-    return Tracing(
+    tracing = Tracing(
         verdict=str(ModelKey(named)) if named else misfit.key.error or UNEXPLAINED,
         chosen=choice.key.effects,
         near=(),
         aliases=near_aliases(search, beside, None),
         guesses=() if (choice.key.effects if timed else named) else _guesses(misfit),
         beside=tuple(n for n in choice.key.effects if n not in named),
-        misfit=_found(misfit, [_scored(misfit, key, held_out) for key in tabled]),
+        misfit=_found(misfit, [_scored(misfit, models, k, held_out) for k in tabled]),
         p_value=misfit.model(choice.key).chi_square[2],
         **common,
     )
+    return tracing, models
 
 
 def _common(
-    found: Verdict, keys: Sequence[ModelKey], probabilities: dict[str, float]
+    found: Verdict, models: RivalSet, probabilities: dict[str, float]
 ) -> dict[str, Any]:
-    """Return what a tracing has in any case, with records of some models."""
-    evidences = {str(k): recorded(found, k) for k in dict.fromkeys(keys)}
+    """Return what a tracing has in any case, with records of the models."""
+    evidences = {str(key): fit.evidence for key, fit in models.fits.items()}
     return {
         "probabilities": probabilities,
         "inclusion": found.inclusion,
@@ -167,14 +184,14 @@ def _weights(misfit: Verdict) -> dict[ModelKey, float]:
 def _found(misfit: Verdict, models: Sequence[ModelError]) -> Found:
     choice, search = misfit.choice, misfit.search
     m = search.rivals.measurements
-    size, time_scale = search.errors.process(search.found[choice.key].posterior.beside)
+    size, time_scale = search.errors.process(search.found[choice.key].beside)
     return Found(
         models=(*models,),
         helps=choice.key.effects,
         named=choice.named,
         support=choice.support,
         open_forms=_open_forms(misfit),
-        sensor=np.sqrt(_by_channel(search.unit**2, m.channel)),
+        sensor=np.sqrt(m.by_channel(search.unit**2)),
         passes=misfit.passes(choice.key),
         size=size,
         time_scale=time_scale if m.is_sequence else np.nan,
@@ -197,36 +214,31 @@ def _open_forms(misfit: Verdict) -> dict[str, str]:
     return {e.name: str(e.family) for e in named if e.family != e.hook}
 
 
-def _scored(misfit: Verdict, key: ModelKey, held_out: Trials | None) -> ModelError:
+def _scored(
+    misfit: Verdict, models: RivalSet, key: ModelKey, held_out: Trials | None
+) -> ModelError:
     """Return a model's errors on trials that it was not fitted to."""
     search, rivals = misfit.search, misfit.rivals
     left, bare = (search.found[k].left for k in (key, ModelKey()))
     excess = max(left.mean_square - 1, 0.0) / max(bare.mean_square - 1, 1e-2)
-    m = rivals.measurements
     kept = search.errors.is_scored
-    own = _by_channel((left.error * search.unit)[kept] ** 2, m.channel[kept])
+    square = (left.error * search.unit)[kept] ** 2
+    own = rivals.measurements.part(kept).by_channel(square)
     return ModelError(
         name=str(key),
         probability=misfit.choice.probabilities.get(key, 0.0),
         left_out=np.sqrt(own),
-        held_out=None if held_out is None else _held_out(misfit, key, held_out),
+        held_out=None if held_out is None else _held_out(models, key, held_out),
         remains=float(min(excess, 1.0)),
         parts=(*left.square[np.isfinite(left.square)].tolist(),),
     )
 
 
-def _held_out(misfit: Verdict, key: ModelKey, held_out: Trials) -> Array:
+def _held_out(models: RivalSet, key: ModelKey, held_out: Trials) -> Array:
     """Return the root mean square error on held-out trials by channel, (c,)."""
-    prediction = predict(misfit.models, held_out, key=key)
-    m = Measurements.of(held_out, is_sequence=True)
-    channel = np.zeros(int(np.prod(m.shape)), dtype=np.int64)
-    channel[m.position] = m.channel
-    error = prediction.of(held_out) - prediction.middle
-    return np.sqrt(_by_channel(error**2, channel[prediction.position]))
-
-
-def _by_channel(square: Array, channel: NDArray[np.int64]) -> Array:
-    return np.bincount(channel, square) / np.maximum(np.bincount(channel), 1)
+    prediction = predict(models, held_out, key=key)
+    m = prediction.measurements
+    return np.sqrt(m.by_channel((m.x - prediction.middle) ** 2))
 
 
 def _estimates(found: Verdict, evidences: dict[str, Evidence]) -> tuple[Estimate, ...]:

@@ -42,6 +42,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -63,7 +64,7 @@ class Choice:
         named: Effects of them that are probably the cause.
         support: What speaks for each effect that helps.
         instead: Effects that may stand in the place of an effect that helps, if any
-            (:meth:`Rule.stand_ins`).
+            (:meth:`Compared.stand_ins`).
     """
 
     key: ModelKey
@@ -123,39 +124,61 @@ class Rule:
     remaining: float = 0.25
     formula: float = 2.0
 
-    def choose(
+    def is_cause(self, support: Support) -> bool:
+        """Return whether an effect that helps is probably the cause."""
+        return (
+            support.inclusion > self.included
+            and support.gained >= np.log(self.decisive)
+            and support.remains <= self.remaining
+            and support.guessed <= self.formula
+        )
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Fitted models, as the rule compares them.
+
+    Attributes:
+        rule: The rule.
+        models: Scores of the models; with a set of effects, of the sets with one effect
+            less.
+        names: Names of all effects, in the order of the sets.
+        timed: Whether x has a time axis.
+    """
+
+    rule: Rule
+    models: Mapping[ModelKey, Scored]
+    names: Sequence[str]
+    timed: bool = True
+
+    def choice(
         self,
-        models: Mapping[ModelKey, Scored],
-        names: Sequence[str],
         equivalent: Sequence[frozenset[str]] = (),
-        *,
-        timed: bool = True,
         guessed: Callable[[ModelKey, str], float] | None = None,
     ) -> Choice:
         """Return the effects that help, and their probability of being the cause.
 
         Args:
-            models: Fitted models; with a set of effects, the sets with one effect less.
-            names: Names of all effects.
-            equivalent: Groups of them that nothing separates, which share their mass.
-            timed: Whether x has a time axis.
+            equivalent: Groups of effects that nothing separates, which share their
+                mass.
             guessed: Function that returns the nats that guesses in the place of an
                 effect of a set gain over it; None where none were made.
         """
-        probabilities = self._probabilities(models, timed=timed)
+        models, probabilities = self.models, self.probabilities
         alike = {
-            n: next((g for g in equivalent if n in g), frozenset({n})) for n in names
+            n: next((g for g in equivalent if n in g), frozenset({n}))
+            for n in self.names
         }
 
         def share(group: frozenset[str]) -> float:
             return sum(v for k, v in probabilities.items() if group & {*k.effects})
 
         def helping(top: ModelKey) -> tuple[ModelKey, dict[str, float]]:
-            near = self.stand_ins(models, top, names)
+            near = self.stand_ins(top)
             pooled = {n: share(g.union(near.get(n, ()))) for n, g in alike.items()}
-            return self._pruned(models, top, pooled, timed=timed)
+            return self._pruned(top, pooled)
 
-        top, *larger = self.starts(models, names, timed=timed)
+        top, *larger = self.starts()
         key, better = helping(top)
         for start in larger:
             again = helping(start)
@@ -168,131 +191,95 @@ class Rule:
                 inclusion=share(alike[n]),
                 better=better[n],
                 gained=max(models[key].gain(models[key.without(n)]), 0.0),
-                remains=_remains(models, key, n),
+                remains=self._remains(key, n),
                 guessed=-np.inf if guessed is None else guessed(key, n),
             )
             for n in key.effects
         }
-        inclusion = {n: share(frozenset({n})) for n in names}
-        named = tuple(n for n, own in support.items() if self.is_cause(own))
-        if _explains(models, key):
+        inclusion = {n: share(frozenset({n})) for n in self.names}
+        named = tuple(n for n, own in support.items() if self.rule.is_cause(own))
+        if self._explains(key):
             named = key.effects
-        instead = self.stand_ins(models, key, names)
-        return Choice(key, probabilities, inclusion, named, support, instead)
+        return Choice(
+            key, probabilities, inclusion, named, support, self.stand_ins(key)
+        )
 
-    def nothing(
-        self, models: Mapping[ModelKey, Scored], names: Sequence[str]
-    ) -> Choice:
-        """Return the choice where there is no alarm, with what is probable.
-
-        Args:
-            models: Fitted models.
-            names: Names of all effects.
-        """
-        log_p = np.array([m.log_p for m in models.values()])
-        p = dict(zip(models, np.exp(log_p - log_sum_exp(log_p)).tolist(), strict=True))
-        p = dict(sorted(p.items(), key=lambda item: -item[1]))
+    def nothing(self) -> Choice:
+        """Return the choice where there is no alarm, with what is probable."""
+        p = _normalized({key: m.log_p for key, m in self.models.items()})
         inclusion = {
-            n: sum((v for k, v in p.items() if n in k.effects), 0.0) for n in names
+            n: sum((v for k, v in p.items() if n in k.effects), 0.0) for n in self.names
         }
         return Choice(ModelKey(), p, inclusion, (), {}, {})
 
-    def is_cause(self, support: Support) -> bool:
-        """Return whether an effect that helps is probably the cause."""
-        return (
-            support.inclusion > self.included
-            and support.gained >= np.log(self.decisive)
-            and support.remains <= self.remaining
-            and support.guessed <= self.formula
-        )
-
-    def starts(
-        self,
-        models: Mapping[ModelKey, Scored],
-        names: Sequence[str],
-        *,
-        timed: bool = True,
-    ) -> list[ModelKey]:
-        """Return the sets that the rule prunes; :func:`choose` needs all their parts.
-
-        Args:
-            models: Fitted models.
-            names: Names of all effects.
-            timed: Whether x has a time axis.
+    def starts(self) -> list[ModelKey]:
+        """Return the sets that the rule prunes; :meth:`choice` needs all their parts.
 
         Returns:
             The most probable set. Relatives share the probability of a further effect:
             where the sets with one of them are together more probable than the set
             without, that with the likeliest of them follows.
         """
-        probabilities = self._probabilities(models, timed=timed)
+        probabilities = self.probabilities
         found = [next(iter(probabilities))]
         while larger := [k for k in probabilities if found[-1] in k.parts]:
             (new,) = {*larger[0].effects} - {*found[-1].effects}
-            near = {new, *self.stand_ins(models, larger[0], names).get(new, ())}
+            near = {new, *self.stand_ins(larger[0]).get(new, ())}
             alike = [k for k in larger if near & {*k.effects}]
             if sum(probabilities[k] for k in alike) <= probabilities[found[-1]]:
                 break
             found.append(larger[0])
         return found
 
-    def _probabilities(
-        self, models: Mapping[ModelKey, Scored], *, timed: bool
-    ) -> dict[ModelKey, float]:
-        """Return the probabilities of the admitted models, most probable first."""
-        keys = self.admitted(models, timed=timed)
-        log_p = np.array(
-            [models[key].log_p - self._cost(key, timed=timed) for key in keys]
-        )
-        p = np.exp(log_p - log_sum_exp(log_p))
-        return {keys[i]: float(p[i]) for i in np.argsort(-p, kind="stable")}
+    @cached_property
+    def probabilities(self) -> dict[ModelKey, float]:
+        """Probabilities of the admitted models, most probable first."""
+        net = {key: self._net(key) for key in self.admitted()}
+        return _normalized(net)
 
-    def _cost(self, key: ModelKey, *, timed: bool) -> float:
-        """Return the gain that a set of this size needs, nats."""
-        num = len(key.effects)
-        second = 0.0 if timed or num < 2 else np.log(self.second_untimed)
-        return second + np.log(self.decisive) * max(num - 2, 0)
+    def _net(self, key: ModelKey) -> float:
+        """Return the log probability of a set less the gain that one of its size needs.
 
-    def stand_ins(
-        self, models: Mapping[ModelKey, Scored], key: ModelKey, names: Sequence[str]
-    ) -> dict[str, tuple[str, ...]]:
+        It is in nats, as are both.
+        """
+        num, own = len(key.effects), self.rule
+        second = 0.0 if self.timed or num < 2 else np.log(own.second_untimed)
+        cost = second + np.log(own.decisive) * max(num - 2, 0)
+        return self.models[key].log_p - cost
+
+    def stand_ins(self, key: ModelKey) -> dict[str, tuple[str, ...]]:
         """Return the effects that may stand in the place of each effect of a set.
 
         With it there, and the others as they are, a new trial is not surely predicted
-        worse.
+        worse. Sets that were not fitted do not count.
 
         Args:
-            models: Fitted models; sets that were not fitted do not count.
             key: The set.
-            names: Names of all effects, in the order of the sets.
         """
-        square = models[key].square
+        models, square = self.models, self.models[key].square
         found: dict[str, tuple[str, ...]] = {}
         for n in key.effects:
             rest = {*key.effects} - {n}
             sets = {
-                other: ModelKey(tuple(m for m in names if m in {*rest, other}))
-                for other in names
+                other: ModelKey(tuple(m for m in self.names if m in {*rest, other}))
+                for other in self.names
                 if other not in key.effects
             }
             near = tuple(
                 other
                 for other, k in sets.items()
-                if k in models and predicts_better(square, models[k].square) < self.sure
+                if k in models
+                and predicts_better(square, models[k].square) < self.rule.sure
             )
             if near:
                 found[n] = near
         return found
 
     def _pruned(
-        self,
-        models: Mapping[ModelKey, Scored],
-        key: ModelKey,
-        pooled: Mapping[str, float],
-        *,
-        timed: bool,
+        self, key: ModelKey, pooled: Mapping[str, float]
     ) -> tuple[ModelKey, dict[str, float]]:
         """Return the part of a set whose effects all help, and how surely each does."""
+        models, own = self.models, self.rule
         while True:
             better = {
                 n: predicts_better(models[key].square, models[key.without(n)].square)
@@ -301,58 +288,61 @@ class Rule:
             without = {n: models[key.without(n)].error for n in key.effects}
             # Few trials that are badly predicted without an effect hide from a t test
             # how much it is needed.
-            most = self.needed**2 * models[key].error
+            most = own.needed**2 * models[key].error
             # What fits to the sensor needs no more than evidence, but for several
             # effects that may imitate a trajectory.
-            enough = _explains(models, key) or (models[key].fits and not timed)
+            enough = self._explains(key) or (models[key].fits and not self.timed)
             failing = [
                 n
                 for n in key.effects
-                if pooled[n] < self.included
-                or not (enough or better[n] >= self.better or without[n] >= most)
+                if pooled[n] < own.included
+                or not (enough or better[n] >= own.better or without[n] >= most)
             ]
             if not failing:
                 return key, better
             key = key.without(min(failing, key=without.__getitem__))
 
-    def admitted(
-        self, models: Mapping[ModelKey, Scored], *, timed: bool = True
-    ) -> list[ModelKey]:
+    def admitted(self) -> list[ModelKey]:
         """Return the models that predict left-out trials about as well as the best.
 
         It also returns those that are far more probable than all of them.
         """
+        models, own, timed = self.models, self.rule, self.timed
         best = min(models.values(), key=lambda m: m.error)
         smallest = max(best.error, 1.0)  # below the sensor's, by chance
-
-        most = (
-            self.admitted_within if timed else self.admitted_untimed
-        ) ** 2 * smallest
+        within = own.admitted_within if timed else own.admitted_untimed
+        most = within**2 * smallest
 
         def is_as_good(model: Scored) -> bool:
             if model.error <= most:
                 return True
-            return timed and predicts_better(best.square, model.square) < self.sure
+            return timed and predicts_better(best.square, model.square) < own.sure
 
         as_good = {key for key, m in models.items() if is_as_good(m)}
         # Whether anything is missing is a question of evidence where something fits.
-        if explaining := {key for key in models if _explains(models, key)}:
+        if explaining := {key for key in models if self._explains(key)}:
             as_good |= {ModelKey(), *explaining}
-        net = {key: m.log_p - self._cost(key, timed=timed) for key, m in models.items()}
-        enough = max(net[key] for key in as_good) + self.ahead
+        net = {key: self._net(key) for key in models}
+        enough = max(net[key] for key in as_good) + own.ahead
         return [key for key in models if key in as_good or net[key] > enough]
 
+    def _explains(self, key: ModelKey) -> bool:
+        """Return whether a model leaves the sensor's error, with too little to imitate.
 
-def _explains(models: Mapping[ModelKey, Scored], key: ModelKey) -> bool:
-    """Return whether a model leaves the sensor's error, and has too little to imitate.
+        Several effects fit much that was not declared.
+        """
+        return self.models[key].fits and len(key.effects) <= 1
 
-    Several effects fit much that was not declared.
-    """
-    return models[key].fits and len(key.effects) <= 1
+    def _remains(self, key: ModelKey, name: str) -> float:
+        """Return u, the share of the excess error that an effect of a set leaves."""
+        every = key, key.without(name), ModelKey()
+        own, other, bare = (self.models[k].excess for k in every)
+        return float(np.clip(max(own / other, own / bare), 0.0, 1.0))
 
 
-def _remains(models: Mapping[ModelKey, Scored], key: ModelKey, name: str) -> float:
-    """Return u, the share of the excess error that an effect of a set leaves."""
-    own, other, bare = models[key], models[key.without(name)], models[ModelKey()]
-    u = max(own.excess / other.excess, own.excess / bare.excess)
-    return float(np.clip(u, 0.0, 1.0))
+def _normalized(log_p: Mapping[ModelKey, float]) -> dict[ModelKey, float]:
+    """Return probabilities of models, most probable first."""
+    values = np.array([*log_p.values()])
+    p = np.exp(values - log_sum_exp(values))
+    keys = [*log_p]
+    return {keys[i]: float(p[i]) for i in np.argsort(-p, kind="stable")}

@@ -27,7 +27,7 @@ from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.states import States
 from sbi_active.criticism.misfit.guesses import gained_by_guesses
 from sbi_active.criticism.misfit.intervals import covariance, widened
-from sbi_active.criticism.misfit.rule import Choice, Rule
+from sbi_active.criticism.misfit.rule import Choice, Compared, Rule
 from sbi_active.criticism.misfit.scored import Scored
 from sbi_active.criticism.results import (
     NONE,
@@ -105,8 +105,7 @@ class Verdict:
         is_declared = noise is not None and noise.posterior is None and spare > 0
         if not is_declared or rivals.roughness.any():
             return found
-        lower = float(chi2.cdf(square, spare))
-        return replace(found, least_chi_square=square, lower_p_value=lower)
+        return replace(found, lower_p_value=float(chi2.cdf(square, spare)))
 
     def _log_bayes_factor(
         self, use: NDArray[np.bool_] | None = None, factor: float = 1.0
@@ -148,9 +147,8 @@ class Verdict:
     def choice(self) -> Choice:
         """What helps, and what is named; without an alarm nothing."""
         if not self.detection.alarm:
-            names = self.search.names
             scored = {k: self._scored(c) for k, c in self.search.found.items()}
-            return self.rule.nothing(scored, names)
+            return Compared(self.rule, scored, self.search.names).nothing()
         self.search.fit_larger()
         timed = self.rivals.measurements.is_sequence
         guessed = None if timed else partial(gained_by_guesses, self.search)
@@ -167,12 +165,11 @@ class Verdict:
         joint = self.states.joint(c.model.key, use, factor)
         log_p = c.log_prior + log_sum_exp(np.array([*joint.values()]))
         state = max(joint, key=joint.__getitem__).error
-        beside = c.posterior
+        beside, mixture = c.beside, self.search.errors.mixture
         if use is not None or factor != 1:
-            errors = self.search.errors
-            beside = errors.posterior(c.model, c.grams, use, factor=factor)
+            beside = mixture(c.model, c.grams, use, beside=True, factor=factor)
         square = (standard or self.standard)(c)
-        log_beside = c.log_prior + beside.log_process
+        log_beside = c.log_prior + beside.log_evidence
         return Scored(log_p, square, c.model.rms**2, state, log_beside)
 
     def _settled(
@@ -193,11 +190,10 @@ class Verdict:
             for key, candidate in search.found.items():
                 if key not in scored:
                     scored[key] = score(candidate)
-            tops = self.rule.starts(scored, search.names, timed=timed)
-            missing = [key for top in tops for key in _missing(search, top)]
+            compared = Compared(self.rule, scored, search.names, timed)
+            missing = [k for top in compared.starts() for k in _missing(search, top)]
             if not missing:
-                given = scored, search.names, self.equivalent
-                choice = self.rule.choose(*given, timed=timed, guessed=guessed)
+                choice = compared.choice(self.equivalent, guessed)
                 bare = scored[ModelKey()]
                 gain = scored[choice.key].gain(bare)
                 # Numbers that scatter each for itself may follow anything a little.

@@ -11,7 +11,7 @@ from torch import Tensor
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.rivals.further_trials import are_known, conditions_at
+from sbi_active.criticism.rivals.further_trials import are_known, unmeasured
 from sbi_active.criticism.steps.predictive import predict
 from sbi_active.seeding import derive_seed
 
@@ -90,18 +90,9 @@ def simulated(rivals: RivalSet, candidates: Tensor) -> Tensor:
 
 def following(rivals: RivalSet, candidates: Tensor) -> Trials:
     """Return each candidate as if it were the next trial."""
-    own, num = rivals.trials, len(candidates)
-    x, times = own.template()
-    trials = Trials(
-        candidates.double(),
-        x.expand(num, *x.shape),
-        index=torch.full((num,), float(own.index.max()) + 1),
-        sample_times=times,
-        repeat_of=torch.full((num,), -1),
-        **conditions_at(rivals.model, own, candidates),
-    )
-    trials.action_is_label = own.action_is_label
-    return trials
+    last = float(rivals.trials.index.max())
+    index = torch.full((len(candidates),), last + 1)
+    return unmeasured(rivals.model, rivals.trials, candidates, index)
 
 
 def outside_candidates(

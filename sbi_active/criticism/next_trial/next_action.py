@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -88,13 +88,10 @@ class PredictedRival:
             seed=seed,
             scored=False,
         )
-        num = len(self._trials)
-        x = np.where(prediction.valid[:, prediction.trial], prediction.x, np.nan)
+        trial = prediction.measurements.trial
+        x = np.where(prediction.valid[:, trial], prediction.x, np.nan)
         every = np.stack([x, prediction.mean, prediction.sd])
-        each = np.split(
-            np.arange(len(prediction.trial)),
-            np.cumsum(np.bincount(prediction.trial, minlength=num))[:-1],
-        )
+        each = [np.flatnonzero(trial == t) for t in range(len(self._trials))]
         return torch.from_numpy(np.stack([every[:, :, at] for at in each], 2))
 
 
@@ -118,14 +115,13 @@ def choose_action(
         beyond: Whether to try others where these separate nothing.
     """
     candidates = permitted_candidates(rivals, actions)
-    misfit = tracing.misfit
+    own, misfit = _Choosing(rivals, tracing), tracing.misfit
     shares = tracing.probabilities if misfit is None else misfit.weights
     named = [n for n, p in shares.items() if p > PLAN.negligible][: PLAN.max_rivals]
-    gain = np.zeros(len(candidates))
-    action = None
+    gain, action = np.zeros(len(candidates)), None
     if len(named) > 1:
         p = np.array([shares[n] for n in named])
-        action, gain = _most_telling(rivals, tracing, named, p / p.sum(), candidates)
+        action, gain = own.most_telling(named, p / p.sum(), candidates)
     found = NextAction(
         action=action,
         candidates=candidates.double().numpy(),
@@ -135,7 +131,7 @@ def choose_action(
     if len(named) < 2:
         return found
     if any(is_force(e) for e in rivals.library if e.name in tracing.chosen):
-        found = _by_range(rivals, tracing, found, actions)
+        found = own.by_range(found, actions)
     groups = [g & {*named} for g in tracing.equivalent]
     if action is None:
         groups.append(frozenset(named))
@@ -144,101 +140,92 @@ def choose_action(
     if not beyond or not groups:
         return found
     others = outside_candidates(actions, candidates, limit=PLAN.max_outside)
-    return _look_outside(rivals, tracing, found, simulated(rivals, others))
+    return own.look_outside(found, simulated(rivals, others))
 
 
-def _most_telling(
-    rivals: RivalSet,
-    tracing: Tracing,
-    names: Sequence[str],
-    p: Array,
-    candidates: Tensor,
-) -> tuple[Array | None, Array]:
-    """Return the best candidate, None if it tells nothing, and what each tells."""
-    design = _select(rivals, tracing, names, p, candidates)
-    gain = design.expected_information_gain.clamp_min(0.0).numpy()
-    told = gain[design.index]
-    others = np.flatnonzero(gain >= PLAN.something)
-    if told < PLAN.nothing and len(others):
-        # The draws that chose it do not report: at some of them alone it tells much.
-        part = candidates[torch.from_numpy(others)]
-        design = _select(rivals, tracing, names, p, part, again=True)
-        gain[others] = design.expected_information_gain.clamp_min(0.0).numpy()
-        told = gain[others[design.index]]
-    return (design.action.double().numpy() if told >= PLAN.nothing else None), gain
+@dataclass(frozen=True)
+class _Choosing:
+    """Designs that tell rivals apart, by the models and the verdict on them."""
 
+    rivals: RivalSet
+    tracing: Tracing
 
-def _by_range(
-    rivals: RivalSet, tracing: Tracing, found: NextAction, actions: ActionSpace
-) -> NextAction:
-    """Return the choice with the best action within the range tried, and beyond it.
+    def most_telling(
+        self, names: Sequence[str], p: Array, candidates: Tensor
+    ) -> tuple[Array | None, Array]:
+        """Return the best candidate, None if it tells nothing, and what each tells."""
+        design = self.select(names, p, candidates)
+        gain = design.expected_information_gain.clamp_min(0.0).numpy()
+        told = gain[design.index]
+        others = np.flatnonzero(gain >= PLAN.something)
+        if told < PLAN.nothing and len(others):
+            # The draws that chose it do not report: at some of them alone it tells
+            # much.
+            part = candidates[torch.from_numpy(others)]
+            design = self.select(names, p, part, again=True)
+            gain[others] = design.expected_information_gain.clamp_min(0.0).numpy()
+            told = gain[others[design.index]]
+        return (design.action.double().numpy() if told >= PLAN.nothing else None), gain
 
-    Within it forms of a force look alike, or the trials had told them apart; a
-    prediction beyond it rests on the form.
-    """
-    tried, gain = rivals.trials.action, found.information_gain
-    candidates = torch.from_numpy(found.candidates)
-    low, high = tried.min(0).values.double(), tried.max(0).values.double()
-    inside = ((candidates >= low) & (candidates <= high)).all(-1).numpy()
-    if inside.any():
-        best = int(np.argmax(np.where(inside, gain, -np.inf)))
-        told = float(gain[best])
-        found = replace(found, within=found.candidates[best], within_gain=told)
-    if not inside.all():
-        best = int(np.argmax(np.where(inside, -np.inf, gain)))
-        beyond, told = found.candidates[best], float(gain[best])
-    else:
-        others = outside_candidates(actions, candidates.float(), limit=PLAN.max_outside)
-        others = simulated(rivals, others)
-        if not len(others):
-            return found
-        names = found.separates
-        p = np.array(
-            [max(tracing.probabilities.get(n, 0.0), PLAN.fewest) for n in names]
+    def by_range(self, found: NextAction, actions: ActionSpace) -> NextAction:
+        """Return the choice with the best action within the range tried, and beyond it.
+
+        Within it forms of a force look alike, or the trials had told them apart; a
+        prediction beyond it rests on the form.
+        """
+        tried, gain = self.rivals.trials.action, found.information_gain
+        candidates = torch.from_numpy(found.candidates)
+        low, high = tried.min(0).values.double(), tried.max(0).values.double()
+        inside = ((candidates >= low) & (candidates <= high)).all(-1).numpy()
+        if inside.any():
+            best = int(np.argmax(np.where(inside, gain, -np.inf)))
+            told = float(gain[best])
+            found = replace(found, within=found.candidates[best], within_gain=told)
+        if not inside.all():
+            best = int(np.argmax(np.where(inside, -np.inf, gain)))
+            beyond, told = found.candidates[best], float(gain[best])
+        else:
+            limit = PLAN.max_outside
+            others = outside_candidates(actions, candidates.float(), limit=limit)
+            others = simulated(self.rivals, others)
+            if not len(others):
+                return found
+            shares = [self.tracing.probabilities.get(n, 0.0) for n in found.separates]
+            p = np.maximum(shares, PLAN.fewest)
+            design = self.select(found.separates, p / p.sum(), others)
+            told = float(design.expected_information_gain[design.index])
+            beyond = design.action.double().numpy()
+        return replace(found, beyond=beyond, beyond_gain=max(told, 0.0))
+
+    def look_outside(self, found: NextAction, others: Tensor) -> NextAction:
+        """Return the choice with an action that is not permitted, if one separates."""
+        for group in found.inseparable if len(others) else ():
+            names = [n for n in found.separates if n in group]
+            design = self.select(names, np.full(len(names), 1 / len(names)), others)
+            gain = float(design.expected_information_gain[design.index])
+            error = float(design.standard_error[design.index])
+            if gain - 2 * error >= PLAN.nothing and gain > found.outside_gain:
+                found = replace(
+                    found,
+                    outside=design.action.double().numpy(),
+                    outside_separates=(*names,),
+                    outside_gain=gain,
+                )
+        return found
+
+    def select(
+        self, names: Sequence[str], p: Array, candidates: Tensor, *, again: bool = False
+    ) -> Design:
+        """Return the design that tells rivals apart, of some probabilities."""
+        evidences, rivals = self.tracing.evidences, self.rivals
+        models = [
+            PredictedRival(rivals, evidences[name].key, float(share), candidates)
+            for name, share in zip(names, p, strict=True)
+        ]
+        designer = InformationGainDesigner(
+            DiscreteActions(candidates),
+            num_samples=PLAN.samples * len(models),
+            eliminate=False,  # a part of the samples would be too few for densities
         )
-        design = _select(rivals, tracing, names, p / p.sum(), others)
-        told = float(design.expected_information_gain[design.index])
-        beyond = design.action.double().numpy()
-    return replace(found, beyond=beyond, beyond_gain=max(told, 0.0))
-
-
-def _look_outside(
-    rivals: RivalSet, tracing: Tracing, found: NextAction, others: Tensor
-) -> NextAction:
-    """Return the choice with an action that is not permitted, if one separates."""
-    for group in found.inseparable if len(others) else ():
-        names = [n for n in found.separates if n in group]
-        equal = np.full(len(names), 1 / len(names))
-        design = _select(rivals, tracing, names, equal, others)
-        gain = float(design.expected_information_gain[design.index])
-        error = float(design.standard_error[design.index])
-        if gain - 2 * error >= PLAN.nothing and gain > found.outside_gain:
-            found = replace(
-                found,
-                outside=design.action.double().numpy(),
-                outside_separates=(*names,),
-                outside_gain=gain,
-            )
-    return found
-
-
-def _select(
-    rivals: RivalSet,
-    tracing: Tracing,
-    names: Sequence[str],
-    p: Array,
-    candidates: Tensor,
-    *,
-    again: bool = False,
-) -> Design:
-    models = [
-        PredictedRival(rivals, tracing.evidences[name].key, float(share), candidates)
-        for name, share in zip(names, p, strict=True)
-    ]
-    designer = InformationGainDesigner(
-        DiscreteActions(candidates),
-        num_samples=PLAN.samples * len(models),
-        eliminate=False,  # a part of the samples would be too few for densities
-    )
-    seed = derive_seed(rivals.seed, "next action", *names, *["again"] * again)
-    return designer.select(models, target="model", seed=seed)
+        seed = derive_seed(rivals.seed, "next action", *names, *["again"] * again)
+        return designer.select(models, target="model", seed=seed)

@@ -92,8 +92,9 @@ def _difference(verdict: Prediction, free: Prediction, num: int) -> Array:
     mean, sd = verdict.moments()
     other, spread = free.moments()
     square = ((other - mean) ** 2 + spread**2) / sd**2
-    total = np.bincount(verdict.trial, square, minlength=num)
-    size = np.bincount(verdict.trial, minlength=num)
+    trial = verdict.measurements.trial
+    total = np.bincount(trial, square, minlength=num)
+    size = np.bincount(trial, minlength=num)
     return np.sqrt(np.maximum(total / np.maximum(size, 1) - 1, 0.0))
 
 

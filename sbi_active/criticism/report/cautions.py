@@ -115,7 +115,7 @@ def _of_models(report: Contents) -> Iterator[Case]:
     misses = tracing.chosen and tracing.misfit is None and tracing.p_value < REFUTED
     yield "SA510", misses, tracing
     if detection.lower_p_value <= TOO_SMALL:
-        variance = abs(detection.least_chi_square / detection.degrees_of_freedom)
+        variance = abs(detection.chi_square / detection.degrees_of_freedom)
         yield "SA523", True, variance**0.5
     for p in tracing.bounds.parameters:
         where = "in the bare model" if p.model == NONE else f"with {p.model}"

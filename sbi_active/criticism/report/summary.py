@@ -22,6 +22,7 @@ from sbi_active.criticism.results import (
     Tracing,
 )
 from sbi_active.criticism.steps.detection import LEVEL
+from sbi_active.criticism.steps.tracing import credible_set
 from sbi_active.criticism.under_misfit import UNDECLARED, Misfit
 
 #: Trials that refute a verdict where none are named.
@@ -136,13 +137,7 @@ def not_told_from(tracing: Tracing, names: Collection[str]) -> list[str]:
 
 def suspects(tracing: Tracing) -> tuple[float, ...]:
     """Return the indices of trials that hold 90 % of a gross error's probability."""
-    found, total = [], 0.0
-    for index, share in tracing.outliers.items():  # most probable first
-        if total >= 0.9:
-            break
-        found.append(index)
-        total += share
-    return (*found,)
+    return credible_set(tracing.outliers)
 
 
 def suspects_in_words(tracing: Tracing) -> str:

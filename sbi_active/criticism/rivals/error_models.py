@@ -21,12 +21,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
-from typing_extensions import Self, override
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
@@ -81,10 +79,19 @@ class NoiseCell:
         before[..., 1:] = u[..., :-1]
         return (u - self.rho * before) / np.sqrt(1 - self.rho**2)
 
+    @cached_property
+    def log_scales(self) -> Array:
+        """Log of what :meth:`whiten` divides each number by, shape (N,)."""
+        return np.log(self.sd) + 0.5 * np.log1p(-(self.rho**2))
+
     @property
     def log_scale(self) -> float:
         """Log determinant of the inverse of :meth:`whiten`."""
-        return float(np.log(self.sd).sum() + 0.5 * np.log1p(-(self.rho**2)).sum())
+        return float(self.log_scales.sum())
+
+    def part(self, at: NDArray[np.bool_]) -> NoiseCell:
+        """Return this noise of some of the numbers, shape (N,)."""
+        return replace(self, sd=self.sd[at], rho=self.rho[at])
 
 
 @dataclass(frozen=True)
@@ -96,15 +103,22 @@ class NoiseGrid:
         scales: Factors on the standard deviation, shape (j,).
         log_weights: Log prior probabilities of these, shape (j,); None for equal ones.
         offset: Log probability that is added to all, of noise that stands for another.
-        ratio: Sizes of the channels in units of a common one, shape (c,), where a
-            prediction asks for those of each; None for one size.
+        channel: Channel of each number, shape (N,), where each has a size of its own;
+            None for one size.
+        factors: Sizes of each channel in units of that of the cells, shape (c, s).
+        log_factors: Log prior probabilities of these, shape (c, s).
+        ratio: Sizes of the channels in those of the cells, shape (c,), where a
+            prediction asks for those of each.
     """
 
     cells: Sequence[NoiseCell]
     scales: Array = field(default_factory=lambda: np.ones(1))
     log_weights: Array | None = None
     offset: float = 0.0
-    ratio: Array | None = None
+    channel: NDArray[np.int64] | None = None
+    factors: Array = field(default_factory=lambda: np.ones((1, 1)))
+    log_factors: Array = field(default_factory=lambda: np.zeros((1, 1)))
+    ratio: Array = field(default_factory=lambda: np.ones(1))
 
     @cached_property
     def log_prior(self) -> Array:
@@ -122,12 +136,7 @@ class NoiseGrid:
     @property
     def is_known(self) -> bool:
         """Whether nothing of it is unknown, so that one transform whitens all."""
-        return self.shape == (1, 1)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Numbers of cells and scales."""
-        return len(self.cells), len(self.scales)
+        return len(self.cells) == self.factors.size == len(self.scales) == 1
 
     @property
     def typical_sd(self) -> Array:
@@ -140,17 +149,10 @@ class NoiseGrid:
 
     def joint(self, residual: Array) -> Array:
         """Return log p(residual, cell, scale), shape (n, cells, scales)."""
-        num = residual.shape[1]
         parts = []
         for cell, prior in zip(self.cells, self.log_prior, strict=True):
-            e = cell.whiten(residual)
-            if np.isinf(cell.df):
-                square = np.einsum("ni,ni->n", e, e)[:, None]
-                log_p = -0.5 * square / self.scales**2 - 0.5 * num * LOG_2PI
-            else:
-                log_p = student(e[:, None] / self.scales[:, None], cell.df).sum(-1)
-            log_p = log_p - num * np.log(self.scales) - cell.log_scale
-            parts.append(prior + self.log_scale_prior + log_p)
+            each = log_sum_exp(self._by_size(cell, residual), axis=3).sum(2)
+            parts.append(prior + self.log_scale_prior + each - cell.log_scale)
         return np.stack(parts, 1)
 
     def posterior(self, residual: Array) -> Array:
@@ -161,92 +163,15 @@ class NoiseGrid:
     def start(self) -> Whitener:
         """Return the whitening transform to start a least-squares search with."""
         middle = np.argsort(self.scales)[len(self.scales) // 2]
-        cell = self.cells[int(np.argmax(self.log_prior))]
-        return self._whitener(cell, self.scales[middle])
+        sizes = np.full(len(self.factors), self.scales[middle])
+        return self._whitener(int(np.argmax(self.log_prior)), sizes)
 
     def whitener(self, residual: Array) -> Whitener:
         """Return the whitening transform that a residual (N,) makes most probable.
 
         It maps (..., N) to (..., N), linearly.
         """
-        best = np.unravel_index(np.argmax(self.joint(residual[None])[0]), self.shape)
-        return self._whitener(self.cells[int(best[0])], self.scales[best[1]])
-
-    def noise_posterior(
-        self, residual: Array, rng: np.random.Generator
-    ) -> tuple[NDArray[np.intp], Array]:
-        """Return a cell and a size of the noise for each residual, at random.
-
-        Args:
-            residual: Residuals, shape (n, N).
-            rng: Source of the draws.
-
-        Returns:
-            Cells, shape (n,), and factors on their deviations, shape (n,), or (n, c)
-            where each channel has its own.
-        """
-        cell, scale = drawn(self.joint(residual), rng)
-        return cell, self.sizes(self.scales[scale])
-
-    def sizes(self, scales: Array) -> Array:
-        """Return the sizes of :meth:`noise_posterior` that scales (n,) stand for."""
-        return scales if self.ratio is None else scales[:, None] * self.ratio
-
-    def by_number(self, sizes: Array) -> Array:
-        """Return the size of each number, shape (n, N), from those of draws."""
-        return np.broadcast_to(sizes[:, None], (len(sizes), len(self.cells[0].sd)))
-
-    def scaled(self, scales: Array, log_weights: Array) -> Self:
-        """Return this noise with further factors on its standard deviation."""
-        product = np.multiply.outer(self.scales, scales).ravel()
-        weight = np.add.outer(self.log_scale_prior, log_weights).ravel()
-        return replace(self, scales=product, log_weights=weight)
-
-    def with_extra(self, sd: Array) -> Self:
-        """Return this noise with an independent error of deviation sd, shape (N,)."""
-        cells = [replace(cell, sd=np.hypot(cell.sd, sd)) for cell in self.cells]
-        return replace(self, cells=cells)
-
-    def part(self, at: NDArray[np.bool_]) -> Self:
-        """Return this noise of some of the numbers, shape (N,)."""
-        cells = [replace(c, sd=c.sd[at], rho=c.rho[at]) for c in self.cells]
-        return replace(self, cells=cells)
-
-    def _whitener(self, cell: NoiseCell, scale: Any) -> Whitener:
-        return lambda residual: cell.whiten(residual) / scale
-
-
-@dataclass(frozen=True, kw_only=True)
-class ChannelNoise(NoiseGrid):
-    """Gaussian noise with an unknown size in each channel.
-
-    The sd of its cells is each channel's middle size; ``scales`` are of all alike.
-
-    Attributes:
-        channel: Channel of each number, shape (N,).
-        factors: Sizes of each channel in units of its middle one, shape (c, j).
-        log_factors: Log prior probabilities of these, shape (c, j).
-    """
-
-    channel: NDArray[np.int64]
-    factors: Array
-    log_factors: Array
-
-    is_known = False  # type: ignore[assignment]
-
-    @override
-    def joint(self, residual: Array) -> Array:
-        parts = []
-        for cell, prior in zip(self.cells, self.log_prior, strict=True):
-            each = log_sum_exp(self._by_size(cell, residual), axis=3).sum(2)
-            parts.append(prior + self.log_scale_prior + each - cell.log_scale)
-        return np.stack(parts, 1)
-
-    @override
-    def whitener(self, residual: Array) -> Whitener:
-        cell, sizes = self.likeliest(residual)
-        unit, own = sizes[self.channel], self.cells[cell]
-        return lambda residual: own.whiten(residual / unit)
+        return self._whitener(*self.likeliest(residual))
 
     def likeliest(self, residual: Array) -> tuple[int, Array]:
         """Return the cell and the sizes (c,) that a residual (N,) points to."""
@@ -260,51 +185,123 @@ class ChannelNoise(NoiseGrid):
         """Return noise with sizes whose ratio is that which a residual (N,) points to.
 
         For that residual it is as probable as this one, so that models with either can
-        be compared.
+        be compared. Noise of one size is this one.
         """
+        if self.channel is None:
+            return self
         _, ratio = self.likeliest(residual)
-        unit = ratio[self.channel]
-        cells = [replace(cell, sd=cell.sd * unit) for cell in self.cells]
+        cells = [replace(c, sd=c.sd * ratio[self.channel]) for c in self.cells]
         new = NoiseGrid(cells, scales=np.geomspace(1 / 30, 30, 40), ratio=ratio)
         one = residual[None]
         apart = self.log_likelihood(one) - new.log_likelihood(one)
         return replace(new, offset=apart[0])
 
-    @override
     def noise_posterior(
         self, residual: Array, rng: np.random.Generator
     ) -> tuple[NDArray[np.intp], Array]:
+        """Return a cell and sizes of the noise for each residual, at random.
+
+        Args:
+            residual: Residuals, shape (n, N).
+            rng: Source of the draws.
+
+        Returns:
+            Cells, shape (n,), and factors on their deviations by channel, shape (n, c).
+        """
         cells, scales = drawn(self.joint(residual), rng)
-        sizes = np.empty((len(residual), len(self.factors)))
+        sizes = self.sizes(self.scales[scales])
+        if self.channel is None:
+            return cells, sizes
+        sizes = np.repeat(sizes, len(self.factors), 1)
         for cell in np.unique(cells):
             own = np.flatnonzero(cells == cell)
             by_size = self._by_size(self.cells[cell], residual[own])
             at_scale = by_size[np.arange(len(own)), scales[own]]
             for c, factors in enumerate(self.factors):
                 (picked,) = drawn(at_scale[:, c], rng)
-                sizes[own, c] = self.scales[scales[own]] * factors[picked]
+                sizes[own, c] *= factors[picked]
         return cells, sizes
 
-    @override
-    def by_number(self, sizes: Array) -> Array:
-        return sizes[:, self.channel]
+    def sizes(self, scales: Array) -> Array:
+        """Return the sizes of the channels that scales (n,) stand for, (n, c)."""
+        return scales[:, None] * self.ratio
 
-    @override
-    def part(self, at: NDArray[np.bool_]) -> Self:
-        return replace(super().part(at), channel=self.channel[at])
+    def by_number(self, sizes: Array) -> Array:
+        """Return the size of each number, shape (n, N), from those of channels."""
+        return sizes[:, self._groups]
+
+    def errors(
+        self, cells: Array, sizes: Array, rng: np.random.Generator
+    ) -> tuple[Array, Array]:
+        """Return errors at random, and their deviations, shape (n, N).
+
+        Args:
+            cells: Cell of each draw, shape (n,).
+            sizes: Factors on the cell's deviations, shape (n, N).
+            rng: Source of the errors.
+        """
+        own = [self.cells[cell] for cell in cells]
+        rho, u = np.stack([cell.rho for cell in own]), rng.normal(size=sizes.shape)
+        for row, cell in zip(u, own, strict=True):
+            if np.isfinite(df := cell.df):
+                row[:] = rng.standard_t(df, size=len(row)) * np.sqrt((df - 2) / df)
+        for k in range(1, u.shape[1]) if rho.any() else ():
+            step = np.sqrt(1 - rho[:, k] ** 2) * u[:, k]
+            u[:, k] = rho[:, k] * u[:, k - 1] + step
+        sd = np.stack([cell.sd for cell in own]) * sizes
+        return u * sd, sd
+
+    def log_density(self, cells: Array, sizes: Array, residual: Array) -> Array:
+        """Return log densities of residuals (n, N), each in its cell, shape (n,)."""
+        log_p, u = np.empty(len(residual)), residual / sizes
+        for cell in np.unique(cells):
+            own, alone = cells == cell, replace(self.cells[cell], log_weight=0.0)
+            log_p[own] = NoiseGrid([alone]).log_likelihood(u[own])
+        return log_p - np.log(sizes).sum(1)
+
+    def scaled(self, scales: Array, log_weights: Array) -> NoiseGrid:
+        """Return this noise with further factors on its standard deviation."""
+        product = np.multiply.outer(self.scales, scales).ravel()
+        weight = np.add.outer(self.log_scale_prior, log_weights).ravel()
+        return replace(self, scales=product, log_weights=weight)
+
+    def with_extra(self, sd: Array) -> NoiseGrid:
+        """Return this noise with an independent error of deviation sd, shape (N,)."""
+        cells = [replace(cell, sd=np.hypot(cell.sd, sd)) for cell in self.cells]
+        return replace(self, cells=cells)
+
+    def part(self, at: NDArray[np.bool_]) -> NoiseGrid:
+        """Return this noise of some of the numbers, shape (N,)."""
+        channel = None if self.channel is None else self.channel[at]
+        return replace(self, cells=[c.part(at) for c in self.cells], channel=channel)
+
+    @property
+    def _groups(self) -> NDArray[np.int64]:
+        """Channel of each number among those with sizes of their own, shape (N,)."""
+        if self.channel is None:
+            return np.zeros(len(self.cells[0].sd), dtype=np.int64)
+        return self.channel
+
+    def _whitener(self, cell: int, sizes: Array) -> Whitener:
+        own, unit = self.cells[cell], sizes[self._groups]
+        return lambda residual: own.whiten(residual) / unit
 
     def _by_size(self, cell: NoiseCell, residual: Array) -> Array:
-        """Return log p(residual of a channel, size | cell, scale), (n, k, c, j).
+        """Return log p(residual of a channel, size | cell, scale), (n, j, c, s).
 
         Up to the log scale of the cell.
         """
-        member = self.channel[:, None] == np.arange(len(self.factors))
-        square, count = cell.whiten(residual) ** 2 @ member, member.sum(0)
-        size = self.scales[:, None, None] * self.factors  # (k, c, j)
-        log_p = -0.5 * square[:, None, :, None] / size**2
-        log_p = log_p - count[:, None] * (np.log(size) + 0.5 * LOG_2PI)
+        member = self._groups[:, None] == np.arange(len(self.factors))
+        e, count = cell.whiten(residual), member.sum(0)[:, None]
+        size = self.scales[:, None, None] * self.factors
+        if np.isinf(cell.df):
+            log_p = -0.5 * (e**2 @ member)[:, None, :, None] / size**2
+            log_p = log_p - 0.5 * count * LOG_2PI
+        else:
+            each = student(e[:, None, :, None] / size[:, self._groups], cell.df)
+            log_p = np.einsum("njis,ic->njcs", each, member)
         total = log_sum_exp(self.log_factors, axis=1)[:, None]
-        return log_p + (self.log_factors - total)
+        return log_p - count * np.log(size) + (self.log_factors - total)
 
 
 def drawn(log_p: Array, rng: np.random.Generator) -> tuple[NDArray[np.intp], ...]:

@@ -82,16 +82,27 @@ def conditions_at(
     }
 
 
-def together(trials: Trials, further: dict[str, Any]) -> dict[str, Any]:
-    """Return the conditions of trials, with further ones behind them.
+def unmeasured(
+    model: SimulatorModel, trials: Trials, action: Tensor, index: Tensor
+) -> Trials:
+    """Return trials at some actions, with all numbers that any trial has.
 
     Args:
+        model: The simulator.
         trials: Measured trials.
-        further: Conditions from :func:`conditions_at`.
+        action: Actions, shape (a, action_dim).
+        index: Place of each trial in the order of execution, shape (a,).
     """
-    own = {"inputs": trials.inputs, "start": trials.start}
-    joined = {key: _joined(own[key], further[key]) for key in own if key in further}
-    return {**further, **joined}
+    x, times = trials.template()
+    found = Trials(
+        action.double(),
+        x.expand(len(action), *x.shape),
+        index=index,
+        sample_times=times,
+        **conditions_at(model, trials, action),
+    )
+    found.action_is_label = trials.action_is_label
+    return found
 
 
 def _signals(
@@ -129,9 +140,3 @@ def _starts(start: Any, first: Tensor, found: Tensor) -> Any:
         return None
     known = found.reshape(-1, *[1] * (start.ndim - 1))
     return start[first].where(known, start.mean(0))
-
-
-def _joined(own: Any, further: Any) -> Any:
-    if isinstance(own, dict):
-        return {name: torch.cat([own[name], further[name]]) for name in own}
-    return None if own is None else torch.cat([own, further])

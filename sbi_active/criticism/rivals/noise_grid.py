@@ -7,13 +7,12 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch.distributions import Distribution
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
-from sbi_active.criticism.rivals.error_models import ChannelNoise, NoiseCell, NoiseGrid
+from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.seeding import forked_generators
-from sbi_active.simulation.noise.base import NoiseModel, declared_sds
+from sbi_active.simulation.noise.base import NoiseModel
 from sbi_active.simulation.noise.posterior import NoisePosterior, SdGrid
 
 #: Cells of the correlation time, from half a sample step to twice the recording, and
@@ -44,16 +43,11 @@ def declared_noise(
         ValueError: If a declared standard deviation is zero.
     """
     if noise is None:
-        one = np.ones(len(measurements))
-        return NoiseGrid(_correlated(measurements, one))
-    names = noise.parameter_names
-    if "correlation_time" in names:
-        grid = _product(noise.posterior, measurements)
-        if grid is not None:
+        return NoiseGrid(_correlated(measurements, np.ones(len(measurements))))
+    names, rows = noise.parameter_names, noise.parameters[None]
+    if noise.posterior is not None:
+        if (grid := _product(noise, measurements)) is not None:
             return grid
-    if noise.posterior is None:
-        rows = noise.parameters[None]
-    else:
         with forked_generators(seed, "noise"):
             rows = noise.posterior.sample(torch.Size([NUM_DRAWS])).double()
         rows = rows.reshape(NUM_DRAWS, -1)  # of one parameter they may be numbers
@@ -63,7 +57,7 @@ def declared_noise(
         values = dict(zip(names, row.tolist(), strict=True))
         sds = np.array([v for k, v in values.items() if k.startswith("sd")])
         if not len(sds):  # a noise model of the user's, taken as Gaussian of its size
-            sds = declared_sds(noise).numpy()
+            sds = noise.declared_sds().numpy()
         if (sds <= 0).any():
             raise ValueError(
                 "expected measurement noise with a standard deviation > 0; got "
@@ -81,35 +75,32 @@ def declared_noise(
     return NoiseGrid(cells)
 
 
-def _product(
-    posterior: Distribution | None, measurements: Measurements
-) -> NoiseGrid | None:
+def _product(noise: NoiseModel, measurements: Measurements) -> NoiseGrid | None:
     """Return the sum over a grid of standard deviations times a correlation time.
 
     None unless the posterior is such a grid with independent parts, as one is that
     stands for noise of unknown size, in all channels or in each: a few draws of it
     would miss what the trials tell of the size to some percent.
     """
-    if not isinstance(posterior, NoisePosterior) or posterior.shared is None:
+    posterior = noise.posterior
+    if "correlation_time" not in noise.parameter_names or not (
+        isinstance(posterior, NoisePosterior) and isinstance(posterior.sd, SdGrid)
+    ):
         return None
-    sd, shared = posterior.sd, posterior.shared
-    if not isinstance(sd, SdGrid):
-        return None
-    weights = sd.log_weight
+    sd, weights = posterior.sd, posterior.sd.log_weight
     if not torch.equal(weights, weights[:1].expand_as(weights)):
         return None
     middle = (weights[0].exp() * sd.nodes.log()).sum(1).exp()
-    factors, log_p = (sd.nodes / middle[:, None]).numpy(), weights[0].numpy()
+    factors, log_factors = (sd.nodes / middle[:, None]).numpy(), weights[0].numpy()
     channel = _channel_of(measurements, sd.num_channels)
     unit = middle.numpy()[channel]
-    times = (shared.edges[1:] * shared.edges[:-1]).sqrt().tolist()
     cells = [
-        NoiseCell.of(measurements, sd=unit, correlation_time=tau, log_weight=w)
-        for tau, w in zip(times, shared.log_weight.tolist(), strict=True)
+        NoiseCell.of(measurements, sd=unit, correlation_time=tau, log_weight=log_p)
+        for tau, log_p in posterior.cells
     ]
     if sd.num_channels == 1:
-        return NoiseGrid(cells, scales=factors[0], log_weights=log_p[0])
-    return ChannelNoise(cells, channel=channel, factors=factors, log_factors=log_p)
+        return NoiseGrid(cells, scales=factors[0], log_weights=log_factors[0])
+    return NoiseGrid(cells, channel=channel, factors=factors, log_factors=log_factors)
 
 
 def measurement_sds(noise: NoiseModel | None, measurements: Measurements) -> Any:
@@ -139,7 +130,7 @@ def scattered(noise: NoiseGrid) -> NoiseGrid:
 def _correlated(
     measurements: Measurements, sd: Array, log_weight: float = 0.0
 ) -> list[NoiseCell]:
-    if not measurements.has_time or not np.isfinite(measurements.gap).any():
+    if not measurements.is_sequence:
         return [NoiseCell.of(measurements, sd=sd, log_weight=log_weight)]
     times = np.geomspace(0.5 * measurements.step, 2 * measurements.span, NUM_TIMES)
     each = np.full(NUM_TIMES, np.log1p(-INDEPENDENT) - np.log(NUM_TIMES))

@@ -19,6 +19,7 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 
@@ -204,13 +205,10 @@ class ResidualProcess:
     def _joint(self, residual: Array) -> Array:
         """Return log p(residual, basis, amplitude, scale), shape (n, bases, ...)."""
         found = []
-        for basis in self._bases:
-            e = self.noise.cells[basis.cell].whiten(residual)
-            q = (e @ basis.directions) ** 2
-            rest = np.maximum(np.einsum("ni,ni->n", e, e) - q.sum(1), 0.0)
-            square = rest[:, None] + q @ (1 / self._total(basis)).T
-            log_p = -0.5 * square[..., None] / self.noise.scales**2
-            found.append(log_p + self._log_constant(basis, residual.shape[1]))
+        for e, q, total, log_p in self._each(residual):
+            rest = np.maximum(np.einsum("ni,ni->n", e, e) - (q**2).sum(1), 0.0)
+            square = rest[:, None] + q**2 @ (1 / total).T
+            found.append(log_p - 0.5 * square[..., None] / self.noise.scales**2)
         return np.stack(found, 1)
 
     def grams(self, rows: Array) -> tuple[Array, Array]:
@@ -223,27 +221,29 @@ class ResidualProcess:
             Gram matrices, shape (h, k, k), and the log weights of all h with the
             constants of their densities, shape (h,).
         """
-        grams, log_p = [], []
-        for basis in self._bases:
-            e = self.noise.cells[basis.cell].whiten(rows.T).T
-            q = basis.directions.T @ e
-            less = 1 - 1 / self._total(basis)
-            gram = e.T @ e - np.einsum("am,mi,mj->aij", less, q, q)
+        grams, logs = [], []
+        for e, q, total, log_p in self._each(rows.T):
+            gram = e @ e.T - np.einsum("am,im,jm->aij", 1 - 1 / total, q, q)
             gram = gram[:, None] / self.noise.scales[:, None, None] ** 2
             grams.append(gram.reshape(-1, *gram.shape[2:]))
-            log_p.append(self._log_constant(basis, len(rows)).ravel())
-        return np.concatenate(grams), np.concatenate(log_p)
+            logs.append(log_p.ravel())
+        return np.concatenate(grams), np.concatenate(logs)
 
-    def _total(self, basis: _Basis) -> Array:
-        """Return the variance along each direction, shape (amplitudes, m)."""
-        return 1 + self.amplitudes[:, None] ** 2 * basis.variances
+    def _each(self, rows: Array) -> Iterator[tuple[Array, Array, Array, Array]]:
+        """Yield rows (n, N) whitened by the noise, process by process.
 
-    def _log_constant(self, basis: _Basis, num: int) -> Array:
-        """Return log weights and volumes of densities, shape (amplitudes, scales)."""
-        cell, scales = self.noise.cells[basis.cell], self.noise.scales
-        log_det = 0.5 * np.log(self._total(basis)).sum(1)[:, None] + cell.log_scale
-        log_p = self.noise.log_scale_prior - num * (np.log(scales) + 0.5 * LOG_2PI)
-        return log_p - log_det + basis.log_weight - np.log(len(self.amplitudes))
+        With their parts along its directions, the variance along each of these, shape
+        (amplitudes, m), and log weights and volumes, shape (amplitudes, scales).
+        """
+        scales, num = self.noise.scales, rows.shape[1]
+        for basis in self._bases:
+            cell = self.noise.cells[basis.cell]
+            total = 1 + self.amplitudes[:, None] ** 2 * basis.variances
+            log_det = 0.5 * np.log(total).sum(1)[:, None] + cell.log_scale
+            log_p = self.noise.log_scale_prior - num * (np.log(scales) + 0.5 * LOG_2PI)
+            log_p = log_p - log_det + basis.log_weight - np.log(len(self.amplitudes))
+            e = cell.whiten(rows)
+            yield e, e @ basis.directions, total, log_p
 
 
 def _coordinates(m: Measurements, place: Array, span: float) -> tuple[Array, Array]:

@@ -18,7 +18,7 @@ from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.results import NONE
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
-from sbi_active.criticism.rivals.further_trials import conditions_at, together
+from sbi_active.criticism.rivals.further_trials import unmeasured
 from sbi_active.criticism.rivals.noise_grid import declared_noise
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.inference.sampling.least_squares import basis_of
@@ -280,20 +280,5 @@ def every_action(rivals: RivalSet, actions: ActionSpace) -> Trials:
         values = actions.sample((48,), seed=derive_seed(rivals.seed, "every"))
     order = np.random.default_rng(rivals.seed).permutation(len(values))
     own = rivals.trials
-    template, first = own.template()
-    times = own.sample_times
-    if times is not None and times.ndim == 2:
-        assert first is not None
-        times = torch.cat([times, first.expand(len(values), -1)])
-    conditions = together(own, conditions_at(rivals.model, own, values[order]))
-    every = Trials(
-        torch.cat([own.action, values[order].double()]),
-        torch.cat([own.x, template.expand(len(values), *template.shape)]),
-        index=torch.cat(
-            [own.index, own.index.max() + 1 + torch.arange(len(values)).double()]
-        ),
-        sample_times=times,
-        **conditions,
-    )
-    every.action_is_label = own.action_is_label
-    return every
+    index = own.index.max() + 1 + torch.arange(len(values)).double()
+    return own.joined(unmeasured(rivals.model, own, values[order], index))

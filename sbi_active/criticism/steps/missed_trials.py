@@ -33,7 +33,7 @@ from sbi_active.criticism.results import NONE, Tracing
 from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import declared_noise, measurement_sds
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
-from sbi_active.criticism.steps.predictive import Prediction, correlated_errors
+from sbi_active.criticism.steps.predictive import Prediction
 from sbi_active.criticism.under_misfit import Misfit
 from sbi_active.seeding import derive_seed
 
@@ -66,31 +66,27 @@ def missed_trials(
     Returns:
         Farthest first.
     """
-    simulator = TrialSimulator(rivals.simulator.model, trials)
-    m = simulator.measurements
-    place = np.full(trials.x.numel(), -1)
-    place[m.position] = np.arange(len(m))
-    rows = place[after.position]  # the first part of a trial may not be scored
-    x = after.of(trials)
-    sensor = _sensor(rivals, tracing.misfit, m)
-    tails = []
-    misfit = tracing.misfit
+    m, x, misfit = after.measurements, after.measurements.x, tracing.misfit
+    sensor, tails = _sensor(rivals, misfit, m), []
     for prediction, model in ((before, NONE), (after, tracing.model)):
         errors = prediction.x - prediction.mean
         if misfit is not None:
             seed = derive_seed(rivals.seed, "missed")
-            errors = _beside_process(misfit, m, len(errors), seed)[:, rows]
-        tail = _tails(prediction, errors, x)
+            every = TrialSimulator(rivals.simulator.model, trials).measurements
+            # The first part of a trial may not be scored.
+            errors = _beside_process(misfit, every, len(errors), seed)
+            errors = errors[:, np.isin(every.position, m.position)]
+        tail = _tails(prediction, errors)
         if misfit is not None and sensor is not None:
-            error = (x - prediction.middle) / sensor[rows]
-            among = error, prediction.trial, len(trials), misfit.of(model).parts
+            error = (x - prediction.middle) / sensor
+            among = error, m.trial, len(trials), misfit.of(model).parts
             tail = np.maximum(tail, _beside_others(*among))
         tails.append(np.where(_is_sure_of_none(prediction), 0.0, tail))
-    unit = np.sqrt((after.sd**2).mean(0)) if sensor is None else sensor[rows]
+    unit = np.sqrt((after.sd**2).mean(0)) if sensor is None else sensor
     share = level / len(trials)
     found = []
     for t in np.flatnonzero(tails[1] < share).tolist():
-        at = after.trial == t
+        at = m.trial == t
         error = (x - after.middle)[at] / unit[at]
         size = float(np.sqrt(np.mean(error**2)))
         missed = MissedTrial(
@@ -132,21 +128,20 @@ def outlying_trials(squares: Sequence[float]) -> list[tuple[int, float]]:
     return sorted(found, key=lambda each: -each[1])
 
 
-def _tails(prediction: Prediction, errors: Array, x: Array) -> Array:
+def _tails(prediction: Prediction, errors: Array) -> Array:
     """Return the tail probability of each trial's T, (t,); 1 where none is scored.
 
     Args:
         prediction: Prediction of the trials.
         errors: Draws of the errors beside it, shape (n, N).
-        x: Measured numbers, shape (N,).
     """
-    off = prediction.mean - prediction.middle
+    m, off = prediction.measurements, prediction.mean - prediction.middle
     sd = np.sqrt((off**2).mean(0) + (errors**2).mean(0))
     sd = np.maximum(sd, np.finfo(float).tiny)
-    off, errors, own = off / sd, errors / sd, (x - prediction.middle) / sd
+    off, errors, own = off / sd, errors / sd, (m.x - prediction.middle) / sd
     found = np.ones(prediction.valid.shape[1])
-    for t in np.unique(prediction.trial):
-        at = prediction.trial == t
+    for t in np.unique(m.trial):
+        at = m.trial == t
         a, b = off[:, at], errors[:, at]
         # Posterior and errors are independent: each draw of one with each of the other.
         drawn = (a**2).sum(1)[:, None] + (b**2).sum(1) + 2 * a @ b.T
@@ -187,7 +182,7 @@ def _beside_process(misfit: Misfit, m: Measurements, num: int, seed: int) -> Arr
     time = 0.0 if np.isnan(misfit.time_scale) else misfit.time_scale
     cell = NoiseCell.of(m, sd=misfit.size * sensor, correlation_time=time)
     cells, ones = np.zeros(num, dtype=np.intp), np.ones((num, len(m)))
-    process, _ = correlated_errors(NoiseGrid([cell]), cells, ones, rng)
+    process, _ = NoiseGrid([cell]).errors(cells, ones, rng)
     return process + sensor * rng.normal(size=process.shape)
 
 

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from sbi_active.arrays import Array
+from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import ModelKey, Residuals
-from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseCell, NoiseGrid
+from sbi_active.criticism.rivals.error_models import LOG_2PI
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.trial_simulator import TrialSimulator
 from sbi_active.criticism.rivals.validity import log_outcomes
@@ -33,8 +34,7 @@ class Prediction:
         x: Draws with errors, shape (n, N).
         log_likelihood: Log likelihood of the measurements of each trial given the draw,
             noise included, shape (n, t), nats.
-        trial: Trial of each number, shape (N,).
-        position: Position of each number in the flattened x, shape (N,).
+        measurements: The measurements that are predicted.
         valid: Whether each trial has an outcome, one draw each, shape (n, t), bool.
         probability_valid: Probability that it has one, given the draw, shape (n, t).
         at_best: Noise-free prediction by the best fit, shape (N,), where every model
@@ -45,8 +45,7 @@ class Prediction:
     sd: Array
     x: Array
     log_likelihood: Array
-    trial: Array
-    position: Array
+    measurements: Measurements
     valid: Array
     probability_valid: Array
     at_best: Array | None = None
@@ -55,10 +54,6 @@ class Prediction:
     def middle(self) -> Array:
         """Prediction that errors refer to: that of the best fit, or the mean, (N,)."""
         return self.mean.mean(0) if self.at_best is None else self.at_best
-
-    def of(self, trials: Trials) -> Array:
-        """Return what was measured in the trials that are predicted, (N,)."""
-        return trials.x.double().numpy().reshape(-1)[self.position]
 
     @property
     def log_density(self) -> Array:
@@ -153,7 +148,7 @@ def predict(
         mean = mean + shift
     cells, sizes = fit.error.noise_posterior(own_residual, rng)
     sizes = noise.by_number(sizes)
-    errors, sd = correlated_errors(noise, cells, sizes, rng)
+    errors, sd = noise.errors(cells, sizes, rng)
     errors, sd = errors * factor, np.sqrt((sd * factor) ** 2 + extra**2)
     errors = errors + extra * rng.normal(size=mean.shape)
     each = np.empty((num_draws, len(target) if scored else 0))
@@ -164,62 +159,21 @@ def predict(
             e, own = residual / sd[:, at], np.log(sd[:, at])
             each[:, t] = (-0.5 * e**2 - own - 0.5 * LOG_2PI).sum(1)
         else:
-            log_scale = np.log(factor[:, at]).sum(1)
-            e = residual / factor[:, at]
-            each[:, t] = _log_density(noise, cells, sizes, e, at) - log_scale
+            e, log_scale = residual / factor[:, at], np.log(factor[:, at]).sum(1)
+            log_p = noise.part(at).log_density(cells, sizes[:, at], e)
+            each[:, t] = log_p - log_scale
         each[:, t] += flags[t]
+    kept = ~drops
     return Prediction(
-        mean[:, ~drops],
-        sd[:, ~drops],
-        (mean + errors)[:, ~drops],
+        mean[:, kept],
+        sd[:, kept],
+        (mean + errors)[:, kept],
         each,
-        m.trial[~drops],
-        m.position[~drops],
+        m.part(kept),
         rng.uniform(size=probability.shape) < probability,
         probability,
-        None if at_best is None else at_best[~drops],
+        None if at_best is None else at_best[kept],
     )
-
-
-def correlated_errors(
-    noise: NoiseGrid, cells: Array, sizes: Array, rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """Return errors along each trial, and their deviations, shape (n, N).
-
-    Args:
-        noise: Noise of the numbers.
-        cells: Cell of each draw, shape (n,).
-        sizes: Factors on the cell's deviations, shape (n, N).
-        rng: Source of the errors.
-    """
-    shape = sizes.shape
-    e = rng.normal(size=shape)
-    for i, cell in enumerate(cells):
-        df = noise.cells[cell].df
-        if np.isfinite(df):
-            e[i] = rng.standard_t(df, size=shape[1]) * np.sqrt((df - 2) / df)
-    rho = np.stack([noise.cells[c].rho for c in cells])
-    u = e
-    if rho.any():
-        u = np.empty_like(e)
-        u[:, 0] = e[:, 0]
-        for k in range(1, shape[1]):
-            step = np.sqrt(1 - rho[:, k] ** 2) * e[:, k]
-            u[:, k] = rho[:, k] * u[:, k - 1] + step
-    sd = np.stack([noise.cells[c].sd for c in cells]) * sizes
-    return u * sd, sd
-
-
-def _log_density(
-    noise: NoiseGrid, cells: Array, sizes: Array, residual: Array, at: Array
-) -> Array:
-    """Return log densities of one trial's residuals, each in its cell, shape (n,)."""
-    log_p, own_sizes = np.empty(len(residual)), sizes[:, at]
-    for cell in np.unique(cells):
-        whole, own = noise.cells[cell], cells == cell
-        part = NoiseGrid([NoiseCell(0.0, whole.sd[at], whole.rho[at], whole.df)])
-        log_p[own] = part.log_likelihood(residual[own] / own_sizes[own])
-    return log_p - np.log(own_sizes).sum(1)
 
 
 def find_residuals(

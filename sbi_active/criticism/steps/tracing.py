@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from math import comb
+from typing import TypeVar
 
 import numpy as np
 
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.results import NONE
 from sbi_active.inference.sampling.weights import log_sum_exp
+
+Name = TypeVar("Name")
 
 #: All sets of one effect more are together this much less probable, nats.
 COST = float(np.log(3.0))
@@ -44,7 +47,7 @@ def log_prior(names: tuple[str, ...], prior: Mapping[str, float]) -> float:
     return float(log_mean + np.log(k / comb(num - 1, k - 1)) - COST * (k - 1))
 
 
-def credible_set(probabilities: dict[str, float]) -> tuple[str, ...]:
+def credible_set(probabilities: Mapping[Name, float]) -> tuple[Name, ...]:
     """Return the smallest set of names with 90 % of the probability, best first."""
     names, total = [], 0.0
     for name, p in probabilities.items():  # most probable first

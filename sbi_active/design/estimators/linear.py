@@ -14,8 +14,6 @@ from sbi_active.design.estimators.base import (
     InformationGainEstimator,
     numbers_of,
 )
-from sbi_active.simulation import NoiseModel
-from sbi_active.simulation.noise.whitening import whitened
 
 NUM_GROUPS = 24  # of simulations, each left out in turn
 
@@ -99,7 +97,7 @@ class LinearGain(InformationGainEstimator):
             return []
         bent, theta = [], simulations.theta.double()
         for row in mean:
-            y = _rows(noise, row)
+            y = noise.whiten(row).flatten(1)
             complete = y.isfinite().all(1)
             off = _off_plane(theta[complete])
             rest = off @ y[complete]
@@ -126,21 +124,12 @@ class LinearGain(InformationGainEstimator):
         theta = (theta if self.target is None else self.target(theta)).double()
         gain = torch.full(mean.shape[:2], torch.nan, dtype=torch.float64)
         for a, row in enumerate(mean):
-            y = _rows(noise, row)
+            y = noise.whiten(row).flatten(1)
             complete = y.isfinite().all(1)
             # What is lost counts as knowing nothing.
             gain[a] = 0.0
             gain[a, complete] = _jackknife(theta[complete], y[complete])
         return gain
-
-
-def _rows(noise: NoiseModel, mean: Tensor) -> Tensor:
-    """Return outcomes in deviations of their noise, shape (n, N)."""
-    each = getattr(noise, "each", None)
-    if each is None:
-        return whitened(noise, mean).flatten(1)
-    joint = whitened(each, mean.flatten(0, 1))  # of several actions
-    return joint.reshape(len(mean), -1)
 
 
 def _fewest(dim: int, *, spare: int = 3) -> int:

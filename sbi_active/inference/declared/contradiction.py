@@ -34,7 +34,6 @@ from torch import Tensor
 from sbi_active.arrays import Array
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.engine.potential import SimulatedLikelihood
-from sbi_active.simulation.noise.whitening import whitened
 
 
 @dataclass(frozen=True)
@@ -96,7 +95,7 @@ def find_contradiction(
     if jacobian is not None:
         informed = int((np.abs(jacobian).max(0) > informed_above).sum())
     found = compared(
-        *(likelihood.action, likelihood.x, lambda gap: whitened(likelihood.noise, gap)),
+        *(likelihood.action, likelihood.x, likelihood.noise.whiten),
         squares,
         num_fitted=informed,
     )

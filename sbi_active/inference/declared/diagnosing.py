@@ -20,7 +20,6 @@ from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
 from sbi_active.inference.engine import Fit, Settings, SimulatedPotential
 from sbi_active.inference.engine.potential import SimulatedLikelihood
 from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation.noise.whitening import is_known_gaussian
 
 #: Whether something that is taken for granted holds, and its figure.
 Doubt = tuple[bool, float]
@@ -189,7 +188,7 @@ def _noise_terms(
     Those of Gaussian noise are its peak less half a chi-square.
     """
     noise, x = likelihood.noise, likelihood.x[trial]
-    if is_known_gaussian(noise):
+    if noise.is_known_gaussian:
         freedom = torch.tensor(0.5 * float(x.isfinite().sum()))
         half = torch.distributions.Gamma(freedom.double(), 1.0)
         drawn = half.sample(torch.Size([len(theta) * num_repeats]))

@@ -24,7 +24,6 @@ from sbi_active.inference.sampling.coordinates import NormalCoordinates
 from sbi_active.inference.sampling.least_squares import LeastSquares, Whitener
 from sbi_active.inference.sampling.row_cache import RowCache
 from sbi_active.simulation import SimulatorModel
-from sbi_active.simulation.noise.whitening import whitened
 from sbi_active.simulation.outcomes import Outcome
 from sbi_active.simulation.workers.settings import Workers
 
@@ -361,7 +360,7 @@ class SimulatedPotential:
             y, _ = own.table.mean(theta, action)
             if y.shape[1:] != x.shape:  # all rows are lost or without a number
                 y = np.full((len(u), *x.shape), np.nan)
-            part = whitened(own.noise, (x - torch.from_numpy(y)) / own.inflation)
+            part = own.noise.whiten((x - torch.from_numpy(y)) / own.inflation)
             part = part.flatten(1).numpy()
             seen = x.isfinite().flatten().numpy()
             parts.append(np.where(seen, part, 0.0))

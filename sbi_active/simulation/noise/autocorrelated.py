@@ -8,18 +8,11 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
-from typing_extensions import Self
+from typing_extensions import Self, override
 
 from sbi_active.arrays import own_tensor
-from sbi_active.simulation.noise.base import ScaleNoise, standard_normals
-from sbi_active.simulation.noise.gaussian import LOG_2PI
-from sbi_active.simulation.noise.posterior import (
-    Cells,
-    NoisePosterior,
-    SdGrid,
-    log_grid_evidence,
-    log_student_evidence,
-)
+from sbi_active.simulation.noise.base import LOG_2PI, ScaleNoise, standard_normals
+from sbi_active.simulation.noise.posterior import Cells, NoisePosterior, SdGrid
 
 
 class AutocorrelatedNoise(ScaleNoise):
@@ -152,16 +145,9 @@ class AutocorrelatedNoise(ScaleNoise):
             )
         super()._check_shape(shape)
 
-    def _draw(
-        self,
-        seeds: Tensor | None,
-        shape: torch.Size,
-        parameters: Tensor,
-        times: Tensor | None,
-    ) -> Tensor:
-        normal = standard_normals(seeds, shape).reshape(len(parameters), shape[1], -1)
-        step = time_stamps(times, shape).diff()
-        ratio = step / parameters[:, -1:]
+    def _draw(self, seeds: Tensor | None, shape: torch.Size, rows: Tensor) -> Tensor:
+        normal = standard_normals(seeds, shape).reshape(len(rows), shape[1], -1)
+        ratio = time_stamps(self.times, shape).diff() / rows[:, -1:]
         rho, spread = torch.exp(-ratio), (-torch.expm1(-2 * ratio)).sqrt()
         path = [normal[:, 0]]
         for t in range(shape[1] - 1):
@@ -169,47 +155,30 @@ class AutocorrelatedNoise(ScaleNoise):
                 rho[:, t, None] * path[-1] + spread[:, t, None] * normal[:, t + 1]
             )
         noise = torch.stack(path, 1).reshape(shape)
-        return self._spread(parameters[:, :-1], shape) * noise
+        return self._spread(rows[:, :-1], shape) * noise
 
-    def _log_density(
-        self, residual: Tensor, parameters: Tensor, times: Tensor | None
-    ) -> Tensor:
-        tau, sd = parameters[:, -1], parameters[:, :-1]
-        square, log_factor, count = self._summed(residual, tau, times)
+    def _log_density(self, residual: Tensor, rows: Tensor) -> Tensor:
+        tau, sd = rows[:, -1], rows[:, :-1]
+        square, log_factor, count = self._summed(residual, tau)
         density = -0.5 * square / sd**2 - count * (sd.log() + 0.5 * LOG_2PI)
         return (density - 0.5 * log_factor).sum(1)
 
-    def _marginal(self, residual: Tensor, times: Tensor | None) -> Tensor:
-        posterior = self.posterior
-        if not isinstance(posterior, NoisePosterior):
-            return super()._marginal(residual, times)
-        one = isinstance(posterior.sd, SdGrid) and posterior.sd.num_channels == 1
-        if one:
-            return super()._marginal(residual, times)
-        assert posterior.shared is not None
-        edges, log_weight = posterior.shared.edges, posterior.shared.log_weight
-        terms = []
-        for cell, weight in enumerate(log_weight.tolist()):
-            tau = (edges[cell] * edges[cell + 1]).sqrt().expand(len(residual))
-            square, log_factor, count = self._summed(residual, tau, times)
-            if isinstance(posterior.sd, SdGrid):
-                evidence = log_grid_evidence(square, count, posterior.sd, cell=cell)
-            else:
-                evidence = log_student_evidence(square, count, posterior.sd, cell=cell)
-            terms.append((evidence - 0.5 * log_factor).sum(1) + weight)
-        return torch.stack(terms).logsumexp(0)
+    def _log_evidence(self, residual: Tensor, p: NoisePosterior, cell: int) -> Tensor:
+        tau = torch.full_like(residual[:, 0].flatten(1)[:, 0], p.cells[cell][0])
+        square, log_factor, count = self._summed(residual, tau)
+        return p.sd.log_evidence(square, count, cell) - 0.5 * log_factor
 
-    def _summed(
-        self, residual: Tensor, tau: Tensor, times: Tensor | None
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the innovations' sums, each of shape (n, channels)."""
-        square, log_factor = innovations(residual, tau, times)
-        count = (~residual.isnan()).double()
-        square, log_factor, count = (
-            self._by_channel(part.reshape(residual.shape))
-            for part in (square, log_factor, count)
-        )
-        return square, log_factor, count
+    def _summed(self, residual: Tensor, tau: Tensor) -> Sequence[Tensor]:
+        """Return squares of innovations, log factors and counts, (n, channels)."""
+        parts = innovations(residual, tau, self.times)
+        return [*map(self._by_channel, (*parts, (~residual.isnan()).double()))]
+
+    @override
+    def whiten(self, value: Tensor) -> Tensor:
+        v = value.double()
+        tau = self.parameters[-1].double().expand(len(v))
+        change, variance = chained(v, tau, self.times)
+        return super().whiten((change / variance.sqrt()).reshape(v.shape))
 
 
 def innovations(

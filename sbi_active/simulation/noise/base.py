@@ -10,11 +10,13 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
-from typing_extensions import override
+from typing_extensions import Self, override
 
 from sbi_active.arrays import own_tensor
 from sbi_active.seeding import forked_generators, row_normals, row_uniforms
 from sbi_active.simulation.noise.posterior import NoisePosterior
+
+LOG_2PI = math.log(2 * math.pi)
 
 
 class NoiseModel(ABC):
@@ -40,14 +42,19 @@ class NoiseModel(ABC):
             declared exactly.
         times: Time stamps of the first axis of x in seconds, shape (T,); None if
             they were not given.
+        measurement_sd: Known standard deviation of the measurement alone, where the
+            noise also stands for what a simulator gets wrong; None if it does not.
+        is_known_gaussian: Whether it is Gaussian and nothing of it is unknown.
     """
 
     parameter_names: tuple[str, ...] = ()
     parameters: Tensor = torch.empty(0, dtype=torch.float64)
     posterior: Distribution | None = None
     times: Tensor | None = None
+    measurement_sd: float | Tensor | None = None
+    is_known_gaussian: bool = False
 
-    def at(self, times: Tensor | None) -> NoiseModel:
+    def at(self, times: Tensor | None) -> Self:
         """Return the same noise at time stamps (T,), in seconds."""
         noise = copy.copy(self)
         noise.times = (
@@ -101,12 +108,40 @@ class NoiseModel(ABC):
             Shape (n,), float64, nats.
         """
 
+    def whiten(self, value: Tensor) -> Tensor:
+        r"""Return :math:`C^{-1/2} v` for the covariance C, shape (n, \*x_shape).
+
+        Unknown parameters are at the values that the noise declares for them, and heavy
+        tails count by their standard deviation.
+
+        Args:
+            value: v, in the units of x, shape (n, \*x_shape); NaN where not observed.
+
+        Returns:
+            Float64; NaN where not observed.
+        """
+        sds = self.declared_sds()
+        return value.double() / (sds if len(sds) > 1 else sds[0])
+
+    def declared_sds(self, *, num: int = 4_096) -> Tensor:
+        """Return the standard deviations, shape (1,) or (channels,).
+
+        A noise model that has no such parameter is sampled around zero.
+        """
+        named = zip(self.parameter_names, self.parameters, strict=True)
+        if sds := [value for name, value in named if name.startswith("sd")]:
+            return torch.stack(sds).double()
+        with forked_generators(0, "sd"):
+            draws = self.sample(torch.zeros(num, 1, dtype=torch.float64))
+        return draws.std().reshape(1).double()
+
 
 class ScaleNoise(NoiseModel):
     r"""Noise with a standard deviation and further parameters common to all channels.
 
-    This class has the checks and shapes; a kind of noise implements ``_draw`` and
-    ``_log_density`` given parameters, and ``_marginal`` where it has a closed form.
+    This class has the checks and shapes, and sums over a posterior; its noise is
+    independent and Gaussian. Another kind implements ``_draw`` and ``_log_density``
+    given parameters, and ``_log_evidence`` given a cell of what channels share.
 
     Args:
         sd: Standard deviation, in the units of x; a number, or one a channel (the last
@@ -150,6 +185,11 @@ class ScaleNoise(NoiseModel):
         known = "" if self.posterior is None else ", with a posterior"
         return f"{type(self).__name__}({text}{known})"
 
+    @property
+    def is_known_gaussian(self) -> bool:  # pyright: ignore
+        """Whether it is Gaussian and nothing of it is unknown."""
+        return self.posterior is None
+
     @override
     def sample(
         self,
@@ -159,12 +199,11 @@ class ScaleNoise(NoiseModel):
         times: Tensor | None = None,
         parameters: Tensor | None = None,
     ) -> Tensor:
-        shape = mean.shape
+        shape, own = mean.shape, self if times is None else self.at(times)
         self._check_shape(shape)
         if parameters is None and self.posterior is not None:
             parameters = self._draw_parameters(seeds, shape)
-        rows = self._rows(parameters, len(mean))
-        noise = self._draw(seeds, shape, rows, self.times if times is None else times)
+        noise = own._draw(seeds, shape, self._rows(parameters, len(mean)))
         return mean + noise.to(mean)
 
     @override
@@ -181,9 +220,9 @@ class ScaleNoise(NoiseModel):
         observed = ~x.isnan()
         impossible = observed & ~(x.isfinite() & mean.isfinite())
         residual = torch.where(observed & ~impossible, x - mean, torch.nan)
-        times = self.times if times is None else times
+        own = self if times is None else self.at(times)
         if parameters is None and self.posterior is not None:
-            density = self._marginal(residual, times)
+            density = own._marginal(residual)
         else:
             rows = self._rows(parameters, len(x))
             if not bool((rows[:, : self._num_sd] > 0).all()):
@@ -191,33 +230,41 @@ class ScaleNoise(NoiseModel):
                     "expected a standard deviation > 0 for a density; got 0, at which "
                     "there is none; give the noise of every channel"
                 )
-            density = self._log_density(residual, rows.to(x.device), times)
+            density = own._log_density(residual, rows.to(x.device))
         return density.masked_fill(impossible.flatten(1).any(1), -torch.inf)
 
-    @abstractmethod
-    def _draw(
-        self,
-        seeds: Tensor | None,
-        shape: torch.Size,
-        parameters: Tensor,
-        times: Tensor | None,
-    ) -> Tensor:
-        """Return noise of a shape (n, *x_shape), float64; parameters (n, p)."""
+    def _draw(self, seeds: Tensor | None, shape: torch.Size, rows: Tensor) -> Tensor:
+        """Return noise of a shape (n, *x_shape), float64, by parameters (n, p)."""
+        return self._spread(rows, shape) * standard_normals(seeds, shape)
 
-    @abstractmethod
-    def _log_density(
-        self, residual: Tensor, parameters: Tensor, times: Tensor | None
-    ) -> Tensor:
+    def _log_density(self, residual: Tensor, rows: Tensor) -> Tensor:
         """Return log densities (n,) of residuals, NaN where not observed."""
+        sd = self._spread(rows, residual.shape)
+        density = -0.5 * (residual / sd) ** 2 - torch.log(sd) - 0.5 * LOG_2PI
+        return observed_terms(density, residual).flatten(1).sum(1)
 
-    def _marginal(self, residual: Tensor, times: Tensor | None) -> Tensor:
-        """Return log densities (n,) averaged over the posterior's fixed draws."""
+    def _marginal(self, residual: Tensor) -> Tensor:
+        """Return log densities (n,) averaged over the posterior.
+
+        It is exact for a posterior of this library, and else by fixed draws.
+        """
+        posterior = self.posterior
+        if isinstance(posterior, NoisePosterior):
+            terms = [
+                self._log_evidence(residual, posterior, k).sum(1) + log_p
+                for k, (_, log_p) in enumerate(posterior.cells)
+            ]
+            return torch.stack(terms).logsumexp(0)
         draws = self._fixed_draws().to(residual.device)
-        terms = [
-            self._log_density(residual, draw.expand(len(residual), -1), times)
-            for draw in draws
-        ]
+        each = draws[:, None].expand(-1, len(residual), -1)
+        terms = [self._log_density(residual, rows) for rows in each]
         return torch.stack(terms).logsumexp(0) - math.log(len(draws))
+
+    def _log_evidence(self, residual: Tensor, p: NoisePosterior, cell: int) -> Tensor:
+        """Return log densities by channel with its size summed out, (n, num_sd)."""
+        square = self._by_channel(observed_terms(residual.square(), residual))
+        count = self._by_channel((~residual.isnan()).double())
+        return p.sd.log_evidence(square, count, cell)
 
     def _check(self, parameters: Tensor) -> None:
         """Raise if parameters (..., p) are outside their range."""
@@ -278,23 +325,6 @@ class ScaleNoise(NoiseModel):
     def _by_channel(self, terms: Tensor) -> Tensor:
         """Return sums over all but the channels, (n, *x_shape) -> (n, num_sd)."""
         return terms.reshape(len(terms), -1, self._num_sd).sum(1)
-
-
-def declared_sds(noise: NoiseModel, *, num: int = 4_096) -> Tensor:
-    """Return the standard deviations of a noise model, shape (1,) or (channels,).
-
-    A noise model that has no such parameter is sampled around zero.
-    """
-    sds = [
-        v
-        for name, v in zip(noise.parameter_names, noise.parameters, strict=True)
-        if name.startswith("sd")
-    ]
-    if sds:
-        return torch.stack(sds).double()
-    with forked_generators(0, "sd"):
-        draws = noise.sample(torch.zeros(num, 1, dtype=torch.float64))
-    return draws.std().reshape(1).double()
 
 
 def observed_terms(terms: Tensor, residual: Tensor) -> Tensor:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Callable, Sequence
+from typing import Literal, TypeVar
 
 import numpy as np
 import torch
@@ -28,6 +28,7 @@ from sbi_active.simulation.noise.posterior import (
 )
 from sbi_active.simulation.noise.student import StudentTNoise, log_student
 
+Kind = TypeVar("Kind", bound=NoiseModel)
 NoiseKind = Literal["gaussian", "autocorrelated", "student"]
 
 #: A choice: from a variance that hardly exists to nearly Gaussian, each cell a factor
@@ -140,10 +141,8 @@ def _groups(repeats: Array | Sequence[Array]) -> list[Tensor]:
 
 def _gaussian(groups: list[Tensor], num_sd: int) -> GaussianNoise:
     square, freedom = _sums_of_squares(groups, num_sd)
-    conditional = InverseChiSquare(freedom, (square / freedom)[None])
-    sd = conditional.variance[0].sqrt()
-    posterior = NoisePosterior(conditional)
-    return GaussianNoise(_scalar_if_one(sd), posterior=posterior)
+    sd = InverseChiSquare(freedom, (square / freedom)[None])
+    return _noise(GaussianNoise, sd)
 
 
 def _sums_of_squares(groups: list[Tensor], num_sd: int) -> tuple[Tensor, Tensor]:
@@ -219,13 +218,8 @@ def _autocorrelated(
             -0.5 * log_factor.sum() - 0.5 * (freedom * square.log()).sum()
         )
     shared, kept = _heavy(edges, torch.stack(log_weight))
-    conditional = InverseChiSquare(freedom, torch.stack(squares)[kept] / freedom)
-    cell, tau = shared.quantile(torch.tensor(0.5, dtype=torch.float64))
-    return AutocorrelatedNoise(
-        _scalar_if_one(conditional.variance[cell].sqrt()),
-        tau,
-        posterior=NoisePosterior(conditional, shared=shared),
-    )
+    sd = InverseChiSquare(freedom, torch.stack(squares)[kept] / freedom)
+    return _noise(AutocorrelatedNoise, sd, shared)
 
 
 def _heavy(
@@ -265,12 +259,8 @@ def _student(
     # The prior of sd is uniform over cells, each as wide in its logarithm.
     log_prior = df_nodes.log() - 0.1 * df_nodes + torch.log(DF_EDGES.diff())
     shared, kept = _heavy(DF_EDGES, log_prior + log_p.logsumexp(2).sum(1))
-    grid = SdGrid(edges, log_p[kept].log_softmax(2))
-    cell, df = shared.quantile(torch.tensor(0.5, dtype=torch.float64))
-    middle = torch.full((1, num_sd), 0.5, dtype=torch.float64)
-    sd = grid.quantile(cell.reshape(1), middle)[0]
-    posterior = NoisePosterior(grid, shared=shared)
-    return StudentTNoise(_scalar_if_one(sd), df, posterior=posterior)
+    sd = SdGrid(edges, log_p[kept].log_softmax(2))
+    return _noise(StudentTNoise, sd, shared)
 
 
 def _log_evidence(
@@ -302,5 +292,15 @@ def _log_evidence(
     return total
 
 
-def _scalar_if_one(sd: Tensor) -> Tensor:
-    return sd[0] if len(sd) == 1 else sd
+def _noise(
+    kind: Callable[..., Kind],
+    sd: InverseChiSquare | SdGrid,
+    shared: Cells | None = None,
+) -> Kind:
+    """Return noise with a posterior, at s and the median of what channels share."""
+    cell, values = torch.tensor(0), list[Tensor]()
+    if shared is not None:
+        cell, *values = shared.quantile(torch.tensor(0.5, dtype=torch.float64))
+    middle = sd.middle(cell)
+    middle = middle[0] if len(middle) == 1 else middle
+    return kind(middle, *values, posterior=NoisePosterior(sd, shared=shared))

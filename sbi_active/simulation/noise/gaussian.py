@@ -2,24 +2,10 @@
 
 from __future__ import annotations
 
-import math
-
-import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.simulation.noise.base import (
-    ScaleNoise,
-    observed_terms,
-    standard_normals,
-)
-from sbi_active.simulation.noise.posterior import (
-    InverseChiSquare,
-    NoisePosterior,
-    log_student_evidence,
-)
-
-LOG_2PI = math.log(2 * math.pi)
+from sbi_active.simulation.noise.base import ScaleNoise
 
 
 class GaussianNoise(ScaleNoise):
@@ -39,6 +25,7 @@ class GaussianNoise(ScaleNoise):
 
     Example:
         >>> noise = GaussianNoise(2.0)
+        >>> import torch
         >>> noise.log_prob(torch.zeros(1, 1), torch.zeros(1, 1)).item()
         -1.612...
     """
@@ -47,28 +34,3 @@ class GaussianNoise(ScaleNoise):
         self, sd: float | Tensor, *, posterior: Distribution | None = None
     ) -> None:
         super().__init__(sd, posterior=posterior)
-
-    def _draw(
-        self,
-        seeds: Tensor | None,
-        shape: torch.Size,
-        parameters: Tensor,
-        times: Tensor | None,
-    ) -> Tensor:
-        return self._spread(parameters, shape) * standard_normals(seeds, shape)
-
-    def _log_density(
-        self, residual: Tensor, parameters: Tensor, times: Tensor | None
-    ) -> Tensor:
-        sd = self._spread(parameters, residual.shape)
-        density = -0.5 * (residual / sd) ** 2 - torch.log(sd) - 0.5 * LOG_2PI
-        return observed_terms(density, residual).flatten(1).sum(1)
-
-    def _marginal(self, residual: Tensor, times: Tensor | None) -> Tensor:
-        posterior = self.posterior
-        if not isinstance(posterior, NoisePosterior):
-            return super()._marginal(residual, times)
-        assert isinstance(posterior.sd, InverseChiSquare)
-        square = self._by_channel(observed_terms(residual.square(), residual))
-        count = self._by_channel((~residual.isnan()).double())
-        return log_student_evidence(square, count, posterior.sd, cell=0).sum(1)

@@ -37,6 +37,10 @@ class InverseChiSquare:
         """Number of standard deviations."""
         return len(self.freedom)
 
+    def middle(self, cell: Tensor) -> Tensor:
+        """Return s at one cell, shape (channels,)."""
+        return self.variance[cell].sqrt()
+
     def quantile(self, cell: Tensor, uniform: Tensor) -> Tensor:
         """Return sd at cells (n,) and levels (n, channels)."""
         chi_square = chdtri(self.freedom.numpy(), uniform.numpy())
@@ -51,6 +55,32 @@ class InverseChiSquare:
         log_p = half * torch.log(0.5 * chi_square) - 0.5 * chi_square
         return (log_p - torch.lgamma(half) + math.log(2.0) - torch.log(sd)).sum(-1)
 
+    def log_evidence(self, square: Tensor, count: Tensor, cell: int) -> Tensor:
+        r"""Return the log density of Gaussian numbers with their size integrated out.
+
+        .. math::
+            \int \prod_{j=1}^{m} N(e_j; 0, \sigma^2) \, p(\sigma) \, d\sigma =
+            \frac{\Gamma(\frac{\nu + m}{2})}{\Gamma(\frac{\nu}{2})
+            (\pi \nu s^2)^{m / 2}}
+            \left( 1 + \frac{\sum_j e_j^2}{\nu s^2} \right)^{-\frac{\nu + m}{2}}
+
+        Args:
+            square: Sum of squares, shape (n, channels).
+            count: Number m of the squares, shape (n, channels).
+            cell: Cell of the shared parameter.
+
+        Returns:
+            Shape (n, channels), nats.
+        """
+        freedom = self.freedom.to(square)
+        total = freedom * self.variance[cell].to(square)
+        return (
+            torch.lgamma(0.5 * (freedom + count))
+            - torch.lgamma(0.5 * freedom)
+            - 0.5 * count * torch.log(math.pi * total)
+            - 0.5 * (freedom + count) * torch.log1p(square / total)
+        )
+
 
 @dataclass(frozen=True)
 class Cells:
@@ -64,9 +94,15 @@ class Cells:
     edges: Tensor
     log_weight: Tensor
 
+    @property
+    def nodes(self) -> Tensor:
+        """Geometric middle of the cells, shape (..., cells)."""
+        return (self.edges[..., 1:] * self.edges[..., :-1]).sqrt()
+
     def quantile(self, uniform: Tensor) -> tuple[Tensor, Tensor]:
         """Return the cell and the value at levels of the leading shape."""
-        mass = self.log_weight.exp()
+        own = self._at(uniform.shape)
+        mass = own.log_weight.exp()
         above = mass.cumsum(-1)
         above = above / above[..., -1:]
         last = mass.shape[-1] - 1
@@ -74,20 +110,24 @@ class Cells:
         cell = torch.searchsorted(above, level).clamp_max(last)
         top, share = above.gather(-1, cell), mass.gather(-1, cell)
         within = 1 - ((top - level) / share).clamp(0, 1)
-        low, high = self.edges.gather(-1, cell), self.edges.gather(-1, cell + 1)
+        low, high = own.edges.gather(-1, cell), own.edges.gather(-1, cell + 1)
         return cell[..., 0], (low * (high / low) ** within)[..., 0]
 
     def log_prob(self, value: Tensor) -> tuple[Tensor, Tensor]:
         """Return the cell and the log density of values of the leading shape."""
-        last = self.log_weight.shape[-1] - 1
-        cell = (
-            torch.searchsorted(self.edges, value[..., None].contiguous()) - 1
-        ).clamp(0, last)
-        width = torch.log(self.edges[..., 1:] / self.edges[..., :-1]).gather(-1, cell)
-        log_p = self.log_weight.gather(-1, cell) - width.log()
-        inside = (value >= self.edges[..., 0]) & (value <= self.edges[..., -1])
+        own, last = self._at(value.shape), self.log_weight.shape[-1] - 1
+        cell = torch.searchsorted(own.edges, value[..., None].contiguous()) - 1
+        cell = cell.clamp(0, last)
+        width = torch.log(own.edges[..., 1:] / own.edges[..., :-1]).gather(-1, cell)
+        log_p = own.log_weight.gather(-1, cell) - width.log()
+        inside = (value >= own.edges[..., 0]) & (value <= own.edges[..., -1])
         log_p = torch.where(inside, log_p[..., 0] - value.log(), -torch.inf)
         return cell[..., 0], log_p
+
+    def _at(self, shape: torch.Size) -> Cells:
+        """Return the same cells for each of some values."""
+        parts = (self.edges, self.log_weight)
+        return Cells(*(part.expand(*shape, -1).contiguous() for part in parts))
 
 
 @dataclass(frozen=True)
@@ -110,19 +150,32 @@ class SdGrid:
     @property
     def nodes(self) -> Tensor:
         """Geometric middle of the cells, shape (channels, s)."""
-        return (self.edges[:, 1:] * self.edges[:, :-1]).sqrt()
+        return Cells(self.edges, self.log_weight).nodes
+
+    def middle(self, cell: Tensor) -> Tensor:
+        """Return the median at one cell, shape (channels,)."""
+        level = torch.full((1, self.num_channels), 0.5, dtype=torch.float64)
+        return self.quantile(cell.reshape(1), level)[0]
 
     def quantile(self, cell: Tensor, uniform: Tensor) -> Tensor:
         """Return sd at cells (n,) and levels (n, channels)."""
-        return self._cells(cell).quantile(uniform)[1]
+        return Cells(self.edges, self.log_weight[cell]).quantile(uniform)[1]
 
     def log_prob(self, cell: Tensor, sd: Tensor) -> Tensor:
         """Return log densities (n,) of sd (n, channels) at cells (n,)."""
-        return self._cells(cell).log_prob(sd.contiguous())[1].sum(-1)
+        return Cells(self.edges, self.log_weight[cell]).log_prob(sd)[1].sum(-1)
 
-    def _cells(self, cell: Tensor) -> Cells:
-        edges = self.edges.expand(len(cell), *self.edges.shape).contiguous()
-        return Cells(edges, self.log_weight[cell])
+    def log_evidence(self, square: Tensor, count: Tensor, cell: int) -> Tensor:
+        r"""Return the log density of Gaussian numbers with their size summed out.
+
+        .. math::
+            \sum_k P(\sigma_k) \prod_{j=1}^{m} N(e_j; 0, \sigma_k^2)
+
+        Arguments are those of :meth:`.InverseChiSquare.log_evidence`.
+        """
+        nodes, weight = self.nodes.to(square), self.log_weight[cell].to(square)
+        density = -0.5 * square[..., None] / nodes**2 - count[..., None] * nodes.log()
+        return (density + weight).logsumexp(-1) - 0.5 * count * math.log(2 * math.pi)
 
 
 class NoisePosterior(Distribution):
@@ -148,6 +201,14 @@ class NoisePosterior(Distribution):
         super().__init__(torch.Size(), torch.Size([num]), validate_args=False)
 
     @property
+    def cells(self) -> list[tuple[float, float]]:
+        """Middle and log weight of each cell of the shared parameter; one without."""
+        if self.shared is None:
+            return [(math.nan, 0.0)]
+        own = self.shared.nodes.tolist(), self.shared.log_weight.tolist()
+        return [*zip(*own, strict=True)]
+
+    @property
     def support(self) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Positive numbers."""
         return constraints.independent(constraints.positive, 1)
@@ -166,7 +227,7 @@ class NoisePosterior(Distribution):
         cell = torch.zeros(len(uniform), dtype=torch.long)
         if self.shared is None:
             return self.sd.quantile(cell, uniform)
-        cell, value = self._shared(len(uniform)).quantile(uniform[:, c])
+        cell, value = self.shared.quantile(uniform[:, c])
         sd = self.sd.quantile(cell, uniform[:, :c])
         return torch.cat([sd, value[:, None]], 1)
 
@@ -177,63 +238,5 @@ class NoisePosterior(Distribution):
         cell = torch.zeros(len(value), dtype=torch.long)
         if self.shared is None:
             return self.sd.log_prob(cell, value).reshape(shape)
-        cell, log_p = self._shared(len(value)).log_prob(value[:, c])
+        cell, log_p = self.shared.log_prob(value[:, c])
         return (log_p + self.sd.log_prob(cell, value[:, :c])).reshape(shape)
-
-    def _shared(self, num: int) -> Cells:
-        assert self.shared is not None
-        edges, weight = self.shared.edges, self.shared.log_weight
-        return Cells(
-            edges.expand(num, -1).contiguous(), weight.expand(num, -1).contiguous()
-        )
-
-
-def log_grid_evidence(
-    square: Tensor, count: Tensor, sd: SdGrid, *, cell: int
-) -> Tensor:
-    r"""Sum a Gaussian's standard deviation out over its grid, channel by channel.
-
-    .. math::
-        \log \sum_k P(\sigma_k) \prod_{j=1}^{m} N(e_j; 0, \sigma_k^2)
-
-    Args:
-        square: Sum of squares, shape (n, channels).
-        count: Number m of the squares, shape (n, channels).
-        sd: The grid.
-        cell: Cell of the shared parameter.
-
-    Returns:
-        Shape (n, channels), nats.
-    """
-    nodes, weight = sd.nodes.to(square), sd.log_weight[cell].to(square)
-    density = -0.5 * square[..., None] / nodes**2 - count[..., None] * nodes.log()
-    return (density + weight).logsumexp(-1) - 0.5 * count * math.log(2 * math.pi)
-
-
-def log_student_evidence(
-    square: Tensor, count: Tensor, sd: InverseChiSquare, *, cell: int
-) -> Tensor:
-    r"""Integrate a Gaussian's standard deviation out.
-
-    .. math::
-        \int \prod_{j=1}^{m} N(e_j; 0, \sigma^2) \, p(\sigma) \, d\sigma =
-        \frac{\Gamma(\frac{\nu + m}{2})}{\Gamma(\frac{\nu}{2}) (\pi \nu s^2)^{m / 2}}
-        \left( 1 + \frac{\sum_j e_j^2}{\nu s^2} \right)^{-\frac{\nu + m}{2}}
-
-    Args:
-        square: Sum of squares, shape (n, channels).
-        count: Number m of the squares, shape (n, channels).
-        sd: Posterior of the standard deviations.
-        cell: Cell of the shared parameter.
-
-    Returns:
-        Shape (n, channels), nats.
-    """
-    freedom = sd.freedom.to(square)
-    total = freedom * sd.variance[cell].to(square)
-    return (
-        torch.lgamma(0.5 * (freedom + count))
-        - torch.lgamma(0.5 * freedom)
-        - 0.5 * count * torch.log(math.pi * total)
-        - 0.5 * (freedom + count) * torch.log1p(square / total)
-    )

@@ -51,6 +51,8 @@ class StudentTNoise(ScaleNoise):
     ) -> None:
         super().__init__(sd, shared={"df": df}, posterior=posterior)
 
+    is_known_gaussian = False  # type: ignore[assignment]
+
     def _check(self, parameters: Tensor) -> None:
         super()._check(parameters)
         df = parameters[..., -1]
@@ -60,57 +62,35 @@ class StudentTNoise(ScaleNoise):
                 f"{df.tolist()}; use for example 4"
             )
 
-    def _draw(
-        self,
-        seeds: Tensor | None,
-        shape: torch.Size,
-        parameters: Tensor,
-        times: Tensor | None,
-    ) -> Tensor:
+    def _draw(self, seeds: Tensor | None, shape: torch.Size, rows: Tensor) -> Tensor:
         num = math.prod(shape[1:])
         if seeds is None:
-            uniform = torch.rand(len(parameters), 2 * num, dtype=torch.float64)
+            uniform = torch.rand(len(rows), 2 * num, dtype=torch.float64)
             uniform = uniform.clamp_min(1e-16)
         else:
             uniform = row_uniforms(seeds, 2 * num)
-        df = parameters[:, -1:]
+        df = rows[:, -1:]
         radius = (df * torch.expm1(-2 / df * uniform[:, :num].log())).sqrt()
         student = radius * torch.cos(2 * math.pi * uniform[:, num:])
-        scale = self._spread(_scale(parameters[:, :-1], df), shape)
+        scale = self._spread(_scale(rows[:, :-1], df), shape)
         return scale * student.reshape(shape)
 
-    def _log_density(
-        self, residual: Tensor, parameters: Tensor, times: Tensor | None
-    ) -> Tensor:
-        df = parameters[:, -1:]
-        scale = self._spread(_scale(parameters[:, :-1], df), residual.shape)
+    def _log_density(self, residual: Tensor, rows: Tensor) -> Tensor:
+        df = rows[:, -1:]
+        scale = self._spread(_scale(rows[:, :-1], df), residual.shape)
         df = df.reshape(-1, *[1] * (residual.ndim - 1))
         density = log_student(residual / scale, df) - scale.log()
         return observed_terms(density, residual).flatten(1).sum(1)
 
-    def _marginal(self, residual: Tensor, times: Tensor | None) -> Tensor:
-        posterior = self.posterior
-        if not isinstance(posterior, NoisePosterior):
-            return super()._marginal(residual, times)
-        assert posterior.shared is not None
-        assert isinstance(posterior.sd, SdGrid)
-        nodes = posterior.sd.nodes.to(residual.device)
+    def _log_evidence(self, residual: Tensor, p: NoisePosterior, cell: int) -> Tensor:
+        assert isinstance(p.sd, SdGrid)
         e = residual.reshape(len(residual), -1, self._num_sd)
-        edges, log_weight = posterior.shared.edges, posterior.shared.log_weight
-        terms = []
-        for cell, weight in enumerate(log_weight.tolist()):
-            df = (edges[cell] * edges[cell + 1]).sqrt().to(e.device)
-            scale = _scale(nodes, df)  # (channels, s)
-            log_p = torch.stack(
-                [
-                    observed_terms(log_student(e / s, df) - s.log(), e).sum(1)
-                    for s in scale.T
-                ],
-                -1,
-            )
-            log_p = (log_p + posterior.sd.log_weight[cell].to(e.device)).logsumexp(-1)
-            terms.append(log_p.sum(1) + weight)
-        return torch.stack(terms).logsumexp(0)
+        df = torch.tensor(p.cells[cell][0], dtype=torch.float64, device=e.device)
+        log_p = [
+            observed_terms(log_student(e / s, df) - s.log(), e).sum(1)
+            for s in _scale(p.sd.nodes.to(e.device), df).T
+        ]
+        return (torch.stack(log_p, -1) + p.sd.log_weight[cell].to(e)).logsumexp(-1)
 
 
 def log_student(z: Tensor, df: Tensor) -> Tensor:

@@ -86,3 +86,19 @@ def test_measurements_order_channels_before_times():
 def test_bad_trials(arguments, keywords, message):
     with pytest.raises(ValueError, match=message):
         Trials(*arguments, **keywords)
+
+
+def test_joined_trials_have_all_of_both_and_names_of_their_own():
+    x = torch.arange(12.0).reshape(2, 6)
+    parts = {"sample_times": torch.arange(12.0).reshape(2, 6), "names": [1, 2]}
+    own = Trials([0.0, 1.0], x, start={"speed": [3.0, 4.0]}, **parts)
+    times = torch.arange(6.0)
+    start = {"speed": [5.0, 3.0]}
+    new = Trials([2.0, 0.0], x, index=[2, 3], start=start, sample_times=times)
+    both = own.joined(new)
+    assert both.names == ("1", "2", "new 2", "3")
+    assert both.index.tolist() == [0, 1, 2, 3]
+    assert both.start["speed"].tolist() == [3, 4, 5, 3]
+    assert both.sample_times[2:].tolist() == 2 * [times.tolist()]
+    assert both.repeat_of.tolist() == [-1, -1, -1, 0]
+    assert len(own) == 2

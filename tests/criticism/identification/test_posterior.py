@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sbi_active.criticism.identification.posterior import Unknowns, sample
+from sbi_active.criticism.identification.posterior import Sampler, Unknowns
 from sbi_active.criticism.linear.processes import Grams, Processes
 
 WHITE = Processes(np.ones(1), np.zeros(1), np.full(1, np.inf), np.zeros(1, bool))
@@ -33,7 +33,7 @@ def unknowns(low=-np.inf, effect=(-1, -1, 0)):
 
 def draws(grams, own, size: float | None = 1.0, seed=0):
     rng = np.random.default_rng(seed)
-    return sample(grams, WHITE, own, [size], rng, sweeps=60)
+    return Sampler(grams, WHITE, own, [size], rng).draws(60)
 
 
 def test_without_doubt_it_is_least_squares():

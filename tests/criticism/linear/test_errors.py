@@ -52,6 +52,12 @@ def problem(*, low=-np.inf, ragged=False, num=NUM, differs=False):
     return model, Errors(m, unit, noise, largest=2.0, varying=varying)
 
 
+def both_of(errors, model, use=None):
+    """Posteriors with the sensor's error, and beside a process."""
+    grams = errors.grams(model.rows)
+    return [errors.mixture(model, grams, use, beside=b) for b in (False, True)]
+
+
 def about_zero(model):
     """Residual at u = 0 and minus its derivatives, shape (N, 1 + d)."""
     at_zero = model.residual - model.jacobian @ model.u
@@ -67,7 +73,7 @@ def kernel(m, shape, tau):
 def test_the_evidence_is_that_of_the_dense_integral(ragged):
     model, errors = problem(ragged=ragged)
     m, rows = errors.measurements, about_zero(model)
-    found = errors.posterior(model, errors.grams(model.rows))
+    found = both_of(errors, model)
     logs, means = [], []
     for shape in KERNELS:
         for tau in errors.times:
@@ -83,15 +89,15 @@ def test_the_evidence_is_that_of_the_dense_integral(ragged):
                     means.append(model.center + gain @ off)
     logs, means = np.array(logs), np.array(means)
     p = np.exp(logs - logs.max())
-    assert found.log_process == pytest.approx(np.log(np.mean(p)) + logs.max())
-    assert found.beside.mean == pytest.approx(p @ means / p.sum())
+    assert found[1].log_evidence == pytest.approx(np.log(np.mean(p)) + logs.max())
+    assert found[1].mean == pytest.approx(p @ means / p.sum())
     alone = []
     for width in WIDTHS:
         prior = np.diag(model.widened(width) ** 2)
         cov = np.eye(len(m)) + rows[:, 1:] @ prior @ rows[:, 1:].T
         off = rows[:, 0] - rows[:, 1:] @ model.center
         alone.append(multivariate_normal(np.zeros(len(m)), cov).logpdf(off))
-    assert found.log_sensor == pytest.approx(np.log(np.mean(np.exp(alone))))
+    assert found[0].log_evidence == pytest.approx(np.log(np.mean(np.exp(alone))))
 
 
 def test_a_parameter_that_differs_from_trial_to_trial_is_a_dense_integral_too():
@@ -100,8 +106,8 @@ def test_a_parameter_that_differs_from_trial_to_trial_is_a_dense_integral_too():
     varying = np.stack([3 * model.jacobian[:, 0], np.zeros(len(m))], 1)
     cells = [NoiseCell.of(m, sd=plain.unit)]
     errors = Errors(m, plain.unit, NoiseGrid(cells), largest=2.0, varying=varying)
-    found = errors.posterior(model, errors.grams(model.rows))
-    without = plain.posterior(model, plain.grams(model.rows))
+    found = both_of(errors, model)
+    without = both_of(plain, model)
     j = model.jacobian[:, 0] / np.sqrt(np.mean(model.jacobian[:, 0] ** 2))
     logs = []
     for column in (j, 0 * j):
@@ -114,16 +120,13 @@ def test_a_parameter_that_differs_from_trial_to_trial_is_a_dense_integral_too():
                 off = rows[:, 0] - design @ model.center
                 logs.append(multivariate_normal(np.zeros(len(m)), cov).logpdf(off))
     varies = np.log(np.mean(np.exp(np.array(logs) - max(logs)))) + max(logs)
-    both = np.logaddexp(without.log_process, varies) - np.log(2)
-    assert found.log_process == pytest.approx(both)
-    own, other = errors.process(found.beside), plain.process(without.beside)
+    both = np.logaddexp(without[1].log_evidence, varies) - np.log(2)
+    assert found[1].log_evidence == pytest.approx(both)
+    own, other = errors.process(found[1]), plain.process(without[1])
     assert own == pytest.approx(other)
     use = np.arange(errors.num_folds) != 3
-    part = errors.posterior(model, errors.grams(model.rows), use)
-    assert (
-        part.log_sensor
-        == plain.posterior(model, plain.grams(model.rows), use).log_sensor
-    )
+    part, without = both_of(errors, model, use), both_of(plain, model, use)
+    assert part[0].log_evidence == without[0].log_evidence
 
 
 def test_a_bound_of_phi_counts_by_the_posterior_within_it():
@@ -235,7 +238,7 @@ def test_evidence_keeps_its_digits_however_far_the_prior_is(far):
         high=np.append(model.high, np.inf),
         trial_of=np.append(model.trial_of, -1),
     )
-    found = errors.posterior(away, errors.grams(away.rows)).log_sensor
+    found = both_of(errors, away)[0].log_evidence
     logs = []
     for width in WIDTHS:
         jacobian, sd = away.jacobian, away.widened(width)

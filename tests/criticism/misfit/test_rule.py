@@ -3,11 +3,19 @@
 import numpy as np
 import pytest
 
-from sbi_active.criticism.misfit.rule import Rule
+from sbi_active.criticism.misfit.rule import Compared, Rule
 from sbi_active.criticism.misfit.scored import Scored, predicts_better
 from sbi_active.criticism.results import ModelKey
 
-choose, starts = Rule().choose, Rule().starts
+
+def choose(models, names, equivalent=(), *, timed=True, guessed=None):
+    return Compared(Rule(), models, names, timed).choice(equivalent, guessed)
+
+
+def starts(models, names, *, timed=True):
+    return Compared(Rule(), models, names, timed).starts()
+
+
 WIGGLE = 1 + 0.05 * np.sin(np.arange(8))
 
 

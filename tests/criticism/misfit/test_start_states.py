@@ -78,8 +78,8 @@ def test_a_held_out_trial_tells_of_its_start_by_its_first_samples(found):
     assert error < 0.5 * far
     # What was used to find the start is not scored.
     p = predict(criticism.rivals, held, key=ModelKey(("drag",)))
-    assert len(p.position) == 4 * (SAMPLES - 6)
-    assert {int(i) % SAMPLES for i in p.position} == {*range(6, SAMPLES)}
+    assert len(p.measurements) == 4 * (SAMPLES - 6)
+    assert {int(i) % SAMPLES for i in p.measurements.position} == {*range(6, SAMPLES)}
 
 
 def test_start_states_are_those_of_least_squares(found):

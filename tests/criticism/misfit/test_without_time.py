@@ -120,3 +120,23 @@ def test_a_model_that_fits_is_no_misfit():
     assert found.trace().verdict == "quadratic"
     assert found.misfit() is None
     assert found.trace().misfit is None
+
+
+def test_held_out_errors_are_told_number_by_number_as_left_out_ones_are():
+    """Two numbers in units of their own: their errors have no common size."""
+    unit, gen = torch.tensor([1.0, 100.0]), torch.Generator().manual_seed(3)
+
+    def both(theta, action, **effects):
+        return line(theta, action, **effects) * unit
+
+    action = torch.linspace(-2, 2, 24)[torch.randperm(24, generator=gen)][:, None]
+    x = both(torch.tensor(THETA).expand(24, -1), action, quadratic=0.8, hidden=HIDDEN)
+    x = x + SENSOR * unit * torch.randn(x.shape, generator=gen)
+    role = ["fit"] * NUM_TRIALS + ["held out"] * 8
+    model = SimulatorModel(both, noise=GaussianNoise(SENSOR * unit), batched=True)
+    own = Trials(action, x, role=role)
+    misfit = Criticism(model, PRIOR, own, effects=EFFECTS, summaries=0).trace().misfit
+    for found in misfit.models:
+        held_out = found.held_out / unit.numpy()
+        assert held_out.max() < 2 * held_out.min()
+        assert found.left_out.shape == found.held_out.shape

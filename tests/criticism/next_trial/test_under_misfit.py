@@ -45,10 +45,10 @@ def test_trials_unlike_those_at_hand_tell_most(missed):
 
 def test_an_action_that_some_draws_alone_chose_is_chosen_again(missed, monkeypatch):
     """Its report is of other draws, and there it may tell nothing."""
-    select, calls = next_action._select, []
+    select, calls = next_action._Choosing.select, []
 
-    def unlucky(rivals, tracing, names, p, candidates, **options):
-        design = select(rivals, tracing, names, p, candidates, **options)
+    def unlucky(self, names, p, candidates, **options):
+        design = select(self, names, p, candidates, **options)
         calls.append(len(candidates))
         if options:
             return design
@@ -57,7 +57,7 @@ def test_an_action_that_some_draws_alone_chose_is_chosen_again(missed, monkeypat
         return replace(design, expected_information_gain=gain)
 
     first = missed.next_action()
-    monkeypatch.setattr(next_action, "_select", unlucky)
+    monkeypatch.setattr(next_action._Choosing, "select", unlucky)
     chosen = missed.next_action()
     assert calls[0] == len(LARGER.values)
     assert 0 < calls[1] < calls[0]

@@ -159,8 +159,8 @@ CASES = {
     "SA521": (told("outlier", outliers={3.0: 0.95}), told(outliers={3.0: 0.95})),
     "SA522": (told(needed=(3.0,)), told(needed=(3.0, 5.0))),
     "SA523": (
-        noted(lower_p_value=1e-9, least_chi_square=1.0),
-        noted(lower_p_value=0.1, least_chi_square=30.0),
+        noted(lower_p_value=1e-9, chi_square=1.0),
+        noted(lower_p_value=0.1, chi_square=30.0),
     ),
     "SA103": (told(bounds=Bounds(parameters=(BOUND,))), told()),
     "SA529": (growing(0.4), growing(0.0)),

@@ -75,7 +75,7 @@ def test_unknown_size_and_correlation_are_summed_on_their_grid():
         sd=(0.1, 3.0), correlation_time=(0.05, 2.0), num_sds=9, num_times=5
     )
     grid = declared_noise(noise, m)
-    assert grid.shape == (5, 9)
+    assert (len(grid.cells), len(grid.scales)) == (5, 9)
     sds, times = (
         low * (high / low) ** ((np.arange(num) + 0.5) / num)
         for low, high, num in ((0.1, 3.0, 9), (0.05, 2.0, 5))

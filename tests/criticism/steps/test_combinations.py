@@ -28,7 +28,7 @@ def test_a_name_may_contain_what_joins_names():
     shapes = rivals(x).effects
     renamed = [replace(e, name=f"{n} + {n} lag") for n, e in shapes.items()]
     some = RivalSet(rivals(x).model, linear_world.PRIOR, Trials(ACTION, x), renamed)
-    tracing = traced(judged(some), None)
+    tracing, _ = traced(judged(some), None)
     assert tracing.chosen == ("curve + curve lag", "kink + kink lag")
     assert tracing.model == "curve + curve lag + kink + kink lag"
     assert tracing.inclusion["wave + wave lag"] < 0.2

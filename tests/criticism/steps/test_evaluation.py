@@ -40,11 +40,11 @@ def crps(x, mean, sd):
 @pytest.fixture(scope="module")
 def fitted():
     some = rivals(X)
-    return some, traced(judged(some), None)
+    return traced(judged(some), None)
 
 
 def test_scores_before_and_after_are_those_of_the_normal_predictives(fitted):
-    some, tracing = fitted
+    tracing, some = fitted
     made = evaluate_held_out(some, tracing, Trials(ACTION, OTHERS))
     own = OTHERS[:, 0].double().numpy()
     for scores, names in ((made.before, ()), (made.after, ("curve",))):
@@ -63,7 +63,9 @@ def test_scores_before_and_after_are_those_of_the_normal_predictives(fitted):
 
 
 def test_each_trial_is_predicted_from_the_others():
-    made = evaluate_left_out(judged(rivals(X)), Trials(ACTION, X), num_draws=2000)
+    found = judged(rivals(X))
+    own = Trials(ACTION, X)
+    made = evaluate_left_out(found, found.models, own, num_draws=2000)
     own = X[:, 0].double().numpy()
     for scores, names in ((made.before, ()), (made.after, ("curve",))):
         each = [predictive(X, names, np.arange(12) != t) for t in range(12)]
@@ -91,7 +93,7 @@ def test_errors_of_some_trials_are_those_of_a_verdict_on_them():
 
 @pytest.mark.parametrize("names", [(), ("curve",)])
 def test_residuals_are_standardized_by_the_normal_predictive(fitted, names):
-    made = find_residuals(fitted[0], ModelKey(names))
+    made = find_residuals(fitted[1], ModelKey(names))
     mean, sd = predictive(X, names)
     own = X[:, 0].double().numpy()
     np.testing.assert_allclose(made.mean[:, 0], mean, atol=0.02)

@@ -61,7 +61,7 @@ def report_of(x, *, action=SPEEDS, noise=SENSOR, seed=0, **changes):
 @pytest.fixture(scope="module")
 def fitted():
     some = rivals(measured(curve=0.5))
-    return some, traced(judged(some), None)
+    return traced(judged(some), None)
 
 
 @pytest.mark.parametrize("drag", [0.0, 0.3])
@@ -80,7 +80,7 @@ def test_a_trial_in_another_unit_is_named_first(drag):
 
 
 def test_the_level_is_that_of_all_held_out_trials(fitted):
-    some, tracing = fitted
+    tracing, some = fitted
     trials = Trials(ACTION, measured(curve=0.5, seed=1))
     named = evaluate_held_out(some, tracing, trials, level=12 * 0.9).missed
     assert 6 <= len(named) <= 12
@@ -132,7 +132,7 @@ def test_errors_under_misfit_are_compared_with_those_of_left_out_trials():
 
 
 def test_what_no_model_predicts_refutes_none(fitted):
-    some, tracing = fitted
+    tracing, some = fitted
     x = measured(curve=0.5, seed=1)
     mean, _ = posterior(measured(curve=0.5), ("curve",))
     x[0] += 1e4 if columns(("curve",))[0, 2] * mean[2] < 0 else -1e4  # nearer the bare
@@ -149,7 +149,7 @@ def test_trials_that_agree_are_not_named():
 
 
 def test_the_tail_is_that_of_the_normal_predictive(fitted):
-    some, tracing = fitted
+    tracing, some = fitted
     x = measured(curve=0.5, seed=1)
     x[5] = x[5] + 0.8
     (missed,) = evaluate_held_out(some, tracing, Trials(ACTION, x)).missed

@@ -25,7 +25,7 @@ from tests.criticism.steps.linear_world import (
 
 def tracing_of(x, **keywords):
     found = judged(rivals(x))
-    return traced(found, None, **keywords), found
+    return traced(found, None, **keywords)[0], found
 
 
 def test_families_share_what_none_leaves():
@@ -67,7 +67,7 @@ def test_probabilities_are_priors_times_evidences(phi):
     told = {str(key): p for key, p in found.probabilities.items()}
     assert sum(told.values()) == pytest.approx(1)
     assert {k: p for k, p in told.items() if p > 0} == pytest.approx(expected)
-    chosen = traced(found, None).chosen
+    chosen = traced(found, None)[0].chosen
     assert chosen == ((*phi,) if found.detection.alarm else ())
 
 
@@ -125,7 +125,7 @@ def test_effects_that_the_trials_do_not_separate_count_as_one():
     x = measured(curve=0.1, kink=0.28)
     group = frozenset({"curve", "twin"})
     found = judged(rivals(x, twin), [group])
-    tracing = traced(found, None)
+    tracing, _ = traced(found, None)
     assert group in tracing.near
     assert tracing.equivalent == (group,)
     p = tracing.probabilities
