@@ -85,12 +85,10 @@ class Combination:
             names: The names.
             most: Number of terms that are written out.
         """
+        part, sign = (_factor, "*") if self.is_product else (_summand, "+")
         shown = sorted(self.terms, key=lambda t: not t.log)[:most]
-        if self.is_product:
-            text = "".join(_factor(t, names[t.index], i) for i, t in enumerate(shown))
-            return text + " * ..." * (len(shown) < len(self.terms))
-        text = "".join(_summand(t, names[t.index], i) for i, t in enumerate(shown))
-        return text + " + ..." * (len(shown) < len(self.terms))
+        text = "".join(part(t, names[t.index], i) for i, t in enumerate(shown))
+        return text + f" {sign} ..." * (len(shown) < len(self.terms))
 
     @property
     def complexity(self) -> float:
@@ -109,11 +107,8 @@ def linked(combinations: Sequence[Combination]) -> list[list[Combination]]:
         touched = [g for g in groups if any(own & {*c.index} for c in g)]
         groups = [g for g in groups if g not in touched]
         groups.append([*(c for g in touched for c in g), combination])
-    return sorted((sorted(g, key=_place) for g in groups), key=lambda g: _place(g[0]))
-
-
-def _place(combination: Combination) -> tuple[int, ...]:
-    return combination.index
+    groups = [sorted(group, key=lambda c: c.index) for group in groups]
+    return sorted(groups, key=lambda group: group[0].index)
 
 
 def _digits(value: float) -> int:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from textwrap import shorten
 from typing import Any, ClassVar
 
 import numpy as np
@@ -36,7 +38,7 @@ class CombinationSettings:
             Gaussian hump fills 1.2.
         enough: Number of effective draws a parameter below which their
             covariance has narrow directions that the belief has not.
-        named: Number of parameters that are named.
+        named: Number of characters of the names of parameters.
         outliers: Share of draws left out: a belief may hold a little of the
             prior.
         formulas: Settings of the search for formulas.
@@ -48,7 +50,7 @@ class CombinationSettings:
     bins: int = 20
     filled: float = 0.5
     enough: int = 10
-    named: int = 6
+    named: int = 60
     outliers: float = 0.01
     formulas: FormulaSettings = field(default_factory=FormulaSettings)
 
@@ -75,10 +77,9 @@ class KnownCombination:
     width: float
 
     def __str__(self) -> str:
-        step = (self.high - self.low) / 20  # a digit that says something
         largest = max(abs(self.low), abs(self.high), 1e-300)
-        ratio = largest / step if step > 0 else 1e6
-        digits = int(np.clip(np.ceil(np.log10(ratio)), 2, 6))
+        share = max((self.high - self.low) / largest, 2e-5)
+        digits = max(math.ceil(math.log10(20 / share)), 2)  # that say something
         value, low, high = (
             f"{v:.{digits}g}" for v in (self.value, self.low, self.high)
         )
@@ -93,20 +94,17 @@ class UnknownCombination:
         text: The formula, or names.
         width: Width as in :class:`KnownCombination`; the smallest of several
             parameters.
-        several: Whether these are parameters, each by itself.
         as_prior: Width above which it is as wide as the prior, in words.
     """
 
     as_prior: ClassVar[float] = 0.9
     text: str
     width: float
-    several: bool = False
 
     def __str__(self) -> str:
         if self.width > self.as_prior:
             return f"{self.text} (as wide as the prior)"
-        least = "at least " if self.several else ""
-        return f"{self.text} ({least}{self.width:.0%} as wide as the prior)"
+        return f"{self.text} ({self.width:.0%} as wide as the prior)"
 
 
 @dataclass(frozen=True)
@@ -288,8 +286,8 @@ def _left(
         if wide > settings.open:
             return UnknownCombination(other.text(names), wide)
     index = sorted({i for c in group for i in c.index})
-    each = ", ".join(names[i] for i in index[: settings.named])
-    if len(index) > settings.named:
-        each += f" and {len(index) - settings.named} others"
+    each = shorten(
+        ", ".join(names[i] for i in index), settings.named, placeholder=" ..."
+    )
     least = float(own[index].min())
-    return UnknownCombination(f"{each}, each by itself", least, several=True)
+    return UnknownCombination(f"{each}, each by itself", least)
