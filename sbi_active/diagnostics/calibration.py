@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
-from sbi.diagnostics.sbc import check_uniformity_frequentist
-from scipy.stats import beta, kstest, norm
+from scipy.stats import binomtest, kstest, norm
 from torch import Tensor
 
 if TYPE_CHECKING:
@@ -22,21 +21,18 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class Stratum:
-    """Figures of one group of actions in one round, or of all of them.
+    """Figures of one group of actions, or of all of them.
 
     Every interval holds at the same time as all others with the check's level.
 
     Attributes:
         name: Name of the action or group; "all".
-        round: Round of the network, from 1; 0 for all.
         num_rows: Simulations behind it.
         coverage: Share of truths in the network's smallest regions, by their level.
         coverage_interval: Interval of each of these shares (Clopper & Pearson).
         rank_distance: Largest distance of the ranks' distribution from uniform, one a
             parameter (Kolmogorov & Smirnov).
         rank_interval: Interval of that distance, one a parameter.
-        p_value: Probability that ranks of uniform ones are as far, one a parameter, as
-            sbi gives.
         gap: Log-score gap, a lower bound in nats.
         gap_interval: Interval of that bound.
         information: Information that outcomes tell beyond the belief, nats: gap and
@@ -47,13 +43,11 @@ class Stratum:
     """
 
     name: str
-    round: int
     num_rows: int
     coverage: dict[float, float]
     coverage_interval: dict[float, Interval]
     rank_distance: tuple[float, ...]
     rank_interval: tuple[Interval, ...]
-    p_value: tuple[float, ...]
     gap: float
     gap_interval: Interval
     information: float
@@ -62,8 +56,31 @@ class Stratum:
     reasons: tuple[str, ...]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Calibration:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Judged:
+    """A verdict with its reasons.
+
+    Attributes:
+        verdict: "trust", "refine" or "stop".
+        reasons: Reasons for the verdict, a sentence each; empty for "trust".
+        parameter_names: Names of the parameters.
+    """
+
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    parameter_names: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return all figures, in a form that JSON can hold."""
+        found = asdict(self)
+        return {entry.name: found[entry.name] for entry in fields(self) if entry.repr}
+
+    def __repr__(self) -> str:
+        return str(self)
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Calibration(Judged):
     """Whether an amortized posterior can be trusted, action by action.
 
     ``print(calibration)`` reports it in words, the verdict first.
@@ -75,7 +92,7 @@ class Calibration:
             often, or is less informative than the belief before.
         reasons: Reasons for the verdict, a sentence each; empty for "trust".
         overall: Figures of all rows.
-        strata: Figures by action and round.
+        strata: Figures by action.
         parameter_names: Names of the parameters.
         gap_method: "likelihood" or "classifier", see :mod:`.log_score`.
         num_invalid: Rows without a measurement that the network cannot take.
@@ -83,35 +100,20 @@ class Calibration:
         ranks: Ranks of the truths among ``num_posterior_samples``, shape (n, d + 1);
             the last by the network's density.
         num_posterior_samples: Draws of the network a row.
-        label: Index of each row's stratum, shape (n,).
-        tarp: Expected coverage and credibility by distances to random points (Lemos et
-            al. 2023), of all rows.
-        tarp_area: Area between these from .5 up; negative for too narrow a posterior.
     """
 
-    verdict: Verdict
-    reasons: tuple[str, ...]
     overall: Stratum
     strata: tuple[Stratum, ...]
-    parameter_names: tuple[str, ...]
     gap_method: str
     num_invalid: int
     num_simulations: int
     ranks: Tensor = field(repr=False)
     num_posterior_samples: int
-    label: Tensor = field(repr=False)
-    tarp: tuple[Tensor, Tensor] = field(repr=False)
-    tarp_area: float
 
     @property
     def flagged(self) -> list[str]:
         """Names of the strata that are not to be trusted."""
         return [s.name for s in self.strata if s.verdict != "trust"]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return all figures, in a form that JSON can hold."""
-        found = asdict(self)
-        return {entry.name: found[entry.name] for entry in fields(self) if entry.repr}
 
     def __str__(self) -> str:
         lines = [f"{self.verdict}: {describe(self.overall)}"]
@@ -121,13 +123,37 @@ class Calibration:
             lines.append(f"{self.num_invalid} rows without a measurement left out")
         return "\n".join(lines)
 
-    __repr__ = __str__
-
     def plot(self) -> Figure:
-        """Draw ranks as sbi does, coverage, and gaps and coverage by stratum."""
+        """Draw ranks as sbi does, and coverage and gap of each stratum."""
+        import matplotlib.pyplot as plt
+        from sbi.analysis.plot import sbc_rank_plot
+
         from sbi_active.display.figures import legible
 
-        return legible(_plotted(self))
+        figure, axes = plt.subplots(1, 3, figsize=(14, 4.5), layout="constrained")
+        figure.suptitle(f"calibration: {self.verdict}")
+        sbc_rank_plot(
+            self.ranks[:, :-1],
+            self.num_posterior_samples,
+            plot_type="cdf",
+            parameter_labels=[*self.parameter_names],
+            fig=figure,
+            ax=axes[0],
+        )
+        color = {"trust": "C2", "refine": "C1", "stop": "C3"}
+        for i, s in enumerate(self.strata):
+            values = s.coverage[0.9], s.gap
+            ends = [s.coverage_interval[0.9], s.gap_interval]
+            for ax, value, end in zip(axes[1:], values, ends, strict=True):
+                error = np.abs(np.array(end) - value)[:, None]
+                ax.errorbar(i, value, error, fmt="o", color=color[s.verdict])
+        names = [s.name for s in self.strata]
+        labels = "coverage of 90 % regions", "log-score gap [nats]"
+        for ax, ideal, label in zip(axes[1:], (0.9, 0.0), labels, strict=True):
+            ax.axhline(ideal, color="k", ls="--")
+            ax.set_ylabel(label)
+            ax.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
+        return legible(figure)
 
 
 def describe(stratum: Stratum) -> str:
@@ -168,7 +194,6 @@ class Tolerance:
 
 def judge(
     name: str,
-    round_: int,
     ranks: Tensor,
     gap: Tensor,
     gained: Tensor,
@@ -184,7 +209,6 @@ def judge(
 
     Args:
         name: Name of the stratum.
-        round_: Round of the network.
         ranks: Ranks, shape (n, d + 1), the last by density.
         gap: Terms of the log-score gap, shape (n,), nats.
         gained: log q - log b at the truths, shape (n,), nats.
@@ -207,7 +231,6 @@ def judge(
     distance = [float(kstest(c, "uniform", method="asymp").statistic) for c in columns]
     margin = math.sqrt(math.log(2 / each) / (2 * n))
     ranged = [(max(v - margin, 0.0), min(v + margin, 1.0)) for v in distance]
-    p_value = check_uniformity_frequentist(ranks[:, :dim], num_posterior_samples)
     mean = float(gap.mean())
     information = float((gap + gained).mean())
     excess = gap - tolerance.lost * (gap + gained).clamp_min(-20)
@@ -233,13 +256,11 @@ def judge(
         reasons.append(("refine", f"{text} that outcomes tell: it is blunt"))
     return Stratum(
         name=name,
-        round=round_,
         num_rows=n,
         coverage=coverage,
         coverage_interval=intervals,
         rank_distance=(*distance,),
         rank_interval=(*ranged,),
-        p_value=(*p_value.tolist(),),
         gap=mean,
         gap_interval=_interval(gap, each),
         information=information,
@@ -251,10 +272,8 @@ def judge(
 
 def clopper_pearson(successes: int, n: int, level: float) -> Interval:
     """Return the exact binomial interval of a share (Clopper & Pearson 1934)."""
-    k = successes
-    low = 0.0 if k == 0 else float(beta.ppf(level / 2, k, n - k + 1))
-    high = 1.0 if k == n else float(beta.ppf(1 - level / 2, k + 1, n - k))
-    return low, high
+    low, high = binomtest(successes, n).proportion_ci(1 - level)
+    return float(low), float(high)
 
 
 def _interval(values: Tensor, level: float) -> Interval:
@@ -270,50 +289,3 @@ def _interval(values: Tensor, level: float) -> Interval:
     half = float(norm.isf(level / 2)) * float(values.std()) / len(values) ** 0.5
     mean = float(values.mean())
     return mean - half, mean + half
-
-
-def _plotted(found: Calibration) -> Figure:
-    """Draw ranks, TARP, and coverage and gap of each stratum with their intervals."""
-    import matplotlib.pyplot as plt
-    from sbi.analysis.plot import sbc_rank_plot
-
-    figure, axes = plt.subplots(2, 2, figsize=(11, 8), layout="constrained")
-    figure.suptitle(f"calibration: {found.verdict}")
-    (ranks, tarp), (shares, gaps) = axes
-    for k, name in enumerate(found.parameter_names):
-        sbc_rank_plot(
-            found.ranks[:, k : k + 1],
-            found.num_posterior_samples,
-            plot_type="cdf",
-            ranks_labels=[name],
-            colors=[f"C{k}"],
-            fig=figure,
-            ax=ranks,
-        )
-    ranks.set_title("ranks of the truth")
-    coverage, credibility = found.tarp
-    tarp.plot(credibility, coverage, color="blue", label="TARP")
-    levels, middle = [*found.overall.coverage], [*found.overall.coverage.values()]
-    ends = np.array([*found.overall.coverage_interval.values()]).T
-    error = abs(ends - middle)
-    tarp.errorbar(levels, middle, error, fmt="o", label="smallest regions")
-    tarp.plot([0, 1], [0, 1], "k--", label="ideal")
-    tarp.set(xlabel="credibility level", ylabel="expected coverage")
-    tarp.legend()
-    color = {"trust": "C2", "refine": "C1", "stop": "C3"}
-    for i, s in enumerate(found.strata):
-        for ax, value, (low, high) in (
-            (shares, s.coverage[0.9], s.coverage_interval[0.9]),
-            (gaps, s.gap, s.gap_interval),
-        ):
-            error = [[max(value - low, 0)], [max(high - value, 0)]]
-            ax.errorbar(i, value, error, fmt="o", color=color[s.verdict])
-    names = [s.name for s in found.strata]
-    for ax, ideal, label in (
-        (shares, 0.9, "coverage of 90 % regions"),
-        (gaps, 0.0, "log-score gap [nats]"),
-    ):
-        ax.axhline(ideal, color="k", ls="--")
-        ax.set_ylabel(label)
-        ax.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
-    return figure
