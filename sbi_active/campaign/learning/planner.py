@@ -71,7 +71,7 @@ class Planner:
         listed = actions.listed()
         self._limits.cost(actions.sample((8,), seed=0) if listed is None else listed)
         self._designs = find_method(state.method).designs
-        self._designer: Any = RandomDesigner(actions, workers=options.workers)
+        self._designer: Any = RandomDesigner(actions)
         if self._designs:
             self._designer = InformationGainDesigner(
                 actions,
@@ -145,7 +145,7 @@ class Planner:
         if target == "auto" and self._checks(index):
             told = [t.action for t in self._state.trials if t.is_measured]
             places = most_unlike(permitted(limits), told)
-            designer = RandomDesigner(places, workers=self._state.options.workers)
+            designer = RandomDesigner(places)
             return self._select(index, learner, designer), "check"
         # What nothing explains would draw the next trial after it; reports have it.
         trials, about_model = self._state.explained, None
