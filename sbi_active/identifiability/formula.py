@@ -93,10 +93,10 @@ class Combination:
     @property
     def complexity(self) -> float:
         """Digits that it takes to write it; a sum is simpler than a product."""
-        digits = sum(_digits(t.weight) + (t.shift != 0) for t in self.terms)
-        digits += sum(_digits(t.shift) for t in self.terms if t.shift)
+        text = self.text(["x"] * (1 + max(self.index)), most=len(self.terms))
         logs = [t.log for t in self.terms]
-        return digits + (0.25 if all(logs) else 1.5 * any(logs))
+        kind = 0.25 if all(logs) else 1.5 * any(logs)
+        return kind + sum(character.isdigit() for character in text)
 
 
 def linked(combinations: Sequence[Combination]) -> list[list[Combination]]:
@@ -109,12 +109,6 @@ def linked(combinations: Sequence[Combination]) -> list[list[Combination]]:
         groups.append([*(c for g in touched for c in g), combination])
     groups = [sorted(group, key=lambda c: c.index) for group in groups]
     return sorted(groups, key=lambda group: group[0].index)
-
-
-def _digits(value: float) -> int:
-    if abs(value) == 1:
-        return 0
-    return 1 if abs(value) in SIMPLE else len(f"{abs(value):.4g}".strip("0.")) or 1
 
 
 def _summand(term: Term, name: str, place: int) -> str:

@@ -128,12 +128,9 @@ class Combinations:
         return bool(self.known or self.unknown)
 
     def __str__(self) -> str:
-        parts = []
-        if self.known:
-            known = [*map(str, self.known[: self.most_shown])]
-            if len(self.known) > len(known):
-                known.append(f"and {len(self.known) - len(known)} combinations more")
-            parts.append(f"known: {', '.join(known)}")
+        known = [*map(str, self.known[: self.most_shown])]
+        known += ["..."] * (len(self.known) > len(known))
+        parts = [f"known: {', '.join(known)}"] if known else []
         if self.unknown:
             parts.append(f"not known: {', '.join(map(str, self.unknown))}")
         return "; ".join(parts)
@@ -213,10 +210,16 @@ def combinations_of_draws(
     filled = _filled(after, before, settings.bins)
     is_open = (own > settings.open) & (filled > settings.filled * own.clip(max=1.0))
     formulas = settings.formulas
-    found = search(moments, np.flatnonzero(is_open).tolist(), low, span, formulas)
-    widths = dict(found)
+    indices = np.flatnonzero(is_open).tolist()
+    widths = dict(search(moments, indices, low, span, formulas))
     groups = linked([*widths])
-    known = [_known(c, widths[c], after, names) for g in groups for c in g]
+    tail = 0.5 * (1 - KnownCombination.level)
+    known = []
+    for combination in (c for group in groups for c in group):
+        value = combination.value(after)
+        low, middle, high = np.quantile(value, [tail, 0.5, 1 - tail]).tolist()
+        found = combination.text(names), middle, low, high, widths[combination]
+        known.append(KnownCombination(*found))
     unknown = [_left(group, moments, own, names, settings) for group in groups]
     named = {i for c in widths for i in c.index}
     best = min([*own[~is_open].tolist(), *widths.values()], default=np.inf)
@@ -261,15 +264,6 @@ def _filled(draws: Array, prior: Array, bins: int) -> Array:
     each = zip(draws.T, edges.T, strict=True)
     places = [np.bincount(np.searchsorted(at, own), minlength=bins) for own, at in each]
     return np.exp(entropy(places, axis=1)) / bins
-
-
-def _known(
-    combination: Combination, own: float, draws: Array, names: Sequence[str]
-) -> KnownCombination:
-    tail = 0.5 * (1 - KnownCombination.level)
-    value = combination.value(draws)
-    low, middle, high = np.quantile(value, [tail, 0.5, 1 - tail]).tolist()
-    return KnownCombination(combination.text(names), middle, low, high, own)
 
 
 def _left(

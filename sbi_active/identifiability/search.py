@@ -122,12 +122,10 @@ def search(
             c, s = moments(terms)
             for vector in _eigenvectors(c, s)[1].T:
                 combination = rounded(terms, vector, c, s, limits)
-                keep(combination, _own_width(combination, moments))
+                keep(
+                    combination, width(combination.weight, *moments(combination.terms))
+                )
     return found
-
-
-def _own_width(combination: Combination, moments: Moments) -> float:
-    return width(combination.weight, *moments(combination.terms))
 
 
 def _ranked(
@@ -173,7 +171,9 @@ def _best_formula(
     tried = [_fitted(terms, moments, limits) for terms in _forms(subset, low)]
     if len(subset) == 2:
         tried += _shifted(moments, subset, low, span, limits, needed)
-    widths = [_own_width(combination, moments) for combination in tried]
+    widths = [
+        width(combination.weight, *moments(combination.terms)) for combination in tried
+    ]
     limit = max(limits.about_as_good * min(widths), limits.floor)
     good = [pair for pair in zip(tried, widths, strict=True) if pair[1] <= limit]
     return min(good, key=lambda pair: (pair[0].complexity, pair[1]))

@@ -209,13 +209,10 @@ def moved_along(
                 found[:, row, at.index(term.index)] = term.weight * term.slope(rows)
         return np.where(np.isfinite(found), found, 0.0) * scale
 
-    def solved(gradient: Array, gap: Array) -> Array:  # by the shortest steps
-        return np.einsum("kig,kg->ki", np.linalg.pinv(gradient), gap)
-
     for _ in range(3):  # other directions for those that found no place inside
         direction = rng.standard_normal((len(theta), len(at)))
         slope = gradient(theta)
-        direction -= solved(slope, np.einsum("kgi,ki->kg", slope, direction))
+        direction -= _shortest(slope, np.einsum("kgi,ki->kg", slope, direction))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True) + 1e-300
         for size, sign in product(probe.own.moves, (1.0, -1.0)):
             tried = theta.copy()
@@ -223,7 +220,7 @@ def moved_along(
             with np.errstate(all="ignore"):
                 for _ in range(probe.own.newton_steps if group else 0):
                     gap = values(tried) - values(theta)
-                    tried[:, at] -= solved(gradient(tried), gap) * scale
+                    tried[:, at] -= _shortest(gradient(tried), gap) * scale
             rows = torch.from_numpy(np.nan_to_num(tried)).float()
             inside = within_support(probe.prior, rows)
             inside &= torch.from_numpy(np.isfinite(tried).all(1))
@@ -232,3 +229,8 @@ def moved_along(
     step = (result - probe.theta).double().numpy() / probe.deviation
     far = np.sqrt((step**2).sum(1))
     return result if np.median(far) > probe.own.fewest_moved else None
+
+
+def _shortest(gradient: Array, gap: Array) -> Array:
+    """Return the shortest steps that change combinations by some, (k, g) -> (k, d)."""
+    return np.einsum("kig,kg->ki", np.linalg.pinv(gradient), gap)

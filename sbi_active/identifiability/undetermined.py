@@ -111,12 +111,11 @@ def find_undetermined(
     probe = Sensitivities(simulate, prior, actions, free, num_theta, seed, own)
     if not np.isfinite(probe.base).any():
         return ()
-    where = _where(len(actions), num_permitted)
-    for practical in (False, True):
-        found = _formulas(probe, names, where, practical)
-        if found:
-            return found
-    return _local(probe, names, where)
+    where = f"none of {len(actions)} actions that were tried"
+    if num_permitted is not None and num_permitted <= len(actions):
+        where = "no permitted action"
+    about = probe, names, where
+    return _formulas(*about, False) or _formulas(*about, True) or _local(*about)
 
 
 def _formulas(
@@ -159,10 +158,8 @@ def _holds(
     probe: Sensitivities, indices: Sequence[int], group: Sequence[Combination]
 ) -> tuple[bool, bool]:
     """Return whether x is about, or exactly, the same where the combinations are."""
-    found = []
-    for turn in range(2):
-        moved = moved_along(probe, indices, group, turn)
-        found.append((False, False) if moved is None else probe.same(moved))
+    moved = (moved_along(probe, indices, group, turn) for turn in range(2))
+    found = [(False, False) if theta is None else probe.same(theta) for theta in moved]
     about, exactly = zip(*found, strict=True)
     return all(about), all(exactly)
 
@@ -175,9 +172,6 @@ def _local(
     if not (size == 0).any(1).all():
         return ()
     direction = vectors[:, :, -1]
-    direction *= np.sign(
-        direction[np.arange(len(direction)), np.abs(direction).argmax(1)]
-    )[:, None]
     step = np.zeros_like(probe.draws[: len(direction)])
     small = 3 * probe.own.step
     step[:, probe.free] = small * direction * probe.deviation[probe.free]
@@ -189,21 +183,12 @@ def _local(
     at = [k for k in range(len(probe.free)) if shares[k] > probe.own.same]
     if len(at) < 2:
         return ()
-    indices = [probe.free[k] for k in at]
-    own = tuple(names[i] for i in indices)
-    changes = 0.1 * direction[0, at] * probe.deviation[indices]
-    move = ", ".join(f"{n} by {c:+.2g}" for n, c in zip(own, changes, strict=True))
+    own = tuple(names[probe.free[k]] for k in at)
     text = (
         f"{where} determines all of {_and(own)}: at each of {len(direction)} draws of "
-        f"the prior one direction {WHAT[exactly]}, such as {move} at one of them; {DO}"
+        f"the prior one direction {WHAT[exactly]}; {DO}"
     )
     return (Undetermined(own, (), exactly, text),)
-
-
-def _where(num: int, num_permitted: int | None) -> str:
-    if num_permitted is not None and num_permitted <= num:
-        return "no permitted action"
-    return f"none of {num} actions that were tried"
 
 
 def _sentence(
