@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -55,9 +55,9 @@ class BeliefCheck(Judged):
         reasons: Reasons for the verdict, a sentence each.
         parameter_names: Names of the parameters; the last of the figures is the joint
             density.
-        beyond: Nats by which refits, at their own draws, exceed the belief; one a
-            refit, the belief is too narrow or elsewhere.
-        within: Nats at the belief's draws, likewise: it is too wide, or elsewhere.
+        refits: Nats by which each refit, at its own draws, exceeds the belief, which is
+            too narrow or elsewhere; and nats at the belief's draws, likewise, where it
+            is too wide or elsewhere.
         spread: Standard deviation of the normal scores of the ranks, one a parameter
             and one for the density: 1 where right, more for too narrow.
         p_value: p-value of spread and mean of the scores, one as for ``spread``.
@@ -65,8 +65,7 @@ class BeliefCheck(Judged):
         num_simulations: Rows of new outcomes.
     """
 
-    beyond: tuple[float, ...]
-    within: tuple[float, ...]
+    refits: tuple[tuple[float, float], ...]
     spread: tuple[float, ...]
     p_value: tuple[float, ...]
     num_repeats: int
@@ -75,9 +74,8 @@ class BeliefCheck(Judged):
     def __str__(self) -> str:
         lines = [f"{self.verdict}: {self.num_repeats} repeats around the belief"]
         lines += [f"- {reason}" for reason in self.reasons]
-        if self.beyond:
-            pairs = zip(self.beyond, self.within, strict=True)
-            texts = [f"{a:.2f} and {b:.2f}" for a, b in pairs]
+        if self.refits:
+            texts = [f"{a:.2f} and {b:.2f}" for a, b in self.refits]
             lines.append(f"  refits differ by {'; '.join(texts)} nats")
         names = *self.parameter_names, "density"
         for name, spread, p in zip(names, self.spread, self.p_value, strict=False):
@@ -131,26 +129,19 @@ def check_belief(
         simulator = inference.simulator if simulator is None else simulator
         own = inference.state.options.refinement
         refinement = own if refinement is None else refinement
-    elif hasattr(inference, "trials"):
-        prior, trials = inference._prior, inference.trials
     else:
-        raise TypeError(
-            f"expected a trainer or a campaign; got {type(inference).__name__}; pass "
-            "inference, whose update gave the belief"
-        )
-    if simulator is None or not trials:
-        raise ValueError(
-            "expected a simulator and at least one trial; got "
-            f"{'no simulator' if simulator is None else 'no trial'}; pass simulator, "
-            "and check a belief after its first update"
-        )
-    belief = inference.belief
-    action = torch.stack([t.action for t in trials])
-    x = torch.stack([t.x for t in trials])
-    model, settings = simulator, refinement
+        prior, trials = inference._prior, inference.trials
+    require(
+        simulator is not None and len(trials) > 0,
+        "a simulator and at least one trial",
+        f"{simulator} and {len(trials)} trials",
+        "pass simulator, and check a belief after its first update",
+    )
+    belief, model = inference.belief, cast(Any, simulator)
+    action, x = (torch.stack([getattr(t, k) for t in trials]) for k in ("action", "x"))
 
     def refined(action: Tensor, x: Tensor, seed: int) -> Distribution:
-        return refine(model, prior, action, x, settings=settings, seed=seed)
+        return refine(model, prior, action, x, settings=refinement, seed=seed)
 
     infer = refined if infer is None else infer
     refits = [
@@ -158,9 +149,9 @@ def check_belief(
         for r in range(num_refits)
     ]
     sizes = num_repeats, num_copies, num_posterior_samples
-    scores = _scores(*(belief, simulator, infer, action, x), sizes=sizes, seed=seed)
-    names = getattr(simulator, "parameter_names", None)
-    names = names_of(belief, belief.event_shape[0]) if names is None else names
+    scores = _scores(*(belief, model, infer, action, x), sizes=sizes, seed=seed)
+    dim = belief.event_shape[0]
+    names = getattr(simulator, "parameter_names", None) or names_of(belief, dim)
     return _judge((*names,), refits, scores, level, len(x) * num_copies * num_repeats)
 
 
@@ -262,8 +253,7 @@ def _judge(
             text = "two inferences of the same trials differ; raise num_histories"
             found.append(("refine", text))
     is_other = bool(found)
-    z = np.ascontiguousarray(scores.T)
-    total, shift = (z**2).sum(1), z.sum(1) / max(n, 1)
+    total, shift = (scores**2).sum(0), scores.sum(0) / max(n, 1)
     tail = np.minimum(2 * np.minimum(chi2.sf(total, n), chi2.cdf(total, n)), 1.0)
     side = 2 * norm.sf(np.abs(shift) * n**0.5)
     p_value = np.minimum(2 * np.minimum(tail, side), 1.0)
@@ -282,8 +272,7 @@ def _judge(
         verdict=worst([v for v, _ in found]),
         reasons=(*(text for _, text in found),),
         parameter_names=names,
-        beyond=(*(a for a, _ in refits),),
-        within=(*(b for _, b in refits),),
+        refits=(*refits,),
         spread=(*spread.tolist(),),
         p_value=(*p_value.tolist(),),
         num_repeats=n,

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
 import torch
 from scipy.stats import binomtest, kstest, norm
 from torch import Tensor
@@ -28,11 +27,11 @@ class Stratum:
     Attributes:
         name: Name of the action or group; "all".
         num_rows: Simulations behind it.
-        coverage: Share of truths in the network's smallest regions, by their level.
-        coverage_interval: Interval of each of these shares (Clopper & Pearson).
+        coverage: Share of truths in the network's smallest 90 % regions.
+        coverage_interval: Interval of that share (Clopper & Pearson).
         rank_distance: Largest distance of the ranks' distribution from uniform, one a
             parameter (Kolmogorov & Smirnov).
-        rank_interval: Interval of that distance, one a parameter.
+        rank_margin: Half of the interval of that distance.
         gap: Log-score gap, a lower bound in nats.
         gap_interval: Interval of that bound.
         information: Information that outcomes tell beyond the belief, nats: gap and
@@ -44,10 +43,10 @@ class Stratum:
 
     name: str
     num_rows: int
-    coverage: dict[float, float]
-    coverage_interval: dict[float, Interval]
+    coverage: float
+    coverage_interval: Interval
     rank_distance: tuple[float, ...]
-    rank_interval: tuple[Interval, ...]
+    rank_margin: float
     gap: float
     gap_interval: Interval
     information: float
@@ -119,49 +118,27 @@ class Calibration(Judged):
         lines = [f"{self.verdict}: {describe(self.overall)}"]
         lines += [f"- {reason}" for reason in self.reasons]
         lines += [f"  {s.name}: {describe(s)}" for s in self.strata]
-        if self.num_invalid:
-            lines.append(f"{self.num_invalid} rows without a measurement left out")
+        lines += [f"{self.num_invalid} rows left out"] * (self.num_invalid > 0)
         return "\n".join(lines)
 
     def plot(self) -> Figure:
-        """Draw ranks as sbi does, and coverage and gap of each stratum."""
-        import matplotlib.pyplot as plt
+        """Draw the ranks of the truths in all rows, as sbi does."""
         from sbi.analysis.plot import sbc_rank_plot
 
         from sbi_active.display.figures import legible
 
-        figure, axes = plt.subplots(1, 3, figsize=(14, 4.5), layout="constrained")
-        figure.suptitle(f"calibration: {self.verdict}")
-        sbc_rank_plot(
-            self.ranks[:, :-1],
-            self.num_posterior_samples,
-            plot_type="cdf",
-            parameter_labels=[*self.parameter_names],
-            fig=figure,
-            ax=axes[0],
-        )
-        color = {"trust": "C2", "refine": "C1", "stop": "C3"}
-        for i, s in enumerate(self.strata):
-            values = s.coverage[0.9], s.gap
-            ends = [s.coverage_interval[0.9], s.gap_interval]
-            for ax, value, end in zip(axes[1:], values, ends, strict=True):
-                error = np.abs(np.array(end) - value)[:, None]
-                ax.errorbar(i, value, error, fmt="o", color=color[s.verdict])
-        names = [s.name for s in self.strata]
-        labels = "coverage of 90 % regions", "log-score gap [nats]"
-        for ax, ideal, label in zip(axes[1:], (0.9, 0.0), labels, strict=True):
-            ax.axhline(ideal, color="k", ls="--")
-            ax.set_ylabel(label)
-            ax.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
-        return legible(figure)
+        num, names = self.num_posterior_samples, [*self.parameter_names]
+        ranks = self.ranks[:, :-1]
+        drawn = sbc_rank_plot(ranks, num, plot_type="cdf", parameter_labels=names)
+        return legible(drawn[0])
 
 
 def describe(stratum: Stratum) -> str:
     """Return coverage and gap of a stratum with their intervals."""
-    low, high = stratum.coverage_interval[0.9]
+    low, high = stratum.coverage_interval
     least, most = stratum.gap_interval
     return (
-        f"90 % regions hold {stratum.coverage[0.9]:.0%} of the truths "
+        f"90 % regions hold {stratum.coverage:.0%} of the truths "
         f"({low:.0%} to {high:.0%}), the log score is {stratum.gap:.2f} nats "
         f"({least:.2f} to {most:.2f}) short, {stratum.lost:.0%} of what outcomes tell"
     )
@@ -193,7 +170,7 @@ class Tolerance:
 
 
 def judge(
-    name: str,
+    stratum: str,
     ranks: Tensor,
     gap: Tensor,
     gained: Tensor,
@@ -202,13 +179,12 @@ def judge(
     level: float,
     tolerance: Tolerance,
     names: Sequence[str],
-    levels: tuple[float, ...] = (0.5, 0.8, 0.9, 0.95),
     num_kinds: int = 4,
 ) -> Stratum:
     r"""Return the figures of a stratum.
 
     Args:
-        name: Name of the stratum.
+        stratum: Name of the stratum.
         ranks: Ranks, shape (n, d + 1), the last by density.
         gap: Terms of the log-score gap, shape (n,), nats.
         gained: log q - log b at the truths, shape (n,), nats.
@@ -216,27 +192,22 @@ def judge(
         level: Level of error of one stratum, shared among its figures.
         tolerance: Tolerance of the figures.
         names: Names of the parameters.
-        levels: Levels of the smallest regions, .9 among them.
         num_kinds: Number of kinds of figures beside the ranks of each parameter.
     """
     n, dim = len(ranks), ranks.shape[1] - 1
     each = level / (num_kinds + dim)
     uniform = (ranks.double() + 0.5) / (num_posterior_samples + 1)
     # The smallest region that holds the truth has the draws of a higher density.
-    credible = 1 - uniform[:, -1]
-    inside = {c: int((credible <= c).sum()) for c in levels}
-    coverage = {c: num / n for c, num in inside.items()}
-    intervals = {c: clopper_pearson(num, n, each) for c, num in inside.items()}
+    inside = int((1 - uniform[:, -1] <= 0.9).sum())
+    low, high = interval = clopper_pearson(inside, n, each)
     columns = uniform[:, :dim].T.numpy()
     distance = [float(kstest(c, "uniform", method="asymp").statistic) for c in columns]
     margin = math.sqrt(math.log(2 / each) / (2 * n))
-    ranged = [(max(v - margin, 0.0), min(v + margin, 1.0)) for v in distance]
     mean = float(gap.mean())
     information = float((gap + gained).mean())
     excess = gap - tolerance.lost * (gap + gained).clamp_min(-20)
     reasons: list[tuple[Verdict, str]] = []
-    low, high = intervals[0.9]
-    text = f"90 % regions hold {coverage[0.9]:.0%} of the truths, at"
+    text = f"90 % regions hold {inside / n:.0%} of the truths, at"
     if high < 0.9 - tolerance.excluded:
         word = f"most {high:.0%}: it excludes the truth too often"
         reasons.append(("stop", f"{text} {word}"))
@@ -244,10 +215,10 @@ def judge(
         reasons.append(("refine", f"{text} most {high:.0%}: it is too sure"))
     elif low > 0.9 + tolerance.coverage:
         reasons.append(("refine", f"{text} least {low:.0%}: it is too wide"))
-    for k, (least, _) in enumerate(ranged):
-        if least > tolerance.rank_distance:
-            text = f"ranks of {names[k]} are {distance[k]:.2f} from uniform"
-            reasons.append(("refine", f"{text}, at least {least:.2f}"))
+    for name, off in zip(names, distance, strict=True):
+        if off - margin > tolerance.rank_distance:
+            text = f"ranks of {name} are {off:.2f} from uniform"
+            reasons.append(("refine", f"{text}, at least {off - margin:.2f}"))
     if _interval(gained, each)[1] < 0:
         text = f"it has {gained.mean():.2f} nats about the truth"
         reasons.append(("stop", f"{text}: the belief before the outcome knew more"))
@@ -255,12 +226,12 @@ def judge(
         text = f"the log score is {mean:.2f} nats short of {information:.2f}"
         reasons.append(("refine", f"{text} that outcomes tell: it is blunt"))
     return Stratum(
-        name=name,
+        name=stratum,
         num_rows=n,
-        coverage=coverage,
-        coverage_interval=intervals,
+        coverage=inside / n,
+        coverage_interval=interval,
         rank_distance=(*distance,),
-        rank_interval=(*ranged,),
+        rank_margin=margin,
         gap=mean,
         gap_interval=_interval(gap, each),
         information=information,
@@ -287,5 +258,4 @@ def _interval(values: Tensor, level: float) -> Interval:
         ends = values.quantile(torch.tensor([0.01, 0.99], dtype=torch.float64))
         values = values.clamp(ends[0], ends[1])
     half = float(norm.isf(level / 2)) * float(values.std()) / len(values) ** 0.5
-    mean = float(values.mean())
-    return mean - half, mean + half
+    return float(values.mean()) - half, float(values.mean()) + half

@@ -86,34 +86,28 @@ def check_calibration(
     References:
         Talts et al. 2018, arXiv:1804.06788; Deistler et al. 2022, arXiv:2210.04815.
     """
-    sizes = num_simulations, num_posterior_samples
-    require(
-        min(sizes) >= 100,
-        "at least 100 simulations and posterior samples",
-        f"{sizes[0]} and {sizes[1]}",
-        "use 1000 and 200",
-    )
+    num = min(num_simulations, num_posterior_samples)
+    what = "at least 100 simulations and posterior samples"
+    require(num >= 100, what, num, "use 1000 and 200")
     ways = "auto", "likelihood", "classifier"
     require(gap in ways, f"gap among {ways}", repr(gap), "pass one of these")
     if is_campaign(inference):
         simulator = inference.simulator if simulator is None else simulator
         actions = inference.actions if actions is None else actions
-    if simulator is None or actions is None:
-        raise ValueError(
-            "expected a simulator and actions, which only a campaign brings; got none; "
-            "pass simulator and actions="
-        )
-    posterior, space = amortized(inference), action_space(actions)
+    posterior = amortized(inference)
     belief = posterior.belief if belief is None else belief
-    if belief is None:
+    if simulator is None or actions is None or belief is None:
         raise ValueError(
-            "expected the belief that the network was trained under; got none; pass "
-            "belief="
+            "expected a simulator, actions and the belief that the network was trained "
+            f"under; got {simulator}, {actions} and {belief}; pass what is None"
         )
+    space = action_space(actions)
     own = derive_seed(seed, "round", 0)
     with single_thread(), kept_generators(), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Number of .* samples should be")
-        action, label, strata = stratified_actions(space, sizes[0], max_strata, own)
+        action, label, strata = stratified_actions(
+            space, num_simulations, max_strata, own
+        )
         with forked_generators(derive_seed(own, "theta")):
             theta = belief.sample(torch.Size([len(action)])).float()
         by_likelihood = gap != "classifier" and declares_noise(

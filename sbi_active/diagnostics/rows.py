@@ -52,12 +52,7 @@ def _name(space: ActionSpace, action: Tensor) -> str:
 
 
 def draws_within(
-    network: Any,
-    prior: Distribution,
-    num: int,
-    condition: Tensor,
-    *,
-    tries: tuple[int, ...] = (1, 8, 40),
+    network: Any, prior: Distribution, num: int, condition: Tensor, *, times: int = 10
 ) -> Tensor:
     """Return draws of a network within the prior's support, shape (num, n, theta_dim).
 
@@ -69,16 +64,9 @@ def draws_within(
         prior: Prior with the support.
         num: Number of draws of each row.
         condition: Packed conditions, shape (n, c).
-        tries: Times as many draws as are needed, for the rows that still lack.
+        times: Times as many draws as are needed, of which those inside are taken.
     """
-    kept = torch.empty(num, len(condition), *prior.event_shape)
-    left = torch.arange(len(condition))
-    for times in tries:
-        drawn = network.sample(torch.Size([times * num]), condition[left])
-        inside = within_support(prior, drawn.flatten(0, 1)).reshape(drawn.shape[:2])
-        first = (~inside).to(torch.int8).argsort(dim=0, stable=True)[:num]
-        kept[:, left] = drawn.gather(0, first[..., None].expand(kept[:, left].shape))
-        left = left[inside.sum(0) < num]
-        if len(left) == 0:
-            break
-    return kept
+    drawn = network.sample(torch.Size([times * num]), condition)
+    inside = within_support(prior, drawn.flatten(0, 1)).reshape(drawn.shape[:2])
+    first = (~inside).to(torch.int8).argsort(dim=0, stable=True)[:num]
+    return drawn.gather(0, first[..., None].expand(-1, -1, drawn.shape[-1]))
