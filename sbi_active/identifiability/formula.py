@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,13 +30,13 @@ class Term:
 
     def coordinate(self, theta: Array) -> Array:
         """Return theta or its logarithm, not weighed, shape (n,)."""
-        own = theta[:, self.index]
-        return np.log(own + self.shift) if self.log else own
+        moved = theta[:, self.index] + self.shift
+        return np.log(moved) if self.log else moved
 
     def slope(self, theta: Array) -> Array:
         """Return the derivative of the coordinate, shape (n,)."""
-        own = theta[:, self.index]
-        return 1 / (own + self.shift) if self.log else np.ones(len(own))
+        moved = theta[:, self.index] + self.shift
+        return 1 / moved if self.log else np.ones_like(moved)
 
 
 @dataclass(frozen=True)
@@ -72,11 +72,6 @@ class Combination:
         """Return the value of the formula, (n, d) -> (n,)."""
         sums = self.coordinate(theta)
         return np.exp(sums) if self.is_product else sums
-
-    def mirrored(self) -> Combination:
-        """Return the one in which all terms but the first have the other sign."""
-        first, *others = self.terms
-        return Combination((first, *(replace(t, weight=-t.weight) for t in others)))
 
     def text(self, names: Sequence[str], *, most: int = 4) -> str:
         """Return the formula, with the names of all parameters of the simulator.

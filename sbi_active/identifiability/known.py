@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from textwrap import shorten
 from typing import Any, ClassVar
 
@@ -94,15 +95,13 @@ class UnknownCombination:
         text: The formula, or names.
         width: Width as in :class:`KnownCombination`; the smallest of several
             parameters.
-        as_prior: Width above which it is as wide as the prior, in words.
     """
 
-    as_prior: ClassVar[float] = 0.9
     text: str
     width: float
 
     def __str__(self) -> str:
-        if self.width > self.as_prior:
+        if self.width > 0.9:
             return f"{self.text} (as wide as the prior)"
         return f"{self.text} ({self.width:.0%} as wide as the prior)"
 
@@ -117,10 +116,8 @@ class Combinations:
     Attributes:
         known: Combinations with their intervals.
         unknown: Combinations that are left open.
-        most_shown: Number of known ones that are written out.
     """
 
-    most_shown: ClassVar[int] = 3
     known: tuple[KnownCombination, ...] = ()
     unknown: tuple[UnknownCombination, ...] = ()
 
@@ -128,7 +125,7 @@ class Combinations:
         return bool(self.known or self.unknown)
 
     def __str__(self) -> str:
-        known = [*map(str, self.known[: self.most_shown])]
+        known = [*map(str, self.known[:3])]  # more are no sentence
         known += ["..."] * (len(self.known) > len(known))
         parts = [f"known: {', '.join(known)}"] if known else []
         if self.unknown:
@@ -175,11 +172,11 @@ def combinations_of(
         the profile likelihood, Bioinformatics 2009.
     """
     draws = []
-    for key, distribution in (("prior", prior), ("belief", belief)):
+    for key, distribution in (("belief", belief), ("prior", prior)):
         with forked_generators(seed, "combinations", key):
-            found = distribution.sample(torch.Size([settings.num_draws]))
-        draws.append(found.double().numpy())
-    return combinations_of_draws(draws[1], draws[0], names, settings)
+            drawn = distribution.sample(torch.Size([settings.num_draws]))
+        draws.append(drawn.double().numpy())
+    return combinations_of_draws(draws[0], draws[1], names, settings)
 
 
 def combinations_of_draws(
@@ -190,9 +187,8 @@ def combinations_of_draws(
 ) -> Combinations:
     """Return combinations by draws of a belief and of the prior, (m, d) and (n, d)."""
     dim = before.shape[1]
-    if dim < 2 or not (np.isfinite(before).all() and np.isfinite(after).all()):
-        return Combinations()
-    if _effective(after) < settings.enough * dim:
+    is_finite = np.isfinite(before).all() and np.isfinite(after).all()
+    if dim < 2 or not is_finite or _effective(after) < settings.enough * dim:
         return Combinations()
     names = names or [f"theta_{i + 1}" for i in range(dim)]
     kept = _without_outliers(after, settings.outliers)
@@ -237,11 +233,9 @@ def note_combinations(belief: Any, names: Sequence[str] | None, *, seed: int) ->
         names: Names of the parameters, or None.
         seed: Seed of the draws.
     """
-    try:
+    with suppress(np.linalg.LinAlgError):  # of draws without a covariance
         found = combinations_of(belief, belief.prior, names, seed=seed)
-    except np.linalg.LinAlgError:  # of draws without a covariance nothing is said
-        return
-    belief.diagnostics = belief.diagnostics.extended(combinations=found)
+        belief.diagnostics = belief.diagnostics.extended(combinations=found)
 
 
 def _effective(draws: Array) -> float:
@@ -275,7 +269,8 @@ def _left(
 ) -> UnknownCombination:
     """Return the combination that the known ones leave open."""
     if len(group) == 1 and len(group[0].terms) == 2:
-        other = group[0].mirrored()
+        first, second = group[0].terms
+        other = Combination((first, replace(second, weight=-second.weight)))
         wide = width(other.weight, *moments(other.terms))
         if wide > settings.open:
             return UnknownCombination(other.text(names), wide)

@@ -85,13 +85,11 @@ def search(
     if len(open_parameters) < 2:
         return found
     plain = [Term(i) for i in open_parameters]
-    covariance, prior = moments(plain)
-    place = {index: k for k, index in enumerate(open_parameters)}
-    alone = np.sqrt(covariance.diagonal() / prior.diagonal())
+    covariance, prior = (m.diagonal() for m in moments(plain))
+    alone = dict(zip(open_parameters, np.sqrt(covariance / prior), strict=True))
 
     def keep(combination: Combination, own: float) -> None:
-        at = [place[i] for i in combination.index]
-        if own > limits.known * alone[at].min():
+        if own > limits.known * min(alone[i] for i in combination.index):
             return
         together = [*(c for c, _ in found), combination]
         weight = block_diag(*(c.weight for c in together))
@@ -109,12 +107,11 @@ def search(
         for rank, (best, subset) in enumerate(ranked):
             if len(found) >= len(plain) - 1:
                 return found
-            is_shifted = size == 2 and rank < limits.most_shifted
-            if best > (limits.worth_a_shift if is_shifted else limits.known):
+            may_shift = size == 2 and rank < limits.most_shifted
+            if best > (limits.worth_a_shift if may_shift else limits.known):
                 break
-            known_pair = any({*c.index} <= {*subset} for c, _ in found)
-            if not known_pair:
-                needed = limits.known * alone[[place[i] for i in subset]].min()
+            if not any({*c.index} <= {*subset} for c, _ in found):  # a pair of it
+                needed = limits.known * min(alone[i] for i in subset)
                 keep(*_best_formula(moments, subset, low, span, limits, needed))
     for log in (False, True):
         if len(plain) > 3 and (not log or (low[list(open_parameters)] > 0).all()):
@@ -138,14 +135,17 @@ def _ranked(
         subsets = [*itertools.combinations(range(len(usable)), size)]
         if not subsets:
             continue
-        c, s = moments([Term(i, log=log) for i in usable])
-        at = np.array(subsets)
-        rows, columns = at[:, :, None], at[:, None, :]
-        widths = _eigenvectors(c[rows, columns], s[rows, columns])[0][:, 0]
+        widths = _widths([Term(i, log=log) for i in usable], np.array(subsets), moments)
         for subset, own in zip(subsets, widths.tolist(), strict=True):
             key = tuple(usable[k] for k in subset)
             best[key] = min(own, best.get(key, np.inf))
     return sorted((own, subset) for subset, own in best.items())
+
+
+def _widths(terms: Sequence[Term], subsets: Array, moments: Moments) -> Array:
+    """Return the smallest width of a combination of each subset of terms."""
+    rows, columns = subsets[:, :, None], subsets[:, None, :]
+    return _eigenvectors(*(m[rows, columns] for m in moments(terms)))[0][:, 0]
 
 
 def _eigenvectors(covariance: Array, prior: Array) -> tuple[Array, Array]:
@@ -221,10 +221,8 @@ def _shifted(
         best, least = 0.0, np.inf
         for _ in range(1 + refined):
             moved = [Term(i, log=True, shift=float(shift)) for shift in shifts]
-            parts = moments([Term(other, log=True), *moved])
             at = np.stack([np.zeros(len(shifts), int), 1 + np.arange(len(shifts))], 1)
-            pairs = (m[at[:, :, None], at[:, None, :]] for m in parts)
-            widths = _eigenvectors(*pairs)[0][:, 0]
+            widths = _widths([Term(other, log=True), *moved], at, moments)
             k = int(widths.argmin())
             best, least = float(shifts[k]), float(widths[k])
             ends = shifts[max(k - 1, 0)], shifts[min(k + 1, len(shifts) - 1)]

@@ -136,8 +136,8 @@ class Sensitivities:
 
     def singular(self) -> tuple[Array, Array]:
         """Return singular values, 0 where they are errors, (k, d), and vectors."""
-        k, d = len(self.theta), len(self.free)
-        stacked = self.jacobian.reshape(k, -1, d)
+        d = len(self.free)
+        stacked = self.jacobian.reshape(len(self.theta), -1, d)
         _, size, vectors = np.linalg.svd(stacked, full_matrices=True)
         size = np.pad(size, ((0, 0), (0, d - size.shape[1])))
         off = np.sqrt(((self.rounding / self.noise) ** 2).sum((1, 2))) / self.own.step
@@ -152,8 +152,7 @@ class Sensitivities:
         if practical:
             known = np.minimum(known, self.own.trials * size**2)
         information = (vectors * known[:, None, :]) @ vectors.swapaxes(1, 2)
-        prior = np.corrcoef(self.draws[:, self.free].T).reshape(2 * [len(self.free)])
-        prior = prior + 1e-9 * np.eye(len(prior))
+        prior = np.corrcoef(self.draws[:, self.free].T) + 1e-9 * np.eye(len(self.free))
         return np.linalg.inv(np.linalg.inv(prior) + information)
 
     def same(
@@ -197,10 +196,8 @@ def moved_along(
     result = probe.theta.clone()
 
     def values(rows: Array) -> Array:
-        found = np.empty((len(rows), len(group)))
-        for column, combination in enumerate(group):
-            found[:, column] = combination.coordinate(rows)
-        return found
+        each = [combination.coordinate(rows) for combination in group]
+        return np.array(each).reshape(len(group), len(rows)).T
 
     def gradient(rows: Array) -> Array:  # in prior deviations
         found = np.zeros((len(rows), len(group), len(at)))
@@ -226,9 +223,9 @@ def moved_along(
             inside &= torch.from_numpy(np.isfinite(tried).all(1))
             inside &= (result == probe.theta).all(dim=1)
             result = torch.where(inside[:, None], rows, result)
-    step = (result - probe.theta).double().numpy() / probe.deviation
-    far = np.sqrt((step**2).sum(1))
-    return result if np.median(far) > probe.own.fewest_moved else None
+    steps = (result - probe.theta).double().numpy() / probe.deviation
+    far = np.median(np.linalg.norm(steps, axis=1)) > probe.own.fewest_moved
+    return result if far else None
 
 
 def _shortest(gradient: Array, gap: Array) -> Array:

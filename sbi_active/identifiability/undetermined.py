@@ -111,9 +111,9 @@ def find_undetermined(
     probe = Sensitivities(simulate, prior, actions, free, num_theta, seed, own)
     if not np.isfinite(probe.base).any():
         return ()
-    where = f"none of {len(actions)} actions that were tried"
-    if num_permitted is not None and num_permitted <= len(actions):
-        where = "no permitted action"
+    is_all = num_permitted is not None and num_permitted <= len(actions)
+    tried = f"none of {len(actions)} actions that were tried"
+    where = "no permitted action" if is_all else tried
     about = probe, names, where
     return _formulas(*about, False) or _formulas(*about, True) or _local(*about)
 
@@ -180,10 +180,10 @@ def _local(
     if not about:
         return ()
     shares = np.sqrt((direction**2).mean(0))
-    at = [k for k in range(len(probe.free)) if shares[k] > probe.own.same]
-    if len(at) < 2:
+    moved = zip(probe.free, shares, strict=True)
+    own = tuple(names[i] for i, share in moved if share > probe.own.same)
+    if len(own) < 2:
         return ()
-    own = tuple(names[probe.free[k]] for k in at)
     text = (
         f"{where} determines all of {_and(own)}: at each of {len(direction)} draws of "
         f"the prior one direction {WHAT[exactly]}; {DO}"
