@@ -24,28 +24,33 @@ def cross_fit(
     """Return scores of every row (n,) by members fitted and chosen without it.
 
     Args:
-        score: ``score(train, test)``, both of rows, gives the scores of the test rows
-            by each member fitted to the training rows, shape (members, test).
+        score: ``score(train, test)``, see :func:`held_out`.
         block: Number of the block that a row belongs to, shape (n,): rows of a block
             share a fold, which the member scores that is the best on the others.
         weight: Weight of each row in the choice, shape (n,).
     """
-    fold = block % NUM_FOLDS
-    held_out: Tensor | None = None
-    for k in range(NUM_FOLDS):
-        train, test = torch.nonzero(fold != k)[:, 0], torch.nonzero(fold == k)[:, 0]
-        if len(test) == 0:
-            continue
-        scores = score(train, test)
-        if held_out is None:
-            held_out = torch.zeros(len(scores), len(block), dtype=torch.float64)
-        held_out[:, test] = scores
-    assert held_out is not None
+    fold, scores = block % NUM_FOLDS, held_out(score, block)
     result = torch.empty(len(block), dtype=torch.float64)
     for k in range(NUM_FOLDS):
-        others = (held_out * weight)[:, fold != k].sum(1)
-        result[fold == k] = held_out[int(others.argmax()), fold == k]
+        others = (scores * weight)[:, fold != k].sum(1)
+        result[fold == k] = scores[int(others.argmax()), fold == k]
     return result
+
+
+def held_out(score: Callable[[Tensor, Tensor], Tensor], block: Tensor) -> Tensor:
+    """Return scores of every row by members fitted to other folds, (members, n).
+
+    Args:
+        score: ``score(train, test)``, both of rows, gives the scores of the test rows
+            by each member fitted to the training rows, shape (members, test).
+        block: Number of the block that a row belongs to, shape (n,).
+    """
+    fold, parts, rows = block % NUM_FOLDS, [], []
+    for k in fold.unique().tolist():
+        train, test = (torch.nonzero(part)[:, 0] for part in (fold != k, fold == k))
+        parts.append(score(train, test))
+        rows.append(test)
+    return torch.cat(parts, 1).double()[:, torch.cat(rows).argsort()]
 
 
 def by_pattern(
