@@ -221,18 +221,13 @@ class Quantity:
             given = [base, dict(zip(names, phi, strict=True))]
         value = torch.as_tensor(self.function(*given)).detach().double()
         value = value[:, None] if value.ndim == 1 else value
-        if value.ndim != 2 or len(value) != len(theta) or not value.shape[1]:
+        lost = int((~value.isfinite()).sum())
+        if value.ndim != 2 or len(value) != len(theta) or not value.shape[1] or lost:
             raise ValueError(
-                f"expected values of target= of shape ({len(theta)},) or "
+                f"expected finite values of target= of shape ({len(theta)},) or "
                 f"({len(theta)}, k) at parameters {tuple(theta.shape)}; got "
-                f"{tuple(value.shape)}; return one row for each of the parameters"
-            )
-        lost = int((~value.isfinite().all(1)).sum())
-        if lost:
-            raise ValueError(
-                f"expected finite numbers from target=; got NaN or inf in {lost} of "
-                f"{len(theta)} rows; return a number for all parameters, such as the "
-                "largest loss where a controller fails"
+                f"{tuple(value.shape)}, {lost} of them NaN or inf; return a number in "
+                "each row, such as the largest loss where a controller fails"
             )
         return value
 

@@ -131,11 +131,11 @@ class RivalSampler:
         rows = []
         for own in action:
             drawn = [self._predict(k, own, each, seed) for k in range(num_rivals)]
-            if len({part.shape for part in drawn}) > 1:
+            shapes = [tuple(part.shape[1:]) for part in drawn]
+            if len({*shapes}) > 1 or shapes[0][:1] != (each,):
                 raise ValueError(
-                    "expected outcomes of one shape from all rivals; got "
-                    f"{[tuple(part.shape[1:]) for part in drawn]}; predict the "
-                    "same x"
+                    f"expected {each} outcomes of one shape from all rivals; got "
+                    f"{shapes}; return one row a draw, and predict the same x"
                 )
             rows.append(torch.stack(drawn, 2).flatten(1, 2))
         self.num_drawn += len(rows) * rows[0].shape[1]
@@ -154,22 +154,17 @@ class RivalSampler:
         Shape (1 or 3, n, *x_shape).
         """
         rival, own = self.rivals[k], derive_seed(seed, k)
-        x = torch.as_tensor(rival.predict(action, num, own))
-        if x.ndim == 0 or len(x) != num:
-            raise ValueError(
-                f"expected {num} outcomes from rival {k}; got shape {tuple(x.shape)}; "
-                "return one row a draw"
-            )
-        parts = [x]
+        parts = [torch.as_tensor(rival.predict(action, num, own))]
         if self._is_noisy:
             assert isinstance(rival, NoisyRivalPredictive)
             parts += [torch.as_tensor(p) for p in rival.predict_mean(action, num, own)]
-            if len({part.shape for part in parts}) > 1:
-                raise ValueError(
-                    f"expected means and deviations of shape {tuple(x.shape)} from "
-                    f"rival {k}; got {[tuple(p.shape) for p in parts[1:]]}; return "
-                    "one of each a number"
-                )
+        x = parts[0]
+        if any(part.shape != x.shape for part in parts):
+            raise ValueError(
+                f"expected means and deviations of shape {tuple(x.shape)} from rival "
+                f"{k}; got {[tuple(p.shape) for p in parts[1:]]}; return one of each "
+                "a number"
+            )
         # kernels as narrow as the noise need what a float loses of a large number
         exact = self._is_noisy and x[0].numel() <= MOST_NUMBERS
         dtype = torch.float64 if exact else torch.float32
