@@ -44,8 +44,7 @@ class Design:
         bound: Side of the information that the estimates lie on.
         index: Index of the chosen candidate.
         num_simulations: Simulations spent.
-        name: Name of the action, with its unit.
-        labels: Names of its entries, with their units.
+        labels: Names of the action's entries, with their units.
         estimator: Class that estimated.
         num_samples: Simulations of each candidate, shape (a,). Candidates that were
             eliminated early have fewer.
@@ -69,7 +68,6 @@ class Design:
     bound: Bound
     index: int
     num_simulations: int
-    name: str = "action"
     estimator: str = "none"
     num_samples: Tensor = field(default_factory=lambda: torch.empty(0).long())
     stopped: str = "at random"
@@ -150,14 +148,7 @@ def action_labels(actions: ActionSpace) -> tuple[str, ...]:
     return tuple(f"{name} [{unit}]" if unit else name for name, unit in pairs)
 
 
-def naming(actions: ActionSpace) -> dict[str, Any]:
-    """Return the fields of a :class:`Design` that name its actions."""
-    labels = action_labels(actions)
-    name = labels[0] if len(labels) == 1 else "action"
-    return {"name": name, "labels": labels}
-
-
-def equal_errors(error: Tensor) -> dict[str, Tensor]:
+def equal_errors(error: Tensor) -> dict[str, Any]:
     """Return the fields of a :class:`Design` for errors that are all alike.
 
     Args:

@@ -32,9 +32,7 @@ def draw(design: Any, ax: Axes | None = None) -> Axes:
 def labels_of(design: Any) -> list[str]:
     """Return names of the entries of the action, with units where known."""
     dim = design.candidates.shape[1]
-    if design.labels:
-        return [*design.labels]
-    return [design.name] if dim == 1 else [f"action {j + 1}" for j in range(dim)]
+    return [*design.labels] or [f"action {j + 1}" for j in range(dim)]
 
 
 def _gain_label(design: Any) -> str:
