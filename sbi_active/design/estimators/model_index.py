@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -26,7 +26,15 @@ from sbi_active.seeding import derive_seed
 
 
 class RivalPredictive(Protocol):
-    """A rival model: how probable it is, and what it predicts."""
+    """A rival model: how probable it is, and what it predicts.
+
+    One that knows what its noise adds to a draw has ``predict_mean(action, num_samples,
+    seed)`` as well, which returns the outcomes without noise behind the draws of
+    ``predict`` and the standard deviations of the noise in them, both of the shape of
+    the draws. A posterior draw that is used again has the same outcome without noise.
+    The predictive density is then a mixture of the noise's, sharper than any density
+    fitted to the outcomes alone.
+    """
 
     @property
     def probability(self) -> float:
@@ -43,27 +51,6 @@ class RivalPredictive(Protocol):
 
         Returns:
             Shape (n, *x_shape), NaN where there is no measurement.
-        """
-        ...
-
-
-@runtime_checkable
-class NoisyRivalPredictive(RivalPredictive, Protocol):
-    """A rival that knows what its noise adds to a draw.
-
-    Its predictive density is then a mixture of the noise's, sharper than any density
-    fitted to the outcomes alone.
-    """
-
-    def predict_mean(
-        self, action: Tensor, num_samples: int, seed: int
-    ) -> tuple[Tensor, Tensor]:
-        """Return means and deviations behind the draws of ``predict``.
-
-        Returns:
-            The outcomes without noise, and the standard deviations of the noise in
-            them, both of the shape of the draws. A posterior draw that is used again
-            has the same outcome without noise.
         """
         ...
 
@@ -108,7 +95,7 @@ class RivalSampler:
         self.rivals = [r for r, p in zip(rivals, values, strict=True) if p > 0]
         self.probability = probability[probability > 0] / total
         self.seed, self.num_drawn, self._num_waves = seed, 0, 0
-        self._is_noisy = all(isinstance(r, NoisyRivalPredictive) for r in self.rivals)
+        self._is_noisy = all(hasattr(r, "predict_mean") for r in self.rivals)
 
     def draw(
         self, num_samples: int, action: Tensor, *, replicates: bool
@@ -153,10 +140,10 @@ class RivalSampler:
 
         Shape (1 or 3, n, *x_shape).
         """
-        rival, own = self.rivals[k], derive_seed(seed, k)
+        rival: Any = self.rivals[k]
+        own = derive_seed(seed, k)
         parts = [torch.as_tensor(rival.predict(action, num, own))]
         if self._is_noisy:
-            assert isinstance(rival, NoisyRivalPredictive)
             parts += [torch.as_tensor(p) for p in rival.predict_mean(action, num, own)]
         x = parts[0]
         if any(part.shape != x.shape for part in parts):
