@@ -13,7 +13,7 @@ from torch import Tensor
 from sbi_active.actions import ActionSpace, MixedActions
 from sbi_active.actions.signals import SignalActions
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.expected import suggests
+from sbi_active.expected import require, suggests
 from sbi_active.mujoco.models.machine import Machine
 from sbi_active.mujoco.models.names import (
     element_id,
@@ -296,12 +296,8 @@ def _noise(model: Any, channels: Sequence[Any], noise: Any) -> Any:
         known = [c.name for c in channels]
         for name in noise:
             require_name(name, known, "sensor")
-        lost = [name for name in known if name not in noise]
-        if lost:
-            raise ValueError(
-                f"expected the noise of every sensor; got none of {', '.join(lost)}; "
-                "add it"
-            )
+        lost = ", ".join(name for name in known if name not in noise)
+        require(not lost, "the noise of every sensor", f"none of {lost}", "add it")
         sds = [float(noise[name]) for name in known]
         return sds[0] if len(sds) == 1 else torch.tensor(sds)
     if noise is not None:
