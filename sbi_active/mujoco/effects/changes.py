@@ -10,7 +10,7 @@ from typing_extensions import override
 
 from sbi_active.arrays import Array
 from sbi_active.mujoco.models.changes import ModelChange, StateChange
-from sbi_active.mujoco.models.names import element_id, names_of
+from sbi_active.mujoco.models.names import element_id
 from sbi_active.mujoco.models.quantities import (
     ATTRIBUTES,
     Entry,
@@ -220,11 +220,9 @@ class ContactChange(ModelChange):
 
     Attributes:
         what: Quantity that is multiplied.
-        geoms: Names of geoms; () for every geom and pair.
     """
 
     what: Literal["friction", "softness", "restitution"]
-    geoms: tuple[str, ...] = ()
 
     @override
     def fields(self) -> tuple[str, ...]:
@@ -234,10 +232,7 @@ class ContactChange(ModelChange):
     @override
     def write(self, model: Any, phi: Array) -> None:
         factor = float(np.exp(phi[0]))
-        geoms, pairs = (field_of(model, name) for name in self.fields())
-        every = self.geoms or names_of(model, "geom")
-        rows = [geoms[element_id(model, "geom", name)] for name in every]
-        for values in rows if self.geoms else [*rows, *pairs]:
+        for values in (row for name in self.fields() for row in field_of(model, name)):
             if self.what == "friction":
                 values *= factor
             elif values[0] <= 0:  # (-stiffness, -damping)

@@ -69,7 +69,7 @@ def _change(changes: str, element: Element) -> Any:
         case ["tilt", "x" | "y" as axis]:
             return GravityTilt(axis)
         case ["contact", what]:
-            return ContactChange(what, names)  # pyright: ignore
+            return ContactChange(what)  # pyright: ignore
         case ["density" | "viscosity" as what]:
             return QuantityChange("option", names, what)
         case [power] if "^" in power:
