@@ -141,7 +141,7 @@ def network_row(problem: str, kind: str, seed: int) -> dict[str, object]:
         "verdict": found.verdict,
         "flagged_strata": sum(flagged),
         "strata": len(flagged),
-        "coverage": found.overall.coverage[0.9],
+        "coverage": found.overall.coverage,
         "gap": found.overall.gap,
         "lost": found.overall.lost,
         "wrong_flagged": "" if wrong is None else int(flagged[wrong]),

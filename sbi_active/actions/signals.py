@@ -253,14 +253,10 @@ def _grid(times: Any, rounding: float) -> Tensor:
         )
     grid = own_tensor(times, torch.float64, name="input_times")
     steps = grid.diff() if grid.ndim == 1 else grid[:0]
-    if len(steps) < 1 or not bool((steps > 0).all()):
+    uneven = bool(((steps - steps.mean()).abs() > rounding * steps.mean()).any())
+    if len(steps) < 1 or uneven or not bool((steps > 0).all()):
         raise ValueError(
-            f"expected input_times (m,) that increase; got shape {tuple(grid.shape)}; "
-            "pass two or more times"
-        )
-    if bool(((steps - steps.mean()).abs() > rounding * steps.mean()).any()):
-        raise ValueError(
-            f"expected input_times with one step; got {float(steps.min()):g} to "
-            f"{float(steps.max()):g}; pass a uniform grid"
+            "expected input_times (m,) that increase by one step; got shape "
+            f"{tuple(grid.shape)} and steps {steps.tolist()[:6]}; pass a uniform grid"
         )
     return grid

@@ -58,12 +58,10 @@ class Waveform:
                 f"expected actions of {', '.join(self.names)}; got {action.shape[1]} "
                 "entries; give one each, or fix some by name"
             )
-        given = dict(zip(self.names, action.unbind(1), strict=True))
         one = torch.ones(len(action), dtype=action.dtype)
-        every = [
-            (given[name] if name in given else self.fixed[name] * one)[:, None]
-            for name, _ in self.every
-        ]
+        given = {name: value * one for name, value in self.fixed.items()}
+        given |= dict(zip(self.names, action.unbind(1), strict=True))
+        every = [given[name][:, None] for name, _ in self.every]
         return {self.input: _SHAPES[self.shape](self, every, input_times)}
 
 
@@ -239,9 +237,8 @@ def _fixed(
 def _chirp(waveform: Waveform, every: list[Tensor], times: Tensor) -> Tensor:
     amplitude, first, last = every
     t = times - times[0]
-    return amplitude * torch.sin(
-        2 * math.pi * (first * t + (last - first) * t**2 / (2 * t[-1]))
-    )
+    turns = first * t + (last - first) * t**2 / (2 * t[-1])
+    return amplitude * torch.sin(2 * math.pi * turns)
 
 
 def _step(waveform: Waveform, every: list[Tensor], times: Tensor) -> Tensor:

@@ -44,9 +44,7 @@ class Design:
         bound: Side of the information that the estimates lie on.
         index: Index of the chosen candidate.
         num_simulations: Simulations spent.
-        name: Name of the action, with its unit.
-        labels: Names of its entries, with their units.
-        categorical: Mask of the entries that are of a list beside a space without end.
+        labels: Names of the action's entries, with their units.
         estimator: Class that estimated.
         num_samples: Simulations of each candidate, shape (a,). Candidates that were
             eliminated early have fewer.
@@ -70,7 +68,6 @@ class Design:
     bound: Bound
     index: int
     num_simulations: int
-    name: str = "action"
     estimator: str = "none"
     num_samples: Tensor = field(default_factory=lambda: torch.empty(0).long())
     stopped: str = "at random"
@@ -79,7 +76,6 @@ class Design:
     cost: Tensor | None = None
     steps: tuple[Design, ...] = ()
     labels: tuple[str, ...] = ()
-    categorical: tuple[bool, ...] = ()
 
     @property
     def utility(self) -> Tensor:
@@ -135,15 +131,10 @@ class Design:
 
         The plot is over one entry of the action with two standard errors, over two as a
         map with the candidates that were evaluated, and over more as the best of them
-        in order. Entries of a list beside a space without end have a panel for each of
-        their values.
+        in order.
 
         Args:
             ax: Axes to draw on; None makes a figure.
-
-        Returns:
-            The axes; where there are several panels the ones around them, whose
-            ``child_axes`` they are.
         """
         drawn = draw(self, ax)
         figure: Any = drawn.get_figure(root=True)
@@ -157,21 +148,7 @@ def action_labels(actions: ActionSpace) -> tuple[str, ...]:
     return tuple(f"{name} [{unit}]" if unit else name for name, unit in pairs)
 
 
-def are_categories(actions: ActionSpace) -> tuple[bool, ...]:
-    """Return a mask of an action's entries that are of a list beside endless ones."""
-    listed = [(part.listed() is not None, part.action_dim) for part in actions.parts()]
-    mixed = len({is_listed for is_listed, _ in listed}) > 1
-    return tuple(mixed and is_listed for is_listed, dim in listed for _ in range(dim))
-
-
-def naming(actions: ActionSpace) -> dict[str, Any]:
-    """Return the fields of a :class:`Design` that name its actions."""
-    labels = action_labels(actions)
-    name = labels[0] if len(labels) == 1 else "action"
-    return {"name": name, "labels": labels, "categorical": are_categories(actions)}
-
-
-def equal_errors(error: Tensor) -> dict[str, Tensor]:
+def equal_errors(error: Tensor) -> dict[str, Any]:
     """Return the fields of a :class:`Design` for errors that are all alike.
 
     Args:

@@ -12,10 +12,9 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
-from sbi_active.callers import stack_level
 from sbi_active.design.design import Design
 from sbi_active.design.elimination import as_batch, eliminate
-from sbi_active.design.estimators.automatic import find_estimator
+from sbi_active.design.estimators.automatic import by_name, find_estimator
 from sbi_active.design.estimators.base import (
     InformationGainEstimator,
     at_least,
@@ -35,7 +34,6 @@ from sbi_active.design.search import (
 )
 from sbi_active.design.target import Target, target_estimator
 from sbi_active.expected import Shown, suggests
-from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import Simulations
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
@@ -295,17 +293,6 @@ class InformationGainDesigner(Shown):
 def _find_search(search: str | Search, actions: ActionSpace) -> Search:
     if isinstance(search, Search):
         return search
-    if search == "bayesopt":
-        warn(
-            'SA701 search="bayesopt" goes in the next version: use search="gradient"',
-            stacklevel=stack_level(),
-        )
-        search = "gradient"
     if search == "auto":
         search = "gradient" if actions.listed() is None else "exhaustive"
-    if search not in SEARCHES:
-        raise ValueError(
-            f"expected search among 'auto', {', '.join(map(repr, SEARCHES))}; got "
-            f"{search!r}; choose one of these or pass a search"
-        )
-    return SEARCHES[search]()
+    return by_name(search, "search", SEARCHES, {"bayesopt": "gradient"})

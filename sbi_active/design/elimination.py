@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sbi_active.design.design import Design, naming
+from sbi_active.design.design import Design, action_labels
 from sbi_active.design.estimators.base import CandidateSimulations, standard_error
 from sbi_active.design.evaluator import GainEvaluator
 from sbi_active.design.limits import DesignLimits
@@ -235,7 +235,7 @@ def choose(
             [runs * (len(a) + len(b)) for a, b in zip(*halves, strict=True)]
         ),
         cost=None if limits.price is None else price,
-        **naming(limits.actions),
+        labels=action_labels(limits.actions),
         **known,
     )
 

@@ -51,8 +51,8 @@ class GivenGains:
             averaged.
 
     Raises:
-        TypeError: If the rows are no simulations.
-        ValueError: If they are of other actions, or there is no model.
+        TypeError: If the rows are no simulations, or of other actions.
+        ValueError: If there is no model.
     """
 
     def __init__(
@@ -68,15 +68,10 @@ class GivenGains:
         num_cells: int = 128,
     ) -> None:
         dim = limits.actions.action_dim
-        if not isinstance(rows, Simulations):
+        if not isinstance(rows, Simulations) or rows.action.shape[1] != dim:
             raise TypeError(
-                "expected Simulations(theta, action, x) for simulations=; got "
-                f"{type(rows).__name__}; wrap the rows in it"
-            )
-        if rows.action.shape[1] != dim:
-            raise ValueError(
-                f"expected simulations of actions (n, {dim}); got "
-                f"{tuple(rows.action.shape)}; pass those of this space"
+                f"expected Simulations(theta, action, x) of actions (n, {dim}) for "
+                f"simulations=; got {rows!r:.80}; wrap rows of this space in it"
             )
         self.rows, self.model, self.belief = rows, model, belief
         self.limits, self.seed = limits, seed

@@ -111,29 +111,24 @@ class DesignLimits:
         Raises:
             ValueError: If none does; it names the largest share.
         """
-        eligible = valid >= self.least
-        if bool(eligible.any()):
-            return eligible
-        if bool(valid.isnan().all()):
+        eligible, most = valid >= self.least, float(valid.nan_to_num(0.0).max())
+        if not bool(eligible.any()):
             raise ValueError(
-                "expected simulations; got none, all rows of all candidates were lost "
-                "to faults; look at the simulator's tracebacks"
+                "expected a candidate that gives a measurement with a probability of "
+                f"at least {self.least:g}; got {most:.3g} at most, 0 where every row "
+                "was lost to faults; look at the simulator's tracebacks, lower "
+                "min_probability_valid or add gentler candidates"
             )
-        raise ValueError(
-            f"expected a candidate that gives a measurement with a probability of at "
-            f"least {self.least:g}; got {float(valid.nan_to_num(0.0).max()):.3g} at "
-            "most; lower min_probability_valid or add gentler candidates"
-        )
+        return eligible
 
     def excluded_note(self, eligible: Tensor) -> tuple[str, ...]:
         """Return a note on the number of excluded candidates; empty if none is."""
-        num = int((~eligible).sum())
-        if num == 0:
-            return ()
-        return (
+        num, least = int((~eligible).sum()), f"{self.least:g}"
+        note = (
             f"{num} of {len(eligible)} candidates excluded: a measurement is less "
-            f"probable than {self.least:g}, or every simulation was lost",
+            f"probable than {least}, or every simulation was lost"
         )
+        return (note,) if num else ()
 
     def _tolerance(self, same: float = 0.01) -> Tensor:
         """Return differences within which two actions are the same, (action_dim,)."""

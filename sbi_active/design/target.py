@@ -58,27 +58,19 @@ def target_estimator(
             f"target={name_of(target)!r}; got {given!r}; leave out estimator="
         )
     if target == "model":
-        if not isinstance(model, Sequence) or simulations is not None:
-            got = type(model).__name__ if simulations is None else "given simulations"
+        if not isinstance(model, Sequence) or simulations is not None or num_others:
             raise ValueError(
-                f"expected a sequence of rivals for target='model'; got {got}; pass "
-                "objects with probability and predict(action, num_samples, seed)"
-            )
-        if num_others:
-            raise ValueError(
-                "expected one action at a time and none pending for "
-                f"target='model'; got {num_others} others; ask for them in turn"
+                "expected a sequence of rivals, no simulations= and one action at a "
+                f"time for target='model'; got {type(model).__name__} and {num_others} "
+                "others; pass objects with probability and "
+                "predict(action, num_samples, seed)"
             )
         return None
-    if simulator is None and simulations is None:
+    if belief is None or (simulator is None and simulations is None):
         raise ValueError(
-            "expected a simulator; got None; pass the one that the belief's "
-            "parameters belong to"
-        )
-    if belief is None:
-        raise ValueError(
-            "expected belief=, the distribution of the parameters; got none, and "
-            "the model has none; pass the belief of this round"
+            "expected a simulator and belief=, the distribution of its parameters; got "
+            f"{'no belief' if belief is None else 'no simulator'}, and the model has "
+            "none; pass both"
         )
     if simulations is not None and num_others:
         raise ValueError(
@@ -97,17 +89,11 @@ def target_estimator(
     estimator = find_estimator(given)
     if estimator is None or not estimator.needs_model:
         return estimator
-    if model is None:
+    if model is None or (num_others and not hasattr(model, "log_likelihood")):
         raise ValueError(
-            f"expected a model for {type(estimator).__name__}; got None; pass "
+            f"expected a model for {type(estimator).__name__}, with log_likelihood if "
+            f"several actions are to tell together; got {type(model).__name__}; pass "
             "the trained posterior, or estimator='auto'"
-        )
-    if num_others and not hasattr(model, "log_likelihood"):
-        raise ValueError(
-            "expected an estimator of the joint information of several actions, by the "
-            f"noise or by a model with log_likelihood; got {type(estimator).__name__} "
-            f"on {type(model).__name__}, which knows single outcomes; use "
-            "estimator='auto', or one action at a time without pending ones"
         )
     return estimator
 
@@ -221,18 +207,13 @@ class Quantity:
             given = [base, dict(zip(names, phi, strict=True))]
         value = torch.as_tensor(self.function(*given)).detach().double()
         value = value[:, None] if value.ndim == 1 else value
-        if value.ndim != 2 or len(value) != len(theta) or not value.shape[1]:
+        lost = int((~value.isfinite()).sum())
+        if value.ndim != 2 or len(value) != len(theta) or not value.shape[1] or lost:
             raise ValueError(
-                f"expected values of target= of shape ({len(theta)},) or "
+                f"expected finite values of target= of shape ({len(theta)},) or "
                 f"({len(theta)}, k) at parameters {tuple(theta.shape)}; got "
-                f"{tuple(value.shape)}; return one row for each of the parameters"
-            )
-        lost = int((~value.isfinite().all(1)).sum())
-        if lost:
-            raise ValueError(
-                f"expected finite numbers from target=; got NaN or inf in {lost} of "
-                f"{len(theta)} rows; return a number for all parameters, such as the "
-                "largest loss where a controller fails"
+                f"{tuple(value.shape)}, {lost} of them NaN or inf; return a number in "
+                "each row, such as the largest loss where a controller fails"
             )
         return value
 

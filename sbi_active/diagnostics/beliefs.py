@@ -21,8 +21,8 @@ References:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -30,7 +30,7 @@ from scipy.stats import chi2, norm
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.diagnostics.calibration import Verdict, worst
+from sbi_active.diagnostics.calibration import Judged, Verdict, worst
 from sbi_active.diagnostics.check import is_campaign
 from sbi_active.diagnostics.log_score import smooth
 from sbi_active.expected import require, suggests
@@ -44,8 +44,8 @@ from sbi_active.simulation import simulate
 Infer = Callable[[Tensor, Tensor, int], Distribution]
 
 
-@dataclass(frozen=True, kw_only=True)
-class BeliefCheck:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class BeliefCheck(Judged):
     """Whether a refined belief can be trusted.
 
     Attributes:
@@ -55,51 +55,32 @@ class BeliefCheck:
         reasons: Reasons for the verdict, a sentence each.
         parameter_names: Names of the parameters; the last of the figures is the joint
             density.
-        beyond: Nats by which refits, at their own draws, exceed the belief; one a
-            refit, the belief is too narrow or elsewhere.
-        within: Nats at the belief's draws, likewise: it is too wide, or elsewhere.
+        refits: Nats by which each refit, at its own draws, exceeds the belief, which is
+            too narrow or elsewhere; and nats at the belief's draws, likewise, where it
+            is too wide or elsewhere.
         spread: Standard deviation of the normal scores of the ranks, one a parameter
             and one for the density: 1 where right, more for too narrow.
-        spread_interval: Interval of each spread, 95 %.
-        shift: Mean of the scores, one as for ``spread``.
-        p_value: p-value of spread and shift together, one as for ``spread``.
+        p_value: p-value of spread and mean of the scores, one as for ``spread``.
         num_repeats: Repeats of posterior SBC.
         num_simulations: Rows of new outcomes.
     """
 
-    verdict: Verdict
-    reasons: tuple[str, ...]
-    parameter_names: tuple[str, ...]
-    beyond: tuple[float, ...]
-    within: tuple[float, ...]
+    refits: tuple[tuple[float, float], ...]
     spread: tuple[float, ...]
-    spread_interval: tuple[tuple[float, float], ...]
-    shift: tuple[float, ...]
     p_value: tuple[float, ...]
     num_repeats: int
     num_simulations: int
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return all figures, in a form that JSON can hold."""
-        return asdict(self)
-
     def __str__(self) -> str:
         lines = [f"{self.verdict}: {self.num_repeats} repeats around the belief"]
         lines += [f"- {reason}" for reason in self.reasons]
-        if self.beyond:
-            pairs = zip(self.beyond, self.within, strict=True)
-            texts = [f"{a:.2f} and {b:.2f}" for a, b in pairs]
+        if self.refits:
+            texts = [f"{a:.2f} and {b:.2f}" for a, b in self.refits]
             lines.append(f"  refits differ by {'; '.join(texts)} nats")
-        figures = self.spread, self.spread_interval, self.shift, self.p_value
-        names = (*self.parameter_names, "density")
-        for name, spread, (low, high), shift, p in zip(names, *figures, strict=False):
-            lines.append(
-                f"  {name}: scores spread {spread:.2f} ({low:.2f} to {high:.2f}), "
-                f"shift {shift:.2f}, p = {p:.2g}"
-            )
+        names = *self.parameter_names, "density"
+        for name, spread, p in zip(names, self.spread, self.p_value, strict=False):
+            lines.append(f"  {name}: scores spread {spread:.2f}, p = {p:.2g}")
         return "\n".join(lines)
-
-    __repr__ = __str__
 
 
 @suggests
@@ -112,7 +93,6 @@ def check_belief(
     num_refits: int = 2,
     num_posterior_samples: int = 200,
     refinement: RefinementOptions | None = None,
-    belief: Distribution | None = None,
     infer: Infer | None = None,
     level: float = 0.02,
     seed: int = 0,
@@ -131,7 +111,6 @@ def check_belief(
         num_posterior_samples: Draws that a repeat's parameters are ranked among.
         refinement: Options of the refits; None takes the campaign's settings, or the
             defaults.
-        belief: Belief to be judged; None takes the current one.
         infer: ``infer(action, x, seed)`` gives a belief; None refines.
         level: Probability that ranks alone flag a right belief, at most.
         seed: Seed of all draws.
@@ -140,54 +119,39 @@ def check_belief(
         ValueError: If there is no trial, no simulator, or sizes are too small.
     """
     require(
-        not num_repeats or (num_repeats >= 10 and num_copies >= 1),
-        "num_repeats 0 or at least 10, num_copies at least 1",
-        f"{num_repeats} and {num_copies}",
-        "use 40 and 6",
+        num_copies >= 1 and (num_repeats >= 10 or (num_repeats == 0 < num_refits)),
+        "num_copies and num_repeats at least 1 and 10, or refits alone",
+        f"{num_copies}, {num_repeats} and {num_refits} refits",
+        "use 6, 40 and 2",
     )
-    asked = num_repeats or num_refits
-    require(asked > 0, "repeats or refits", "neither", "pass num_refits=2")
     if is_campaign(inference):
         prior, trials = inference.prior, inference.state.explained
         simulator = inference.simulator if simulator is None else simulator
         own = inference.state.options.refinement
         refinement = own if refinement is None else refinement
-    elif hasattr(inference, "trials"):
-        prior, trials = inference._prior, inference.trials
     else:
-        raise TypeError(
-            f"expected a trainer or a campaign; got {type(inference).__name__}; pass "
-            "inference, whose update gave the belief"
-        )
-    if simulator is None or not trials:
-        raise ValueError(
-            "expected a simulator and at least one trial; got "
-            f"{'no simulator' if simulator is None else 'no trial'}; pass simulator, "
-            "and check a belief after its first update"
-        )
-    belief = inference.belief if belief is None else belief
-    assert belief is not None
-    action = torch.stack([t.action for t in trials])
-    x = torch.stack([t.x for t in trials])
-    model, settings = simulator, refinement
+        prior, trials = inference._prior, inference.trials
+    require(
+        simulator is not None and len(trials) > 0,
+        "a simulator and at least one trial",
+        f"{simulator} and {len(trials)} trials",
+        "pass simulator, and check a belief after its first update",
+    )
+    belief, model = inference.belief, cast(Any, simulator)
+    action, x = (torch.stack([getattr(t, k) for t in trials]) for k in ("action", "x"))
 
     def refined(action: Tensor, x: Tensor, seed: int) -> Distribution:
-        return refine(model, prior, action, x, settings=settings, seed=seed)
+        return refine(model, prior, action, x, settings=refinement, seed=seed)
 
     infer = refined if infer is None else infer
     refits = [
         _compare(belief, infer(action, x, derive_seed(seed, "refit", r)), seed)
         for r in range(num_refits)
     ]
-    scores = np.zeros((0, 0))
-    if num_repeats:
-        scores = _scores(
-            *(belief, simulator, infer, action, x),
-            sizes=(num_repeats, num_copies, num_posterior_samples),
-            seed=seed,
-        )
-    names = getattr(simulator, "parameter_names", None)
-    names = names_of(belief, belief.event_shape[0]) if names is None else names
+    sizes = num_repeats, num_copies, num_posterior_samples
+    scores = _scores(*(belief, model, infer, action, x), sizes=sizes, seed=seed)
+    dim = belief.event_shape[0]
+    names = getattr(simulator, "parameter_names", None) or names_of(belief, dim)
     return _judge((*names,), refits, scores, level, len(x) * num_copies * num_repeats)
 
 
@@ -249,7 +213,7 @@ def _scores(
         own = torch.cat([theta, smooth(after, theta[None])]).double()
         below = (values < own).sum(0).numpy() + ties * (values == own).sum(0).numpy()
         scores.append(norm.ppf((below + 0.5) / (num_draws + 1)))
-    return np.stack(scores)
+    return np.array(scores).reshape(num, -1 if num else 0)
 
 
 def _judge(
@@ -289,13 +253,11 @@ def _judge(
             text = "two inferences of the same trials differ; raise num_histories"
             found.append(("refine", text))
     is_other = bool(found)
-    z = np.ascontiguousarray(scores.T)
-    total, shift = (z**2).sum(1), z.sum(1) / max(n, 1)
+    total, shift = (scores**2).sum(0), scores.sum(0) / max(n, 1)
     tail = np.minimum(2 * np.minimum(chi2.sf(total, n), chi2.cdf(total, n)), 1.0)
     side = 2 * norm.sf(np.abs(shift) * n**0.5)
     p_value = np.minimum(2 * np.minimum(tail, side), 1.0)
     spread = (total / max(n, 1)) ** 0.5
-    ends = (total[:, None] / chi2.ppf([0.975, 0.025], max(n, 1))) ** 0.5
     labels = (*names, "the density")
     for k in np.flatnonzero(p_value < level / (dim + 1)):
         text = f"ranks of {labels[k]} in repeats are not uniform (p = {p_value[k]:.1g})"
@@ -310,11 +272,8 @@ def _judge(
         verdict=worst([v for v, _ in found]),
         reasons=(*(text for _, text in found),),
         parameter_names=names,
-        beyond=(*(a for a, _ in refits),),
-        within=(*(b for _, b in refits),),
+        refits=(*refits,),
         spread=(*spread.tolist(),),
-        spread_interval=(*map(tuple, ends.tolist()),),
-        shift=(*shift.tolist(),),
         p_value=(*p_value.tolist(),),
         num_repeats=n,
         num_simulations=num_simulations,

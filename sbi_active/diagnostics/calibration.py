@@ -7,10 +7,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
 import torch
-from sbi.diagnostics.sbc import check_uniformity_frequentist
-from scipy.stats import beta, kstest, norm
+from scipy.stats import binomtest, kstest, norm
 from torch import Tensor
 
 if TYPE_CHECKING:
@@ -22,21 +20,18 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class Stratum:
-    """Figures of one group of actions in one round, or of all of them.
+    """Figures of one group of actions, or of all of them.
 
     Every interval holds at the same time as all others with the check's level.
 
     Attributes:
         name: Name of the action or group; "all".
-        round: Round of the network, from 1; 0 for all.
         num_rows: Simulations behind it.
-        coverage: Share of truths in the network's smallest regions, by their level.
-        coverage_interval: Interval of each of these shares (Clopper & Pearson).
+        coverage: Share of truths in the network's smallest 90 % regions.
+        coverage_interval: Interval of that share (Clopper & Pearson).
         rank_distance: Largest distance of the ranks' distribution from uniform, one a
             parameter (Kolmogorov & Smirnov).
-        rank_interval: Interval of that distance, one a parameter.
-        p_value: Probability that ranks of uniform ones are as far, one a parameter, as
-            sbi gives.
+        rank_margin: Half of the interval of that distance.
         gap: Log-score gap, a lower bound in nats.
         gap_interval: Interval of that bound.
         information: Information that outcomes tell beyond the belief, nats: gap and
@@ -47,13 +42,11 @@ class Stratum:
     """
 
     name: str
-    round: int
     num_rows: int
-    coverage: dict[float, float]
-    coverage_interval: dict[float, Interval]
+    coverage: float
+    coverage_interval: Interval
     rank_distance: tuple[float, ...]
-    rank_interval: tuple[Interval, ...]
-    p_value: tuple[float, ...]
+    rank_margin: float
     gap: float
     gap_interval: Interval
     information: float
@@ -62,8 +55,31 @@ class Stratum:
     reasons: tuple[str, ...]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Calibration:
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Judged:
+    """A verdict with its reasons.
+
+    Attributes:
+        verdict: "trust", "refine" or "stop".
+        reasons: Reasons for the verdict, a sentence each; empty for "trust".
+        parameter_names: Names of the parameters.
+    """
+
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    parameter_names: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return all figures, in a form that JSON can hold."""
+        found = asdict(self)
+        return {entry.name: found[entry.name] for entry in fields(self) if entry.repr}
+
+    def __repr__(self) -> str:
+        return str(self)
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Calibration(Judged):
     """Whether an amortized posterior can be trusted, action by action.
 
     ``print(calibration)`` reports it in words, the verdict first.
@@ -75,7 +91,7 @@ class Calibration:
             often, or is less informative than the belief before.
         reasons: Reasons for the verdict, a sentence each; empty for "trust".
         overall: Figures of all rows.
-        strata: Figures by action and round.
+        strata: Figures by action.
         parameter_names: Names of the parameters.
         gap_method: "likelihood" or "classifier", see :mod:`.log_score`.
         num_invalid: Rows without a measurement that the network cannot take.
@@ -83,59 +99,46 @@ class Calibration:
         ranks: Ranks of the truths among ``num_posterior_samples``, shape (n, d + 1);
             the last by the network's density.
         num_posterior_samples: Draws of the network a row.
-        label: Index of each row's stratum, shape (n,).
-        tarp: Expected coverage and credibility by distances to random points (Lemos et
-            al. 2023), of all rows.
-        tarp_area: Area between these from .5 up; negative for too narrow a posterior.
     """
 
-    verdict: Verdict
-    reasons: tuple[str, ...]
     overall: Stratum
     strata: tuple[Stratum, ...]
-    parameter_names: tuple[str, ...]
     gap_method: str
     num_invalid: int
     num_simulations: int
     ranks: Tensor = field(repr=False)
     num_posterior_samples: int
-    label: Tensor = field(repr=False)
-    tarp: tuple[Tensor, Tensor] = field(repr=False)
-    tarp_area: float
 
     @property
     def flagged(self) -> list[str]:
         """Names of the strata that are not to be trusted."""
         return [s.name for s in self.strata if s.verdict != "trust"]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return all figures, in a form that JSON can hold."""
-        found = asdict(self)
-        return {entry.name: found[entry.name] for entry in fields(self) if entry.repr}
-
     def __str__(self) -> str:
         lines = [f"{self.verdict}: {describe(self.overall)}"]
         lines += [f"- {reason}" for reason in self.reasons]
         lines += [f"  {s.name}: {describe(s)}" for s in self.strata]
-        if self.num_invalid:
-            lines.append(f"{self.num_invalid} rows without a measurement left out")
+        lines += [f"{self.num_invalid} rows left out"] * (self.num_invalid > 0)
         return "\n".join(lines)
 
-    __repr__ = __str__
-
     def plot(self) -> Figure:
-        """Draw ranks as sbi does, coverage, and gaps and coverage by stratum."""
+        """Draw the ranks of the truths in all rows, as sbi does."""
+        from sbi.analysis.plot import sbc_rank_plot
+
         from sbi_active.display.figures import legible
 
-        return legible(_plotted(self))
+        num, names = self.num_posterior_samples, [*self.parameter_names]
+        ranks = self.ranks[:, :-1]
+        drawn = sbc_rank_plot(ranks, num, plot_type="cdf", parameter_labels=names)
+        return legible(drawn[0])
 
 
 def describe(stratum: Stratum) -> str:
     """Return coverage and gap of a stratum with their intervals."""
-    low, high = stratum.coverage_interval[0.9]
+    low, high = stratum.coverage_interval
     least, most = stratum.gap_interval
     return (
-        f"90 % regions hold {stratum.coverage[0.9]:.0%} of the truths "
+        f"90 % regions hold {stratum.coverage:.0%} of the truths "
         f"({low:.0%} to {high:.0%}), the log score is {stratum.gap:.2f} nats "
         f"({least:.2f} to {most:.2f}) short, {stratum.lost:.0%} of what outcomes tell"
     )
@@ -167,8 +170,7 @@ class Tolerance:
 
 
 def judge(
-    name: str,
-    round_: int,
+    stratum: str,
     ranks: Tensor,
     gap: Tensor,
     gained: Tensor,
@@ -177,14 +179,12 @@ def judge(
     level: float,
     tolerance: Tolerance,
     names: Sequence[str],
-    levels: tuple[float, ...] = (0.5, 0.8, 0.9, 0.95),
     num_kinds: int = 4,
 ) -> Stratum:
     r"""Return the figures of a stratum.
 
     Args:
-        name: Name of the stratum.
-        round_: Round of the network.
+        stratum: Name of the stratum.
         ranks: Ranks, shape (n, d + 1), the last by density.
         gap: Terms of the log-score gap, shape (n,), nats.
         gained: log q - log b at the truths, shape (n,), nats.
@@ -192,28 +192,22 @@ def judge(
         level: Level of error of one stratum, shared among its figures.
         tolerance: Tolerance of the figures.
         names: Names of the parameters.
-        levels: Levels of the smallest regions, .9 among them.
         num_kinds: Number of kinds of figures beside the ranks of each parameter.
     """
     n, dim = len(ranks), ranks.shape[1] - 1
     each = level / (num_kinds + dim)
     uniform = (ranks.double() + 0.5) / (num_posterior_samples + 1)
     # The smallest region that holds the truth has the draws of a higher density.
-    credible = 1 - uniform[:, -1]
-    inside = {c: int((credible <= c).sum()) for c in levels}
-    coverage = {c: num / n for c, num in inside.items()}
-    intervals = {c: clopper_pearson(num, n, each) for c, num in inside.items()}
+    inside = int((1 - uniform[:, -1] <= 0.9).sum())
+    low, high = interval = clopper_pearson(inside, n, each)
     columns = uniform[:, :dim].T.numpy()
     distance = [float(kstest(c, "uniform", method="asymp").statistic) for c in columns]
     margin = math.sqrt(math.log(2 / each) / (2 * n))
-    ranged = [(max(v - margin, 0.0), min(v + margin, 1.0)) for v in distance]
-    p_value = check_uniformity_frequentist(ranks[:, :dim], num_posterior_samples)
     mean = float(gap.mean())
     information = float((gap + gained).mean())
     excess = gap - tolerance.lost * (gap + gained).clamp_min(-20)
     reasons: list[tuple[Verdict, str]] = []
-    low, high = intervals[0.9]
-    text = f"90 % regions hold {coverage[0.9]:.0%} of the truths, at"
+    text = f"90 % regions hold {inside / n:.0%} of the truths, at"
     if high < 0.9 - tolerance.excluded:
         word = f"most {high:.0%}: it excludes the truth too often"
         reasons.append(("stop", f"{text} {word}"))
@@ -221,10 +215,10 @@ def judge(
         reasons.append(("refine", f"{text} most {high:.0%}: it is too sure"))
     elif low > 0.9 + tolerance.coverage:
         reasons.append(("refine", f"{text} least {low:.0%}: it is too wide"))
-    for k, (least, _) in enumerate(ranged):
-        if least > tolerance.rank_distance:
-            text = f"ranks of {names[k]} are {distance[k]:.2f} from uniform"
-            reasons.append(("refine", f"{text}, at least {least:.2f}"))
+    for name, off in zip(names, distance, strict=True):
+        if off - margin > tolerance.rank_distance:
+            text = f"ranks of {name} are {off:.2f} from uniform"
+            reasons.append(("refine", f"{text}, at least {off - margin:.2f}"))
     if _interval(gained, each)[1] < 0:
         text = f"it has {gained.mean():.2f} nats about the truth"
         reasons.append(("stop", f"{text}: the belief before the outcome knew more"))
@@ -232,14 +226,12 @@ def judge(
         text = f"the log score is {mean:.2f} nats short of {information:.2f}"
         reasons.append(("refine", f"{text} that outcomes tell: it is blunt"))
     return Stratum(
-        name=name,
-        round=round_,
+        name=stratum,
         num_rows=n,
-        coverage=coverage,
-        coverage_interval=intervals,
+        coverage=inside / n,
+        coverage_interval=interval,
         rank_distance=(*distance,),
-        rank_interval=(*ranged,),
-        p_value=(*p_value.tolist(),),
+        rank_margin=margin,
         gap=mean,
         gap_interval=_interval(gap, each),
         information=information,
@@ -251,10 +243,8 @@ def judge(
 
 def clopper_pearson(successes: int, n: int, level: float) -> Interval:
     """Return the exact binomial interval of a share (Clopper & Pearson 1934)."""
-    k = successes
-    low = 0.0 if k == 0 else float(beta.ppf(level / 2, k, n - k + 1))
-    high = 1.0 if k == n else float(beta.ppf(1 - level / 2, k + 1, n - k))
-    return low, high
+    low, high = binomtest(successes, n).proportion_ci(1 - level)
+    return float(low), float(high)
 
 
 def _interval(values: Tensor, level: float) -> Interval:
@@ -268,52 +258,4 @@ def _interval(values: Tensor, level: float) -> Interval:
         ends = values.quantile(torch.tensor([0.01, 0.99], dtype=torch.float64))
         values = values.clamp(ends[0], ends[1])
     half = float(norm.isf(level / 2)) * float(values.std()) / len(values) ** 0.5
-    mean = float(values.mean())
-    return mean - half, mean + half
-
-
-def _plotted(found: Calibration) -> Figure:
-    """Draw ranks, TARP, and coverage and gap of each stratum with their intervals."""
-    import matplotlib.pyplot as plt
-    from sbi.analysis.plot import sbc_rank_plot
-
-    figure, axes = plt.subplots(2, 2, figsize=(11, 8), layout="constrained")
-    figure.suptitle(f"calibration: {found.verdict}")
-    (ranks, tarp), (shares, gaps) = axes
-    for k, name in enumerate(found.parameter_names):
-        sbc_rank_plot(
-            found.ranks[:, k : k + 1],
-            found.num_posterior_samples,
-            plot_type="cdf",
-            ranks_labels=[name],
-            colors=[f"C{k}"],
-            fig=figure,
-            ax=ranks,
-        )
-    ranks.set_title("ranks of the truth")
-    coverage, credibility = found.tarp
-    tarp.plot(credibility, coverage, color="blue", label="TARP")
-    levels, middle = [*found.overall.coverage], [*found.overall.coverage.values()]
-    ends = np.array([*found.overall.coverage_interval.values()]).T
-    error = abs(ends - middle)
-    tarp.errorbar(levels, middle, error, fmt="o", label="smallest regions")
-    tarp.plot([0, 1], [0, 1], "k--", label="ideal")
-    tarp.set(xlabel="credibility level", ylabel="expected coverage")
-    tarp.legend()
-    color = {"trust": "C2", "refine": "C1", "stop": "C3"}
-    for i, s in enumerate(found.strata):
-        for ax, value, (low, high) in (
-            (shares, s.coverage[0.9], s.coverage_interval[0.9]),
-            (gaps, s.gap, s.gap_interval),
-        ):
-            error = [[max(value - low, 0)], [max(high - value, 0)]]
-            ax.errorbar(i, value, error, fmt="o", color=color[s.verdict])
-    names = [s.name for s in found.strata]
-    for ax, ideal, label in (
-        (shares, 0.9, "coverage of 90 % regions"),
-        (gaps, 0.0, "log-score gap [nats]"),
-    ):
-        ax.axhline(ideal, color="k", ls="--")
-        ax.set_ylabel(label)
-        ax.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
-    return figure
+    return float(values.mean()) - half, float(values.mean()) + half

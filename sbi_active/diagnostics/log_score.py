@@ -96,7 +96,13 @@ def gap_by_likelihood(
 
 
 def gap_by_classifier(
-    theta: Tensor, condition: Tensor, draws: Tensor, log_q: Any, *, seed: int
+    theta: Tensor,
+    condition: Tensor,
+    draws: Tensor,
+    log_q: Any,
+    *,
+    seed: int,
+    largest: float = 6.0,
 ) -> Tensor:
     r"""Return terms of a lower bound on the gap, by a classifier trained on half.
 
@@ -111,6 +117,7 @@ def gap_by_classifier(
         draws: Draws of q, shape (m, n, d), at least three.
         log_q: Log density of rows of draws, (m, n, d) -> (m, n).
         seed: Seed of the halves and the classifier.
+        largest: Largest log ratio T, what thousands of rows can tell.
 
     Returns:
         Shape (n,), nats.
@@ -133,13 +140,7 @@ def gap_by_classifier(
         model = HistGradientBoostingClassifier(random_state=k, **options)
         rows = np.concatenate([true[on], false[0][on]])
         model.fit(rows, np.repeat([1, 0], int(on.sum())))
-        p, *q = (_log_ratio(model, f[off]) for f in (true, *false))
+        ratios = (model.decision_function(f[off]) for f in (true, *false))
+        p, *q = (np.clip(ratio, -largest, largest) for ratio in ratios)
         terms[off] = p - np.mean([np.exp(v) for v in q], 0) + 1
     return torch.from_numpy(terms)
-
-
-def _log_ratio(model: Any, rows: np.ndarray, *, largest: float = 6.0) -> np.ndarray:
-    """Return a classifier's log ratios, at most what thousands of rows can tell."""
-    probability = model.predict_proba(rows)[:, 1]
-    ratio = np.log(probability) - np.log1p(-probability)
-    return np.clip(ratio, -largest, largest)

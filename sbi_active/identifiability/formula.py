@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,13 +30,13 @@ class Term:
 
     def coordinate(self, theta: Array) -> Array:
         """Return theta or its logarithm, not weighed, shape (n,)."""
-        own = theta[:, self.index]
-        return np.log(own + self.shift) if self.log else own
+        moved = theta[:, self.index] + self.shift
+        return np.log(moved) if self.log else moved
 
     def slope(self, theta: Array) -> Array:
         """Return the derivative of the coordinate, shape (n,)."""
-        own = theta[:, self.index]
-        return 1 / (own + self.shift) if self.log else np.ones(len(own))
+        moved = theta[:, self.index] + self.shift
+        return 1 / moved if self.log else np.ones_like(moved)
 
 
 @dataclass(frozen=True)
@@ -73,11 +73,6 @@ class Combination:
         sums = self.coordinate(theta)
         return np.exp(sums) if self.is_product else sums
 
-    def mirrored(self) -> Combination:
-        """Return the one in which all terms but the first have the other sign."""
-        first, *others = self.terms
-        return Combination((first, *(replace(t, weight=-t.weight) for t in others)))
-
     def text(self, names: Sequence[str], *, most: int = 4) -> str:
         """Return the formula, with the names of all parameters of the simulator.
 
@@ -85,20 +80,18 @@ class Combination:
             names: The names.
             most: Number of terms that are written out.
         """
+        part, sign = (_factor, "*") if self.is_product else (_summand, "+")
         shown = sorted(self.terms, key=lambda t: not t.log)[:most]
-        if self.is_product:
-            text = "".join(_factor(t, names[t.index], i) for i, t in enumerate(shown))
-            return text + " * ..." * (len(shown) < len(self.terms))
-        text = "".join(_summand(t, names[t.index], i) for i, t in enumerate(shown))
-        return text + " + ..." * (len(shown) < len(self.terms))
+        text = "".join(part(t, names[t.index], i) for i, t in enumerate(shown))
+        return text + f" {sign} ..." * (len(shown) < len(self.terms))
 
     @property
     def complexity(self) -> float:
         """Digits that it takes to write it; a sum is simpler than a product."""
-        digits = sum(_digits(t.weight) + (t.shift != 0) for t in self.terms)
-        digits += sum(_digits(t.shift) for t in self.terms if t.shift)
+        text = self.text(["x"] * (1 + max(self.index)), most=len(self.terms))
         logs = [t.log for t in self.terms]
-        return digits + (0.25 if all(logs) else 1.5 * any(logs))
+        kind = 0.25 if all(logs) else 1.5 * any(logs)
+        return kind + sum(character.isdigit() for character in text)
 
 
 def linked(combinations: Sequence[Combination]) -> list[list[Combination]]:
@@ -109,17 +102,8 @@ def linked(combinations: Sequence[Combination]) -> list[list[Combination]]:
         touched = [g for g in groups if any(own & {*c.index} for c in g)]
         groups = [g for g in groups if g not in touched]
         groups.append([*(c for g in touched for c in g), combination])
-    return sorted((sorted(g, key=_place) for g in groups), key=lambda g: _place(g[0]))
-
-
-def _place(combination: Combination) -> tuple[int, ...]:
-    return combination.index
-
-
-def _digits(value: float) -> int:
-    if abs(value) == 1:
-        return 0
-    return 1 if abs(value) in SIMPLE else len(f"{abs(value):.4g}".strip("0.")) or 1
+    groups = [sorted(group, key=lambda c: c.index) for group in groups]
+    return sorted(groups, key=lambda group: group[0].index)
 
 
 def _summand(term: Term, name: str, place: int) -> str:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from textwrap import shorten
 from typing import Any, ClassVar
 
 import numpy as np
@@ -36,7 +39,7 @@ class CombinationSettings:
             Gaussian hump fills 1.2.
         enough: Number of effective draws a parameter below which their
             covariance has narrow directions that the belief has not.
-        named: Number of parameters that are named.
+        named: Number of characters of the names of parameters.
         outliers: Share of draws left out: a belief may hold a little of the
             prior.
         formulas: Settings of the search for formulas.
@@ -48,7 +51,7 @@ class CombinationSettings:
     bins: int = 20
     filled: float = 0.5
     enough: int = 10
-    named: int = 6
+    named: int = 60
     outliers: float = 0.01
     formulas: FormulaSettings = field(default_factory=FormulaSettings)
 
@@ -75,10 +78,9 @@ class KnownCombination:
     width: float
 
     def __str__(self) -> str:
-        step = (self.high - self.low) / 20  # a digit that says something
         largest = max(abs(self.low), abs(self.high), 1e-300)
-        ratio = largest / step if step > 0 else 1e6
-        digits = int(np.clip(np.ceil(np.log10(ratio)), 2, 6))
+        share = max((self.high - self.low) / largest, 2e-5)
+        digits = max(math.ceil(math.log10(20 / share)), 2)  # that say something
         value, low, high = (
             f"{v:.{digits}g}" for v in (self.value, self.low, self.high)
         )
@@ -93,20 +95,15 @@ class UnknownCombination:
         text: The formula, or names.
         width: Width as in :class:`KnownCombination`; the smallest of several
             parameters.
-        several: Whether these are parameters, each by itself.
-        as_prior: Width above which it is as wide as the prior, in words.
     """
 
-    as_prior: ClassVar[float] = 0.9
     text: str
     width: float
-    several: bool = False
 
     def __str__(self) -> str:
-        if self.width > self.as_prior:
+        if self.width > 0.9:
             return f"{self.text} (as wide as the prior)"
-        least = "at least " if self.several else ""
-        return f"{self.text} ({least}{self.width:.0%} as wide as the prior)"
+        return f"{self.text} ({self.width:.0%} as wide as the prior)"
 
 
 @dataclass(frozen=True)
@@ -119,10 +116,8 @@ class Combinations:
     Attributes:
         known: Combinations with their intervals.
         unknown: Combinations that are left open.
-        most_shown: Number of known ones that are written out.
     """
 
-    most_shown: ClassVar[int] = 3
     known: tuple[KnownCombination, ...] = ()
     unknown: tuple[UnknownCombination, ...] = ()
 
@@ -130,12 +125,9 @@ class Combinations:
         return bool(self.known or self.unknown)
 
     def __str__(self) -> str:
-        parts = []
-        if self.known:
-            known = [*map(str, self.known[: self.most_shown])]
-            if len(self.known) > len(known):
-                known.append(f"and {len(self.known) - len(known)} combinations more")
-            parts.append(f"known: {', '.join(known)}")
+        known = [*map(str, self.known[:3])]  # more are no sentence
+        known += ["..."] * (len(self.known) > len(known))
+        parts = [f"known: {', '.join(known)}"] if known else []
         if self.unknown:
             parts.append(f"not known: {', '.join(map(str, self.unknown))}")
         return "; ".join(parts)
@@ -180,11 +172,11 @@ def combinations_of(
         the profile likelihood, Bioinformatics 2009.
     """
     draws = []
-    for key, distribution in (("prior", prior), ("belief", belief)):
+    for key, distribution in (("belief", belief), ("prior", prior)):
         with forked_generators(seed, "combinations", key):
-            found = distribution.sample(torch.Size([settings.num_draws]))
-        draws.append(found.double().numpy())
-    return combinations_of_draws(draws[1], draws[0], names, settings)
+            drawn = distribution.sample(torch.Size([settings.num_draws]))
+        draws.append(drawn.double().numpy())
+    return combinations_of_draws(draws[0], draws[1], names, settings)
 
 
 def combinations_of_draws(
@@ -195,9 +187,8 @@ def combinations_of_draws(
 ) -> Combinations:
     """Return combinations by draws of a belief and of the prior, (m, d) and (n, d)."""
     dim = before.shape[1]
-    if dim < 2 or not (np.isfinite(before).all() and np.isfinite(after).all()):
-        return Combinations()
-    if _effective(after) < settings.enough * dim:
+    is_finite = np.isfinite(before).all() and np.isfinite(after).all()
+    if dim < 2 or not is_finite or _effective(after) < settings.enough * dim:
         return Combinations()
     names = names or [f"theta_{i + 1}" for i in range(dim)]
     kept = _without_outliers(after, settings.outliers)
@@ -215,10 +206,16 @@ def combinations_of_draws(
     filled = _filled(after, before, settings.bins)
     is_open = (own > settings.open) & (filled > settings.filled * own.clip(max=1.0))
     formulas = settings.formulas
-    found = search(moments, np.flatnonzero(is_open).tolist(), low, span, formulas)
-    widths = dict(found)
+    indices = np.flatnonzero(is_open).tolist()
+    widths = dict(search(moments, indices, low, span, formulas))
     groups = linked([*widths])
-    known = [_known(c, widths[c], after, names) for g in groups for c in g]
+    tail = 0.5 * (1 - KnownCombination.level)
+    known = []
+    for combination in (c for group in groups for c in group):
+        value = combination.value(after)
+        low, middle, high = np.quantile(value, [tail, 0.5, 1 - tail]).tolist()
+        found = combination.text(names), middle, low, high, widths[combination]
+        known.append(KnownCombination(*found))
     unknown = [_left(group, moments, own, names, settings) for group in groups]
     named = {i for c in widths for i in c.index}
     best = min([*own[~is_open].tolist(), *widths.values()], default=np.inf)
@@ -236,11 +233,9 @@ def note_combinations(belief: Any, names: Sequence[str] | None, *, seed: int) ->
         names: Names of the parameters, or None.
         seed: Seed of the draws.
     """
-    try:
+    with suppress(np.linalg.LinAlgError):  # of draws without a covariance
         found = combinations_of(belief, belief.prior, names, seed=seed)
-    except np.linalg.LinAlgError:  # of draws without a covariance nothing is said
-        return
-    belief.diagnostics = belief.diagnostics.extended(combinations=found)
+        belief.diagnostics = belief.diagnostics.extended(combinations=found)
 
 
 def _effective(draws: Array) -> float:
@@ -265,15 +260,6 @@ def _filled(draws: Array, prior: Array, bins: int) -> Array:
     return np.exp(entropy(places, axis=1)) / bins
 
 
-def _known(
-    combination: Combination, own: float, draws: Array, names: Sequence[str]
-) -> KnownCombination:
-    tail = 0.5 * (1 - KnownCombination.level)
-    value = combination.value(draws)
-    low, middle, high = np.quantile(value, [tail, 0.5, 1 - tail]).tolist()
-    return KnownCombination(combination.text(names), middle, low, high, own)
-
-
 def _left(
     group: Sequence[Combination],
     moments: Any,
@@ -283,13 +269,14 @@ def _left(
 ) -> UnknownCombination:
     """Return the combination that the known ones leave open."""
     if len(group) == 1 and len(group[0].terms) == 2:
-        other = group[0].mirrored()
+        first, second = group[0].terms
+        other = Combination((first, replace(second, weight=-second.weight)))
         wide = width(other.weight, *moments(other.terms))
         if wide > settings.open:
             return UnknownCombination(other.text(names), wide)
     index = sorted({i for c in group for i in c.index})
-    each = ", ".join(names[i] for i in index[: settings.named])
-    if len(index) > settings.named:
-        each += f" and {len(index) - settings.named} others"
+    each = shorten(
+        ", ".join(names[i] for i in index), settings.named, placeholder=" ..."
+    )
     least = float(own[index].min())
-    return UnknownCombination(f"{each}, each by itself", least, several=True)
+    return UnknownCombination(f"{each}, each by itself", least)

@@ -5,12 +5,9 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.optimize import minimize_scalar
 
 from sbi_active.arrays import Array
 from sbi_active.identifiability.formula import SIMPLE, Combination, Term
@@ -38,7 +35,8 @@ class FormulaSettings:
             narrowest first: all of twelve parameters. Each takes some 50 ms, where it
             may be known.
         most_triples: Number of parameters up to which all triples are tried.
-        dependent: Share of a direction that is new, below which it is none.
+        dependent: Share of a combination's deviation that others leave of it under the
+            prior, below which it is none.
         together: Width, in prior deviations, that a combination of known ones may have:
             rounded weights leave each of them slightly off what is known, and the
             differences of many would add up to a direction of which nothing is.
@@ -84,44 +82,36 @@ def search(
         Each with its width; empty if there are none.
     """
     found: list[tuple[Combination, float]] = []
-    rows: list[Array] = []  # directions that are known, in prior deviations
     if len(open_parameters) < 2:
         return found
     plain = [Term(i) for i in open_parameters]
-    covariance, prior = moments(plain)
-    place = {index: k for k, index in enumerate(open_parameters)}
-    alone = np.sqrt(covariance.diagonal() / prior.diagonal())
-    deviation = np.sqrt(prior.diagonal())
-    middle = low + 0.5 * span
+    covariance, prior = (m.diagonal() for m in moments(plain))
+    alone = dict(zip(open_parameters, np.sqrt(covariance / prior), strict=True))
 
     def keep(combination: Combination, own: float) -> None:
-        at = [place[i] for i in combination.index]
-        if own > limits.known * alone[at].min():
-            return
-        row = np.zeros(len(plain))
-        slopes = [float(t.slope(middle[None])[0]) for t in combination.terms]
-        row[at] = combination.weight * slopes * deviation[at]
-        row /= np.linalg.norm(row)
-        rest = row - sum((r @ row) * r for r in rows)
-        if np.linalg.norm(rest) <= limits.dependent:
+        if own > limits.known * min(alone[i] for i in combination.index):
             return
         together = [*(c for c, _ in found), combination]
-        if _widest(together, moments) <= limits.together:
-            rows.append(rest / np.linalg.norm(rest))
+        weight = block_diag(*(c.weight for c in together))
+        parts = moments([t for c in together for t in c.terms])
+        c, s = (weight @ m @ weight.T for m in parts)
+        unit = np.sqrt(s.diagonal())
+        apart = np.linalg.inv(s / np.outer(unit, unit) + 1e-9 * np.eye(len(s)))
+        is_new = apart[-1, -1] * limits.dependent**2 < 1
+        if is_new and _eigenvectors(c, s)[0][-1] <= limits.together:
             found.append((combination, own))
 
     sizes = (2, 3) if len(plain) <= limits.most_triples else (2,)
     for size in sizes:
         ranked = _ranked(moments, open_parameters, size, low)
         for rank, (best, subset) in enumerate(ranked):
-            if len(rows) >= len(plain) - 1:
+            if len(found) >= len(plain) - 1:
                 return found
-            is_shifted = size == 2 and rank < limits.most_shifted
-            if best > (limits.worth_a_shift if is_shifted else limits.known):
+            may_shift = size == 2 and rank < limits.most_shifted
+            if best > (limits.worth_a_shift if may_shift else limits.known):
                 break
-            known_pair = any({*c.index} <= {*subset} for c, _ in found)
-            if not known_pair:
-                needed = limits.known * alone[[place[i] for i in subset]].min()
+            if not any({*c.index} <= {*subset} for c, _ in found):  # a pair of it
+                needed = limits.known * min(alone[i] for i in subset)
                 keep(*_best_formula(moments, subset, low, span, limits, needed))
     for log in (False, True):
         if len(plain) > 3 and (not log or (low[list(open_parameters)] > 0).all()):
@@ -129,19 +119,10 @@ def search(
             c, s = moments(terms)
             for vector in _eigenvectors(c, s)[1].T:
                 combination = rounded(terms, vector, c, s, limits)
-                keep(combination, _own_width(combination, moments))
+                keep(
+                    combination, width(combination.weight, *moments(combination.terms))
+                )
     return found
-
-
-def _widest(combinations: Sequence[Combination], moments: Moments) -> float:
-    """Return the width of the least known sum of combinations."""
-    weight = block_diag(*(c.weight for c in combinations))
-    parts = moments([t for c in combinations for t in c.terms])
-    return float(_eigenvectors(*(weight @ m @ weight.T for m in parts))[0][-1])
-
-
-def _own_width(combination: Combination, moments: Moments) -> float:
-    return width(combination.weight, *moments(combination.terms))
 
 
 def _ranked(
@@ -154,14 +135,17 @@ def _ranked(
         subsets = [*itertools.combinations(range(len(usable)), size)]
         if not subsets:
             continue
-        c, s = moments([Term(i, log=log) for i in usable])
-        at = np.array(subsets)
-        rows, columns = at[:, :, None], at[:, None, :]
-        widths = _eigenvectors(c[rows, columns], s[rows, columns])[0][:, 0]
+        widths = _widths([Term(i, log=log) for i in usable], np.array(subsets), moments)
         for subset, own in zip(subsets, widths.tolist(), strict=True):
             key = tuple(usable[k] for k in subset)
             best[key] = min(own, best.get(key, np.inf))
     return sorted((own, subset) for subset, own in best.items())
+
+
+def _widths(terms: Sequence[Term], subsets: Array, moments: Moments) -> Array:
+    """Return the smallest width of a combination of each subset of terms."""
+    rows, columns = subsets[:, :, None], subsets[:, None, :]
+    return _eigenvectors(*(m[rows, columns] for m in moments(terms)))[0][:, 0]
 
 
 def _eigenvectors(covariance: Array, prior: Array) -> tuple[Array, Array]:
@@ -183,24 +167,24 @@ def _best_formula(
     limits: FormulaSettings,
     needed: float,
 ) -> tuple[Combination, float]:
-    """Return the simplest formula about as narrow as the best, and its width.
-
-    A shift is looked for where one may give a width as small as is needed.
-    """
-    tried: list[tuple[Combination, float]] = []
-
-    for terms in _forms(subset, low):
-        c, s = moments(terms)
-        weight = _eigenvectors(c, s)[1][:, 0]
-        combination = rounded(terms, weight, c, s, limits)
-        tried.append((combination, _own_width(combination, moments)))
-    limit = limits.as_good * max(needed, limits.floor)
-    if len(subset) == 2 and _least_shifted(moments, subset, low, span, limits) <= limit:
-        shifted = _shifted(moments, subset, low, span, limits)
-        tried += [(c, _own_width(c, moments)) for c in shifted]
-    limit = max(limits.about_as_good * min(own for _, own in tried), limits.floor)
-    good = [pair for pair in tried if pair[1] <= limit]
+    """Return the simplest formula about as narrow as the best, and its width."""
+    tried = [_fitted(terms, moments, limits) for terms in _forms(subset, low)]
+    if len(subset) == 2:
+        tried += _shifted(moments, subset, low, span, limits, needed)
+    widths = [
+        width(combination.weight, *moments(combination.terms)) for combination in tried
+    ]
+    limit = max(limits.about_as_good * min(widths), limits.floor)
+    good = [pair for pair in zip(tried, widths, strict=True) if pair[1] <= limit]
     return min(good, key=lambda pair: (pair[0].complexity, pair[1]))
+
+
+def _fitted(
+    terms: Sequence[Term], moments: Moments, limits: FormulaSettings
+) -> Combination:
+    """Return the combination of terms with the smallest width, rounded."""
+    c, s = moments(terms)
+    return rounded(terms, _eigenvectors(c, s)[1][:, 0], c, s, limits)
 
 
 def _forms(subset: tuple[int, ...], low: Array) -> Iterator[list[Term]]:
@@ -212,98 +196,43 @@ def _forms(subset: tuple[int, ...], low: Array) -> Iterator[list[Term]]:
             yield terms
 
 
-def _least_shifted(
-    moments: Moments,
-    subset: tuple[int, ...],
-    low: Array,
-    span: Array,
-    limits: FormulaSettings,
-    *,
-    refined: int = 3,
-) -> float:
-    """Return the smallest width of a product in which one of two has a number added.
-
-    Between the two neighbors of the best shift others are tried, so many times: the
-    last are some thousandths of the range apart.
-    """
-    least = np.inf
-    for i, other in (subset, subset[::-1]):
-        shifts = _shifts(low[i], span[i], limits)
-        for _ in range(1 + refined if low[other] > 0 else 0):
-            moved = [Term(i, log=True, shift=float(shift)) for shift in shifts]
-            parts = moments([Term(other, log=True), *moved])
-            at = np.stack([np.zeros(len(shifts), int), 1 + np.arange(len(shifts))], 1)
-            pairs = (m[at[:, :, None], at[:, None, :]] for m in parts)
-            widths = _eigenvectors(*pairs)[0][:, 0]
-            best = int(widths.argmin())
-            least = min(least, float(widths[best]))
-            ends = shifts[max(best - 1, 0)], shifts[min(best + 1, len(shifts) - 1)]
-            shifts = np.linspace(*ends, 2 * len(limits.shifts))
-    return least
-
-
-def _shifts(low: float, span: float, limits: FormulaSettings) -> Array:
-    """Return the shifts that are tried of a parameter, ascending."""
-    sizes = span * np.array(limits.shifts)
-    shifts = np.sort(np.concatenate([-sizes, sizes]))
-    return shifts[shifts > -low + 0.02 * span]
-
-
 def _shifted(
     moments: Moments,
     subset: tuple[int, ...],
     low: Array,
     span: Array,
     limits: FormulaSettings,
+    needed: float,
+    *,
+    refined: int = 3,
 ) -> Iterator[Combination]:
-    """Products in which one of two parameters has a number added, at its best.
+    """Products in which one of two parameters has a number added.
 
-    One with its best exponents, and one with exponents 1 and 1, or 1 and -1.
+    Of each parameter the best shift and rounder ones, if the best gives a width as
+    small as is needed. Between its neighbors others are tried, so many times: the last
+    are some thousandths of the range apart.
     """
     for i, other in (subset, subset[::-1]):
         if low[other] <= 0:
             continue
-
-        def made(is_free: bool, shift: float, i: int = i) -> Combination:
-            moved = {i: float(shift)}
-            terms = [Term(j, log=True, shift=moved.get(j, 0.0)) for j in subset]
-            if is_free:
-                c, s = moments(terms)
-                return rounded(terms, _eigenvectors(c, s)[1][:, 0], c, s, limits)
-            product = Combination(tuple(terms))
-            both = (product, product.mirrored())
-            return min(both, key=lambda one: _own_width(one, moments))
-
-        for is_free in (True, False):
-            product = partial(made, is_free)
-            best = _best_shift(product, moments, low[i], span[i], limits)
-            if best is not None:
-                yield best
-
-
-def _best_shift(
-    made: Callable[[float], Combination],
-    moments: Moments,
-    low: float,
-    span: float,
-    limits: FormulaSettings,
-) -> Combination | None:
-    """Return the product of the roundest shift that is about as narrow as the best."""
-
-    def narrowest(shift: float) -> float:
-        return _own_width(made(shift), moments)
-
-    grid = _shifts(low, span, limits)
-    at = int(np.argmin([narrowest(shift) for shift in grid]))
-    ends = grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)]
-    best: Any = minimize_scalar(
-        narrowest, bounds=ends, method="bounded", options={"xatol": 1e-4 * span}
-    )
-    limit = max(limits.as_good * best.fun, limits.floor)
-    for shift in roundings(float(best.x)):
-        if shift > -low + 0.01 * span and narrowest(shift) <= limit:
-            return made(shift)
-    return None
+        sizes = span[i] * np.array(limits.shifts)
+        shifts = np.sort(np.concatenate([-sizes, sizes]))
+        shifts = shifts[shifts > -low[i] + 0.02 * span[i]]
+        best, least = 0.0, np.inf
+        for _ in range(1 + refined):
+            moved = [Term(i, log=True, shift=float(shift)) for shift in shifts]
+            at = np.stack([np.zeros(len(shifts), int), 1 + np.arange(len(shifts))], 1)
+            widths = _widths([Term(other, log=True), *moved], at, moments)
+            k = int(widths.argmin())
+            best, least = float(shifts[k]), float(widths[k])
+            ends = shifts[max(k - 1, 0)], shifts[min(k + 1, len(shifts) - 1)]
+            shifts = np.linspace(*ends, 2 * len(limits.shifts))
+        if least > limits.as_good * max(needed, limits.floor):
+            continue
+        for shift in np.concatenate([*roundings(np.array([best]))]).tolist():
+            if shift > -low[i] + 0.01 * span[i]:
+                each = (Term(j, log=True, shift=shift * (j == i)) for j in subset)
+                yield _fitted([*each], moments, limits)
 
 
 def width(weight: Array, covariance: Array, prior: Array) -> float:
@@ -321,30 +250,14 @@ def rounded(
 ) -> Combination:
     """Return the combination of the roundest weights that are about as narrow.
 
-    The first weight is 1; each of the others is rounded in turn, and those after it are
-    fitted again.
+    The first weight is 1.
     """
     limit = max(limits.as_good * width(weight, covariance, prior), limits.floor)
     size = np.abs(weight) * np.sqrt(prior.diagonal())
     first = 0 if size[0] > 0.1 * size.max() else int(size.argmax())
     weight = weight / weight[first]
-    order = [k for k in range(len(weight)) if k != first]
-    for place, k in enumerate(order):
-        free = order[place + 1 :]
-        for value in (0.0, *roundings(float(weight[k]))):
-            if value == 0.0 and len(weight) < 4:
-                continue
-            tried = weight.copy()
-            tried[k] = value
-            if free:
-                fixed = [j for j in range(len(weight)) if j not in free]
-                right = covariance[np.ix_(free, fixed)] @ tried[fixed]
-                own = covariance[np.ix_(free, free)]
-                ridge = 1e-12 * np.trace(own) * np.eye(len(free))
-                tried[free] = -np.linalg.solve(own + ridge, right)
-            if width(tried, covariance, prior) <= limit:
-                break
-        weight = tried
+    good = (w for w in roundings(weight) if width(w, covariance, prior) <= limit)
+    weight = next(good, weight)
     has_halves = (2 * weight % 1 == 0).all() and (weight % 1 != 0).any()
     if has_halves and all(t.log for t in terms):
         weight = 2 * weight  # a^2 * b rather than a * b^0.5
@@ -352,11 +265,14 @@ def rounded(
     return Combination(tuple(replace(t, weight=float(w)) for t, w in pairs if w))
 
 
-def roundings(value: float) -> Iterator[float]:
-    """Return numbers near a value, the roundest first, itself to four digits last."""
-    sign = np.sign(value) or 1.0
-    for simple in SIMPLE:
-        if 0.5 < abs(value) / simple < 2:
-            yield float(sign * simple)
+def roundings(values: Array) -> Iterator[Array]:
+    """Return numbers near some, the roundest first, these to four digits last.
+
+    Of four numbers or more, small ones may vanish.
+    """
+    yield np.copysign(1.0, values)
+    simple = np.array([*SIMPLE, 0.0] if len(values) > 3 else SIMPLE)
+    nearest = np.abs(np.abs(values)[:, None] - simple).argmin(1)
+    yield np.copysign(simple[nearest], values)
     for digits in (1, 2, 3, 4):
-        yield float(f"{value:.{digits}g}")
+        yield np.array([float(f"{value:.{digits}g}") for value in values])

@@ -136,8 +136,8 @@ class Sensitivities:
 
     def singular(self) -> tuple[Array, Array]:
         """Return singular values, 0 where they are errors, (k, d), and vectors."""
-        k, d = len(self.theta), len(self.free)
-        stacked = self.jacobian.reshape(k, -1, d)
+        d = len(self.free)
+        stacked = self.jacobian.reshape(len(self.theta), -1, d)
         _, size, vectors = np.linalg.svd(stacked, full_matrices=True)
         size = np.pad(size, ((0, 0), (0, d - size.shape[1])))
         off = np.sqrt(((self.rounding / self.noise) ** 2).sum((1, 2))) / self.own.step
@@ -152,20 +152,26 @@ class Sensitivities:
         if practical:
             known = np.minimum(known, self.own.trials * size**2)
         information = (vectors * known[:, None, :]) @ vectors.swapaxes(1, 2)
-        prior = np.corrcoef(self.draws[:, self.free].T).reshape(2 * [len(self.free)])
-        prior = prior + 1e-9 * np.eye(len(prior))
+        prior = np.corrcoef(self.draws[:, self.free].T) + 1e-9 * np.eye(len(self.free))
         return np.linalg.inv(np.linalg.inv(prior) + information)
 
-    def same(self, moved: Tensor) -> tuple[bool, bool]:
-        """Return whether x is about, and exactly, as at the first parameters."""
-        x = self.x(moved)
-        if not np.array_equal(np.isnan(x), np.isnan(self.base)):
+    def same(
+        self, up: Tensor, down: Tensor | None = None, share: float = 1.0
+    ) -> tuple[bool, bool]:
+        """Return whether x is about, and exactly, the same at two parameter sets.
+
+        Args:
+            up: Parameters of one.
+            down: Parameters of the other; None are the first.
+            share: Share of the noise that may lie between them.
+        """
+        x, base = self.x(up), self.base if down is None else self.x(down)
+        if not (np.isnan(x) == np.isnan(base)).all():
             return False, False
-        gap = np.nan_to_num(np.abs(x - self.base))
-        rounding = 2 * self.rounding
+        gap = np.nan_to_num(np.abs(x - base)) - 2 * self.rounding
         about, exactly = (
-            bool((gap <= share * self.noise + rounding).all())
-            for share in (self.own.same, self.own.equal)
+            bool((gap <= share * size * self.noise).all())
+            for size in (self.own.same, self.own.equal)
         )
         return about, exactly
 
@@ -185,63 +191,43 @@ def moved_along(
 ) -> Tensor | None:
     """Return parameters far from the first at which the combinations are the same."""
     rng = np.random.default_rng([probe.seed, turn])
-    theta = probe.theta.double().numpy()
-    at = list(indices)
+    theta, at = probe.theta.double().numpy(), list(indices)
     scale = probe.deviation[at]
     result = probe.theta.clone()
+
+    def values(rows: Array) -> Array:
+        each = [combination.coordinate(rows) for combination in group]
+        return np.array(each).reshape(len(group), len(rows)).T
+
+    def gradient(rows: Array) -> Array:  # in prior deviations
+        found = np.zeros((len(rows), len(group), len(at)))
+        for row, combination in enumerate(group):
+            for term in combination.terms:
+                found[:, row, at.index(term.index)] = term.weight * term.slope(rows)
+        return np.where(np.isfinite(found), found, 0.0) * scale
+
     for _ in range(3):  # other directions for those that found no place inside
         direction = rng.standard_normal((len(theta), len(at)))
-        gradient = _gradient(theta, group, at) * scale
-        direction -= _solved(gradient, np.einsum("kgi,ki->kg", gradient, direction))
+        slope = gradient(theta)
+        direction -= _shortest(slope, np.einsum("kgi,ki->kg", slope, direction))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True) + 1e-300
         for size, sign in product(probe.own.moves, (1.0, -1.0)):
             tried = theta.copy()
             tried[:, at] += sign * size * direction * scale
-            tried = _back(tried, theta, group, at, scale, probe.own.newton_steps)
+            with np.errstate(all="ignore"):
+                for _ in range(probe.own.newton_steps if group else 0):
+                    gap = values(tried) - values(theta)
+                    tried[:, at] -= _shortest(gradient(tried), gap) * scale
             rows = torch.from_numpy(np.nan_to_num(tried)).float()
             inside = within_support(probe.prior, rows)
             inside &= torch.from_numpy(np.isfinite(tried).all(1))
             inside &= (result == probe.theta).all(dim=1)
             result = torch.where(inside[:, None], rows, result)
-    step = (result - probe.theta).double().numpy() / probe.deviation
-    far = np.sqrt((step**2).sum(1))
-    return result if np.median(far) > probe.own.fewest_moved else None
+    steps = (result - probe.theta).double().numpy() / probe.deviation
+    far = np.median(np.linalg.norm(steps, axis=1)) > probe.own.fewest_moved
+    return result if far else None
 
 
-def _back(
-    tried: Array,
-    theta: Array,
-    group: Sequence[Combination],
-    at: list[int],
-    scale: Array,
-    num_steps: int,
-) -> Array:
-    """Return the places next to some at which all combinations are as at theta."""
-    if not group:
-        return tried
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        aim = np.stack([c.coordinate(theta) for c in group], 1)
-        for _ in range(num_steps):
-            gap = np.stack([c.coordinate(tried) for c in group], 1) - aim
-            lost = np.asarray(~np.isfinite(gap).all(1))
-            gap[lost], safe = 0.0, np.where(lost[:, None], theta, tried)
-            tried = np.where(lost[:, None], np.nan, tried)
-            gradient = _gradient(safe, group, at) * scale
-            tried[:, at] -= _solved(gradient, gap) * scale
-    return tried
-
-
-def _gradient(theta: Array, group: Sequence[Combination], at: list[int]) -> Array:
-    """Return the derivatives of combinations by parameters, shape (k, g, len(at))."""
-    gradient = np.zeros((len(theta), len(group), len(at)))
-    for row, combination in enumerate(group):
-        for term in combination.terms:
-            gradient[:, row, at.index(term.index)] = term.weight * term.slope(theta)
-    return gradient
-
-
-def _solved(gradient: Array, gap: Array) -> Array:
+def _shortest(gradient: Array, gap: Array) -> Array:
     """Return the shortest steps that change combinations by some, (k, g) -> (k, d)."""
-    if not gradient.shape[1]:
-        return np.zeros((len(gap), gradient.shape[2]))
     return np.einsum("kig,kg->ki", np.linalg.pinv(gradient), gap)

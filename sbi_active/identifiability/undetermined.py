@@ -26,6 +26,8 @@ WHAT = {
     False: "changes x by less than a tenth of the noise in a prior deviation",
 }
 
+DO = "fix one of them, or permit actions that they change differently"
+
 
 @dataclass(frozen=True)
 class Undetermined:
@@ -109,12 +111,11 @@ def find_undetermined(
     probe = Sensitivities(simulate, prior, actions, free, num_theta, seed, own)
     if not np.isfinite(probe.base).any():
         return ()
-    where = _where(len(actions), num_permitted)
-    for practical in (False, True):
-        found = _formulas(probe, names, where, practical)
-        if found:
-            return found
-    return _local(probe, names, where)
+    is_all = num_permitted is not None and num_permitted <= len(actions)
+    tried = f"none of {len(actions)} actions that were tried"
+    where = "no permitted action" if is_all else tried
+    about = probe, names, where
+    return _formulas(*about, False) or _formulas(*about, True) or _local(*about)
 
 
 def _formulas(
@@ -137,13 +138,11 @@ def _formulas(
     low, span = probe.draws.min(0), np.ptp(probe.draws, 0)
     formulas = FormulaSettings(floor=own.floor)
     found = search(moments, open_parameters, low, span, formulas)
-    combinations = [c for c, _ in found]
-    groups = linked(combinations)
-    lonely = {*open_parameters} - {
-        i for group in groups for c in group for i in c.index
-    }
+    groups = linked([c for c, _ in found])
+    named = {i for c, _ in found for i in c.index}
+    lonely = [i for i in open_parameters if i not in named]
     candidates = [(sorted({i for c in g for i in c.index}), g) for g in groups]
-    candidates += [([i], []) for i in sorted(lonely) if alone[place[i]] > own.alone]
+    candidates += [([i], []) for i in lonely if alone[place[i]] > own.alone]
     told = []
     for indices, group in candidates:
         about, exactly = _holds(probe, indices, group)
@@ -159,16 +158,10 @@ def _holds(
     probe: Sensitivities, indices: Sequence[int], group: Sequence[Combination]
 ) -> tuple[bool, bool]:
     """Return whether x is about, or exactly, the same where the combinations are."""
-    about, exactly = True, True
-    for turn in range(2):
-        moved = moved_along(probe, indices, group, turn)
-        if moved is None:
-            return False, False
-        same = probe.same(moved)
-        about, exactly = about and same[0], exactly and same[1]
-        if not about:
-            break
-    return about, exactly
+    moved = (moved_along(probe, indices, group, turn) for turn in range(2))
+    found = [(False, False) if theta is None else probe.same(theta) for theta in moved]
+    about, exactly = zip(*found, strict=True)
+    return all(about), all(exactly)
 
 
 def _local(
@@ -179,43 +172,23 @@ def _local(
     if not (size == 0).any(1).all():
         return ()
     direction = vectors[:, :, -1]
-    direction *= np.sign(
-        direction[np.arange(len(direction)), np.abs(direction).argmax(1)]
-    )[:, None]
     step = np.zeros_like(probe.draws[: len(direction)])
     small = 3 * probe.own.step
     step[:, probe.free] = small * direction * probe.deviation[probe.free]
     moves = torch.from_numpy(step).float()
-    gap = probe.x(probe.theta + moves) - probe.x(probe.theta - moves)
-    there = np.isfinite(probe.base)
-    gap = np.where(np.isfinite(gap), np.abs(gap), np.inf)
-    about, exactly = (
-        bool((gap <= 2 * small * share * probe.noise + 2 * probe.rounding)[there].all())
-        for share in (probe.own.same, probe.own.equal)
-    )
+    about, exactly = probe.same(probe.theta + moves, probe.theta - moves, 2 * small)
     if not about:
         return ()
     shares = np.sqrt((direction**2).mean(0))
-    at = [k for k in range(len(probe.free)) if shares[k] > probe.own.same]
-    if len(at) < 2:
+    moved = zip(probe.free, shares, strict=True)
+    own = tuple(names[i] for i, share in moved if share > probe.own.same)
+    if len(own) < 2:
         return ()
-    indices = [probe.free[k] for k in at]
-    own = tuple(names[i] for i in indices)
-    place = ", ".join(f"{names[i]} = {float(probe.theta[0, i]):.3g}" for i in indices)
-    changes = 0.1 * direction[0, at] * probe.deviation[indices]
-    move = ", ".join(f"{n} by {c:+.2g}" for n, c in zip(own, changes, strict=True))
     text = (
         f"{where} determines all of {_and(own)}: at each of {len(direction)} draws of "
-        f"the prior one direction {WHAT[exactly]}, such as {move} at {place}; fix one "
-        "of them, or permit actions that they change differently"
+        f"the prior one direction {WHAT[exactly]}; {DO}"
     )
     return (Undetermined(own, (), exactly, text),)
-
-
-def _where(num: int, num_permitted: int | None) -> str:
-    if num_permitted is not None and num_permitted <= num:
-        return "no permitted action"
-    return f"none of {num} actions that were tried"
 
 
 def _sentence(
@@ -230,7 +203,7 @@ def _sentence(
     what = "" if exactly else ", to a tenth of the noise,"
     return (
         f"{where} tells {_and(own)} apart: x depends on them{what} through {through} "
-        "alone; fix one of them, or permit actions that they change differently"
+        f"alone; {DO}"
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from sbi_active.arrays import Array
+from sbi_active.expected import require
 from sbi_active.seeding import forked_generators
 
 NUM_DRAWS = 10_000
@@ -127,11 +128,8 @@ def randomization(
         >>> round(high - low, 1), found.samples.shape
         (0.9, (1000, 2))
     """
-    for level in levels:
-        if not 0 < level < 1:
-            raise ValueError(
-                f"expected levels between 0 and 1; got {level}; pass probabilities"
-            )
+    are_shares = all(0 < level < 1 for level in levels)
+    require(are_shares, "levels between 0 and 1", levels, "pass probabilities")
     draws = _draws(belief, seed)
     known = _names(belief, names, draws.shape[1])
     ranges = {}
@@ -149,10 +147,8 @@ def _draws(belief: Any, seed: int) -> Array:
 
 
 def _names(belief: Any, names: Sequence[str] | None, num: int) -> tuple[str, ...]:
-    if names is None:
-        names = getattr(belief, "parameter_names", None)
-    if names is None:
-        names = getattr(belief, "names", None)
+    for own in ("parameter_names", "names"):
+        names = getattr(belief, own, None) if names is None else names
     if names is None or len(names) != num:
         raise ValueError(
             f"expected {num} names of parameters; got {names}; pass names="

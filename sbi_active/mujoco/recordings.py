@@ -80,8 +80,10 @@ def trials_of(
         name: [log.numbers(log.columns["input"][i]) for log in cells]
         for i, name in enumerate(inputs)
     }
+    step = float(model.opt.timestep)
     for k, (log, time, values) in enumerate(zip(cells, times, x, strict=True)):
-        _require_seconds(time, float(model.opt.timestep), log.source)
+        require_seconds(time, step, log.source)
+        _note_spacing(time, step, log.source)
         for name, own in series.items():
             require_in_range(model, name, own[k], log.source)
         for channel, column in zip(channels, values.T, strict=True):
@@ -181,19 +183,25 @@ def _cells(
     return Cells({what: frame}, found, what)
 
 
-def _require_seconds(time: Array, step: float, what: str) -> None:
-    """Raise or warn where times can hardly be seconds from the start of a trial.
+def require_seconds(time: Array, step: float, what: str) -> None:
+    """Raise where times can hardly be seconds from the start of a trial.
 
     Args:
-        time: Times of a log, which increase, shape (k,).
+        time: Times, shape (k,).
         step: Time step of the model, s.
-        what: Name of the log in messages.
+        what: Name of the times in messages.
     """
-    if len(time) and (time[0] < 0 or time[0] > MOST_STEPS * step):
+    increase = time.ndim == 1 and len(time) > 0 and (np.diff(time) > 0).all()
+    if not increase or not 0 <= time[0] <= MOST_STEPS * step:
         raise ValueError(
-            f"expected times from the start of the trial in {what}; got {time[0]:g} s "
-            "at first; subtract the time at which the trial starts"
+            f"expected times in {what} that increase from the start of the trial, s; "
+            f"got {np.array2string(time, threshold=6)}; subtract the time at which the "
+            "trial starts"
         )
+
+
+def _note_spacing(time: Array, step: float, what: str) -> None:
+    """Warn of samples that are as far apart as those of a log in ms."""
     spacing = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     if spacing > MOST_APART * step:
         warn(

@@ -7,14 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from sbi.utils import BoxUniform
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, MixedActions
 from sbi_active.actions.signals import SignalActions
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.expected import suggests
+from sbi_active.expected import require, suggests
 from sbi_active.mujoco.models.machine import Machine
 from sbi_active.mujoco.models.names import (
     element_id,
@@ -27,7 +26,7 @@ from sbi_active.mujoco.models.names import (
 )
 from sbi_active.mujoco.models.parameters import Bounded, bounded
 from sbi_active.mujoco.models.spec import Source
-from sbi_active.mujoco.recordings import require_in_range, trials_of
+from sbi_active.mujoco.recordings import require_in_range, require_seconds, trials_of
 from sbi_active.mujoco.sensors import added_sensors, channels_of
 from sbi_active.mujoco.simulator import MODEL, MujocoFunction
 from sbi_active.mujoco.typical import warn_of_idle
@@ -50,11 +49,6 @@ def named_box(parameters: Sequence[Bounded]) -> BoxUniform:
     vars(box)["names"] = tuple(p.name for p in parameters)
     vars(box)["units"] = tuple(p.unit for p in parameters)
     return box
-
-
-#: Time steps before the first reading, beyond which a time is taken for one of a clock:
-#: hours at MuJoCo's default step of 2 ms. Half and twice refuse the same.
-MOST_STEPS = 1e7
 
 
 class Robot(NamedTuple):
@@ -157,7 +151,7 @@ def from_mjcf(
         times = space.input_times
     grid = None if times is None else np.asarray(times, dtype=np.float64)
     if grid is not None:
-        _require_times(grid, float(machine.model.opt.timestep))
+        require_seconds(grid, float(machine.model.opt.timestep), "times=")
     function = MujocoFunction(
         machines,
         channels,
@@ -297,33 +291,13 @@ def _start(
     return {name: float(value) for name, value in start.items()}
 
 
-def _require_times(times: NDArray[Any], step: float) -> None:
-    """Raise if times are not seconds from the start of a trial."""
-    increase = times.ndim == 1 and len(times) > 0 and (np.diff(times) > 0).all()
-    if not (increase and np.isfinite(times).all() and times[0] >= 0):
-        raise ValueError(
-            "expected times that increase from 0 s on, shape (k,); got "
-            f"{np.array2string(times, threshold=6)}; count them from the trial's start"
-        )
-    if times[0] > MOST_STEPS * step:
-        raise ValueError(
-            f"expected times from the start of a trial; got a first one of "
-            f"{times[0]:g} s, {times[0] / step:.0e} time steps of {step:g} s; subtract "
-            "the time at which the trial starts"
-        )
-
-
 def _noise(model: Any, channels: Sequence[Any], noise: Any) -> Any:
     if isinstance(noise, Mapping):
         known = [c.name for c in channels]
         for name in noise:
             require_name(name, known, "sensor")
-        lost = [name for name in known if name not in noise]
-        if lost:
-            raise ValueError(
-                f"expected the noise of every sensor; got none of {', '.join(lost)}; "
-                "add it"
-            )
+        lost = ", ".join(name for name in known if name not in noise)
+        require(not lost, "the noise of every sensor", f"none of {lost}", "add it")
         sds = [float(noise[name]) for name in known]
         return sds[0] if len(sds) == 1 else torch.tensor(sds)
     if noise is not None:

@@ -52,16 +52,12 @@ def added_sensors(source: Source, model: Any, sensors: Sequence[str] | None) -> 
     """
     own = names_of(model, "sensor")
     joints = scalar_joints(model)
-    if sensors is None:
-        if not own:
-            raise ValueError(
-                "expected sensors in the MJCF; got none; pass sensors=['hinge'], say, "
-                f"of its joints {', '.join(map(repr, joints))}"
-            )
+    if sensors is None and own:
         return source
-    if not len(sensors) or isinstance(sensors, str):
+    if not sensors or isinstance(sensors, str):
         raise ValueError(
-            f"expected a list of sensors; got {sensors!r}; pass their names"
+            f"expected a list of sensors, or some in the MJCF; got {sensors!r}; pass "
+            f"sensors=['hinge'], say, of its joints {', '.join(map(repr, joints))}"
         )
     known = [*own, *joints, *[j + VELOCITY for j in joints]]
     edits = []

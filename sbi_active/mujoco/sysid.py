@@ -22,7 +22,7 @@ from sbi_active.actions.signals import SignalActions
 from sbi_active.actions.waveforms import Recorded
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.expected import suggests
+from sbi_active.expected import require, suggests
 from sbi_active.mujoco.models.machine import Machine
 from sbi_active.mujoco.models.names import names_of, scalar_joints, start_places
 from sbi_active.mujoco.models.spec import Source
@@ -155,15 +155,12 @@ class _Edit:
 
 def _groups(given: Any) -> list[Any]:
     groups = list(given) if isinstance(given, Sequence) else [given]
-    for group in groups:
-        for part in ("spec", "control", "sensordata", "initial_state"):
-            if not hasattr(group, part):
-                raise TypeError(
-                    f"expected ModelSequences of mujoco.sysid; got "
-                    f"{type(group).__name__}; pass one or a list"
-                )
-    if not groups:
-        raise ValueError("expected at least one ModelSequences; got none; pass one")
+    parts = "spec", "control", "sensordata", "initial_state"
+    if not groups or not all(hasattr(g, part) for g in groups for part in parts):
+        raise TypeError(
+            f"expected ModelSequences of mujoco.sysid; got {given!r:.80}; pass one or "
+            "a list"
+        )
     return groups
 
 
@@ -257,7 +254,12 @@ class _Sequence:
         begin = float(control.times[0])
         end = begin + (len(control.times) - 1) * step
         series = group.sensordata[i]
-        _require_finite(group.control[i].data, f"controls in {what}")
+        require(
+            bool(np.isfinite(np.asarray(group.control[i].data, dtype=float)).all()),
+            f"finite controls in {what}",
+            "NaN or inf",
+            "fill in what was commanded, or cut the log there",
+        )
         mapping = _mapping(series, group)
         columns = np.concatenate(
             [np.atleast_1d(mapping[s.name][1]).astype(int) for s in signals]
@@ -284,15 +286,6 @@ class _Sequence:
             np.asarray(series.data, dtype=float)[inside][:, columns],
             {name: data[:, j] for j, name in enumerate(names)},
             step * np.arange(len(data)),
-        )
-
-
-def _require_finite(value: Any, what: str) -> None:
-    rows = np.flatnonzero(~np.isfinite(np.asarray(value, dtype=float)).all(-1))
-    if len(rows):
-        raise ValueError(
-            f"expected finite {what}; got NaN or inf in row {rows[0]}; fill in what "
-            "was commanded, or cut the log there"
         )
 
 

@@ -16,7 +16,7 @@ channel alone says to a power of .3, for the tails.
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -240,21 +240,11 @@ class Denoised:
         num_divergences: Divergences of both chains.
     """
 
-    x: Tensor
+    x: Tensor = field(repr=False)
     probability: Tensor
     r_hat: float
     effective_sample_size: float
     num_divergences: int
-
-    def __str__(self) -> str:
-        shares = ", ".join(f"{p:.2f}" for p in self.probability.tolist())
-        return (
-            f"probability of misspecification a channel: {shares}\n"
-            f"NUTS: r_hat {self.r_hat:.3f}, {self.effective_sample_size:.0f} effective "
-            f"draws, {self.num_divergences} divergences"
-        )
-
-    __repr__ = __str__
 
 
 def denoise(
@@ -294,16 +284,12 @@ def denoise(
     """
     x_o, predictive = x_o.double(), predictive.double()
     fits = predictive.ndim == 2 and x_o.shape == predictive.shape[1:]
-    if not fits or len(predictive) < fewest:
+    finite = bool(predictive.isfinite().all()) and not bool(x_o.isinf().any())
+    if not (fits and finite) or len(predictive) < fewest:
         raise ValueError(
-            f"expected an outcome (q,) and at least {fewest} simulations "
-            f"(n, q); got {tuple(x_o.shape)} and {tuple(predictive.shape)}; pass flat "
-            "outcomes"
-        )
-    if bool(x_o.isinf().any()) or not bool(predictive.isfinite().all()):
-        raise ValueError(
-            "expected finite numbers; got inf, or nan in a simulation; set channels "
-            "that were not observed to nan in the outcome alone"
+            f"expected an outcome (q,) and at least {fewest} simulations (n, q) of "
+            f"finite numbers; got {tuple(x_o.shape)} and {tuple(predictive.shape)}; "
+            "set channels that were not observed to nan in the outcome alone"
         )
     seen = x_o.isfinite()
     center = predictive.mean(0)

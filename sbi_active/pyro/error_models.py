@@ -12,7 +12,7 @@ References:
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -35,17 +35,21 @@ class ErrorModel(Protocol):
         ...
 
 
-class _RightOrWrong:
+class _RightOrWrong(ABC):
     """A channel is right, or wrong with some probability."""
 
     probability: float
     spike: float
 
+    @abstractmethod
+    def _wrong(self, x: Tensor, log_sd: Tensor) -> tuple[Distribution, Tensor]:
+        """Return a wrong channel around x, and log densities of its log deviation."""
+
     def _parts(self, x: Tensor, x_o: Tensor) -> Tensor:
         """Return log densities of an outcome that is right and wrong, (2, n, q)."""
-        rho = torch.tensor([1 - self.probability, self.probability]).log().to(x)
-        right = dist.Normal(x, self.spike).log_prob(x_o)
-        return torch.stack([rho[0] + right, rho[1] + self._wrong(x).log_prob(x_o)])
+        right = dist.Normal(x, self.spike).log_prob(x_o) + np.log(1 - self.probability)
+        wrong = self._wrong(x, x)[0].log_prob(x_o) + np.log(self.probability)
+        return torch.stack([right, wrong])
 
     def misspecified(self, x: Tensor, x_o: Tensor) -> Tensor:
         """Return probabilities given denoised outcomes (n, q), shape (n, q)."""
@@ -54,16 +58,8 @@ class _RightOrWrong:
     def log_deviation(self, log_sd: Tensor) -> Tensor:
         """Return the log density of the log deviation of a channel's error, (n,)."""
         right = _known(self.spike, log_sd) + np.log(1 - self.probability)
-        wrong = self._wrong_deviation(log_sd) + np.log(self.probability)
+        wrong = self._wrong(log_sd, log_sd)[1] + np.log(self.probability)
         return torch.logaddexp(right, wrong)
-
-    @abstractmethod
-    def _wrong(self, x: Tensor) -> Distribution:
-        """Return the distribution of a wrong channel around x."""
-
-    @abstractmethod
-    def _wrong_deviation(self, log_sd: Tensor) -> Tensor:
-        """Return the log density of the log deviation of a wrong channel, (n,)."""
 
 
 @dataclass(frozen=True)
@@ -83,11 +79,8 @@ class SpikeAndSlab(_RightOrWrong):
     spike: float = 0.005
     slab: float = 10.0
 
-    def _wrong(self, x: Tensor) -> Distribution:
-        return dist.StudentT(3.0, x, self.slab)
-
-    def _wrong_deviation(self, log_sd: Tensor) -> Tensor:
-        return _student(3.0, self.slab, log_sd)
+    def _wrong(self, x: Tensor, log_sd: Tensor) -> tuple[Distribution, Tensor]:
+        return dist.StudentT(3.0, x, self.slab), _student(3.0, self.slab, log_sd)
 
 
 @dataclass(frozen=True)
@@ -107,15 +100,9 @@ class ChannelBias(_RightOrWrong):
     bias: float = 5.0
     spike: float = 0.005
 
-    @property
-    def _wide(self) -> float:
-        return (self.spike**2 + self.bias**2) ** 0.5
-
-    def _wrong(self, x: Tensor) -> Distribution:
-        return dist.Normal(x, self._wide)
-
-    def _wrong_deviation(self, log_sd: Tensor) -> Tensor:
-        return _known(self._wide, log_sd)
+    def _wrong(self, x: Tensor, log_sd: Tensor) -> tuple[Distribution, Tensor]:
+        wide = (self.spike**2 + self.bias**2) ** 0.5
+        return dist.Normal(x, wide), _known(wide, log_sd)
 
 
 @dataclass(frozen=True)

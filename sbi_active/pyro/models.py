@@ -69,7 +69,7 @@ def from_pyro(
     """
     action = torch.as_tensor(action, dtype=torch.float32).reshape(-1)
     with forked_generators(0, "pyro"):
-        traces = [
+        traces: list[Any] = [
             poutine.trace(model).get_trace(action * scale)
             for scale in torch.linspace(1, 0.5, num_tried)
         ]
@@ -81,16 +81,12 @@ def from_pyro(
             f"{[*traces[0].stochastic_nodes]}; name the outcome with outcome=..."
         )
     for name, d in first.items():
-        if _base(d.support).is_discrete:
+        support = _inner(d.support, "base_constraint")
+        if support.is_discrete or support.event_dim or len(_shape(d)) > 1:
             raise ValueError(
-                f"expected continuous parameters; got {name!r}, which is discrete; sum "
-                "it out in the model"
-            )
-        if _base(d.support).event_dim or len(_shape(d)) > 1:
-            raise ValueError(
-                "expected vectors of parameters with bounds of their own; got "
-                f"{name!r} of shape {tuple(_shape(d))} on {d.support}; write it as a "
-                "function of free ones"
+                "expected vectors of continuous parameters with bounds of their own; "
+                f"got {name!r} of shape {tuple(_shape(d))} on {d.support}; sum a "
+                "discrete one out in the model, and write others by free ones"
             )
         if any(name not in other or not _same(d, other[name]) for other in sites):
             raise ValueError(
@@ -110,7 +106,7 @@ def from_pyro(
     prior = parts[0]
     if len(parts) > 1:
         prior = MultipleIndependent(parts, validate_args=False)
-    noise = _noise([_node(trace, outcome)["fn"] for trace in traces])
+    noise = _noise([trace.nodes[outcome]["fn"] for trace in traces])
     function = _Row(model, first, [*sizes.values()], outcome, noise is not None)
     simulator = SimulatorModel(
         function, noise=noise, batched=False, parameter_names=names
@@ -136,13 +132,9 @@ class _Row:
         }
         with forked_generators(int(rng.integers(2**62))), torch.no_grad():
             model = pyro.condition(self.model, data=data)
-            trace = poutine.trace(model).get_trace(torch.as_tensor(action).float())
-        node = _node(trace, self.outcome)
+            trace: Any = poutine.trace(model).get_trace(torch.as_tensor(action).float())
+        node = trace.nodes[self.outcome]
         return (node["fn"].mean if self.is_mean else node["value"]).reshape(-1).numpy()
-
-
-def _node(trace: Any, site: str) -> dict[str, Any]:
-    return trace.nodes[site]
 
 
 def _latent(trace: Any, outcome: str) -> dict[str, Distribution]:
@@ -158,14 +150,13 @@ def _latent(trace: Any, outcome: str) -> dict[str, Distribution]:
 
 def _noise(found: list[Any]) -> GaussianNoise | StudentTNoise | None:
     """Return the noise of an outcome of constant scale; None for any other."""
-    first, *others = map(_inner, found)
+    first, *others = (_inner(d, "base_dist") for d in found)
     if not isinstance(first, (Normal, StudentT)):
         return None
     names = ("scale",) if isinstance(first, Normal) else ("scale", "df")
     for d in others:
-        alike = type(d) is type(first) and d.batch_shape == first.batch_shape
-        if not alike or not all(
-            torch.equal(getattr(d, name), getattr(first, name)) for name in names
+        if type(d) is not type(first) or any(
+            not torch.equal(getattr(d, name), getattr(first, name)) for name in names
         ):
             return None
     sd = first.scale.reshape(-1)
@@ -178,20 +169,15 @@ def _noise(found: list[Any]) -> GaussianNoise | StudentTNoise | None:
     return StudentTNoise(sd * (df[0] / (df[0] - 2)).sqrt(), df[0])
 
 
-def _inner(d: Any) -> Any:
-    while hasattr(d, "base_dist") and not hasattr(d, "transforms"):
-        d = d.base_dist
-    return d
+def _inner(whole: Any, attribute: str) -> Any:
+    """Return what a distribution or a support of vectors is made of."""
+    while hasattr(whole, attribute) and not hasattr(whole, "transforms"):
+        whole = getattr(whole, attribute)
+    return whole
 
 
 def _shape(d: Distribution) -> torch.Size:
     return d.batch_shape + d.event_shape
-
-
-def _base(support: Any) -> Any:
-    while hasattr(support, "base_constraint"):
-        support = support.base_constraint
-    return support
 
 
 def _same(one: Any, other: Any) -> bool:

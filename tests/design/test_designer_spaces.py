@@ -35,7 +35,7 @@ def test_regret_on_the_numerical_task():
     assert design.num_simulations <= 0.2 * 75_000  # a grid of 101 takes as many
     distance = (design.expected_information_gain - own).abs()
     assert (distance < 4 * design.standard_error + 0.05).all()
-    assert design.name == "xi"
+    assert design.labels == ("xi",)
 
 
 def test_which_search():

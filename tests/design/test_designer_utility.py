@@ -147,8 +147,3 @@ def test_random_choices_of_any_space():
     assert again.action.tolist() == [2.0]
     with pytest.raises(ValueError, match="permits a part of BoxActions"):
         RandomDesigner(BOX).select(seed=0, constraint=lambda a: a[:, 0] > 3)
-    floor = RandomDesigner(BOX).select(
-        None, MODEL, belief=PRIOR, min_probability_valid=0.5, seed=0
-    )
-    assert floor.candidates.shape == (32, 1)
-    assert (floor.probability_valid == 1).all()

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from sbi_active import BoxActions, DiscreteActions, MixedActions
-from sbi_active.design.design import Design, action_labels, are_categories
+from sbi_active import BoxActions
+from sbi_active.design.design import Design, action_labels
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -34,13 +34,11 @@ def design(actions, num=30, index=4, candidates=None, **changes):
         "index": index,
         "num_simulations": 30,
         "labels": action_labels(actions),
-        "categorical": are_categories(actions),
     }
     return Design(**(made | changes))
 
 
 BOX = BoxActions([0.0, -1.0], [2.0, 1.0], names=["speed", "tilt"], units=["m/s", ""])
-TOOLS = DiscreteActions([1.0, 2.0, 3.0], names=["tool"])
 
 
 def offsets(marks):
@@ -63,29 +61,6 @@ def test_two_entries_make_a_map_with_every_candidate_and_the_chosen_one():
     np.testing.assert_allclose(chosen.get_xydata()[0], made.action)
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("speed [m/s]", "tilt")
     assert [a.get_ylabel() for a in ax.figure.axes][1:] == ["EIG (lower bound) [nats]"]
-
-
-@pytest.mark.parametrize("own", [BoxActions(0.0, 1.0, names=["speed"]), BOX])
-def test_each_category_has_a_panel(own):
-    made = design(MixedActions(own, TOOLS))
-    assert made.categorical == (False,) * own.action_dim + (True,)
-    ax = made.plot()
-    panels = [a for a in ax.child_axes if a.get_title()]
-    assert [p.get_title() for p in panels] == ["tool = 1", "tool = 2", "tool = 3"]
-    chosen = [p for p in panels if any(k.get_label() == "chosen" for k in p.lines)]
-    assert [p.get_title() for p in chosen] == [f"tool = {made.action[-1]:g}"]
-    seen = 0
-    for k, panel in enumerate(panels):
-        member = made.candidates[:, -1] == k + 1
-        seen += int(member.sum())
-        if own.action_dim == 2:
-            np.testing.assert_allclose(
-                offsets(map_marks(panel)), made.candidates[member][:, :2]
-            )
-        else:
-            points = np.sort(panel.lines[0].get_xdata())
-            np.testing.assert_allclose(points, made.candidates[member][:, 0].sort()[0])
-    assert seen == len(made.candidates)
 
 
 @pytest.mark.parametrize("dim", [7])

@@ -106,14 +106,14 @@ def test_a_blunt_network_passes_ranks_and_not_the_gap(trained):
         )
         assert found.verdict == "refine"
         assert "blunt" in found.reasons[0]
-        low, high = found.overall.coverage_interval[0.9]
+        low, high = found.overall.coverage_interval
         assert low < 0.9 < high
 
 
 @pytest.mark.parametrize("gap", ["likelihood", "classifier"])
 def test_a_result_says_itself_and_leaves_the_generators_alone(trained, gap):
     before = torch.random.get_rng_state()
-    options = {"num_simulations": 150, "parameter_names": ["k"], "gap": gap}
+    options = {"num_simulations": 150, "gap": gap}
     found, again = (
         check_calibration(trained, MODEL, actions=ACTIONS, **options) for _ in range(2)
     )
@@ -123,8 +123,7 @@ def test_a_result_says_itself_and_leaves_the_generators_alone(trained, gap):
     assert again.to_dict() == found.to_dict()
     assert json.loads(json.dumps(found.to_dict()))["verdict"] == found.verdict
     assert str(found).startswith(found.verdict)
-    assert len(found.plot().axes) == 4
-    assert found.label.max() == 2
+    assert len(found.plot().axes) == 1
     assert found.verdict != "trust" or found.overall.lost < 0.4
 
 
@@ -163,7 +162,7 @@ def test_a_belief_too_wide_or_narrow_is_flagged(own, every, verdicts):
     assert str(found).startswith(found.verdict)
 
 
-def test_rounds_a_continuum_of_actions_and_invalid_rows(trained):
+def test_a_continuum_of_actions_and_invalid_rows(trained):
     space = BoxActions([0.5], [2.0], names=["gain"])
 
     def fails(theta, action):
@@ -173,10 +172,10 @@ def test_rounds_a_continuum_of_actions_and_invalid_rows(trained):
     model = SimulatorModel(fails, noise=GaussianNoise(0.2))
     posterior = with_network(trained, Exact())
     found = check_calibration(
-        [posterior, posterior], model, actions=space, num_simulations=200, max_strata=3
+        posterior, model, actions=space, num_simulations=400, max_strata=3
     )
-    assert [s.round for s in found.strata] == [1, 1, 1, 2, 2, 2]
-    assert found.strata[-1].name.startswith("round 2, near gain")
+    assert len(found.strata) == 3
+    assert found.strata[-1].name.startswith("near gain")
     assert found.num_invalid > 10
     assert len(found.ranks) + found.num_invalid == 400
     assert found.verdict == "trust"

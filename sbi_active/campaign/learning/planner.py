@@ -14,7 +14,7 @@ from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.learning.pooled import PooledLearner
 from sbi_active.campaign.learning.revision import compare
 from sbi_active.campaign.state import CampaignState, Trial
-from sbi_active.design.design import Design, equal_errors, naming
+from sbi_active.design.design import Design, action_labels, equal_errors
 from sbi_active.design.designer import InformationGainDesigner
 from sbi_active.design.estimators.automatic import ESTIMATORS
 from sbi_active.design.limits import DesignLimits
@@ -71,7 +71,7 @@ class Planner:
         listed = actions.listed()
         self._limits.cost(actions.sample((8,), seed=0) if listed is None else listed)
         self._designs = find_method(state.method).designs
-        self._designer: Any = RandomDesigner(actions, workers=options.workers)
+        self._designer: Any = RandomDesigner(actions)
         if self._designs:
             self._designer = InformationGainDesigner(
                 actions,
@@ -145,7 +145,7 @@ class Planner:
         if target == "auto" and self._checks(index):
             told = [t.action for t in self._state.trials if t.is_measured]
             places = most_unlike(permitted(limits), told)
-            designer = RandomDesigner(places, workers=self._state.options.workers)
+            designer = RandomDesigner(places)
             return self._select(index, learner, designer), "check"
         # What nothing explains would draw the next trial after it; reports have it.
         trials, about_model = self._state.explained, None
@@ -286,7 +286,7 @@ def _model_design(criticism: Criticism, limits: DesignLimits) -> Design | None:
         bound="lower",
         index=index,
         num_simulations=criticism.rivals.simulator.num_simulations - spent,
-        **naming(limits.actions),
+        labels=action_labels(limits.actions),
         estimator="ModelIndexGain",
         stopped="budget spent",
         notes=(f"about which is right: {', '.join(found.separates)}",),

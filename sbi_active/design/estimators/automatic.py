@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -55,19 +56,36 @@ def find_estimator(
         return estimator
     if estimator == "auto":
         return None
-    if estimator in FORMER:
+    return by_name(estimator, "estimator", ESTIMATORS, FORMER)
+
+
+def by_name(
+    name: str, what: str, known: Mapping[str, type], former: Mapping[str, str]
+) -> Any:
+    """Return an object of the class of a name.
+
+    Args:
+        name: Name that was given.
+        what: Argument that takes it.
+        known: Classes by name.
+        former: Names by those of the last version, which still work.
+
+    Raises:
+        ValueError: If the name is unknown; it lists the valid ones.
+    """
+    if name in former:
         warn(
-            f"SA701 estimator={estimator!r} goes in the next version: use "
-            f'estimator="{FORMER[estimator]}", or "auto"',
+            f"SA701 {what}={name!r} goes in the next version: use "
+            f'{what}="{former[name]}", or "auto"',
             stacklevel=stack_level(),
         )
-        estimator = FORMER[estimator]
-    if estimator not in ESTIMATORS:
+        name = former[name]
+    if name not in known:
         raise ValueError(
-            f"expected estimator among 'auto', {', '.join(map(repr, ESTIMATORS))}; got "
-            f"{estimator!r}; choose one of these or pass an estimator"
+            f"expected {what} among 'auto', {', '.join(map(repr, known))}; got "
+            f"{name!r}; choose one of these or pass an object of your own"
         )
-    return ESTIMATORS[estimator]()
+    return known[name]()
 
 
 def choose_estimator(

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 from torch import Tensor
 
+from sbi_active.arrays import Array
 from sbi_active.design.estimators.base import CandidateSimulations
+from sbi_active.inference.sampling.mixtures import StudentMixture, lower_factors
 from sbi_active.inference.sampling.weights import silverman
 
 NUM_FOLDS = 4  # a choice: fits of three quarters of the rows, four times
@@ -21,28 +24,33 @@ def cross_fit(
     """Return scores of every row (n,) by members fitted and chosen without it.
 
     Args:
-        score: ``score(train, test)``, both of rows, gives the scores of the test rows
-            by each member fitted to the training rows, shape (members, test).
+        score: ``score(train, test)``, see :func:`held_out`.
         block: Number of the block that a row belongs to, shape (n,): rows of a block
             share a fold, which the member scores that is the best on the others.
         weight: Weight of each row in the choice, shape (n,).
     """
-    fold = block % NUM_FOLDS
-    held_out: Tensor | None = None
-    for k in range(NUM_FOLDS):
-        train, test = torch.nonzero(fold != k)[:, 0], torch.nonzero(fold == k)[:, 0]
-        if len(test) == 0:
-            continue
-        scores = score(train, test)
-        if held_out is None:
-            held_out = torch.zeros(len(scores), len(block), dtype=torch.float64)
-        held_out[:, test] = scores
-    assert held_out is not None
+    fold, scores = block % NUM_FOLDS, held_out(score, block)
     result = torch.empty(len(block), dtype=torch.float64)
     for k in range(NUM_FOLDS):
-        others = (held_out * weight)[:, fold != k].sum(1)
-        result[fold == k] = held_out[int(others.argmax()), fold == k]
+        others = (scores * weight)[:, fold != k].sum(1)
+        result[fold == k] = scores[int(others.argmax()), fold == k]
     return result
+
+
+def held_out(score: Callable[[Tensor, Tensor], Tensor], block: Tensor) -> Tensor:
+    """Return scores of every row by members fitted to other folds, (members, n).
+
+    Args:
+        score: ``score(train, test)``, both of rows, gives the scores of the test rows
+            by each member fitted to the training rows, shape (members, test).
+        block: Number of the block that a row belongs to, shape (n,).
+    """
+    fold, parts, rows = block % NUM_FOLDS, [], []
+    for k in fold.unique().tolist():
+        train, test = (torch.nonzero(part)[:, 0] for part in (fold != k, fold == k))
+        parts.append(score(train, test))
+        rows.append(test)
+    return torch.cat(parts, 1).double()[:, torch.cat(rows).argsort()]
 
 
 def by_pattern(
@@ -135,8 +143,8 @@ def class_members(
 ) -> list[LogDensities]:
     """Fit relative densities of each class, in several ways.
 
-    The order is: none; Gaussians with a common covariance; Gaussians with one each,
-    shrunk to the common one; kernel densities with these covariances.
+    The order is: none; normals with a common covariance; normals with one each, shrunk
+    to the common one; kernel densities with these covariances.
 
     Args:
         x: Outcomes, shape (n, q), q may be 0.
@@ -157,99 +165,71 @@ def class_members(
     ]
     if x.shape[1] == 0 or not bool(enough.all()):
         return members
-    reduce = _discriminating(x, label, num_classes)
+    reduce = _discriminating(x, label)
     z = reduce(x)
-    d = z.shape[1]
-    rows = [z[label == k] for k in range(num_classes)]
-    mean = torch.stack([row.mean(0) for row in rows])
-    scatter = torch.stack(
-        [(r - m).T @ (r - m) for r, m in zip(rows, mean, strict=True)]
-    )
-    tiny = 1e-8 * z.var(0).clamp_min(1e-30).diag()
+    rows = [z[(label == k).numpy()] for k in range(num_classes)]
+    scatter = np.stack([(r - r.mean(0)).T @ (r - r.mean(0)) for r in rows])
+    tiny = np.diag(1e-8 * np.maximum(z.var(0), 1e-30))
     common = scatter.sum(0) / (len(z) - num_classes) + tiny
-    count = torch.tensor([len(row) for row in rows])[:, None, None]
+    count = np.array([len(row) for row in rows])[:, None, None]
     shrunk = (scatter + shrinkage * common) / (count - 1 + shrinkage) + tiny
-    densities: list[LogDensities] = [
-        lambda new: _log_gaussians(new, mean, common.expand_as(shrunk)),
-        lambda new: _log_gaussians(new, mean, shrunk),
-    ]
-    for factor in bandwidths if kernels else ():
-        densities.append(lambda new, f=factor: _log_kernels(new, rows, shrunk, f, d))
-    return members + [lambda new, f=density: f(reduce(new)) for density in densities]
+    one, own = lower_factors(common), lower_factors(shrunk)
+    pairs = [*zip(rows, own, strict=True)]
+    fits = [[_normal(r, one) for r in rows], [_normal(r, f) for r, f in pairs]]
+    for width in bandwidths if kernels else ():
+        widths = [width * silverman(*r.shape) for r in rows]
+        each = zip(pairs, widths, strict=True)
+        fits.append(
+            [_kernels(r, h * f[None].repeat(len(r), 0), f) for (r, f), h in each]
+        )
+    return members + [_by_class(fit, reduce) for fit in fits]
+
+
+def _by_class(
+    mixtures: Sequence[StudentMixture], reduce: Callable[[Tensor], Array]
+) -> LogDensities:
+    def log_density(x: Tensor) -> Tensor:
+        z = reduce(x)
+        return torch.from_numpy(np.stack([m.log_prob(z) for m in mixtures], 1))
+
+    return log_density
+
+
+def _normal(rows: Array, factor: Array) -> StudentMixture:
+    return StudentMixture(rows.mean(0)[None], factor[None], freedom=np.inf)
+
+
+def _kernels(
+    knots: Array, factors: Array, wide: Array, *, tail: float = 0.1
+) -> StudentMixture:
+    """Return normal kernels, and a normal of all draws for what lies between them."""
+    n = len(knots)
+    weights = np.append(np.full(n, (1 - tail) / n), tail)
+    means = np.concatenate([knots, knots.mean(0)[None]])
+    return StudentMixture(means, np.concatenate([factors, wide[None]]), weights, np.inf)
 
 
 def _discriminating(
-    x: Tensor, label: Tensor, num_classes: int, num_spreads: int = 3
-) -> Callable[[Tensor], Tensor]:
-    r"""Return a map to few numbers: :math:`W^{-1} (\mu_k - \mu)` and leading ones.
+    x: Tensor, label: Tensor, num_spreads: int = 3
+) -> Callable[[Tensor], Array]:
+    """Return a map to few numbers: all that there are, or the classes' discriminants.
 
-    Beside them are some directions of equal means but other spreads.
-
-    References:
-        Ledoit & Wolf, J. Multivariate Analysis 2004 (the shrinkage of W).
+    Beside these are some directions of equal means but other spreads. The covariance
+    within classes is shrunk as by Ledoit & Wolf, J. Multivariate Analysis 2004.
     """
-    indicator = torch.nn.functional.one_hot(label, num_classes).double()
+    indicator = torch.nn.functional.one_hot(label).double()
     first = Reduction.fit(x, indicator)
     if x.shape[1] <= first.direction.shape[1]:
-        return first
-    z = first.standard(x)
-    share = indicator / indicator.sum(0)
-    mean = share.T @ z
-    within = z - mean[label]
-    moment = within.T @ within / len(z)
-    n, q = z.shape
-    target = moment.diagonal().mean() * torch.eye(q)
-    spread = (within.square().sum(1).square().sum() / n - moment.square().sum()) / n
-    share_of_target = (spread / (moment - target).square().sum()).clamp(1e-4, 1.0)
-    shrunk = (1 - share_of_target) * moment + share_of_target * target
-    means = torch.linalg.solve(shrunk, (mean - mean.mean(0)).T)
-    left, value, _ = torch.linalg.svd(means, full_matrices=False)
-    left = left[:, value > 1e-9 * value.amax()][:, : num_classes - 1]
-    factor = torch.linalg.cholesky(shrunk)
-    white = torch.linalg.solve_triangular(factor, within.T, upper=False).T
-    # directions whose spread differs most between the classes
-    moments = torch.stack(
-        [white[label == k].T @ white[label == k] for k in range(num_classes)]
-    )
-    moments = moments / indicator.sum(0)[:, None, None]
-    other = (moments - moments.mean(0)).square().sum(0)
-    vector = torch.linalg.eigh(other).eigenvectors[:, -num_spreads:]
-    spreads = torch.linalg.solve_triangular(factor.T, vector, upper=True)
-    direction = torch.cat([left, spreads], 1)
-    return lambda new: first.standard(new) @ direction
-
-
-def _log_gaussians(z: Tensor, mean: Tensor, covariance: Tensor) -> Tensor:
-    factor = torch.linalg.cholesky(covariance)
-    white = torch.linalg.solve_triangular(factor, (z - mean[:, None]).mT, upper=False)
-    log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    return (-0.5 * white.square().sum(1) - log_det[:, None]).T
-
-
-def _log_kernels(
-    z: Tensor, rows: list[Tensor], covariance: Tensor, factor: float, d: int
-) -> Tensor:
-    """Log kernel densities with Gaussian tails of each class, shape (m, k)."""
-    columns = []
-    for row, spread in zip(rows, covariance, strict=True):
-        n = len(row)
-        width = factor * silverman(n, d)
-        root = torch.linalg.cholesky(spread)
-        white, knots = (
-            torch.linalg.solve_triangular(root, part.T, upper=False).T
-            for part in (z, row)
-        )
-        parts = [
-            (-0.5 * torch.cdist(w, knots).square() / width**2).logsumexp(1)
-            for w in white.split(max(1, 2**22 // n))
-        ]
-        log_density = torch.cat(parts) - math.log(n) - d * math.log(width)
-        log_tail = -0.5 * (white - knots.mean(0)).square().sum(1)
-        log_density = torch.logaddexp(
-            log_density + math.log(0.9), log_tail + math.log(0.1)
-        )
-        columns.append(log_density - root.diagonal().log().sum())
-    return torch.stack(columns, 1)
+        return lambda new: first(new).numpy()
+    z, num_classes = first.standard(x).numpy(), indicator.shape[1]
+    fit = LinearDiscriminantAnalysis(solver="eigen", shrinkage="auto")
+    white = fit.fit(z, label.numpy()).scalings_  # what whitens z within the classes
+    each = [(z @ white)[(label == k).numpy()] for k in range(num_classes)]
+    moments = np.stack([np.cov(own.T) for own in each])
+    other = ((moments - moments.mean(0)) ** 2).sum(0)
+    spreads = white @ np.linalg.eigh(other)[1][:, -num_spreads:]
+    direction = np.concatenate([white[:, : num_classes - 1], spreads], 1)
+    return lambda new: first.standard(new).numpy() @ direction
 
 
 #: Numbers of an outcome up to which each kernel has a covariance of its own.
@@ -293,50 +273,27 @@ def noise_members(
     usable = 0 < mean.shape[1] <= MOST_NUMBERS and bool(enough.all())
     if not usable or not bool((mean.isfinite() & (sd > 0)).all()):
         return []
+    classes = [(label == k).numpy() for k in range(len(enough))]
+    known = mean.numpy(), sd.square().numpy()
+    fits = [
+        [_noise_kernels(*(part[own] for part in known), factor=f) for own in classes]
+        for f in factors
+    ]
+    return [_by_class(fit, lambda new: new.numpy()) for fit in fits]
 
-    def member(factor: float) -> LogDensities:
-        classes = [label == k for k in range(len(enough))]
-        parts = [_noise_kernels(mean[own], sd[own], factor) for own in classes]
-        return lambda new: torch.stack([part(new) for part in parts], 1)
 
-    return [member(factor) for factor in factors]
-
-
-def _noise_kernels(mean: Tensor, sd: Tensor, factor: float) -> LogDensities:
-    """Return the log density of one class, by means and deviations (n, q).
-
-    A tenth is a Gaussian of all draws, for what lies between the kernels.
-    """
-    n = len(mean)
-    center = mean.mean(0)
-    apart = mean - center
-    covariance = apart.T @ apart / (n - 1)
-    noise = sd.square()
+def _noise_kernels(mean: Array, variance: Array, *, factor: float) -> StudentMixture:
+    """Return the density of one class, by means and variances (n, q)."""
+    apart = mean - mean.mean(0)
+    covariance = apart.T @ apart / (len(mean) - 1)
     # directions in which the kernels would lie apart without smoothing
-    unit = noise.mean(0).rsqrt()
-    spread = torch.linalg.eigvalsh(unit[:, None] * covariance * unit)
-    num_distinct = len({row.tobytes() for row in mean.numpy()})
+    unit = variance.mean(0) ** -0.5
+    spread = np.linalg.eigvalsh(unit[:, None] * covariance * unit)
+    num_distinct = len({row.tobytes() for row in mean})
     d = max(1, int((spread > 1).sum()))
     h = min(factor * silverman(max(2, num_distinct), d), 1.0)
-    knots = center + math.sqrt(1 - h**2) * apart
-    factors = torch.linalg.cholesky(noise.diag_embed() + h**2 * covariance)
-    wide = torch.linalg.cholesky(noise.mean(0).diag() + covariance)
-
-    def log_density(x: Tensor) -> Tensor:
-        kernels = _log_normal(x - knots[:, None], factors)
-        inner = kernels.logsumexp(0) - math.log(n)
-        tail = _log_normal((x - center)[None], wide[None])[0]
-        return torch.logaddexp(inner + math.log1p(-0.1), tail + math.log(0.1))
-
-    return log_density
-
-
-def _log_normal(apart: Tensor, factor: Tensor) -> Tensor:
-    """Return log N(apart | 0, L L^T), shape (n, m), from (n, m, q) and (n, q, q)."""
-    if factor.shape[-1] == 1:
-        white, log_det = apart / factor, factor[:, 0, 0].log()
-    else:
-        white = torch.linalg.solve_triangular(factor, apart.mT, upper=False).mT
-        log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    constant = 0.5 * factor.shape[-1] * math.log(2 * math.pi)
-    return -0.5 * white.square().sum(-1) - log_det[:, None] - constant
+    knots = mean.mean(0) + np.sqrt(1 - h**2) * apart
+    one = np.eye(mean.shape[1])
+    factors = np.linalg.cholesky(variance[:, None] * one + h**2 * covariance)
+    wide = np.linalg.cholesky(variance.mean(0) * one + covariance)
+    return _kernels(knots, factors, wide)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -26,7 +26,15 @@ from sbi_active.seeding import derive_seed
 
 
 class RivalPredictive(Protocol):
-    """A rival model: how probable it is, and what it predicts."""
+    """A rival model: how probable it is, and what it predicts.
+
+    One that knows what its noise adds to a draw has ``predict_mean(action, num_samples,
+    seed)`` as well, which returns the outcomes without noise behind the draws of
+    ``predict`` and the standard deviations of the noise in them, both of the shape of
+    the draws. A posterior draw that is used again has the same outcome without noise.
+    The predictive density is then a mixture of the noise's, sharper than any density
+    fitted to the outcomes alone.
+    """
 
     @property
     def probability(self) -> float:
@@ -43,27 +51,6 @@ class RivalPredictive(Protocol):
 
         Returns:
             Shape (n, *x_shape), NaN where there is no measurement.
-        """
-        ...
-
-
-@runtime_checkable
-class NoisyRivalPredictive(RivalPredictive, Protocol):
-    """A rival that knows what its noise adds to a draw.
-
-    Its predictive density is then a mixture of the noise's, sharper than any density
-    fitted to the outcomes alone.
-    """
-
-    def predict_mean(
-        self, action: Tensor, num_samples: int, seed: int
-    ) -> tuple[Tensor, Tensor]:
-        """Return means and deviations behind the draws of ``predict``.
-
-        Returns:
-            The outcomes without noise, and the standard deviations of the noise in
-            them, both of the shape of the draws. A posterior draw that is used again
-            has the same outcome without noise.
         """
         ...
 
@@ -108,7 +95,7 @@ class RivalSampler:
         self.rivals = [r for r, p in zip(rivals, values, strict=True) if p > 0]
         self.probability = probability[probability > 0] / total
         self.seed, self.num_drawn, self._num_waves = seed, 0, 0
-        self._is_noisy = all(isinstance(r, NoisyRivalPredictive) for r in self.rivals)
+        self._is_noisy = all(hasattr(r, "predict_mean") for r in self.rivals)
 
     def draw(
         self, num_samples: int, action: Tensor, *, replicates: bool
@@ -131,11 +118,11 @@ class RivalSampler:
         rows = []
         for own in action:
             drawn = [self._predict(k, own, each, seed) for k in range(num_rivals)]
-            if len({part.shape for part in drawn}) > 1:
+            shapes = [tuple(part.shape[1:]) for part in drawn]
+            if len({*shapes}) > 1 or shapes[0][:1] != (each,):
                 raise ValueError(
-                    "expected outcomes of one shape from all rivals; got "
-                    f"{[tuple(part.shape[1:]) for part in drawn]}; predict the "
-                    "same x"
+                    f"expected {each} outcomes of one shape from all rivals; got "
+                    f"{shapes}; return one row a draw, and predict the same x"
                 )
             rows.append(torch.stack(drawn, 2).flatten(1, 2))
         self.num_drawn += len(rows) * rows[0].shape[1]
@@ -153,23 +140,18 @@ class RivalSampler:
 
         Shape (1 or 3, n, *x_shape).
         """
-        rival, own = self.rivals[k], derive_seed(seed, k)
-        x = torch.as_tensor(rival.predict(action, num, own))
-        if x.ndim == 0 or len(x) != num:
-            raise ValueError(
-                f"expected {num} outcomes from rival {k}; got shape {tuple(x.shape)}; "
-                "return one row a draw"
-            )
-        parts = [x]
+        rival: Any = self.rivals[k]
+        own = derive_seed(seed, k)
+        parts = [torch.as_tensor(rival.predict(action, num, own))]
         if self._is_noisy:
-            assert isinstance(rival, NoisyRivalPredictive)
             parts += [torch.as_tensor(p) for p in rival.predict_mean(action, num, own)]
-            if len({part.shape for part in parts}) > 1:
-                raise ValueError(
-                    f"expected means and deviations of shape {tuple(x.shape)} from "
-                    f"rival {k}; got {[tuple(p.shape) for p in parts[1:]]}; return "
-                    "one of each a number"
-                )
+        x = parts[0]
+        if any(part.shape != x.shape for part in parts):
+            raise ValueError(
+                f"expected means and deviations of shape {tuple(x.shape)} from rival "
+                f"{k}; got {[tuple(p.shape) for p in parts[1:]]}; return one of each "
+                "a number"
+            )
         # kernels as narrow as the noise need what a float loses of a large number
         exact = self._is_noisy and x[0].numel() <= MOST_NUMBERS
         dtype = torch.float64 if exact else torch.float32

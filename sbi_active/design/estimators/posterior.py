@@ -24,7 +24,7 @@ from sbi_active.design.estimators.densities import (
     by_pattern,
     cross_fit,
 )
-from sbi_active.design.estimators.emulator import NUM_CHOOSING, kernel, linear
+from sbi_active.design.estimators.emulator import linear
 from sbi_active.design.estimators.entropy import nearest_neighbor_entropy
 from sbi_active.inference.sampling.mixtures import fitted_normals
 from sbi_active.seeding import forked_generators
@@ -204,11 +204,11 @@ Features = Callable[[Tensor], Tensor]
 Regression = tuple[Features, Tensor]
 
 
-def conditional_members(u: Tensor, x: Tensor) -> list[Density]:
+def conditional_members(u: Tensor, x: Tensor, num_knots: int = 100) -> list[Density]:
     """Fit conditional densities of u (n, s), close to standard normal, given x (n, q).
 
     The order is: a Gaussian without x; Gaussians around a linear, a quadratic and a
-    kernel regression, each with a constant covariance and with one that is scaled by a
+    radial regression, each with a constant covariance and with one that is scaled by a
     log-linear function of x; a mixture of Gaussians of (u, x), conditioned on x. Each
     has a share of the standard normal, so that no row costs more than a few nats. They
     are functions of u (k, s) and x (k, q), which may have no numbers, -> (k,).
@@ -224,11 +224,14 @@ def conditional_members(u: Tensor, x: Tensor) -> list[Density]:
             i, j = torch.triu_indices(z.shape[1], z.shape[1])
             return torch.cat([z, z[:, i] * z[:, j]], 1).clamp(-30, 30)
 
-        regressions = [
-            _linear(x, u, reduce.standard),
-            _linear(x, u, quadratic),
-            _kernel(reduce(x), u, reduce),
-        ]
+        knots = reduce(x[:num_knots])
+
+        def radial(x: Tensor) -> Tensor:
+            z = reduce(x)
+            return torch.cat([z, (-torch.cdist(z, knots)).exp()], 1)
+
+        every = reduce.standard, quadratic, radial
+        regressions = [_linear(x, u, features) for features in every]
         for mean, residual in regressions:
             members.append(_around(residual, x, mean))
             members.append(_around(residual, x, mean, quadratic))
@@ -309,43 +312,6 @@ def _ridge(features: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
         fits.append((score, right.T @ (per_value[:, None] * rotated), residual))
     _, slope, residual = min(fits, key=lambda fit: fit[0])
     return torch.cat([(middle - center @ slope)[None], slope]), residual
-
-
-def _kernel(
-    z: Tensor,
-    u: Tensor,
-    reduce: Reduction,
-    lengths: tuple[float, ...] = (0.3, 1.0, 3.0, 10.0),
-) -> Regression:
-    """Kernel ridge regression around a linear trend, leave-one-out residuals.
-
-    The lengths are those tried, in standard deviations of z.
-    """
-    slope, _ = _ridge(z, u)
-    rest = u - linear(z) @ slope
-    few = slice(NUM_CHOOSING)
-    length = min(lengths, key=lambda length: _smooth(z[few], rest[few], length)[0])
-    _, weight, residual = _smooth(z, rest, length)
-
-    def mean(x: Tensor) -> Tensor:
-        new = reduce(x)
-        return linear(new) @ slope + kernel(new / length, z / length) @ weight
-
-    return mean, residual
-
-
-def _smooth(z: Tensor, rest: Tensor, length: float) -> tuple[float, Tensor, Tensor]:
-    """Return score, weights and leave-one-out residuals at the best ridge."""
-    value, vector = torch.linalg.eigh(kernel(z / length, z / length))
-    rotated = vector.T @ rest
-    fits = []
-    for ridge in RIDGES:
-        inverse = 1 / (value.clamp_min(0) + ridge)
-        weight = vector @ (inverse[:, None] * rotated)
-        residual = weight / (vector.square() @ inverse)[:, None]
-        score = float(residual.square().mean(0).log().sum())
-        fits.append((score, weight, residual))
-    return min(fits, key=lambda fit: fit[0])
 
 
 def _mixture(u: Tensor, x: Tensor, reduce: Features, most: int = 6) -> Density:

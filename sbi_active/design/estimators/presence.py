@@ -10,10 +10,11 @@ from torch import Tensor
 from torch.nn.functional import logsigmoid
 
 from sbi_active.design.estimators.base import CandidateSimulations
-from sbi_active.design.estimators.densities import NUM_FOLDS
+from sbi_active.design.estimators.densities import cross_fit, held_out
 from sbi_active.design.estimators.emulator import MeanEmulator, kernel, whitening
 
 Ridges = tuple[float, ...]
+RIDGES: Ridges = (0.1, 3.0, 100.0)
 
 
 def presence_information(simulations: CandidateSimulations) -> Tensor:
@@ -144,16 +145,17 @@ def _classified(theta: Tensor, patterns: Tensor, counted: Tensor) -> Tensor:
     label = torch.stack(
         [_by_share(p, c) for p, c in zip(patterns, counted, strict=True)]
     )
-    weight = counted[:, None].double()
+    weight, rows = counted[:, None].double(), torch.arange(len(theta))
     gain = torch.zeros(counted.shape, dtype=torch.float64)
     for k in range(int(label.max())):  # is it class k, given that it is none before
         hits = (weight * (label == k)).sum(1)
         misses = (weight * (label > k)).sum(1)
         share = hits.sum(1) / (hits + misses).sum(1).clamp_min(1)
         share = share[:, None].clamp(1e-12, 1 - 1e-12)
-        logit, _ = held_out_logits(theta, hits, hits + misses)
-        gain += hits * (logsigmoid(logit) - share.log())
-        gain += misses * (logsigmoid(-logit) - (1 - share).log())
+        baseline = hits * share.log() + misses * (1 - share).log()
+        for row, h, m in zip(gain, hits, misses, strict=True):
+            row += cross_fit(_scoring(theta, h, h + m), rows, torch.ones(len(rows)))
+        gain -= baseline
     return gain / patterns.shape[1]
 
 
@@ -172,48 +174,37 @@ def _log_share(label: Tensor) -> Tensor:
     return (count.double() / len(label)).log()[inverse]
 
 
-def held_out_logits(
-    theta: Tensor, hits: Tensor, total: Tensor, ridges: Ridges = (0.1, 3.0, 100.0)
-) -> tuple[Tensor, Tensor]:
-    """Return logits of a probability at parameters (n, d), fitted to the other folds.
-
-    Args:
-        theta: Parameters.
-        hits: Number of outcomes of a kind at each, shape (a, n): a candidates.
-        total: Number of outcomes at each, shape (a, n).
-        ridges: Precisions of the coefficients' prior, chosen by rows outside a fold.
-
-    Returns:
-        The logits, shape (a, n), and the choice over all rows, an index, shape (a,).
-    """
+def _scoring(
+    theta: Tensor, hits: Tensor, total: Tensor, ridges: Ridges = RIDGES
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """Return how logistic regressions with each ridge score hits (n,) among so many."""
     phi = features_of(theta)(theta)
-    fold = torch.arange(len(theta)) % NUM_FOLDS
-    logits = torch.empty(len(ridges), *hits.shape, dtype=torch.float64)
-    for k in range(NUM_FOLDS):
-        train, test = fold != k, fold == k
-        for logit, ridge in zip(logits, ridges, strict=True):
-            fitted = fit_logistic(phi[train], hits[:, train], total[:, train], ridge)
-            logit[:, test] = fitted @ phi[test].T
-    score = hits * logsigmoid(logits) + (total - hits) * logsigmoid(-logits)
-    result = torch.empty_like(hits)
-    each = torch.arange(len(hits))
-    for k in range(NUM_FOLDS):
-        best = score[..., fold != k].sum(-1).argmax(0)
-        result[:, fold == k] = logits[best, each][:, fold == k]
-    return result, score.sum(-1).argmax(0)
+
+    def score(train: Tensor, test: Tensor) -> Tensor:
+        known = phi[train], hits[train], total[train]
+        logit = torch.stack([fit_logistic(*known, r) for r in ridges]) @ phi[test].T
+        misses = total[test] - hits[test]
+        return hits[test] * logsigmoid(logit) + misses * logsigmoid(-logit)
+
+    return score
 
 
 def probability(
-    theta: Tensor, hits: Tensor, total: Tensor, ridges: Ridges = (0.1, 3.0, 100.0)
+    theta: Tensor, hits: Tensor, total: Tensor, ridges: Ridges = RIDGES
 ) -> Callable[[Tensor], Tensor]:
     """Return a smooth log probability, of parameters (k, d) -> (k,).
 
     It is fitted to hits (n,) among so many outcomes (n,) at parameters (n, d).
+
+    Args:
+        theta: Parameters.
+        hits: Number of outcomes of a kind at each.
+        total: Number of outcomes at each.
+        ridges: Precisions of the coefficients' prior, chosen by rows outside a fold.
     """
-    _, best = held_out_logits(theta, hits[None], total[None], ridges)
-    features = features_of(theta)
-    ridge = ridges[int(best)]
-    coefficient = fit_logistic(features(theta), hits[None], total[None], ridge)[0]
+    scores = held_out(_scoring(theta, hits, total, ridges), torch.arange(len(theta)))
+    ridge, features = ridges[int(scores.sum(1).argmax())], features_of(theta)
+    coefficient = fit_logistic(features(theta), hits, total, ridge)
     return lambda new: logsigmoid(features(new) @ coefficient)
 
 
@@ -240,30 +231,30 @@ def fit_logistic(
     num_steps: int = 25,
     max_move: float = 4.0,
 ) -> Tensor:
-    r"""Return the penalized maximum of the binomial likelihood, (a, p), by Newton.
+    r"""Return the penalized maximum of the binomial likelihood, (p,), by Newton.
 
     .. math::
         \sum_i h_i \log \sigma(\beta^\top \phi_i)
         + (t_i - h_i) \log \sigma(-\beta^\top \phi_i)
         - \tfrac\lambda2 \sum_{j > 0} \beta_j^2
 
-    with features phi (n, p), the first a one, and hits h (a, n) among t. A logit moves
-    by ``max_move`` at most in a step, lest separable labels run away.
+    with features phi (n, p), the first a one, and hits h (n,) among t. A logit moves by
+    ``max_move`` at most in a step, lest separable labels run away.
 
     References:
         Bishop, Pattern Recognition and Machine Learning, 2006, section 4.3.3.
     """
     penalty = torch.full((phi.shape[1],), ridge, dtype=phi.dtype)
     penalty[0] = 1e-3  # a label that never occurs has no maximum without it
-    coefficient = torch.zeros(len(hits), phi.shape[1], dtype=phi.dtype)
+    coefficient = torch.zeros_like(penalty)
     for _ in range(num_steps):
-        mean = (coefficient @ phi.T).sigmoid()
+        mean = (phi @ coefficient).sigmoid()
         gradient = (hits - total * mean) @ phi - penalty * coefficient
         curvature = total * (mean * (1 - mean)).clamp_min(1e-9)
-        hessian = (phi.T * curvature[:, None]) @ phi + torch.diag(penalty)
+        hessian = (phi.T * curvature) @ phi + torch.diag(penalty)
         step = torch.linalg.solve(hessian, gradient)
-        move = (step @ phi.T).abs().amax(1, keepdim=True)
-        coefficient = coefficient + step * (max_move / move.clamp_min(max_move))
-        if float(move.max()) < 1e-6:
+        move = float((phi @ step).abs().max())
+        coefficient = coefficient + step * (max_move / max(move, max_move))
+        if move < 1e-6:
             break
     return coefficient

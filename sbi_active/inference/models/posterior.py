@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import deepcopy
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from sbi.inference.posteriors.base_posterior import NeuralPosterior
@@ -223,14 +223,9 @@ class ActionPosterior:
         return pack(rows, action_rows(action, self.action_dim, num_rows=len(rows)))
 
 
-Direct = TypeVar("Direct", bound=DirectPosterior)
-
-
 def at_conditions(
-    direct: DirectPosterior,
-    condition: Tensor,
-    kind: type[Direct] = DirectPosterior,
-) -> tuple[Direct, Tensor]:
+    direct: DirectPosterior, condition: Tensor
+) -> tuple[DirectPosterior, Tensor]:
     """Return a posterior given the number of a row, and these numbers.
 
     sbi refuses NaN in a condition, and its diagnostics drop such rows; the number of a
@@ -239,12 +234,11 @@ def at_conditions(
     Args:
         direct: Estimator over packed conditions.
         condition: Packed conditions, shape (n, c).
-        kind: Class of the posterior.
 
     Returns:
         The posterior, and numbers of shape (n, 1).
     """
-    posterior = kind(
+    posterior = DirectPosterior(
         _Rewritten(direct.posterior_estimator, torch.Size([1]), condition, _row_of),
         direct.prior,
         max_sampling_batch_size=direct.max_sampling_batch_size,

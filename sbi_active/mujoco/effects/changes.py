@@ -10,7 +10,7 @@ from typing_extensions import override
 
 from sbi_active.arrays import Array
 from sbi_active.mujoco.models.changes import ModelChange, StateChange
-from sbi_active.mujoco.models.names import element_id, names_of
+from sbi_active.mujoco.models.names import element_id
 from sbi_active.mujoco.models.quantities import (
     ATTRIBUTES,
     Entry,
@@ -60,10 +60,7 @@ class Polynomial(ModelChange):
 
     @override
     def fields(self) -> tuple[str, ...]:
-        return (
-            {"damping": "dof_damping", "stiffness": "jnt_stiffness"}[self.what]
-            + "poly",
-        )
+        return (f"{'dof' if self.what == 'damping' else 'jnt'}_{self.what}poly",)
 
     @override
     def write(self, model: Any, phi: Array) -> None:
@@ -71,41 +68,6 @@ class Polynomial(ModelChange):
             i = element_id(model, "joint", name)
             at = int(model.jnt_dofadr[i]) if self.what == "damping" else i
             add_to(model, Entry(self.fields()[0], (at, self.power - 2)), float(phi[0]))
-
-
-@dataclass(frozen=True)
-class PowerForce:
-    r"""A force :math:`-\phi |v|^{p-1} v` or :math:`-\phi (q - q_0)^p` on joints.
-
-    It stands for :class:`Polynomial` where MuJoCo has no field for it.
-
-    Attributes:
-        joints: Place in qpos, place in qvel and rest position of each.
-        what: "damping" or "stiffness".
-        power: p.
-    """
-
-    joints: tuple[tuple[int, int, float], ...]
-    what: Literal["damping", "stiffness"]
-    power: int
-
-    def __call__(self, q: Array, v: Array, t: float, phi: Array) -> Array:
-        """Return the force, shape (n, nv).
-
-        Args:
-            q: Positions, shape (n, nq).
-            v: Velocities, shape (n, nv).
-            t: Time, which is not used.
-            phi: Parameters of the effect, shape (n, 1).
-        """
-        force = np.zeros_like(v)
-        for place, dof, rest in self.joints:
-            if self.what == "damping":
-                speed = v[:, dof]
-                force[:, dof] = -phi[:, 0] * np.abs(speed) ** (self.power - 1) * speed
-            else:
-                force[:, dof] = -phi[:, 0] * (q[:, place] - rest) ** self.power
-        return force
 
 
 @dataclass(frozen=True)
@@ -258,11 +220,9 @@ class ContactChange(ModelChange):
 
     Attributes:
         what: Quantity that is multiplied.
-        geoms: Names of geoms; () for every geom and pair.
     """
 
     what: Literal["friction", "softness", "restitution"]
-    geoms: tuple[str, ...] = ()
 
     @override
     def fields(self) -> tuple[str, ...]:
@@ -272,10 +232,7 @@ class ContactChange(ModelChange):
     @override
     def write(self, model: Any, phi: Array) -> None:
         factor = float(np.exp(phi[0]))
-        geoms, pairs = (field_of(model, name) for name in self.fields())
-        every = self.geoms or names_of(model, "geom")
-        rows = [geoms[element_id(model, "geom", name)] for name in every]
-        for values in rows if self.geoms else [*rows, *pairs]:
+        for values in (row for name in self.fields() for row in field_of(model, name)):
             if self.what == "friction":
                 values *= factor
             elif values[0] <= 0:  # (-stiffness, -damping)

@@ -81,14 +81,6 @@ def elements(
     yield Element("medium", "medium", ("option",))
     if sizes.has_contacts:
         yield Element("contact", "contact", words={"who": "every contact"})
-        touching = [
-            name
-            for i, name in enumerate(names_of(model, "geom"))
-            if model.geom_contype[i] or model.geom_conaffinity[i]
-        ]
-        if 1 < len(touching) <= 6:
-            for name in touching:
-                yield Element("contact", name, (name,), words={"who": name})
 
 
 def _joint(names: tuple[str, ...], sizes: Nominal) -> Element:

@@ -15,7 +15,6 @@ from sbi_active.mujoco.effects.changes import (
     FrictionChange,
     GravityTilt,
     Polynomial,
-    PowerForce,
     QuantityChange,
     ZeroOffset,
 )
@@ -70,28 +69,17 @@ def _change(changes: str, element: Element) -> Any:
         case ["tilt", "x" | "y" as axis]:
             return GravityTilt(axis)
         case ["contact", what]:
-            return ContactChange(what, names)  # pyright: ignore
+            return ContactChange(what)  # pyright: ignore
         case ["density" | "viscosity" as what]:
             return QuantityChange("option", names, what)
         case [power] if "^" in power:
             what, _, exponent = power.partition("^")
-            return _power(names, given["model"], what, int(exponent))
+            if hasattr(given["model"], "dof_dampingpoly"):  # from MuJoCo 3.7 on
+                return Polynomial(names, what, int(exponent))  # pyright: ignore
         case [what]:
             if given.get("is_movable", True) or what == "mass":
                 return QuantityChange(element.kind, names, what)
     return None
-
-
-def _power(names: tuple[str, ...], model: Any, what: Any, power: int) -> Any:
-    """Return a change with a power, a force where this MuJoCo has no field for it."""
-    if hasattr(model, "dof_dampingpoly"):
-        return Polynomial(names, what, power)
-    places = []
-    for name in names:
-        i = element_id(model, "joint", name)
-        place, dof = int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i])
-        places.append((place, dof, float(model.qpos_spring[place])))
-    return PowerForce(tuple(places), what, power)
 
 
 def _transmission(

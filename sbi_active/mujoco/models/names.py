@@ -27,9 +27,8 @@ def names_of(model: Any, kind: str) -> list[str]:
     """
     mujoco = mujoco_of()
     mark, count = KINDS[kind]
-    number = model.njnt if kind == "joint" else getattr(model, count)
-    if kind == "actuator":
-        number = len(model.actuator_trntype)
+    is_actuator = kind == "actuator"
+    number = len(model.actuator_trntype) if is_actuator else getattr(model, count)
     each = (
         mujoco.mj_id2name(model, getattr(mujoco.mjtObj, mark), i) for i in range(number)
     )

@@ -266,10 +266,9 @@ def _affine(
             up[name] - down[name] for up, down in zip(ups, downs, strict=True)
         ]
         slope = np.stack(differences, -1)[places] / (2 * half)
-        scale = np.abs(slope).max() or 1.0
-        slope = np.where(np.abs(slope) < rounding * scale, 0.0, slope)
-        rounded = np.round(slope, 12)
-        slope = np.where(np.abs(slope - rounded) <= rounding * scale, rounded, slope)
+        rounded = np.round(slope, 12)  # of 0 and 1, which most slopes are
+        close = np.abs(slope - rounded) <= rounding * (np.abs(slope).max() or 1.0)
+        slope = np.where(close, rounded, slope)
         constant = value[places] - slope @ middle
         size = np.abs(value[places]) + np.abs(slope) @ np.abs(middle)
         constant = np.where(np.abs(constant) <= rounding * size, 0.0, constant)
