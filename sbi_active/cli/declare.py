@@ -109,6 +109,7 @@ def argument(name: str, metavar: str, type: Any, **more: Any) -> click.Argument:
 NUMBERS, COUNT = Numbers(), click.IntRange(min=1)
 FILE, FOLDER = click.Path(path_type=Path), click.Path(path_type=Path, file_okay=False)
 DIR = argument("folder", "DIR", FOLDER)
+TASK = option("--task", "in place of a simulator", click.Choice(TASKS))
 OF_TASK = repeated("--option", "of the task, as variant=sinh", "NAME=VALUE")
 METHOD = option("--method", "by which it learns", click.Choice(METHODS), default="asbi")
 SEED = option("--seed", "of all that is random", int, default=0)

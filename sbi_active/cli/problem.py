@@ -122,8 +122,12 @@ def problem_of(
     Raises:
         ValueError: If too little is given, or it is not what it has to be.
     """
-    advice = "name it, as in --simulator my_robot.py:fn"
-    require(bool(given.get("simulator")), "--simulator", "none", advice)
+    if given.get("task"):
+        found = task_of(given["task"], given["option"])
+        declared = getattr(found, "effects", list)
+        return found.simulator, found.prior, found.actions, declared()
+    advice = "name one, as in --simulator my_robot.py:fn"
+    require(bool(given.get("simulator")), "--simulator or a task", "none", advice)
     module, name = load_module(given["simulator"], given.get("folder"))
     model = with_noise(getattr(module, name), given.get("noise"))
     prior = _prior_of(given) or getattr(module, "prior", None)
@@ -224,18 +228,13 @@ def open_campaign(
     Raises:
         ValueError: If there is no campaign, or its simulator is not known.
     """
-    reader, known = Campaign.load(folder), _remembered(folder)
-    how: Any = {"simulator_changed": simulator_changed}
-    if simulator is None and "task" in known:
-        task = task_of(known["task"], known["option"])
-        return Campaign.load(folder, simulator=task.simulator, **how)
-    if simulator is not None:
-        known = {"simulator": simulator, "noise": noise}
+    reader, named = Campaign.load(folder), {"simulator": simulator, "noise": noise}
+    known = named if simulator else _remembered(folder)
     model, prior, actions, effects = problem_of(known, needs=())
     if reader.state.version.effects:
         effects = with_generic(effects, model, reader.actions, reader.first_prior)
-    how |= {"simulator": model, "prior": prior, "actions": actions, "effects": effects}
-    campaign = Campaign.load(folder, **how)
+    how = {"simulator": model, "prior": prior, "actions": actions, "effects": effects}
+    campaign = Campaign.load(folder, simulator_changed=simulator_changed, **how)
     remember(folder, **known)
     return campaign
 

@@ -19,7 +19,7 @@ from sbi_active.expected import require
 #: Arguments and options that say what is compared with what.
 CRITICIZE = [
     cli.argument("trials", "TRIALS.csv", cli.FILE),
-    *(cli.SIMULATOR, *cli.SPACE, cli.SEED, cli.JSON),
+    *(cli.SIMULATOR, cli.TASK, cli.OF_TASK, *cli.SPACE, cli.SEED, cli.JSON),
     cli.repeated("--columns", "as x=height_m", "KEY=NAME[,NAME...]"),
     cli.option("--inputs", "at times of their own", cli.FILE, "INPUTS.csv"),
     cli.repeated("--set", "of close_loop, as warm_up=0.5", "NAME=VALUE"),
@@ -48,7 +48,7 @@ def criticize(trials: Path, **given: Any) -> Answer:
         given["out"].mkdir(parents=True, exist_ok=True)
     if not (trials.is_dir() and has_manifest(trials)):
         return _compared(trials, given)
-    own = (*("theta_low", "theta_high", "actions"), "columns", "inputs", "set")
+    own = (*("task", "theta_low", "theta_high", "actions"), "columns", "inputs", "set")
     wrong = ", ".join(name for name in own if given[name])
     what = "--simulator, --noise or --out for a campaign, which has its own problem"
     require(not wrong, what, wrong, "leave it out")

@@ -11,6 +11,7 @@ import torch
 
 from sbi_active import criticism
 from sbi_active.cli import main
+from sbi_active.tasks import get_task
 
 ROBOT = """
 import torch
@@ -191,3 +192,15 @@ def test_a_folder_of_recordings(capsys):
     printed = capsys.readouterr().out
     assert printed.startswith("Verdict: drag")
     assert "held-out trial push 3: " in printed
+
+
+def test_a_task_gives_its_simulator_and_prior(capsys):
+    actions = [-4.0, -2.0, 0.0, 2.0, 4.0, -3.0]
+    task = get_task("numerical")
+    x = [
+        float(task.real_system(torch.tensor([a]), seed=k))
+        for k, a in enumerate(actions)
+    ]
+    write([f"{a},{v:.3f}" for a, v in zip(actions, x, strict=True)], "action_xi,x_y")
+    assert main(["criticize", "trials.csv", "--task", "numerical"]) == 0
+    assert capsys.readouterr().out.startswith("Verdict: none")
