@@ -126,8 +126,8 @@ def problem_of(
         found = task_of(given["task"], given["option"])
         declared = getattr(found, "effects", list)
         return found.simulator, found.prior, found.actions, declared()
-    advice = "name one, as in --simulator my_robot.py:fn"
-    require(bool(given.get("simulator")), "--simulator or a task", "none", advice)
+    advice = "name it, as in --simulator my_robot.py:fn"
+    require(bool(given.get("simulator")), "--simulator", "none", advice)
     module, name = load_module(given["simulator"], given.get("folder"))
     model = with_noise(getattr(module, name), given.get("noise"))
     prior = _prior_of(given) or getattr(module, "prior", None)
