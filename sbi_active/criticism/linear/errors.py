@@ -37,6 +37,7 @@ from sbi_active.criticism.linear.processes import (
     parts_of,
     time_scales,
 )
+from sbi_active.criticism.results import OUTLIER, UNEXPLAINED
 from sbi_active.criticism.rivals.error_models import LOG_2PI, NoiseGrid
 from sbi_active.criticism.steps.nuisances import is_first_part
 from sbi_active.inference.sampling.weights import log_sum_exp
@@ -195,14 +196,44 @@ class Errors:
                 parameter that differs from trial to trial.
             factor: Factor on the scales of the effects' priors.
         """
-        n = len(self.log_sensor)
         some = np.ones(self.num_folds, bool) if use is None else use
-        own = slice(n, None) if beside else slice(n)
-        log_p = self.log_prior if beside else self.log_sensor
-        log_weight = log_p + self.constants(grams, some)[own]
-        log_weight += model.offset[some[self.fold]].sum()
+        state = UNEXPLAINED if beside else None
+        gram, log_weight = self.hypotheses(model, grams, some, state)
+        log_weight = log_weight + model.offset[some[self.fold]].sum()
         widths = [factor * width for width in WIDTHS]
-        return summed(grams.gram[own][:, some].sum(1), log_weight, model, widths)
+        return summed(gram, log_weight, model, widths)
+
+    def hypotheses(
+        self,
+        model: LinearModel,
+        grams: Grams,
+        use: NDArray[np.bool_],
+        state: str | None,
+    ) -> tuple[Array, Array]:
+        """Return Gram matrices (h, k, k) and log weights (h,) in a state of the error.
+
+        Args:
+            model: Linear model.
+            grams: Gram matrices of its rows.
+            use: Parts of the trials that count, shape (f,).
+            state: "unexplained" beside a process or what differs from trial to trial,
+                "scatter" where it is larger, "outlier" with a process in one trial;
+                None for the sensor's alone.
+        """
+        n = len(self.log_sensor)
+        if state == OUTLIER:
+            return self._one_trial(model, grams, use)
+        own = slice(n, None) if state == UNEXPLAINED else slice(n)
+        gram, constants = grams.gram[own][:, use].sum(1), self.constants(grams, use)
+        if state == UNEXPLAINED:
+            return gram, self.log_prior + constants[own]
+        log_p = self.log_sensor + constants[own]
+        if state is None:
+            return gram, log_p
+        size, extra = np.sqrt(1 + self.sizes**2), self.unchanged(model.rows, use)
+        log_p = log_p - grams.count[use].sum() * np.log(size)[:, None]
+        gram = (gram - extra) / size[:, None, None, None] ** 2 + extra
+        return gram.reshape(-1, *gram.shape[2:]), (log_p - np.log(len(size))).ravel()
 
     def process(self, beside: Mixture) -> tuple[float, float]:
         """Return the mean size and the median time scale of a model's process."""
@@ -241,7 +272,7 @@ class Errors:
             log_weight.append(log_p - log_det - 0.5 * own.sum() * LOG_2PI)
         return np.concatenate(grams), np.concatenate(log_weight)
 
-    def one_trial(
+    def _one_trial(
         self, model: LinearModel, grams: Grams, use: NDArray[np.bool_]
     ) -> tuple[Array, Array]:
         """Return Gram matrices with a process in one trial, whichever it is.

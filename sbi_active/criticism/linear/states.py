@@ -127,39 +127,24 @@ class States:
     ) -> Mixture:
         c, errors = self.search.found[self.predicting(key)], self.search.errors
         some = np.ones(errors.num_folds, bool) if use is None else use
-        n, grams = len(errors.log_sensor), c.grams
-        log_weight = errors.constants(grams, some)
-        beside = self._beside_numbers(c, key.error, some)
-        widths = [factor * width for width in WIDTHS] if key.effects else [1.0]
-        gram = grams.gram[:, some].sum(1)
-        if key.error == OUTLIER:
-            gram, log_p = errors.one_trial(c.model, grams, some)
-        elif key.error == SCATTER:
-            size = np.sqrt(1 + errors.sizes**2)
-            log_p = errors.log_sensor + log_weight[:n]
-            log_p = log_p - grams.count[some].sum() * np.log(size)[:, None]
-            log_p = (log_p - np.log(len(size))).ravel()
-            extra = errors.unchanged(c.model.rows, some)
-            gram = (gram[:n] - extra) / size[:, None, None, None] ** 2 + extra
-            gram = gram.reshape(-1, *gram.shape[2:])
-        elif key.error == UNEXPLAINED:
-            gram, log_p = gram[n:], errors.log_prior + log_weight[n:]
-            timed = self.search.rivals.measurements.is_sequence
-            if not (timed and self.search.sensor.is_known):
-                # Errors of their own are scatter; what differs by trial is not.
-                own = slice(errors.num_processes, None)
-                gram, log_p = gram[own], log_p[own]
-                if use is None or not timed:  # it is dear along trajectories
-                    smooth = self.search.smooth(c.model, some)
-                    gram = np.concatenate([gram, smooth[0]])
-                    log_p = np.concatenate([log_p, smooth[1]])
-        elif louder := self.louder(key):
+        gram, log_p = errors.hypotheses(c.model, c.grams, some, key.error)
+        timed = self.search.rivals.measurements.is_sequence
+        is_declared = timed and self.search.sensor.is_known
+        if key.error == UNEXPLAINED and not is_declared:
+            # Errors of their own are scatter; what differs by trial is not.
+            own = slice(errors.num_processes, None)
+            gram, log_p = gram[own], log_p[own]
+            if use is None or not timed:  # it is dear along trajectories
+                smooth = self.search.smooth(c.model, some)
+                gram = np.concatenate([gram, smooth[0]])
+                log_p = np.concatenate([log_p, smooth[1]])
+        elif key.error is None and (louder := self.louder(key)):
             scale = self._scales(louder, factor)[1]
             gram, log_p = errors.scaled(c.model.rows, scale, some)
             log_p = log_p - np.log(len(scale))
-        else:
-            gram, log_p = gram[:n], errors.log_sensor + log_weight[:n]
-        return summed(gram, log_p + beside, c.model, widths)
+        log_p = log_p + self._beside_numbers(c, key.error, some)
+        widths = [factor * width for width in WIDTHS] if key.effects else [1.0]
+        return summed(gram, log_p, c.model, widths)
 
     def _beside_numbers(
         self, c: Candidate, error: str | None, use: NDArray[np.bool_]
