@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import Normal
 
 from sbi_active import GaussianNoise, SimulatorModel
-from sbi_active.criticism import Effect, Trials
+from sbi_active.criticism import Trials
 from sbi_active.criticism.identification import IdentifySettings, identify
 from sbi_active.mujoco import randomization
+from tests.effects import autocorrelated, on_outcomes
 
 TIMES = torch.arange(120, dtype=torch.float64) / 20
 PRIOR = BoxUniform(torch.tensor([1.0, 0.0, 0.5]), torch.tensor([6.0, 1.0, 2.0]))
@@ -31,9 +31,7 @@ def model(noise=None, fn=mean):
 
 def errors(shape, correlation, seed):
     e = np.random.default_rng(seed).standard_normal(shape)
-    for k in range(1, shape[1]):
-        e[:, k] = correlation * e[:, k - 1] + np.sqrt(1 - correlation**2) * e[:, k]
-    return torch.from_numpy(e) * torch.tensor([0.02, 1.0])
+    return torch.from_numpy(autocorrelated(e, correlation)) * torch.tensor([0.02, 1.0])
 
 
 def recorded(correlation=0.0, seed=0, extra=0.0):
@@ -127,9 +125,7 @@ def test_what_may_be_there_is_found_or_not():
     def shift(x, phi, action, context):
         return x + phi[:, None] * torch.tensor([1.0, 0.0], dtype=x.dtype)
 
-    bias = Effect(
-        "bias", hook="observation", prior=Normal(0.0, 0.5), null=0.0, apply=shift
-    )
+    bias = on_outcomes("bias", shift, 0.5)
     extra = torch.tensor([0.1, 0.0])
     for there in (False, True):
         trials = Trials(ACTION, recorded(extra=extra if there else 0.0))

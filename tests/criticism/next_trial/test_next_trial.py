@@ -1,17 +1,24 @@
-"""The next action: the model index as the designer's target."""
+"""The next action: what tells models apart, and what would show an alias."""
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
+from scipy.stats import entropy
 from torch.distributions import Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials
+from sbi_active.criticism.next_trial import next_action
+from sbi_active.criticism.next_trial.candidates import extrapolated
 from sbi_active.criticism.next_trial.next_action import PredictedRival, choose_action
 from sbi_active.criticism.results import ModelKey
 from sbi_active.design.estimators.model_index import ModelIndexGain, RivalSampler
+from tests.criticism.misfit.oscillator import ACTION, EFFECTS, trials
+from tests.criticism.misfit.oscillator import MODEL as OSCILLATOR
+from tests.criticism.misfit.oscillator import PRIOR as RATES
 from tests.effects import on_outcomes
 
 NOISE = 0.1
@@ -137,3 +144,81 @@ def test_a_simulator_that_fails_outside_its_range_names_nothing():
     chosen = c.next_action()
     assert chosen.action is None
     assert chosen.outside is None or float(chosen.outside[0]) > 0
+
+
+# Actions beyond the permitted ones
+
+
+@pytest.mark.parametrize(
+    ("values", "farthest"),
+    [
+        ([0.5, 1.0, 3.0], 4.25),  # a speed has no other sign
+        ([-0.5, -1.0, -3.0], -4.25),
+        ([-1.0, 0.0, 1.0], 2.0),
+    ],
+)
+def test_extrapolated_actions_keep_their_sign_where_there_is_one(values, farthest):
+    actions = DiscreteActions(values)
+    found = extrapolated(actions, actions.values, limit=16)[:, 0]
+    assert not bool(actions.contains(found[:, None]).any())
+    assert abs(farthest) == pytest.approx(float(found.abs().max()))
+    if min(values) >= 0:
+        assert float(found.min()) >= 0
+    if max(values) <= 0:
+        assert float(found.max()) <= 0
+
+
+# The next action where every model misses
+
+
+LARGER = DiscreteActions(torch.cat([ACTION, torch.tensor([[3.0], [4.0]])]))
+
+
+@pytest.fixture(scope="module")
+def missed():
+    return Criticism(
+        OSCILLATOR, RATES, trials(hidden=0.6), effects=EFFECTS, actions=LARGER, seed=0
+    )
+
+
+def test_rivals_count_by_what_they_predict_and_not_by_evidence(missed):
+    tracing, chosen = missed.trace(), missed.next_action()
+    weights = tracing.misfit.weights
+    assert chosen.separates == (*weights,)
+    assert len(weights) > 2
+    # The evidence alone would leave two or three.
+    number = [np.exp(entropy([*p.values()])) for p in (weights, tracing.probabilities)]
+    assert number[0] > 1.5 * number[1]
+    assert max(weights.values()) < max(tracing.probabilities.values()) - 0.1
+    assert {*weights} <= {*tracing.evidences}
+    assert chosen.action is not None
+
+
+def test_trials_unlike_those_at_hand_tell_most(missed):
+    chosen = missed.next_action()
+    assert float(chosen.action[0]) >= 3
+    gain = chosen.information_gain
+    assert gain[-2:].min() > gain[:-2].max()
+    assert gain[-2:].max() > 0.2
+
+
+def test_an_action_that_some_draws_alone_chose_is_chosen_again(missed, monkeypatch):
+    """Its report is of other draws, and there it may tell nothing."""
+    select, calls = next_action._select, []
+
+    def unlucky(rivals, tracing, names, p, candidates, **options):
+        design = select(rivals, tracing, names, p, candidates, **options)
+        calls.append(len(candidates))
+        if options:
+            return design
+        gain = design.expected_information_gain.clone()
+        gain[design.index] = 0.0
+        return replace(design, expected_information_gain=gain)
+
+    first = missed.next_action()
+    monkeypatch.setattr(next_action, "_select", unlucky)
+    chosen = missed.next_action()
+    assert calls[0] == len(LARGER.values)
+    assert 0 < calls[1] < calls[0]
+    assert chosen.action is not None
+    assert chosen.action[0] != first.action[0]
