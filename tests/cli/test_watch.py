@@ -13,7 +13,7 @@ import pytest
 
 from sbi_active.cli import main, watch
 from tests.campaign.storage.campaigns import MODEL, go_on, new
-from tests.cli.sled import run
+from tests.cli.sled import forked
 from tests.display.browser import CHROMIUM, FLAGS, assert_reads_well
 
 
@@ -141,7 +141,7 @@ def test_a_reader_that_leaves_is_no_error(server, capfd):
 
 def test_the_command_ends_by_an_interrupt(place):
     words = ["watch", str(place[0]), "--port", "0"]
-    process = run(words, stdout=subprocess.PIPE)
+    process = forked(words, stdout=subprocess.PIPE)
     said = process.stdout.readline()
     port = re.fullmatch(r".* is shown at http://127.0.0.1:(\d+) until Ctrl-C\n", said)
     assert port is not None, said

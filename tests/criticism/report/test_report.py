@@ -4,7 +4,6 @@ import json
 import pickle
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
@@ -24,6 +23,7 @@ from sbi_active.criticism.report.figures import (
 from sbi_active.criticism.report.sections import sentences
 from sbi_active.criticism.report.words import with_error
 from tests.criticism.report.reports import DRAG, flat, report, residuals, tracing
+from tests.display.parsed import Parsed
 
 NONE = {"tracing": tracing("none"), "residuals_after": None}
 
@@ -110,34 +110,13 @@ def test_a_report_pickles_with_effects_that_are_local_functions():
 # The page, its tables and figures
 
 
-class Page(HTMLParser):
-    """Collects what a page refers to and whether its elements are closed."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.images: list[str] = []
-        self.open: list[str] = []
-
-    def handle_starttag(self, tag, attrs):
-        values = dict(attrs)
-        self.images += [values["src"]] if tag == "img" else []
-        assert values.get("href", "#").startswith("#")
-        assert not (tag == "script" and "src" in values)
-        if tag not in ("img", "meta"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-
 def test_the_page_is_self_contained():
-    page = Page()
-    page.feed(report().to_html())
-    assert page.open == []
-    assert len(page.images) == 3
-    assert all(
-        source.startswith("data:image/svg+xml;base64,") for source in page.images
-    )
+    elements = Parsed(report().to_html()).elements
+    images = [attributes["src"] for tag, attributes in elements if tag == "img"]
+    assert len(images) == 3
+    assert all(source.startswith("data:image/svg+xml;base64,") for source in images)
+    assert all(own.get("href", "#").startswith("#") for _, own in elements)
+    assert not any(tag == "script" and "src" in own for tag, own in elements)
 
 
 def test_markdown_tables_have_as_many_cells_as_headings():
