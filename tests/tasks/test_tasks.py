@@ -14,19 +14,18 @@ from sbi_active.criticism import AugmentedSimulator
 from sbi_active.tasks import get_task  # pyright: ignore
 from sbi_active.tasks.ball_drops import fall  # pyright: ignore
 from sbi_active.tasks.chain import model
-from sbi_active.tasks.location_finding.model import (
-    NOISE_SD,  # pyright: ignore
-    mean,  # pyright: ignore
-)
+from sbi_active.tasks.location_finding import model as locations
 from sbi_active.tasks.oscillator import reference as reference_module
 from sbi_active.tasks.oscillator.model import (
     ACTION_HIGH,
     ACTION_LOW,
     ACTIONS,
+    NOISE_SD,
     PRIOR_HIGH,
     PRIOR_LOW,
     SAMPLE_TIMES,
     SENSOR_RANGE,
+    mean,
 )
 from sbi_active.tasks.oscillator.reference import OscillatorReference
 
@@ -126,19 +125,14 @@ def test_the_closed_form_solves_the_equations(parameters, moving):
 # Location finding: the model and the task
 
 
-def normal(*shape: int, seed: int) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randn(shape, generator=generator, dtype=torch.float64)
-
-
 def test_log_likelihood_is_a_normal_s():
     task = get_task("location_finding")
+    gen = torch.Generator().manual_seed(0)
     theta, action, x = (
-        normal(30, 4, seed=0),
-        normal(30, 2, seed=1),
-        normal(30, 1, seed=2),
+        torch.randn(30, dim, generator=gen, dtype=torch.float64) for dim in (4, 2, 1)
     )
-    expected = Normal(mean(theta, action), NOISE_SD).log_prob(x)[:, 0]
+    center = locations.mean(theta, action)
+    expected = Normal(center, locations.NOISE_SD).log_prob(x)[:, 0]
     torch.testing.assert_close(task.log_likelihood(x, theta, action), expected)
     torch.testing.assert_close(task.simulator.log_prob(x, theta, action), expected)
     assert task.exact_likelihood
