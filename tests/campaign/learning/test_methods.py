@@ -15,7 +15,7 @@ from tests.campaign.sizes import REFINEMENT
 
 DENSITY = MixtureDensity(hidden_features=(16,), num_components=2, num_iterations=150)
 TRAINED = {**dict.fromkeys(("asbi", "nsbi", "alhi", "nlhi"), DENSITY), "seqbed": RATIOS}
-FEW = replace(RATIOS, num_iterations=15)
+FEW = replace(RATIOS, num_iterations=5)
 QUICK = {**dict.fromkeys(TRAINED, OPTIONS.density_estimator), "seqbed": FEW}
 GAINS = {"asbi": "posterior", "alhi": "likelihood", "seqbed": "ratio"}
 
