@@ -276,25 +276,16 @@ SCATTER = effect("scatter", hook="noise", apply=lambda sd, *_: sd)
 @pytest.mark.parametrize(
     ("message", "changes"),
     [
-        (
-            "at least 3 repeats of one action; got a det",
-            {"model": SimulatorModel(response)},
-        ),
+        ("at least 3 repeats of one action", {"model": SimulatorModel(response)}),
         ("noise would count twice", {"model": SimulatorModel(noisy, noise=NOISE)}),
         ("at least two valid trials to fit; got 1", {"trials": measured(1, {}, num=1)}),
-        (
-            "expected trials of the simulator's shape",
-            {"trials": Trials(ONES, torch.ones(3, 4))},
-        ),
+        ("trials of the simulator's shape", {"trials": Trials(ONES, torch.ones(3, 4))}),
         (
             "at least two valid trials to fit; got 0",
             {"trials": Trials(ONES, LOST, role=["fit", "fit", "held out"])},
         ),
         ("expected effects not named none", {"effects": [SCATTER]}),
-        (
-            "expected actions of dimension 1",
-            {"actions": DiscreteActions([[1.0, 2.0]])},
-        ),
+        ("actions of dimension 1", {"actions": DiscreteActions([[1.0, 2.0]])}),
     ],
 )
 def test_what_cannot_be_compared(message, changes):

@@ -94,35 +94,15 @@ SHORT = "trial,time,action_v,x_y"
 @pytest.mark.parametrize(
     ("rows", "header", "message"),
     [
-        (
-            ["1,2,3"],
-            "trial,action_v,x_y",
-            "columns trial, time, .*; got trial, .*trials.csv",
-        ),
+        (["1,2,3"], "trial,action_v,x_y", "columns trial, time, .*; got .*trials.csv"),
         (["1,0,1,2,3"], f"{SHORT},mass", "got mass in trials.csv; rename or"),
-        (
-            ["1,0,1,2,3"],
-            "trial,time,action_v,x_y[m],x_y[cm]",
-            r"x_y\[m\] and x_y\[cm\]",
-        ),
+        (["1,0,1,2,3"], f"{SHORT}[m],x_y[cm]", r"x_y\[m\] and x_y\[cm\]"),
         (["1,0,1,5", "1,1,1,4 cm"], SHORT, r"row 2 \(trial 1\); got '4 cm' .*once, in"),
         (['1,0,1,"5,2"'], SHORT, "got '5,2' in trials.csv; write decimals with a"),
         (["1,0,1,5", "1,,1,4"], SHORT, r"number in column time, row 2 .*an empty cell"),
-        (
-            ["1,0,1,5", "1,1,nan,4"],
-            SHORT,
-            r"column action_v, row 2 \(trial 1\); got nan",
-        ),
-        (
-            ["1,0,1,5", "1,1,2,4"],
-            SHORT,
-            r"one value of action_v .* row 1 and 2.0 in row",
-        ),
-        (
-            ["1,0,1,5", "2,0,1,4", "1,0,1,5"],
-            SHORT,
-            "= 0 s in row 1 and row 3 .trial 1. of trials.csv; remove",
-        ),
+        (["1,0,1,5", "1,1,nan,4"], SHORT, r"action_v, row 2 \(trial 1\); got nan"),
+        (["1,0,1,5", "1,1,2,4"], SHORT, "value of action_v .* row 1 and 2.0 in row 2"),
+        (["1,0,1,5", "2,0,1,4", "1,0,1,5"], SHORT, "row 1 and row 3 .trial 1. of"),
         (["1,0,1,5", "2,0,1,5"], SHORT, "the same numbers in trials 1 and 2 of trials"),
         (["1,0,1,5,fit", "1,1,1,4,held out"], f"{SHORT},role", "value of role in each"),
         (
@@ -132,11 +112,7 @@ SHORT = "trial,time,action_v,x_y"
         ),
         (["1,0,1,5,3", "2,0,1,4,3"], f"{SHORT},index", "got index 3 in rows 1 and 2"),
         (["1\t0\t1\t5"], "trial\ttime\taction_v\tx_y", r"by commas.*sep='\\t'\)\)"),
-        (
-            ["1,0,5,1,5,2"],
-            SHORT,
-            "got 'Expected 4 fields in line 2, saw 6' in tr",
-        ),
+        (["1,0,5,1,5,2"], SHORT, "got 'Expected 4 fields in line 2, saw 6' in tr"),
         ([], "", "names of columns, .* got 'No columns .* in trials.csv"),
         (["1,0,1,"], SHORT, "at least one valid trial"),
     ],
