@@ -18,6 +18,7 @@ from sbi.neural_nets import posterior_nn
 from sbi.utils import BoxUniform, RestrictedPrior
 
 from sbi_active import ALHI, ASBI, SeqBED, SeqBED_B, simulate
+from sbi_active.inference import ActionEmbedding
 from sbi_active.inference.trainers.action_rounds import SilentTracker
 
 # A worker cannot import a test module.
@@ -206,3 +207,19 @@ def test_without_actions_two_rounds_are_numerically_sbi_s(trainer, estimator):
             torch.manual_seed(2)
             drawn.append((posterior.log_prob(theta[:10]), posterior.sample((5,))))
         assert all(torch.equal(*pair) for pair in zip(*drawn, strict=True))
+
+
+def test_embedding_sees_x_in_its_own_shape():
+    seen = []
+
+    class Net(torch.nn.Module):
+        def forward(self, x):
+            seen.append(x.shape)
+            return x.flatten(1).sum(1, keepdim=True)
+
+    embedding = ActionEmbedding(Net(), x_shape=(1, 4, 4), action_dim=2)
+    out = embedding(torch.ones(3, 18))
+    assert seen == [(3, 1, 4, 4)]
+    assert out.tolist() == [[16.0, 1.0, 1.0]] * 3
+    with pytest.raises(ValueError, match="expected a packed condition of 18 numbers"):
+        embedding(torch.ones(3, 17))
