@@ -13,10 +13,57 @@ from torch import Tensor
 from benchmarks.rows import column, grouped
 from sbi_active import Campaign
 from sbi_active.display.table import Table
-from sbi_active.seeding import derive_seed
+from sbi_active.seeding import derive_seed, forked_generators
 
 Rows = Sequence[Mapping[str, str]]
 Cells = Mapping[tuple[Any, ...], Rows]  # by method and target
+STAGES = ("simulation", "training", "design", "scoring", "update")
+NUM_DRAWS = 2_000  # behind the share of a belief that is denser than the truth
+
+
+def drawn_truth(task: Any, seed: int) -> Any:
+    """Return a task with a truth that a seed draws from the prior."""
+    with forked_generators(seed, "truth"):
+        return task.with_truth(task.prior.sample((1,))[0])
+
+
+def known_truth(belief: Any, truth: Tensor, draws: Tensor) -> dict[str, object]:
+    """Return what a belief says of the truth.
+
+    "hpd" is the share of the belief that is denser than the truth: the truth is in the
+    region of highest density of level c where this is below c.
+    """
+    log_p = float(belief.log_prob(truth))
+    return {
+        "theta_true": " ".join(f"{v:.6g}" for v in truth.tolist()),
+        "log_prob_true": log_p,
+        "hpd": float((belief.log_prob(draws) > log_p).double().mean()),
+    }
+
+
+def last_round(
+    campaign: Campaign, truth: Tensor, stages: Sequence[str] = STAGES
+) -> tuple[dict[str, object], Tensor]:
+    """Return the figures that all campaigns have of a round, and draws of its belief.
+
+    Args:
+        campaign: After the round.
+        truth: Shape (theta_dim,).
+        stages: Stages of a round whose time is told.
+    """
+    trial, belief = campaign.history[-1], campaign.belief
+    assert trial.design is not None
+    with forked_generators(derive_seed(trial.index, "draws")):
+        draws = belief.sample((NUM_DRAWS,))
+    gain = trial.design.expected_information_gain
+    row = known_truth(belief, truth, draws) | {
+        "eig": float(gain[trial.design.index]),
+        "num_simulations": trial.num_simulations,
+    }
+    for stage in stages:
+        row[f"cpu_{stage}"] = trial.cpu_seconds.get(stage, 0.0)
+        row[f"wall_{stage}"] = trial.seconds.get(stage, 0.0)
+    return row, draws
 
 
 def played(

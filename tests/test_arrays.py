@@ -1,12 +1,25 @@
-"""Numbers as users bring them."""
+"""What users bring and get: numbers, keywords, and warnings at their line."""
 
 import re
 
 import numpy as np
 import pytest
 import torch
+from sbi.utils import BoxUniform
 
+from sbi_active import (
+    Campaign,
+    CampaignOptions,
+    DiscreteActions,
+    InformationGainDesigner,
+    SimulatorModel,
+)
 from sbi_active.arrays import measured, own_tensor
+from sbi_active.criticism import Trials
+from sbi_active.criticism.data.tables import read_trials
+from sbi_active.criticism.misfit.rule import Rule
+from sbi_active.mujoco import from_mjcf
+from sbi_active.simulation.workers.settings import Workers
 
 MASKED = np.ma.masked_array([1.0, 2.0], mask=[False, True])
 
@@ -51,3 +64,56 @@ def test_what_is_masked_or_none_is_nan():
 def test_what_is_no_real_number_is_refused(given, text):
     with pytest.raises(ValueError, match=re.escape(text)):
         measured(given, name="speed")
+
+
+# Keywords that are mistyped, and what a notebook shows of an object
+
+
+PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
+ACTIONS = DiscreteActions([1.0, 2.0], names=["push"])
+NONE = torch.zeros(0, 1), torch.zeros(0, 1)
+
+
+def slide(theta, action):
+    return theta * action
+
+
+@pytest.mark.parametrize(
+    ("call", "wrong", "meant"),
+    [
+        (CampaignOptions, "num_simulation", "num_simulations"),
+        (lambda **k: Campaign(slide, PRIOR, ACTIONS, **k), "metod", "method"),
+        (lambda **k: InformationGainDesigner(ACTIONS, **k), "estimators", "estimator"),
+        (lambda **k: SimulatorModel(slide, **k), "noize", "noise"),
+        (lambda **k: Trials([0.0], [0.0], **k), "sample_time", "sample_times"),
+        (lambda **k: from_mjcf("", {}, **k), "sensor", "sensors"),
+        (Rule, "chances", "chance"),
+        (Workers, "num_worker", "num_workers"),
+    ],
+)
+def test_a_mistyped_keyword_is_told_with_the_one_that_was_meant(call, wrong, meant):
+    with pytest.raises(TypeError, match=f"got '{wrong}'; did you mean '{meant}'"):
+        call(**{wrong: None})
+
+
+# Warnings point at the user's line, from however deep
+
+
+def read_two_deep(path):
+    return read_trials(path)
+
+
+@pytest.mark.parametrize("read", [Trials.from_csv, read_trials, read_two_deep])
+def test_a_warning_of_a_table_points_at_who_read_it(read, tmp_path):
+    file = tmp_path / "trials.csv"
+    file.write_text("action_speed,x_place\n1,0.1\n2,\n")
+    for path in (file, tmp_path):
+        with pytest.warns(UserWarning, match="1 of 2 cells") as noted:
+            read(path)
+        assert [note.filename for note in noted] == [__file__]
+
+
+def test_a_warning_of_an_array_points_at_who_passed_it():
+    with pytest.warns(UserWarning, match="x is inf") as noted:
+        Trials([1.0, 2.0], torch.tensor([1.0, torch.inf]))
+    assert noted[0].filename == __file__

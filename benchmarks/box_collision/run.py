@@ -35,6 +35,8 @@ from benchmarks.rounds import (
     by_round,
     cells_of,
     coverage_table,
+    drawn_truth,
+    last_round,
     num_rounds,
     played,
 )
@@ -43,12 +45,11 @@ from sbi_active import Campaign, CampaignOptions
 from sbi_active.campaign.learning.methods import METHODS
 from sbi_active.campaign.options import CampaignDetails
 from sbi_active.display.table import Table
-from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.seeding import derive_seed
 from sbi_active.tasks import Task, get_task
 from sbi_active.tasks.box_collision import BoxCollisionReference, exact_posterior  # pyright: ignore
 
 REPORTED = (3.0, 5.0, 7.0)  # m/s
-STAGES = ("simulation", "training", "design", "scoring", "update")
 PARTS = {  # of a round, in the paper's words
     "simulation": ("simulation",),
     "training": ("training",),
@@ -172,7 +173,6 @@ def spread(values: Any) -> str:
     return f"{values.mean():.1f} +- {values.std():.1f}" if len(values) else "-"
 
 
-NUM_DRAWS = 2_000  # behind the share of a belief that is denser than the truth
 OPTIONS = CampaignOptions(num_samples=250, details=CampaignDetails(num_scored=500))
 #: "learned" has beliefs and information by the networks alone, which is where the
 #: methods differ: by default the declared noise gives both, whatever was learned.
@@ -235,31 +235,14 @@ def options_of(method: str, setting: str) -> CampaignOptions:
 
 def round_row(task: Any, campaign: Campaign, *, is_last: bool) -> dict[str, object]:
     """Return the figures of the last round, without the reference's."""
-    trial, belief = campaign.history[-1], campaign.belief
-    assert trial.design is not None
+    trial = campaign.history[-1]
     assert trial.x is not None
-    log_q = float(belief.log_prob(task.theta_true))
-    with forked_generators(derive_seed(trial.index, "draws")):
-        draws = belief.sample(torch.Size([NUM_DRAWS]))
-    gain = trial.design.expected_information_gain
-    row: dict[str, object] = {
-        "theta_true": " ".join(f"{v:.6g}" for v in task.theta_true.tolist()),
+    row = last_round(campaign, task.theta_true)[0] | {
         "speed": float(trial.action),
         "is_valid": int(trial.status == "ok"),
         **dict(zip("xyz", trial.x.double().tolist(), strict=True)),
-        "eig": float(gain[trial.design.index]),
-        "log_prob_true": log_q,
-        # Share of the belief that is denser than the truth: the truth is in the region
-        # of highest density of level c where this is below c.
-        "hpd": float((belief.log_prob(draws) > log_q).double().mean()),
-        "num_simulations": trial.num_simulations,
     }
-    if is_last:
-        row |= errors(task, belief, "rep_err")
-    for stage in STAGES:
-        row[f"cpu_{stage}"] = trial.cpu_seconds.get(stage, 0.0)
-        row[f"wall_{stage}"] = trial.seconds.get(stage, 0.0)
-    return row
+    return row | (errors(task, campaign.belief, "rep_err") if is_last else {})
 
 
 def errors(task: Any, belief: Any, name: str) -> dict[str, object]:
@@ -287,9 +270,7 @@ def make_task(target: str, seed: int) -> Any:
     """Return a target of the paper, or a truth drawn from the prior."""
     if target != "prior":
         return get_task("box_collision", target=int(target))
-    task = get_task("box_collision")
-    with forked_generators(derive_seed(seed, "truth")):
-        return task.with_truth(task.prior.sample(torch.Size([1]))[0])
+    return drawn_truth(get_task("box_collision"), seed)
 
 
 main = benchmark(

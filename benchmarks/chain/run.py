@@ -27,6 +27,7 @@ import torch
 from scipy.stats import binom, t
 from torch import Tensor
 
+from benchmarks.rounds import drawn_truth
 from benchmarks.rows import benchmark, frame
 from sbi_active import RefinementOptions
 from sbi_active.display.table import Table
@@ -41,9 +42,7 @@ REFERENCES = 2302  # seeds below have a reference
 
 def problem(parameters: int, seed: int) -> tuple[Any, Tensor, Tensor]:
     """Return a task with a drawn truth, its actions and outcomes."""
-    task = get_task("chain", parameters=parameters)
-    with forked_generators(seed, "truth"):
-        task = task.with_truth(task.prior.sample())
+    task = drawn_truth(get_task("chain", parameters=parameters), seed)
     action = task.actions.sample((NUM_TRIALS,), seed=derive_seed(seed, "actions"))
     x = [task.real_system(a, seed=derive_seed(seed, i)) for i, a in enumerate(action)]
     return task, action, torch.stack(x)

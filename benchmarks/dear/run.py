@@ -20,6 +20,7 @@ import torch
 from sbi.inference import NPE_C
 from sbi.utils import RestrictedPrior, get_density_thresholder
 
+from benchmarks.rounds import drawn_truth
 from benchmarks.rows import benchmark, column, grouped
 from sbi_active import Campaign
 from sbi_active.display.table import Table
@@ -168,9 +169,7 @@ def table(rows: list[dict[str, str]]) -> str:
 @lru_cache(1)
 def drawn(name: str, per_round: str, seed: int) -> tuple[Any, list[dict[str, Any]]]:
     """Return a task whose truth is a draw of the prior, and a campaign's rows."""
-    task = get_task(name)
-    with forked_generators(derive_seed(seed, "truth")):
-        task = task.with_truth(task.prior.sample((1,))[0])
+    task = drawn_truth(get_task(name), seed)
     return task, campaign(task, None if per_round == DEFAULT else int(per_round), seed)
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,13 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from benchmarks.rows import frame, write
+from benchmarks.rows import benchmark, frame
 from sbi_active import ASBI, InformationGainDesigner, MixtureDensity, simulate
 from sbi_active.inference import Belief
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import Task, get_task
 
+VARIANTS = ("linear", "sinh", "square")
 NETWORKS = {"faithful": MixtureDensity.faithful(), "default": MixtureDensity()}
 
 
@@ -51,22 +53,20 @@ def rounds(variant: str) -> tuple[Any, Any, Any]:
     return task, task.reference(torch.empty(0, 1), torch.empty(0, 1)), after
 
 
-def worlds() -> list[tuple[str, Task, Distribution, Tensor]]:
-    """Return name, task, belief and exact gain of every case."""
-    cases: list[tuple[str, Task, Distribution, Tensor]] = []
-    for variant in ("linear", "sinh", "square"):
-        task, before, after = rounds(variant)
-        beliefs = task.prior, ExactBelief(after, task.prior)
-        for number, exact in enumerate((before, after)):
-            gain = exact.expected_information_gain(task.actions.values)
-            name = f"{variant}, round {number + 1}"
-            cases.append((name, task, beliefs[number], gain))
-    task = get_task("oscillator")
-    prior = task.reference(torch.empty(0, 2), torch.empty(0, 6))
-    assert prior is not None
-    gain = torch.as_tensor(prior.expected_information_gain(task.actions.values)[0])
-    cases.append(("oscillator, round 1", task, task.prior, gain))
-    return cases
+@cache
+def world(case: str) -> tuple[Task, Distribution, Tensor]:
+    """Return the task of a case, its belief and the exact gain of each action."""
+    name, _, number = case.partition(", round ")
+    if name == "oscillator":
+        task = get_task(name)
+        prior = task.reference(torch.empty(0, 2), torch.empty(0, 6))
+        assert prior is not None
+        gain = torch.as_tensor(prior.expected_information_gain(task.actions.values)[0])
+        return task, task.prior, gain
+    task, *both = rounds(name)
+    exact = both[int(number) - 1]
+    belief = task.prior if number == "1" else ExactBelief(exact, task.prior)
+    return task, belief, exact.expected_information_gain(task.actions.values)
 
 
 def train(task: Task, belief: Distribution, settings: MixtureDensity, seed: int) -> Any:
@@ -106,44 +106,38 @@ def measure(
     }
 
 
-def main(*, seeds: int = 20, oscillator_seeds: int = 4) -> None:
-    """Run what is asked for and is not there yet, and print the table.
-
-    Args:
-        seeds: Number of seeds (numerical task).
-        oscillator_seeds: Number of seeds of the oscillator.
-    """
-    rows: list[dict[str, object]] = []
-    for name, task, belief, exact in worlds():
-        heavy = task.name == "oscillator"
-        num_seeds = oscillator_seeds if heavy else seeds
-        designer = InformationGainDesigner(task.actions)
-        simulators = {
-            "noise declared": task.simulator,
-            "plain function": lambda t, a, s=task.simulator: s(t, a),
-        }
-        for kind, simulator in simulators.items():
-            result = measure(
-                lambda seed, d=designer, s=simulator, b=belief: d.select(
-                    None, s, belief=b, seed=seed
-                ),
-                exact,
-                num_seeds,
-            )
-            rows.append({"case": name, "simulator": kind} | result)
-        bound = InformationGainDesigner(
+def row_of(case: str, kind: str) -> dict[str, object]:
+    """Return errors, regret and cost of a case with a simulator or a network."""
+    task, belief, exact = world(case)
+    num_seeds = 4 if task.name == "oscillator" else 20
+    designer, model = InformationGainDesigner(task.actions), None
+    simulator: Any = task.simulator
+    if kind == "plain function":
+        simulator = lambda theta, action: task.simulator(theta, action)  # noqa: E731
+    elif kind.endswith(" network"):
+        settings = NETWORKS[kind.removesuffix(" network")]
+        model, num_seeds = train(task, belief, settings, 0), 4
+        designer = InformationGainDesigner(
             task.actions, estimator="posterior", eliminate=False
         )
-        for kind, settings in NETWORKS.items():
-            model = train(task, belief, settings, 0)
-            result = measure(
-                lambda seed, d=bound, m=model, t=task, b=belief: d.select(
-                    m, t.simulator, belief=b, seed=seed
-                ),
-                exact,
-                min(num_seeds, 4),
-            )
-            rows.append({"case": name, "simulator": f"{kind} network"} | result)
-        print(f"{name}: done")
-    write(Path(__file__).parent / "result.csv", rows)
-    print(frame(rows).to_string(index=False))
+    return measure(
+        lambda seed: designer.select(model, simulator, belief=belief, seed=seed),
+        exact,
+        num_seeds,
+    )
+
+
+main = benchmark(
+    Path(__file__).parent / "result.csv",
+    row_of,
+    lambda rows: frame(rows).to_string(index=False),
+    case=(
+        *(
+            f"{name}, round {k}"
+            for name in ("linear", "sinh", "square")
+            for k in (1, 2)
+        ),
+        "oscillator, round 1",
+    ),
+    simulator=("noise declared", "plain function", *(f"{n} network" for n in NETWORKS)),
+)

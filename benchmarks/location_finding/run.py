@@ -27,6 +27,7 @@ from benchmarks.location_finding.bounds import (
     posterior_bounds,
 )
 from benchmarks.location_finding.policies import POLICIES, Myopic, ParticleBelief
+from benchmarks.rounds import drawn_truth
 from benchmarks.rows import Row, benchmark, grouped, published
 from sbi_active.display.table import Table
 from sbi_active.seeding import derive_seed, forked_generators
@@ -139,9 +140,7 @@ def roll_out(policy: str, rollout: int, num_trials: int) -> dict[str, Any]:
         rollout: Its number, which gives truth, noise and contrastive draws.
         num_trials: T.
     """
-    task = get_task("location_finding")
-    with forked_generators(derive_seed(rollout, "truth")):
-        task = task.with_truth(task.prior.sample())
+    task = drawn_truth(get_task("location_finding"), rollout)
     player = POLICIES[policy](task, derive_seed(rollout, "policy"))
     seconds = {"design": 0.0, "belief": 0.0}
     for t in range(num_trials):

@@ -20,13 +20,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.rounds import played
+from benchmarks.rounds import drawn_truth, last_round, played
 from benchmarks.rows import benchmark, column, grouped, published, read
 from sbi_active import Campaign, CampaignOptions, RefinementOptions
 from sbi_active.campaign import Trial
 from sbi_active.display.table import Table
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
-from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.tasks import Task, get_task
 
 RESULTS = Path(__file__).parent / "results"
@@ -48,10 +47,7 @@ JITTER, JITTERED = 0.1, "_jittered"
 def make_task(name: str, truth: str, seed: int) -> Task:
     """Return the task with the paper's truth or one drawn from the prior."""
     task = get_task("numerical", variant=name) if name in NUMERICAL else get_task(name)
-    if truth == "fixed":
-        return task
-    with forked_generators(derive_seed(seed, "truth")):
-        return task.with_truth(task.prior.sample((1,))[0])
+    return task if truth == "fixed" else drawn_truth(task, seed)
 
 
 def reference(task: Task, trials: Sequence[Trial]) -> Any:
@@ -105,30 +101,19 @@ def round_row(
     trial, belief = campaign.history[-1], campaign.belief
     assert trial.design is not None
     exact, truth = reference(task, campaign.history), task.theta_true
-    log_q, log_p = (
-        float(belief.log_prob(truth)),
-        float(exact.log_prob(truth[None].double())[0]),
-    )
-    with forked_generators(derive_seed(index, "draws")):
-        draws = belief.sample((2_000,))
+    log_p = float(exact.log_prob(truth[None].double())[0])
+    row, draws = last_round(campaign, truth, STAGES)
     exact_draws = exact.sample(2_000, seed=index)
     exact_log_p = exact.log_prob(exact_draws)
     chosen = trial.design.index
     diagnostics = getattr(belief, "diagnostics", Diagnostics()).to_dict()
-    row: dict[str, object] = {
-        "theta_true": " ".join(f"{v:.6g}" for v in truth.tolist()),
+    row |= {
         "action": " ".join(f"{v:g}" for v in trial.action.tolist()),
-        "eig": float(trial.design.expected_information_gain[chosen]),
-        "log_prob_true": log_q,
         "exact_log_prob_true": log_p,
-        "gap": log_p - log_q,
+        "gap": log_p - float(belief.log_prob(truth)),
         "kl": float((exact_log_p - belief.log_prob(exact_draws.float())).mean()),
-        # Share of the distribution that is denser than the truth: the truth is in the
-        # region of highest density of level c where this is below c.
-        "hpd": float((belief.log_prob(draws) > log_q).double().mean()),
         "exact_hpd": float((exact_log_p > log_p).double().mean()),
         "mass_positive": float((draws[:, 0] > 0).double().mean()),
-        "num_simulations": trial.num_simulations,
         "chained_loss": diagnostics.get("chained_loss"),
         "chained_bluntness": diagnostics.get("chained_bluntness"),
         "trustworthy": diagnostics.get("trustworthy"),
@@ -136,9 +121,6 @@ def round_row(
     if gain is not None:
         row |= {"exact_eig": gain[chosen], "regret": gain.max() - gain[chosen]}
         row |= {f"rep_err_{a:g}": task.reproduction_error(belief, a) for a in REPORTED}
-    for stage in STAGES:
-        row[f"cpu_{stage}"] = trial.cpu_seconds.get(stage, 0.0)
-        row[f"wall_{stage}"] = trial.seconds.get(stage, 0.0)
     return row
 
 

@@ -31,12 +31,15 @@ from benchmarks.pouring.campaign import TEMPERED, GridBelief, rounds
 from benchmarks.pouring.learned import ByAction, learn
 from benchmarks.pouring.network import ByNetwork, learn_networks
 from benchmarks.rounds import (
+    NUM_DRAWS,
     Cells,
     Rows,
     active_against_random,
     by_round,
     cells_of,
     coverage_table,
+    drawn_truth,
+    known_truth,
     num_rounds,
 )
 from benchmarks.rows import benchmark, column
@@ -136,7 +139,6 @@ def mean_log_p(rows: Rows, number: int) -> str:
 
 METHODS = ("asbi", "nsbi", "alhi", "nlhi")
 ACTIVE, BY_NETWORK = ("asbi", "alhi"), ("alhi", "nlhi")
-NUM_DRAWS = 2_000  # behind the share of a belief that is denser than the truth
 
 
 def rows_of(
@@ -153,16 +155,13 @@ def rows_of(
         is_active=method in ACTIVE,
         tempered=TEMPERED if isinstance(learned, ByAction) else 0.0,
     ):
-        log_p = float(found.belief.log_prob(task.theta_true))
         with forked_generators(derive_seed(seed, "draws", found.index)):
             draws = found.belief.sample(torch.Size([NUM_DRAWS]))
-        row = found.row() | {
-            "theta_true": " ".join(f"{v:.6g}" for v in task.theta_true.tolist()),
+        row = found.row() | known_truth(found.belief, task.theta_true, draws)
+        row |= {
             "eig_se": float(found.error[found.delta, found.place]),
             "eig_pca": float(found.gain[0].max()),
             "eig_mesh": float(found.gain[1].max()),
-            "log_prob_true": log_p,
-            "hpd": float((found.belief.log_prob(draws) > log_p).double().mean()),
             "num_rows": learned.num if isinstance(learned, ByNetwork) else 0,
             "power": np.nan,
         }
@@ -185,9 +184,7 @@ def make_task(target: str, seed: int) -> Any:
     """Return a target of the paper, or a truth drawn from the prior."""
     if target != "prior":
         return get_task("pouring", target=int(target))
-    task = get_task("pouring")
-    with forked_generators(derive_seed(seed, "truth")):
-        return task.with_truth(task.prior.sample(torch.Size([1]))[0])
+    return drawn_truth(get_task("pouring"), seed)
 
 
 def table(rows: Rows) -> str:

@@ -1,4 +1,4 @@
-"""Ask, tell, update: the course of a campaign, and what it refuses."""
+"""Ask, tell, update: the course of a campaign, its network, and what it refuses."""
 
 import contextlib
 import re
@@ -8,9 +8,15 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import Campaign, DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active import (
+    Campaign,
+    CampaignOptions,
+    DiscreteActions,
+    GaussianNoise,
+    SimulatorModel,
+)
 from sbi_active.campaign.options import CampaignDetails
-from tests.campaign.problem import ACTIONS, OPTIONS, PRIOR, campaign, noisy
+from tests.campaign.problem import ACTIONS, OPTIONS, PRIOR, campaign, draws, noisy
 
 
 def test_ask_tell_update():
@@ -161,3 +167,79 @@ def test_narrow_and_wide_priors_that_float32_holds(scale):
     c = Campaign(model, prior, ACTIONS, method="nsbi", options=OPTIONS)
     c.tell(1.8, action=[3.0])
     assert float(c.update().mean) / scale == pytest.approx(0.6, abs=0.05)
+
+
+# When a round's network is trained, what asks it, and the posterior handed out
+
+
+def one_round(c):
+    action = c.ask().action
+    c.tell(0.7 * action)
+    c.update()
+    return c.history[-1]
+
+
+def test_asking_for_the_posterior_trains_it_and_changes_nothing_else():
+    asked, other = campaign("asbi"), campaign("asbi")
+    ahead = asked.posterior  # before any trial
+    assert other.ask().num_simulations == asked.ask().num_simulations
+    state = torch.get_rng_state()
+    posterior = asked.posterior
+    assert torch.equal(torch.get_rng_state(), state)
+    x, action = torch.tensor([1.5]), torch.tensor([3.0])
+    for model in (ahead, posterior):
+        samples = model.sample((2_000,), x=x, action=action)
+        assert float(samples.mean()) == pytest.approx(0.5, abs=0.15)
+    for c in (asked, other):
+        c.tell(torch.tensor([2.1]))
+        c.update()
+    assert torch.equal(draws(asked), draws(other))
+    assert asked.history[0].network_used_by == ("posterior",)
+    assert other.history[0].network_used_by == ()
+
+
+@pytest.mark.parametrize(
+    ("changes", "asks"),
+    [
+        ({"estimator": "posterior"}, ("design",)),
+        ({"refine": False}, ("belief",)),
+    ],
+)
+def test_on_demand_it_is_trained_for_what_needs_it(changes, asks):
+    trial = one_round(campaign("asbi", **changes))
+    assert trial.network_used_by == asks
+    assert "training" in trial.cpu_seconds
+
+
+# A campaign on parameters that no action tells apart
+
+
+BOX = BoxUniform(torch.tensor([0.2, 0.2]), torch.tensor([1.0, 1.0]))
+PUSHES = DiscreteActions([1.0, 2.0])
+
+
+def force(theta, action):
+    return action * theta[:, :1] * theta[:, 1:]
+
+
+FORCE = SimulatorModel(
+    force, noise=GaussianNoise(0.01), parameter_names=["friction", "mass"]
+)
+
+
+def test_what_is_said_outlives_the_process(tmp_path):
+    options = CampaignOptions(network="on demand")
+    given = {"options": options, "directory": tmp_path / "c"}
+    with Campaign(FORCE, BOX, PUSHES, **given) as c:
+        c.attach([2.0], [2 * 0.5 * 0.7])
+        assert repr(c) == "Campaign(asbi, 1 trials)"
+        said = c.update().diagnostics.combinations  # pyright: ignore
+    assert [found.text for found in said.known] == ["friction * mass"]
+    assert [found.text for found in said.unknown] == ["friction / mass"]
+    (known,) = said.known
+    assert known.low - 0.02 < 0.35 < known.high + 0.02
+    assert known.high - known.low < 0.1
+    loaded = Campaign.load(tmp_path / "c", simulator=FORCE)
+    assert repr(loaded) == "Campaign(asbi, 1 trials)"  # nothing was read yet
+    assert loaded.belief.diagnostics.combinations == said  # pyright: ignore
+    assert repr(loaded) == f"Campaign(asbi, 1 trials; {said})"

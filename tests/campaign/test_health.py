@@ -1,4 +1,4 @@
-"""Surprises, log scores and the two tests behind a campaign's health."""
+"""Surprises, log scores, and the two tests behind a campaign's health."""
 
 import math
 from dataclasses import replace
@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from scipy.integrate import quad
+from scipy.stats import binom
 from torch.distributions import MultivariateNormal, Normal
 
 from sbi_active import StopRules
@@ -25,31 +26,24 @@ def simulator(theta, action):
     return theta * action + 0.5 * torch.randn_like(theta)
 
 
-def score(x, simulator=simulator, seed=0, num_samples=2_000):
-    rows = simulate_from(PRIOR, simulator, ACTION, num_samples=num_samples, seed=seed)
-    return SimpleNamespace(
-        **dict(
-            zip(
-                ("surprise", "log_score"),
-                score_outcome(torch.as_tensor(x), rows),
-                strict=True,
-            )
-        )
-    )
+def score(x, simulator=simulator, action=ACTION, num_samples=2_000, seed=0):
+    """Return the surprise and the log score of an outcome."""
+    rows = simulate_from(PRIOR, simulator, action, num_samples=num_samples, seed=seed)
+    return score_outcome(torch.as_tensor(x), rows)
 
 
 def test_surprise_and_log_score_are_those_of_the_predictive():
     predictive = Normal(0.0, math.sqrt(4.25))  # 2 theta + noise
     for x in (0.5, -3.0, 5.0):
-        found = score([x])
+        surprise, log_score = score([x])
         tail = 2 * float(predictive.cdf(torch.tensor(-abs(x))))
         log_p = float(predictive.log_prob(torch.tensor(x)))
         # Binomial error of 2,000 simulations, that of their mean, one in the numerator.
         error = math.sqrt(tail * (1 - tail) / 2_000)
         error += 2 * math.exp(log_p) * math.sqrt(4.25 / 2_000)
-        assert found.surprise == pytest.approx(tail, abs=4 * error + 1 / 2_000)
-        assert found.log_score == pytest.approx(log_p, abs=0.2)
-    assert score([60.0]).surprise == pytest.approx(1 / 2_001)
+        assert surprise == pytest.approx(tail, abs=4 * error + 1 / 2_000)
+        assert log_score == pytest.approx(log_p, abs=0.2)
+    assert score([60.0])[0] == pytest.approx(1 / 2_001)
 
 
 def test_the_e_value_has_mean_one_and_is_continuous_at_one():
@@ -128,3 +122,55 @@ def test_a_lost_calibration_stops_and_is_judged_once(refine, monkeypatch):
     c.run(lambda action: 0.4 * action, num_rounds=3)
     assert len(c.history) == len(calls) == 2
     assert c.stop_reason == "calibration is lost: it excludes the truth"
+
+
+# Surprises are uniform where the simulator is right, and small where it is not
+
+
+def noisy(num_numbers):
+    def simulator(theta, action):
+        return theta * action + 0.5 * torch.randn(len(theta), num_numbers)
+
+    return simulator
+
+
+def drops_out(theta, action):
+    """Each of 40 numbers is there in four of five simulations."""
+    x = noisy(40)(theta, action)
+    return torch.where(torch.rand_like(x) < 0.2, torch.nan, x)
+
+
+def falls_off(theta, action):
+    """A walk that ends where it leaves the table: its last number is its largest."""
+    x = torch.randn(len(theta), 12).cumsum(1) + theta * action
+    is_over = ((x.abs() > 3).cumsum(1) - (x.abs() > 3).long()) > 0
+    return torch.where(is_over, torch.nan, x)
+
+
+def surprises(simulator, num=60, change=None, num_samples=200):
+    found = []
+    for seed in range(num):
+        torch.manual_seed(1_000 + seed)
+        x = simulator(PRIOR.sample((1,)), torch.ones(1, 1))[0]
+        x = x if change is None else change(x)
+        found.append(score(x, simulator, torch.ones(1), num_samples, seed)[0])
+    return torch.tensor(found)
+
+
+def assert_valid(found):
+    """No more are small than chance has it, at a level of 1 in 1,000 each."""
+    for level in (0.01, 0.05, 0.2, 0.5):
+        most = binom.ppf(0.999, len(found), level)
+        assert int((found <= level).sum()) <= most, (level, found.sort().values)
+
+
+@pytest.mark.parametrize("num_numbers", [1, 90])
+def test_surprises_are_uniform_for_any_number_of_numbers(num_numbers):
+    found = surprises(noisy(num_numbers))
+    assert_valid(found)
+    assert float(found.mean()) < 0.65  # not merely large
+
+
+@pytest.mark.parametrize("simulator", [drops_out, falls_off])
+def test_surprises_are_uniform_where_the_simulator_leaves_numbers_out(simulator):
+    assert_valid(surprises(simulator))

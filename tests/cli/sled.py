@@ -2,11 +2,13 @@
 
 import contextlib
 import json
+import locale
 import os
 import subprocess
 import sys
 
 from sbi_active.campaign.telling import SUMMARY
+from sbi_active.cli import main
 from sbi_active.simulation.bank.store import Store
 
 SIMULATOR = """
@@ -32,6 +34,25 @@ def run(words, *, flags=(), env=(), **options):
         env={**os.environ, "OMP_NUM_THREADS": "1", **dict(env)},
         **{"stderr": subprocess.PIPE, "text": True, **options},
     )
+
+
+def forked(words, place="", **options):
+    """Return a call in a process that has imported all that this one has."""
+
+    def call():
+        os.closerange(3, 4_096)  # the pipe of Popen among them
+        locale.setlocale(locale.LC_ALL, place)
+        sys.stdin, sys.stdout = os.fdopen(0), os.fdopen(1, "w")
+        sys.stderr = os.fdopen(2, "w", buffering=1)
+        status = 1
+        try:
+            status = main([*words])
+        finally:
+            sys.stdout.flush(), sys.stderr.flush()
+            os._exit(status)
+
+    pipes = {"stderr": subprocess.PIPE, "text": True, **options}
+    return subprocess.Popen([sys.executable], preexec_fn=call, **pipes)
 
 
 def forget(folder, content=None):

@@ -14,7 +14,7 @@ import torch
 from sbi_active import Campaign
 from sbi_active.cli import main
 from sbi_active.cli.problem import load_module
-from tests.cli.sled import BOX, INIT, SIMULATOR, SMALL, forget, read, run
+from tests.cli.sled import BOX, INIT, SIMULATOR, SMALL, forget, forked, read, run
 
 ODD = """
 import ctypes, os, sys, torch
@@ -209,7 +209,9 @@ def test_a_locale_that_is_not_utf8(camp):
 
     answered(*SLED, *ASK, "--units", "µm", "--names", "größe")
     assert main(["tell", "new", "0.3", "--action", "1"]) == 0
-    answer = read(answered("correct", "new", "0", "0.4", "--reason", "µ", "--json"))
+    words = ["correct", "new", "0", "0.4", "--reason", "µ", "--json"]
+    shown, error = run(words, stdout=subprocess.PIPE, env=env).communicate()
+    answer = read(shown)
     assert (answer["names"], answer["units"]) == (["größe"], ["µm"])
     assert answer["reason"] == "µ"
 
@@ -217,7 +219,7 @@ def test_a_locale_that_is_not_utf8(camp):
 def test_interrupted_while_it_simulates():
     slow = "\nimport time\n\n\ndef slow(theta, action):\n    open('on', 'w')\n"
     Path("slow.py").write_text(SIMULATOR + slow + "    time.sleep(60)\n")
-    process = run(["check", "slow.py:slow", *BOX, *ASK], stdout=subprocess.PIPE)
+    process = forked(["check", "slow.py:slow", *BOX, *ASK], stdout=subprocess.PIPE)
     for _ in range(600):
         if Path("on").exists():
             break

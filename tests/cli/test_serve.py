@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from sbi_active.cli import main
-from tests.cli.sled import BOX, SIMULATOR, SMALL, read, run
+from tests.cli.sled import BOX, SIMULATOR, SMALL, forked, read
 
 LOUD = """
 
@@ -40,7 +40,8 @@ class Server:
 
     def __init__(self, *words):
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-        self.process = run(["serve", "camp", *words], **pipes, encoding="latin-1")
+        words = ["serve", "camp", *words]
+        self.process = forked(words, **pipes, encoding="latin-1")
 
     def says(self, request):
         line = request if isinstance(request, str) else json.dumps(request)

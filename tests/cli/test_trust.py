@@ -119,8 +119,8 @@ def test_what_stands_beside_somebody_is_not_imported(mine, tmp_path):
     for name in ("torch", "sqlite3", "mine"):
         text = f"from pathlib import Path\n{RUN.format(tmp_path / 'stood')}"
         (tmp_path / "camp" / f"{name}.py").write_text(text)
-    for words in (["status", "."], ["report", "."]):
-        process = run(words, cwd=tmp_path / "camp", env={"PYTHONPATH": str(ROOT)})
-        assert process.wait() == 0, process.stderr.read()
+    words, env = ["report", "."], {"PYTHONPATH": str(ROOT)}
+    process = run(words, cwd=tmp_path / "camp", env=env)
+    assert process.wait() == 0, process.stderr.read()
     assert not (tmp_path / "stood").exists()
     assert not mine.exists()

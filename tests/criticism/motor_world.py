@@ -2,11 +2,11 @@
 
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import HalfNormal, Independent, Normal
+from torch.distributions import HalfNormal
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import AugmentedSimulator, Context, Effect, Trials
-from tests.effects import on_outcomes
+from tests.effects import effect, half, normal, on_outcomes
 
 NOISE = 0.05  # rad/s
 STEP = 0.02  # s
@@ -46,22 +46,14 @@ def _voltage(change):
     return apply
 
 
-DEAD_ZONE = Effect(
+DEAD_ZONE = effect(
     "dead zone",
     hook="input",
-    prior=Independent(HalfNormal(torch.tensor([0.2])), 1),
-    null=0.0,
+    prior=half(0.2),
     apply=_voltage(lambda u, phi: u.sign() * (u.abs() - phi).clamp(min=0)),
-    units="V",
 )
-OFFSET = Effect(
-    "voltage offset",
-    hook="input",
-    prior=Independent(Normal(torch.zeros(1), torch.tensor([0.2])), 1),
-    null=0.0,
-    apply=_voltage(lambda u, phi: u + phi),
-    units="V",
-)
+SHIFTED = _voltage(lambda u, phi: u + phi)
+OFFSET = effect("voltage offset", hook="input", prior=normal(0.2), apply=SHIFTED)
 BIAS = on_outcomes("bias", lambda x, phi, action, context: x + phi, sd=0.3)
 COULOMB = Effect.keyword("coulomb", prior=HalfNormal(0.5))
 LIBRARY = [DEAD_ZONE, OFFSET, BIAS, COULOMB]

@@ -1,4 +1,4 @@
-"""What benchmarks print becomes tables of the site, cell by cell."""
+"""What benchmarks print becomes tables of the site, from committed rows."""
 
 import importlib.util
 import re
@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
-def results() -> ModuleType:
+def page() -> ModuleType:
     path = ROOT / "docs" / "_ext" / "results.py"
     spec = importlib.util.spec_from_file_location("results", path)
     module = importlib.util.module_from_spec(spec)
@@ -20,7 +20,7 @@ def results() -> ModuleType:
     return module
 
 
-def test_columns_end_where_their_rule_does(results):
+def test_columns_end_where_their_rule_does(page):
     text = (
         "           gap  regret\n"
         "----  --------  ------\n"
@@ -28,7 +28,7 @@ def test_columns_end_where_their_rule_does(results):
         "nsbi       nan         \n"
         "a line that is no row of the table\n"
     )
-    assert results.as_markdown(text).split("\n") == [
+    assert page.as_markdown(text).split("\n") == [
         "|  | gap | regret |",
         "| --- | --- | --- |",
         "| asbi | .1 \\| .2 | 0.00 |",
@@ -41,12 +41,28 @@ def test_columns_end_where_their_rule_does(results):
     ]
 
 
-def test_each_section_shows_its_tables(results):
+def test_each_section_shows_its_tables(page):
     text = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
-    included = re.findall(r"{include} reference/api/results/(.+)", text)
+    included = re.findall(r"{include} reference/api/page/(.+)", text)
     assert included == [
-        results.file_of(t).name
-        for t in re.findall("## (.+)", text)
-        if t in results.TABLES
+        page.file_of(t).name for t in re.findall("## (.+)", text) if t in page.TABLES
     ]
-    assert {*included} == {results.file_of(title).name for title in results.TABLES}
+    assert {*included} == {page.file_of(title).name for title in page.TABLES}
+
+
+# Every table of the documentation is printed from its committed rows
+
+
+pytest.importorskip("sphinx")
+PATH = Path(__file__).parents[2] / "docs" / "_ext" / "results.py"
+SPEC = importlib.util.spec_from_file_location("results", PATH)
+assert SPEC is not None
+assert SPEC.loader is not None
+results = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(results)
+
+
+@pytest.mark.parametrize("title", results.TABLES)
+def test_a_section_has_its_tables(title):
+    text = results.tables(results.TABLES[title])
+    assert text.count("```bash") == len(results.TABLES[title])

@@ -2,22 +2,17 @@
 
 import pytest
 import torch
-from sbi.utils import BoxUniform
 
 from sbi_active import (
     ALHI,
     ASBI,
-    GaussianNoise,
     RefinementOptions,
     SeqBED,
-    SimulatorModel,
 )
 from sbi_active.inference import SeqBED_LFIRE
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
-from tests.campaign.test_corrections import OPTIONS, RATIOS
+from tests.campaign.problem import MODEL, OPTIONS, PRIOR, RATIOS
 
-PRIOR = BoxUniform(torch.zeros(1), torch.ones(1))
-MODEL = SimulatorModel(lambda theta, action: theta * action, noise=GaussianNoise(0.1))
 SETTINGS = RefinementOptions(num_histories=300, num_effective=25)
 SIZES = (1e15, -3e38)
 

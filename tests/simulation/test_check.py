@@ -108,19 +108,10 @@ def test_a_clean_simulator_is_ready(check, text):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        (
-            DETERMINISTIC,
-            "got identical x from two seeds, and a deterministic simulator",
-        ),
-        (
-            ONE_ROW,
-            "expected x with one row a parameter set, shape (16, ...); got (1, 2)",
-        ),
+        (DETERMINISTIC, "got identical x from two seeds"),
+        (ONE_ROW, "x with one row a parameter set, shape (16, ...); got (1, 2)"),
         (RAISES, "RuntimeError: no model file"),
-        (
-            FLAT,
-            "expected x of one shape; got (2,) a row from 16 rows and (1,) from one",
-        ),
+        (FLAT, "of one shape; got (2,) a row from 16 rows and (1,) from one"),
         (NOTHING, "no row has a measurement"),
         (MIXED, "rows permuted with their seeds do not give permuted x"),
         (NO_PARAMETER, "no parameter changes x"),

@@ -1,8 +1,33 @@
+"""Tasks against their equations, and what they are got by."""
+
+import math
+
+import numpy as np
 import pytest
 import torch
+from scipy.integrate import solve_ivp
+from torch import Tensor
+from torch.distributions import Normal
 
 from sbi_active import simulate
+from sbi_active.criticism import AugmentedSimulator
 from sbi_active.tasks import get_task  # pyright: ignore
+from sbi_active.tasks.ball_drops import fall  # pyright: ignore
+from sbi_active.tasks.chain import model
+from sbi_active.tasks.location_finding import model as locations
+from sbi_active.tasks.oscillator import reference as reference_module
+from sbi_active.tasks.oscillator.model import (
+    ACTION_HIGH,
+    ACTION_LOW,
+    ACTIONS,
+    NOISE_SD,
+    PRIOR_HIGH,
+    PRIOR_LOW,
+    SAMPLE_TIMES,
+    SENSOR_RANGE,
+    mean,
+)
+from sbi_active.tasks.oscillator.reference import OscillatorReference
 
 
 def test_unknown_task_lists_the_valid_names():
@@ -26,3 +51,215 @@ def test_the_simulator_and_the_oracle_are_one_model(variant):
     mean = torch.tensor(ranks).mean()
     # A uniform has mean .5 and sd .289.
     assert abs(float(mean) - 0.5) < 4 * 0.289 / num**0.5
+
+
+# Falling balls: the fall, what it may lack, and the measured drops
+
+
+G, TIMES = 9.81, torch.linspace(0, 4, 61).double()
+LEVEL = torch.zeros(1, 2).double()
+
+
+@pytest.mark.parametrize("strength", [0.5, 3.0])
+@pytest.mark.parametrize("exponent", [1.0, 2.0])
+def test_the_fall_with_drag_is_the_closed_form(strength, exponent):
+    s = (TIMES - 0.2).clamp(min=0)
+    if exponent == 1.0:
+        c = strength / 10
+        way = G / c * s - G / c**2 * (1 - torch.exp(-c * s))
+    else:
+        k = strength / 100
+        way = torch.log(torch.cosh((G * k) ** 0.5 * s)) / k
+    drag = torch.tensor([strength]).double()
+    args = {"times": TIMES[None], "start": 0.2, "drag": drag, "exponent": exponent}
+    x = fall(LEVEL, torch.zeros(1, 1), **args)[0]
+    assert float((x - (47 - way)).abs().max()) < 1e-4
+
+
+def test_every_effect_vanishes_at_its_null_and_moves_x_elsewhere():
+    task = get_task("ball_drops")
+    theta, action = task.prior.sample((16,)), task.actions.values[:1].repeat(16, 1)
+    model = AugmentedSimulator(task.simulator, task.effects(), check=(theta, action))
+    bare = model.evaluate(theta, {}, action)
+    for effect in task.effects():
+        if effect.name == "wind":  # which the drag alone sees
+            continue
+        phi = effect.sample(16).to(theta.dtype)
+        change = (model.evaluate(theta, {effect.name: phi}, action) - bare).abs()
+        assert float(change.max()) > 0.01, effect.name
+
+
+# The chain against an ODE solver, and its options
+
+
+@pytest.mark.parametrize(("parameters", "moving"), [(5, 3), (6, 2)])
+def test_the_closed_form_solves_the_equations(parameters, moving):
+    task = get_task("chain", parameters=parameters)
+    theta, count = task.theta_true.double(), model.num_masses(parameters)
+    k = theta[:count].numpy()
+    m = np.append(theta[count:].numpy(), [1.0] * (2 * count - parameters))[:moving]
+    right = np.append(k[1:], 0.0)[:moving]
+    stiffness = np.diag(k[:moving] + right)
+    off = k[1:moving]
+    stiffness -= np.diag(off, 1) + np.diag(off, -1)
+    root = np.diag(m**-0.5)
+    square, mode = np.linalg.eigh(root @ stiffness @ root)
+    damping = mode @ np.diag(2 * model.DAMPING * np.sqrt(square)) @ mode.T
+    damping = np.diag(m**0.5) @ damping @ np.diag(m**0.5)
+
+    def rate(t, state):
+        y, v = np.split(state, 2)
+        force = np.zeros(moving)
+        force[0] = model.FORCE * np.sin(13.0 * t)
+        return np.concatenate([v, (force - stiffness @ y - damping @ v) / m])
+
+    times = model.SAMPLE_TIMES.numpy()
+    tight = {"method": "DOP853", "rtol": 1e-9, "atol": 1e-12}
+    solved = solve_ivp(rate, (0, 2.0), np.zeros(2 * moving), t_eval=times, **tight)
+    action = torch.tensor([[13.0, float(moving)]])
+    found = model.mean(theta[None], action)[0].numpy()
+    assert found[:moving] == pytest.approx(solved.y[:moving], abs=1e-7)
+    assert (found[moving:] == 0).all()
+
+
+# Location finding: the model and the task
+
+
+def test_log_likelihood_is_a_normal_s():
+    task = get_task("location_finding")
+    gen = torch.Generator().manual_seed(0)
+    theta, action, x = (
+        torch.randn(30, dim, generator=gen, dtype=torch.float64) for dim in (4, 2, 1)
+    )
+    center = locations.mean(theta, action)
+    expected = Normal(center, locations.NOISE_SD).log_prob(x)[:, 0]
+    torch.testing.assert_close(task.log_likelihood(x, theta, action), expected)
+    torch.testing.assert_close(task.simulator.log_prob(x, theta, action), expected)
+    assert task.exact_likelihood
+
+
+# The oscillator against its differential equation, its reference against itself
+
+
+def uniform(n: int, low: Tensor, high: Tensor, seed: int) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    u = torch.rand(n, len(low), generator=generator, dtype=torch.float64)
+    return low + (high.double() - low.double()) * u
+
+
+def history(num_trials: int, seed: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return a true theta, random actions of the grid and outcomes."""
+    theta = uniform(1, PRIOR_LOW, PRIOR_HIGH, seed)
+    generator = torch.Generator().manual_seed(1000 + seed)
+    index = torch.randint(len(ACTIONS), (num_trials,), generator=generator)
+    action = ACTIONS[index].double()
+    noise = torch.randn(num_trials, 6, generator=generator, dtype=torch.float64)
+    return theta, action, mean(theta, action) + NOISE_SD * noise
+
+
+# ------------------------------------------------------------------ the model
+
+
+def test_mean_solves_the_equation_of_motion():
+    theta = uniform(6, PRIOR_LOW, PRIOR_HIGH, 0)
+    action = uniform(6, ACTION_LOW, ACTION_HIGH, 1)
+    theta[0, 3] = 0.0
+    action[1, 1] = theta[1, 0]  # at resonance
+    for row, xi, readings in zip(theta, action, mean(theta, action), strict=True):
+        omega_0, zeta, gain, tau = row.tolist()
+        amplitude, omega = xi.tolist()
+
+        def motion(t, state, omega_0=omega_0, zeta=zeta, gain=gain, tau=tau,
+                   amplitude=amplitude, omega=omega):  # fmt: skip
+            y, v = state
+            force = gain * omega_0**2 * amplitude * math.sin(omega * (t - tau))
+            return [v, force - 2 * zeta * omega_0 * v - omega_0**2 * y]
+
+        solution = solve_ivp(
+            motion,
+            (tau, 4.0),
+            [0.0, 0.0],
+            method="DOP853",
+            t_eval=SAMPLE_TIMES.double().numpy(),
+            rtol=1e-10,
+            atol=1e-12,
+        )
+        expected = SENSOR_RANGE * np.tanh(solution.y[0] / SENSOR_RANGE)
+        np.testing.assert_allclose(readings, expected, atol=1e-7)
+
+
+# -------------------------------------------------------------- the posterior
+
+
+def evidence_by_prior(
+    action: Tensor, x: Tensor, noise_sd: float = NOISE_SD
+) -> tuple[float, float]:
+    """Log evidence and standard error from half a million draws of the prior."""
+    log_likelihood = []
+    for block in range(5):
+        theta = uniform(100_000, PRIOR_LOW, PRIOR_HIGH, 50 + block)
+        total = torch.zeros(len(theta), dtype=torch.float64)
+        for xi, row in zip(action, x, strict=True):
+            density = torch.distributions.Normal(mean(theta, xi[None]), noise_sd)
+            total += density.log_prob(row).sum(-1)
+        log_likelihood.append(total)
+    weight = torch.cat(log_likelihood)
+    top = weight.max()
+    weight = (weight - top).exp()
+    error = weight.std() / weight.mean() / math.sqrt(len(weight))
+    return float(top + weight.mean().log()), float(error)
+
+
+def test_evidence_matches_sampling_from_the_prior():
+    _, action, x = history(2, seed=1)
+    posterior = OscillatorReference(action, x)
+    expected, error = evidence_by_prior(action, x)
+    error = math.hypot(error, posterior.log_evidence_se)
+    assert error < 0.1
+    assert abs(posterior.log_evidence - expected) < 4 * error
+
+    # negative control: the check sees a noise that is a tenth too large
+    wrong = OscillatorReference(action, x, noise_sd=1.1 * NOISE_SD)
+    assert abs(wrong.log_evidence - expected) > 4 * error
+
+
+# ------------------------------------------------------- the information gain
+
+
+def linear_mean(theta: Tensor, action: Tensor) -> Tensor:
+    """Outcomes linear in z, where the prior is a standard normal."""
+    u = (theta.double() - PRIOR_LOW) / (PRIOR_HIGH.double() - PRIOR_LOW)
+    z = torch.special.ndtri(u.clamp(1e-15, 1 - 1e-15))  # finite in the far tails
+    return action[..., :1] * (z @ DESIGN)
+
+
+DESIGN = torch.randn(
+    4, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+)
+
+
+def test_linear_gaussian_limit(monkeypatch):
+    r"""EIG = log det(I + A^2 D D^T / sd^2) / 2, after a first trial."""
+    monkeypatch.setattr(reference_module, "mean", linear_mean)
+    action = torch.tensor([[0.01, 1.0], [0.05, 1.0], [0.15, 1.0]]).double()
+    information = DESIGN @ DESIGN.T / NOISE_SD**2
+    eye = torch.eye(4, dtype=torch.float64)
+    first = torch.tensor([[0.05, 1.0]]).double()
+    x = first[:, :1] * (torch.tensor([[0.5, -0.3, 0.2, 1.0]]).double() @ DESIGN)
+
+    precision = eye + 0.05**2 * information
+    posterior = OscillatorReference(first, x)
+    gain, error = posterior.expected_information_gain(
+        action, num_outer=2_000, num_inner=10_000
+    )
+    after = precision + action[:, :1, None] ** 2 * information
+    exact = 0.5 * (torch.logdet(after) - torch.logdet(precision))
+    assert bool((error < 0.05).all())
+    assert bool(((gain - exact).abs() < 4 * error + 0.01).all())
+
+    covariance = first[0, 0] ** 2 * DESIGN.T @ DESIGN + NOISE_SD**2 * torch.eye(6)
+    marginal = torch.distributions.MultivariateNormal(
+        torch.zeros(6).double(), covariance
+    )
+    exact = float(marginal.log_prob(x))
+    assert abs(posterior.log_evidence - exact) < 4 * posterior.log_evidence_se

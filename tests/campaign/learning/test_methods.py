@@ -1,6 +1,7 @@
 """Every method of a campaign, through the same protocol."""
 
 import warnings
+from dataclasses import replace
 
 import cloudpickle
 import pytest
@@ -14,7 +15,8 @@ from tests.campaign.sizes import REFINEMENT
 
 DENSITY = MixtureDensity(hidden_features=(16,), num_components=2, num_iterations=150)
 TRAINED = {**dict.fromkeys(("asbi", "nsbi", "alhi", "nlhi"), DENSITY), "seqbed": RATIOS}
-QUICK = {**dict.fromkeys(TRAINED, OPTIONS.density_estimator), "seqbed": RATIOS}
+FEW = replace(RATIOS, num_iterations=5)
+QUICK = {**dict.fromkeys(TRAINED, OPTIONS.density_estimator), "seqbed": FEW}
 GAINS = {"asbi": "posterior", "alhi": "likelihood", "seqbed": "ratio"}
 
 

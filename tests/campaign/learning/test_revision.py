@@ -1,4 +1,4 @@
-"""A campaign that compares its simulator with its trials and goes on with another."""
+"""What a campaign's next trial is for, when it stops, and adopting another model."""
 
 from dataclasses import replace
 
@@ -6,7 +6,13 @@ import pytest
 import torch
 from sbi.utils import BoxUniform
 
-from sbi_active import Campaign, DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active import (
+    Campaign,
+    DiscreteActions,
+    GaussianNoise,
+    SimulatorModel,
+    StopRules,
+)
 from sbi_active.campaign.learning.planner import most_unlike
 from sbi_active.campaign.options import CampaignDetails
 from tests.campaign import problem
@@ -29,10 +35,10 @@ DRIFT = on_outcomes(
 LIBRARY = [BIAS, DRIFT]
 
 
-def campaign(simulator=MODEL, **changes):
-    return Campaign(
-        simulator, PRIOR, ACTIONS, method="nsbi", options=replace(OPTIONS, **changes)
-    )
+def campaign(effects=(BIAS,), method="asbi", *, constraint=None, **changes):
+    options = replace(OPTIONS, **changes)
+    given = {"effects": effects, "constraint": constraint, "options": options}
+    return Campaign(MODEL, PRIOR, ACTIONS, method=method, **given)
 
 
 def tell(c, shift=SHIFT, actions=(1.0, -2.0, 2.0, -1.0, 2.0), per_trial=0.0):
@@ -44,7 +50,7 @@ def tell(c, shift=SHIFT, actions=(1.0, -2.0, 2.0, -1.0, 2.0), per_trial=0.0):
 
 @pytest.fixture(scope="module")
 def adopted():
-    c = campaign()
+    c = campaign((), "nsbi")
     tell(c)
     c.update()
     before, health = c.belief, c.health
@@ -105,3 +111,92 @@ def test_every_second_trial_may_go_where_none_was():
         assert trial.design.expected_information_gain.isnan().all() == is_check
         if is_check:
             assert action in unlike.values[:, 0].tolist()
+
+
+# What a campaign may do
+
+
+@pytest.mark.parametrize("method", ["asbi", "nsbi"])
+def test_a_constraint_is_kept_by_designed_and_random_actions(method):
+    given = {"constraint": lambda action: action[:, 0] <= 1.5}
+    actions = DiscreteActions([0.1, 1.0, 2.0, 3.0])
+    c = problem.campaign(method, actions=actions, given=given)
+    c.run(lambda action: 0.7 * action, num_rounds=3)
+    assert all(float(t.action) <= 1.5 for t in c.history)
+    if method == "asbi":
+        assert float(c.history[0].action) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("constraint", "side"), [(None, -1), (lambda action: action[:, 0] >= 0.5, 1)]
+)
+def test_a_constraint_is_kept_by_actions_about_the_model(constraint, side):
+    c = campaign(constraint=constraint)
+    for _ in range(2):
+        c.tell([1.0], action=[2.0])
+    trial = c.ask(target="model")
+    assert side * float(trial.action) > 0
+
+
+# What a campaign's next trial is for, and when it stops
+
+
+def test_with_effects_a_trial_is_for_what_it_tells_more_about():
+    c = campaign()
+    c.tell([1.0], action=[2.0])
+    c.tell([1.0], action=[2.0])
+    # A slope and a bias explain two like trials; more of the same halves neither.
+    trial = c.ask()
+    assert trial.target == "model"
+    assert float(trial.action) < 0  # the far side of the slope
+    assert trial.design.estimator == "ModelIndexGain"
+    assert "bias" in trial.design.notes[0]
+    assert trial.num_simulations >= trial.design.num_simulations > 0
+    assert "criticism" in trial.seconds
+
+
+def test_where_nothing_is_open_the_trial_is_for_the_parameters():
+    c = campaign()
+    # Twelve clean trials on both sides: no bias that would matter.
+    tell(c, shift=0.0, actions=(2.0, -2.0) * 6)
+    assert c.health == "ok"
+    assert c.ask().target == "theta"
+
+
+def run(c, slope=0.5, shift=0.0, num_rounds=6):
+    gen = torch.Generator().manual_seed(1)
+
+    def real_system(action):
+        return slope * action + shift + 0.1 * torch.randn(1, generator=gen)
+
+    c.run(real_system, num_rounds=num_rounds)
+    return c
+
+
+def test_a_run_stops_once_little_is_left_to_learn():
+    c = run(campaign(effects=(), stop=StopRules(min_information_gain=0.5)))
+    assert 1 <= len(c.history) < 6
+    assert c.pending is not None
+    assert c.stop_reason.startswith("the next trial is expected to tell")
+    assert "less than 0.5" in c.stop_reason
+
+
+def test_a_run_stops_once_the_parameters_are_known():
+    # One trial at the largest action leaves a deviation of .1 / 2.
+    c = run(campaign(effects=(), stop=StopRules(max_sd=0.08)))
+    assert len(c.history) == 1
+    assert c.pending is None
+    assert c.stop_reason.startswith("the parameters' standard deviations are 0.0")
+
+
+def test_an_alarm_switches_the_stop_rules_off():
+    stop = StopRules(max_sd=0.5, min_information_gain=0.5)
+    c = campaign(effects=(), method="nsbi", stop=stop)
+    tell(c, shift=0.8, actions=(2.0, -2.0))
+    c.update()
+    assert c.health == "alarm"
+    assert float(c.belief.stddev) < 0.5  # as wide as trials scatter, and within
+    assert c.stop_reason is None
+    num_told = len(c.history)
+    run(c, shift=0.8, num_rounds=2)
+    assert len(c.history) == num_told + 2

@@ -219,8 +219,8 @@ def test_what_only_its_author_can_make_is_asked_for(tmp_path):
 
 def test_adopted_effects_come_back(tmp_path):
     campaign = new(tmp_path / "c", simulator=MODEL, effects=[BIAS])
-    for index, action in enumerate(torch.linspace(0.5, 2.0, 6)):
-        campaign.attach([float(action)], outcome(action[None], index) + 1)
+    for index, action in enumerate(torch.linspace(0.5, 2.0, 4)):
+        campaign.attach([float(action)], outcome(action[None], index) + 0.5)
     report = campaign.criticize(evaluate=False)
     assert report.verdict == "bias"
     campaign.adopt(report)
@@ -237,7 +237,7 @@ def test_adopted_effects_come_back(tmp_path):
     assert again.state.version.effects == ("bias",)
     assert torch.equal(draws(again), draws(campaign))
     assert draws(again).shape[1] == 3
-    again.attach([1.0], outcome(torch.tensor([1.0]), 7) + 1)
+    again.attach([1.0], outcome(torch.tensor([1.0]), 7) + 0.5)
     again.update()
     assert again.history[-1].version == 1
 

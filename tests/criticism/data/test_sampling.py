@@ -6,6 +6,7 @@ import torch
 
 from sbi_active.criticism import Trials
 from sbi_active.criticism.data.sampling import Sampling, suggested_sampling, thinned
+from tests.effects import autocorrelated
 
 STEP = 0.02
 
@@ -13,14 +14,6 @@ STEP = 0.02
 def trials_of(x, step=STEP):
     times = step * torch.arange(1, x.shape[1] + 1).double()
     return Trials(torch.arange(len(x)).double(), x, sample_times=times)
-
-
-def chain(num, length, rho, rng):
-    """Return an autocorrelated error of unit size."""
-    e = rng.normal(size=(num, length))
-    for k in range(1, length):
-        e[:, k] = rho * e[:, k - 1] + np.sqrt(1 - rho**2) * e[:, k]
-    return e
 
 
 def smooth(num, length, width, rng):
@@ -34,7 +27,7 @@ def smooth(num, length, width, rng):
 
 @pytest.mark.parametrize("rho", [0.0, 0.5, 0.95])
 def test_errors_as_assumed_are_kept_all(rho):
-    x = chain(8, 300, rho, np.random.default_rng(0))
+    x = autocorrelated(np.random.default_rng(0).normal(size=(8, 300)), rho)
     found = suggested_sampling(trials_of(x), x)
     assert found.every == 1
     assert abs(found.before) < 0.1

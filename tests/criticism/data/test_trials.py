@@ -1,9 +1,18 @@
+"""Trials as they come: arrays, names, roles, repeats, and units."""
+
+import warnings
+
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
+from benchmarks.robots.models import SPRING_MASS
 from sbi_active.criticism import Trials
 from sbi_active.criticism.data import Measurements
+from sbi_active.criticism.data.units import to_si
+from sbi_active.messages import ChangedWarning
+from sbi_active.mujoco import from_mjcf
 
 
 def test_ragged_trajectories_are_padded_and_masked():
@@ -102,3 +111,192 @@ def test_joined_trials_have_all_of_both_and_names_of_their_own():
     assert both.sample_times[2:].tolist() == 2 * [times.tolist()]
     assert both.repeat_of.tolist() == [-1, -1, -1, 0]
     assert len(own) == 2
+
+
+# What trials make of numbers as they come
+
+
+NAN = float("nan")
+SPEED, STOP = [1.0, 2.0], [[1.0, 2.0], [3.0, 4.0]]
+
+
+@pytest.mark.parametrize("kind", [np.array, torch.tensor])
+def test_what_was_given_may_change_afterwards(kind):
+    given = {
+        "action": kind([1.0, 2.0]),
+        "x": kind([[1.0, 2.0], [3.0, 4.0]]),
+        "index": kind([0.0, 1.0]),
+        "sample_times": kind([0.0, 1.0]),
+    }
+    given = {
+        k: v.double() if torch.is_tensor(v) else v.astype(float)
+        for k, v in given.items()
+    }
+    trials = Trials(**given)
+    before = {k: v.clone() for k, v in vars(trials).items() if torch.is_tensor(v)}
+    for value in given.values():
+        value[:] = 99.0
+    for name, value in before.items():
+        assert torch.equal(getattr(trials, name), value), name
+
+
+def test_what_a_masked_array_masks_is_not_measured():
+    x = np.ma.masked_array(STOP, mask=[[0, 1], [0, 0]])
+    assert Trials(SPEED, x).mask.tolist() == [[True, False], [True, True]]
+
+
+@pytest.mark.parametrize(
+    "x",
+    [
+        torch.ones(2, 1, requires_grad=True),
+        torch.ones(2, 1, dtype=torch.bfloat16),
+        np.array([[1], [1]], dtype=object),
+    ],
+)
+def test_numbers_of_any_type_are_taken(x):
+    assert Trials(SPEED, x).x.tolist() == [[1.0], [1.0]]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"x": np.ones((2, 1)) + 1j}, "x of real numbers; got torch.complex128"),
+        ({"index": [0.0, NAN]}, "expected finite places in index"),
+        ({"repeat_of": [-1, 7]}, "expected repeat_of among the positions 0 to 1"),
+        ({"repeat_of": [1, 0]}, "runs in a circle"),
+        ({"mask": [[255, 1], [1, 0]]}, "expected a mask of True and False.*got 255"),
+    ],
+)
+def test_what_is_no_measurement_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        Trials(**{"action": SPEED, "x": STOP} | changes)
+
+
+def test_repeats_of_repeats_are_repeats_of_the_first():
+    trials = Trials([1.0] * 4, [1.0, 2.0, 3.0, 4.0], repeat_of=[-1, 0, 1, 3])
+    assert trials.repeat_of.tolist() == [-1, 0, 0, -1]
+
+
+def test_repeats_stay_together_where_the_first_is_left_out():
+    role = ["held out", "fit", "fit", "fit"]
+    trials = Trials([1.0] * 4, [1.0, 2.0, 3.0, 4.0], role=role)
+    assert trials.fit.repeat_of.tolist() == [-1, 0, 0]
+    assert trials[[3, 1]].repeat_of.tolist() == [-1, 0]
+
+
+# Units of headers: one reading of them, for tables and for logs of robots
+
+
+UNITS = {"time": "ms", "action_v": "deg/s", "x_y": "mm", "input_u": "mNm"}
+ROWS = [(0, 180, 5, 1), (20, 180, -2, 3)]
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor", "si"),
+    [
+        ("mm/s^2", 1e-3, "m/s^2"),
+        ("m/s²", 1, "m/s²"),
+        ("1/mm", 1e3, "1/m"),
+        ("°", np.pi / 180, "rad"),
+        ("rpm", np.pi / 30, "rad/s"),
+        ("mNm", 1e-3, "N m"),
+        ("N m s/rad", 1, "N m s/rad"),
+        ("mm s-1", 1e-3, "m s-1"),
+        ("min", 60, "s"),
+    ],
+)
+def test_units_become_si(unit, factor, si):
+    assert to_si(unit) == (pytest.approx(factor), si)
+
+
+@pytest.mark.parametrize("unit", ["px", "%", "°C", "g", "counts", "[m]"])
+def test_what_is_no_scale_of_an_si_unit_is_not_guessed(unit):
+    assert to_si(unit) is None
+
+
+@pytest.mark.parametrize("where", ["header", "units"])
+def test_numbers_of_a_table_become_si(where):
+    names, units = [*UNITS], UNITS
+    if where == "header":
+        names = [f"{name} [{unit}]" for name, unit in UNITS.items()]
+        units = None
+    frame = pd.DataFrame(ROWS, columns=names).assign(trial=1)
+    with pytest.warns(ChangedWarning, match="action_v.* to rad/s, x_y.* to m, input_u"):
+        trials = Trials.from_dataframe(frame, units=units)
+    assert trials.sample_times.flatten().tolist() == [0, pytest.approx(0.02)]
+    assert trials.action.item() == pytest.approx(np.pi)
+    assert trials.x.flatten().tolist() == pytest.approx([0.005, -0.002])
+    assert trials.inputs["u"].flatten().tolist() == pytest.approx([0.001, 0.003])
+    assert trials.action_labels == ("v [rad/s]",)
+    assert trials.channel_labels == ("y [m]",)
+
+
+@pytest.mark.filterwarnings("ignore::sbi_active.messages.ChangedWarning")
+def test_numbers_of_a_folder_become_si(tmp_path):
+    names = [f"{name} [{unit}]" for name, unit in UNITS.items()]
+    for shift in (1, 2):
+        rows = [(time, v, y + shift, u) for time, v, y, u in ROWS]
+        frame = pd.DataFrame(rows, columns=names)
+        frame.to_csv(tmp_path / f"run_{shift}.csv", index=False)
+    trials = Trials.from_csv(tmp_path)
+    assert trials.x.flatten().tolist() == pytest.approx([0.006, -0.001, 0.007, 0.0])
+    assert trials.channel_labels == ("y [m]",)
+
+
+def logs(scale=1e3, units=("ms", "mm", "mm/s")):
+    """Two logs at 100 Hz, of which the position was read_robot at 10 Hz."""
+    t = np.arange(0, 1, 0.01)
+    time, position, speed = (f" [{unit}]" if unit else "" for unit in units)
+    slow = np.where(np.arange(100) % 10, np.nan, t)
+    frame = pd.DataFrame(
+        {
+            f"time{time}": scale * t,
+            "push [N]": np.sin(5 * t),
+            f"position{position}": scale * slow,
+            f"speed{speed}": scale * t,
+            f"start slide{position}": 0 * t + scale * 0.1,
+        }
+    )
+    return [frame, frame * 1.0]
+
+
+def read_robot(recordings):
+    robot = from_mjcf(
+        SPRING_MASS, {"cart.mass": (0.5, 2)}, recordings=recordings, noise=0.01
+    )
+    assert robot.trials is not None
+    return robot.trials
+
+
+def test_logs_of_a_robot_become_si_as_tables_do(tmp_path):
+    for k, log in enumerate(logs()):
+        log.to_csv(tmp_path / f"{k}.csv", index=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        converted, same = read_robot(tmp_path), read_robot(logs(1.0, ("", "", "")))
+    assert len(converted) == 2
+    for name in ("x", "sample_times", "input_times"):
+        found, expected = getattr(converted, name), getattr(same, name)
+        assert np.allclose(found, expected, equal_nan=True), name
+    assert converted.x[:, :, 0].isfinite().sum() == 20
+    assert isinstance(converted.start, dict)
+    assert converted.start["slide"].tolist() == pytest.approx([0.1, 0.1])
+
+
+@pytest.mark.parametrize(
+    ("units", "message"),
+    [
+        (("ms", "px", ""), r"'position' in m; got \[px\] in recording 0"),
+        (("ms", "deg", ""), r"'position' in m; got \[deg\] in recording 0"),
+        (("mm", "", ""), r"times in s, .* got mm"),
+    ],
+)
+def test_units_that_cannot_be_those_of_the_model_are_refused(units, message):
+    with pytest.raises(ValueError, match=f"expected {message}"):
+        read_robot(logs(units=units))
+
+
+def test_one_column_in_two_units_is_refused():
+    log = logs()[0].assign(**{"position [m]": 0.0})
+    with pytest.raises(ValueError, match="each quantity once; got position .* and"):
+        read_robot([log])

@@ -11,7 +11,7 @@ from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Trials, close_loop
 from sbi_active.criticism.experiments.choice import limit_of
 from sbi_active.criticism.experiments.settle import NAME, VerdictError, settle
-from tests.effects import on_outcomes
+from tests.effects import added
 
 NOISE = 0.1
 PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
@@ -23,17 +23,9 @@ FORWARD = torch.tensor([1.0, 1.5, 2.0, 2.5, 3.0, 1.0, 2.0, 3.0])[:, None]
 BOTH = DiscreteActions(torch.tensor([-3.0, -2.0, -1.0, 1.0, 1.5, 2.0, 2.5, 3.0]))
 
 
-def effect(name, form):
-    return on_outcomes(
-        name, lambda x, phi, action, context: x + phi * form(action.to(x))
-    )
-
-
 #: Forward they are the same to the last bit, backward they have opposite signs.
-EVEN = effect("lift", lambda xi: xi**2)
-ODD = effect("drag", lambda xi: xi * xi.abs())
-LIBRARY = [EVEN, ODD]
 FORMS = {"lift": lambda xi: xi**2, "drag": lambda xi: xi * xi.abs()}
+LIBRARY = [EVEN, ODD] = [added(name, form) for name, form in FORMS.items()]
 
 
 class Robot:
@@ -226,16 +218,7 @@ def test_a_trial_without_a_measurement_neither_holds_nor_fails():
         asked.append(action)
         return torch.full((1,), torch.nan) if len(asked) == 1 else robot(action)
 
-    report = close_loop(
-        MODEL,
-        PRIOR,
-        trials,
-        effects=LIBRARY,
-        actions=BOTH,
-        real_system=lost_first,
-        max_trials=2,
-        evaluate=False,
-    )
+    report = loop(lost_first, trials, max_trials=2)
     first = report.tested[0]
     assert not first.is_measured
     assert not any("SA531" in str(w) for w in report.warnings)

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
-from torch.distributions import HalfNormal, Normal
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
-from sbi_active.criticism import Criticism, Effect, Trials
+from sbi_active.criticism import Criticism, Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces import force_effects
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, ModelKey
@@ -19,7 +18,7 @@ from tests.criticism.misfit.oscillator import EFFECTS
 from tests.criticism.misfit.oscillator import MODEL as OSCILLATOR
 from tests.criticism.misfit.oscillator import PRIOR as RATES
 from tests.criticism.misfit.oscillator import trials as oscillations
-from tests.effects import BIAS
+from tests.effects import BIAS, added, louder
 
 
 @pytest.fixture(scope="module")
@@ -67,14 +66,7 @@ def test_one_that_does_not_lower_the_error_is_withdrawn(loop):
 @pytest.fixture(scope="module")
 def biased():
     """A small library with an effect on the noise, and a missing bias."""
-    louder = Effect(
-        "louder",
-        hook="noise",
-        prior=HalfNormal(1.0),
-        null=0.0,
-        apply=lambda sd, phi, action, context: sd * (1 + phi[:, :1]),
-    )
-    effects = [*EFFECTS, louder]
+    effects = [*EFFECTS, louder()]
     return Criticism(OSCILLATOR, RATES, oscillations(bias=0.05), effects=effects)
 
 
@@ -139,13 +131,7 @@ def scattered(size, *effects):
     return Criticism(model, prior, trials, effects=effects, seed=0)
 
 
-LOUDER = Effect(
-    "louder",
-    hook="noise",
-    prior=HalfNormal(2.0),
-    null=0.0,
-    apply=lambda sd, phi, action, context: sd * (1 + phi[:, :1] * action.abs()),
-)
+LOUDER = louder(lambda phi, action: phi[:, :1] * action.abs(), 2.0)
 
 
 def test_outcomes_are_told_however_large_the_library():
@@ -156,13 +142,7 @@ def test_outcomes_are_told_however_large_the_library():
         return x.where(x.abs() < 3, torch.nan)
 
     def turned(k):
-        return Effect(
-            f"turned {k}",
-            hook="action",
-            prior=Normal(0.0, 0.5),
-            null=0.0,
-            apply=lambda a, phi, action, context: a + phi * torch.cos(k * a),
-        )
+        return added(f"turned {k}", lambda a: torch.cos(k * a), 0.5, hook="action")
 
     action = torch.linspace(-2, 2, 20, dtype=torch.float64)[:, None]
     error = torch.randn(20, 1, generator=torch.manual_seed(0)).double()

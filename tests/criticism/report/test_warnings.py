@@ -8,7 +8,7 @@ import torch
 from sbi.utils import BoxUniform
 
 from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
-from sbi_active.criticism import Effect, Trials, close_loop, joint_prior
+from sbi_active.criticism import Trials, close_loop, joint_prior
 from sbi_active.criticism.contradictions import (
     BoundParameter,
     Bounds,
@@ -23,7 +23,7 @@ from tests.criticism.report.reports import (
     tracing,
     trials,
 )
-from tests.effects import normal
+from tests.effects import autocorrelated, effect, normal, on_outcomes
 
 SURE = report().detection
 HELD = evaluation()
@@ -54,10 +54,7 @@ def with_noise(kind):
 
 def smooth(correlation, times=None, *, known=0.0):
     """Return residuals along 40 samples with an autocorrelated error."""
-    rng = np.random.default_rng(0)
-    z = rng.normal(size=(8, 40))
-    for k in range(1, 40):
-        z[:, k] = correlation * z[:, k - 1] + (1 - correlation**2) ** 0.5 * z[:, k]
+    z = autocorrelated(np.random.default_rng(0).normal(size=(8, 40)), correlation)
     made = replace(residuals((40,), times=times), refitted=z, correlation=known)
     return {"residuals": made, "residuals_after": made}
 
@@ -187,17 +184,6 @@ def test_a_report_of_a_right_model_has_none():
     assert "Warnings" not in str(right())
 
 
-def on_x(name, change, sd):
-    return Effect(
-        name,
-        hook="observation",
-        prior=normal(sd),
-        null=0.0,
-        apply=lambda x, phi, action, context: x + change(phi, action, context),
-        needs_order=name == "drift",
-    )
-
-
 def curve(theta, action, quadratic=0.0):
     xi = action[:, 0]
     return (theta[:, 0] * xi + quadratic * xi**2)[:, None]
@@ -217,12 +203,15 @@ def measured(missing, **options):
     return close_loop(model, prior, trials, evaluate=False, plan=False, **options)
 
 
-BIAS = on_x("bias", lambda phi, action, context: phi, 0.5)
-DRIFT = on_x("drift", lambda phi, action, context: phi * context.index[:, None], 0.1)
-
-
 def test_trials_of_unknown_order_drift_nowhere():
-    made = measured(lambda xi: 0.8, effects=[BIAS, DRIFT], order="unknown")
+    bias = effect(prior=normal(0.5))
+    drift = on_outcomes(
+        "drift",
+        lambda x, phi, action, context: x + phi * context.index[:, None],
+        0.1,
+        needs_order=True,
+    )
+    made = measured(lambda xi: 0.8, effects=[bias, drift], order="unknown")
     assert "SA526" in [w.code for w in made.warnings]
     assert "drift" not in made.probabilities
     assert made.verdict == "bias"

@@ -14,6 +14,7 @@ from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.mixture import WIDTHS
 from sbi_active.criticism.linear.screening import linear_models
 from sbi_active.criticism.misfit.verdict import Verdict, judge
+from tests.effects import added
 
 ACTION = torch.linspace(-2, 2, 12)[:, None]
 XI = ACTION[:, 0].double().numpy()
@@ -28,15 +29,7 @@ FAMILIES = {"curve": "dynamics", "wave": "dynamics", "kink": "measurement"}
 
 
 def effect(name: str) -> Effect:
-    shape = SHAPES[name]
-    return Effect(
-        name,
-        hook="observation",
-        family=FAMILIES[name],
-        prior=Normal(0.0, 1.0),
-        null=0.0,
-        apply=lambda x, phi, action, context: x + phi * shape(action),
-    )
+    return added(name, SHAPES[name], family=FAMILIES[name])
 
 
 def measured(*, seed: int = 0, further: torch.Tensor | float = 0.0, **phi: float):

@@ -1,10 +1,34 @@
-"""Draws of models that the trials refute."""
+"""What refutes a verdict: errors left out, held out, and of single trials."""
+
+import math
 
 import numpy as np
 import pytest
+import torch
+from sbi.utils import BoxUniform
+from scipy.stats import norm
 
-from sbi_active.criticism.misfit.contrary import widened
-from sbi_active.criticism.results import Estimate, Evidence, ModelKey, Tracing
+from sbi_active import AutocorrelatedNoise, GaussianNoise, SimulatorModel
+from sbi_active.criticism import Effect, Trials, close_loop
+from sbi_active.criticism.misfit.contrary import unless_refuted, widened
+from sbi_active.criticism.misfit.evaluation import evaluate_held_out
+from sbi_active.criticism.misfit.record import traced
+from sbi_active.criticism.results import NONE, Estimate, Evidence, ModelKey, Tracing
+from sbi_active.criticism.steps.missed_trials import outlying_trials
+from tests.criticism.misfit.oscillator import EFFECTS, MODEL, PRIOR
+from tests.criticism.misfit.oscillator import trials as oscillations
+from tests.criticism.report.reports import misfit
+from tests.criticism.report.reports import tracing as reported
+from tests.criticism.steps.linear_world import (
+    ACTION,
+    NOISE,
+    columns,
+    judged,
+    measured,
+    posterior,
+    rivals,
+)
+from tests.effects import autocorrelated, half
 
 RNG = np.random.default_rng(0)
 
@@ -83,3 +107,192 @@ def test_draws_stay_within_the_prior_and_estimates_follow_them():
     assert told.mean == pytest.approx(draws[:, 1:].mean(0))
     assert told.sd == pytest.approx(draws[:, 1:].std(0))
     assert told.sd > 1.2 * estimate.sd
+
+
+# What a verdict rests on
+
+
+def verdict(left_out, held_out=(None, None), **options):
+    """A verdict of models that miss, with errors of the bare one and with drag."""
+    found = misfit(left_out, held_out, **options)
+    made = reported("unexplained", chosen=("drag",), beside=("drag",), misfit=found)
+    return unless_refuted(made, None)
+
+
+@pytest.mark.parametrize(
+    ("left_out", "held_out", "where"),
+    [
+        ((1.45, 1.47), (None, None), "left-out trials"),
+        ((1.45, 1.47), (0.31, 0.3), "left-out trials"),
+        ((1.45, 1.2), (0.31, 5.2), "held-out trials"),
+    ],
+)
+def test_what_raises_an_error_that_is_printed_does_not_help(left_out, held_out, where):
+    made = verdict(left_out, held_out)
+    assert (made.verdict, made.chosen) == ("unexplained", ())
+    assert made.misfit.helps == ()
+    assert made.refuted_on == where
+
+
+def test_channels_count_in_sensor_deviations():
+    # Position in meters falls by half, a force in newtons rises by a tenth.
+    errors = np.array([0.2, 30.0]), np.array([0.1, 33.0])
+    fine, coarse = (0.001, 10.0), (0.1, 1.0)
+    assert verdict(errors, sensor=fine).chosen
+    made = verdict(errors, sensor=coarse)
+    assert not made.chosen
+    assert made.refuted_on == "left-out trials in sensor deviations"
+
+
+# Fitted trials that err far more than the others, where every model misses
+
+
+def test_one_that_errs_ten_times_as_much_is_named():
+    squares = np.random.default_rng(0).chisquare(20, 10)
+    squares[4] = 100 * np.median(squares)
+    ((place, times),) = outlying_trials([*squares])
+    assert place == 4
+    assert times == pytest.approx(10, rel=0.1)
+
+
+def test_ordinary_trials_are_rarely_named():
+    rng = np.random.default_rng(1)
+    named = 0
+    for _ in range(1_000):
+        spread = 100 * np.exp(rng.normal(0, 1, 10))  # as errors of misfit differ
+        named += bool(outlying_trials([*spread]))
+    # A hundredth, and its standard error at 1,000 sets is .003.
+    assert named / 1_000 < 0.02
+
+
+def test_few_trials_do_not_show_how_errors_differ():
+    assert outlying_trials([1.0, 1.0, 1.0, 1e6]) == []
+
+
+# Held-out trials far outside what a verdict's model predicts, and no others
+
+
+SENSOR = 0.005
+SPEEDS = torch.tensor([1.0, 2.5, 1.5, 3.0, 2.0, 0.75, 2.75, 1.25, 2.25, 1.75])
+ROLE = ["fit"] * 6 + ["held out"] * 4
+
+
+def stop(theta, action, *, drag=0.0):
+    """Return the way of a block that slides to rest, without one beyond 9 m/s."""
+    drag = torch.as_tensor(drag)[..., None].clamp(min=1e-6)
+    way = torch.log1p(drag * action**2 / (9.81 * theta)) / (2 * drag)
+    return torch.where(action > 9, torch.nan, way)
+
+
+def slid(*, drag=0.0, seed=0):
+    gen = torch.Generator().manual_seed(seed)
+    x = stop(torch.full((10, 1), 0.4), SPEEDS[:, None], drag=torch.full((10,), drag))
+    return x + SENSOR * torch.randn(10, 1, generator=gen)
+
+
+def report_of(x, *, action=SPEEDS, noise=SENSOR, seed=0, **changes):
+    model = SimulatorModel(stop, noise=GaussianNoise(noise))
+    prior = BoxUniform(torch.tensor([0.1]), torch.tensor([1.0]))
+    trials = Trials(action, x, role=ROLE, **changes)
+    drag = Effect.keyword("drag", prior=half())
+    return close_loop(model, prior, trials, effects=[drag], seed=seed, plan=False)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    some = rivals(measured(curve=0.5))
+    return traced(judged(some), None)
+
+
+@pytest.mark.parametrize("drag", [0.0, 0.3])
+def test_a_trial_in_another_unit_is_named_first(drag):
+    x = slid(drag=drag)
+    x[7] *= 100
+    report = report_of(x)
+    line = str(report).splitlines()[0]
+    assert report.verdict == ("drag" if drag else NONE)
+    assert line.endswith("; held-out trial 7 is far outside it")
+    (missed,) = report.evaluation.missed
+    size = float((x[7] - x[7] / 100) / SENSOR)
+    assert missed.size == pytest.approx(size, rel=0.01)
+    assert missed.by_both
+    assert "SA514" in [w.code for w in report.warnings]
+
+
+def test_the_level_is_that_of_all_held_out_trials(fitted):
+    tracing, some = fitted
+    trials = Trials(ACTION, measured(curve=0.5, seed=1))
+    named = evaluate_held_out(some, tracing, trials, level=12 * 0.9).missed
+    assert 6 <= len(named) <= 12
+    assert [*named] == sorted(named, key=lambda trial: -trial.size)
+
+
+def test_correlated_errors_are_no_contradiction():
+    times = torch.linspace(0.05, 2.0, 40)
+    noise = AutocorrelatedNoise(0.05, correlation_time=1.0)
+    model = SimulatorModel(
+        lambda theta, action: theta * action * torch.ones(40),
+        noise=noise,
+        sample_times=times,
+    )
+    rho, named = float(np.exp(-0.05)), 0
+    for seed in range(3):
+        gen = torch.Generator().manual_seed(seed)
+        e = autocorrelated(torch.randn(10, 40, generator=gen), rho)
+        action = torch.linspace(-1, 1, 10)[:, None]
+        x = 0.5 * action + 0.05 * e
+        prior = BoxUniform(-torch.ones(1), torch.ones(1))
+        trials = Trials(action, x, role=ROLE, sample_times=times)
+        named += len(close_loop(model, prior, trials, plan=False).evaluation.missed)
+    assert named == 0
+
+
+def test_a_measurement_where_the_model_has_none_is_named():
+    x, action = slid(), SPEEDS.clone()
+    action[8] = 12.0
+    report = report_of(x, action=action)
+    (missed,) = report.evaluation.missed
+    assert (missed.name, missed.size) == ("8", math.inf)
+    assert "measured where the model is sure of no measurement" in report.warnings[0]
+
+
+def test_errors_under_misfit_are_compared_with_those_of_left_out_trials():
+    action = torch.linspace(0.5, 2.0, 12, dtype=torch.float64)[:, None]
+    every = oscillations(lag=0.06, hidden=0.1, action=action)
+    role = ["fit", "fit", "held out"] * 4
+    for factor, names in ((1.0, []), (100.0, ["5"])):
+        x = every.x.clone()
+        x[5] *= factor
+        trials = Trials(action, x, role=role, sample_times=every.sample_times)
+        report = close_loop(MODEL, PRIOR, trials, effects=EFFECTS, plan=False)
+        assert report.tracing.misfit is not None
+        assert [trial.name for trial in report.evaluation.missed] == names
+
+
+def test_what_no_model_predicts_refutes_none(fitted):
+    tracing, some = fitted
+    x = measured(curve=0.5, seed=1)
+    mean, _ = posterior(measured(curve=0.5), ("curve",))
+    x[0] += 1e4 if columns(("curve",))[0, 2] * mean[2] < 0 else -1e4  # nearer the bare
+    evaluation = evaluate_held_out(some, tracing, Trials(ACTION, x))
+    rmse = evaluation.table.set_index("metric").loc["rmse"]
+    assert rmse["after"] > rmse["before"]
+    assert [trial.position for trial in evaluation.missed if trial.by_both] == [0]
+    assert unless_refuted(tracing, evaluation).verdict == "curve"
+
+
+def test_trials_that_agree_are_not_named():
+    told = [report_of(slid(drag=d, seed=s)).evaluation for d, s in ((0, 1), (0.3, 2))]
+    assert not any(evaluation.missed for evaluation in told)
+
+
+def test_the_tail_is_that_of_the_normal_predictive(fitted):
+    tracing, some = fitted
+    x = measured(curve=0.5, seed=1)
+    x[5] = x[5] + 0.8
+    (missed,) = evaluate_held_out(some, tracing, Trials(ACTION, x)).missed
+    mean, covariance = posterior(measured(curve=0.5), ("curve",))
+    design = columns(("curve",))[5]
+    sd = np.sqrt(design @ covariance @ design + NOISE**2)
+    z = abs(float(x[5]) - design @ mean) / sd
+    assert np.log(missed.p_value) == pytest.approx(np.log(2 * norm.sf(z)), rel=0.2)

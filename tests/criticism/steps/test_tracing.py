@@ -1,26 +1,33 @@
-"""Probabilities and verdicts, against the exact evidences of a linear world."""
+"""Probabilities, verdicts and scores, against the closed forms of a linear world."""
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 import pytest
 import torch
-from torch.distributions import Normal
+from scipy.stats import norm
 
-from sbi_active.criticism import Effect
+from sbi_active.criticism import Trials
+from sbi_active.criticism.evidence.rival_set import RivalSet
+from sbi_active.criticism.misfit.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.results import ModelKey
+from sbi_active.criticism.steps.predictive import find_residuals
 from sbi_active.criticism.steps.tracing import log_prior, log_priors
 from tests.criticism.steps import linear_world
 from tests.criticism.steps.linear_world import (
     ACTION,
     NOISE,
     SHAPES,
+    columns,
     effect,
     judged,
     measured,
+    posterior,
     rivals,
 )
+from tests.effects import added
 
 
 def tracing_of(x, **keywords):
@@ -114,14 +121,7 @@ def test_a_verdict_that_hangs_on_the_width_of_a_prior_is_not_robust(phi, robust)
 
 
 def test_effects_that_the_trials_do_not_separate_count_as_one():
-    twin = Effect(
-        "twin",
-        hook="observation",
-        family="dynamics",
-        prior=Normal(0.0, 1.0),
-        null=0.0,
-        apply=lambda x, phi, action, context: x + 0.5 * phi * (action**2 - 1),
-    )
+    twin = added("twin", lambda xi: 0.5 * (xi**2 - 1), family="dynamics")
     x = measured(curve=0.1, kink=0.28)
     group = frozenset({"curve", "twin"})
     found = judged(rivals(x, twin), [group])
@@ -144,3 +144,117 @@ def test_inclusion_and_the_credible_set_add_probabilities_up(kink):
     assert sum(p[n] for n in tracing.credible_set) == pytest.approx(max(sums))
     assert max(sums) >= 0.9
     assert max(sum(p[n] for n in names) for names in combinations(p, num - 1)) < 0.9
+
+
+# Sets of several effects, against all sets of a linear world
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_sets_of_several_effects_have_together_a_third_of_the_next_smaller(size):
+    prior = {"none": 0.6, "a": 0.1, "b": 0.2, "c": 0.05, "d": 0.05}
+    log_p = {name: float(np.log(p)) for name, p in prior.items()}
+    sets = combinations("abcd", size)
+    total = sum(np.exp(log_prior(names, log_p)) for names in sets)
+    assert total == pytest.approx(0.4 * 3.0 ** (1 - size))
+
+
+def test_a_name_may_contain_what_joins_names():
+    x = measured(curve=0.5, kink=0.6)
+    shapes = rivals(x).effects
+    renamed = [replace(e, name=f"{n} + {n} lag") for n, e in shapes.items()]
+    some = RivalSet(rivals(x).model, linear_world.PRIOR, Trials(ACTION, x), renamed)
+    tracing, _ = traced(judged(some), None)
+    assert tracing.chosen == ("curve + curve lag", "kink + kink lag")
+    assert tracing.model == "curve + curve lag + kink + kink lag"
+    assert tracing.inclusion["wave + wave lag"] < 0.2
+    assert not tracing.has_several("wave + wave lag")
+    assert tracing.has_several(tracing.model)
+
+
+# Residuals and scores on further trials, in closed form
+
+
+X = measured(curve=0.5)
+OTHERS = measured(curve=0.5, seed=1)
+
+
+def predictive(x, names, known=slice(None)):
+    """Return mean and deviation of a measurement at each of the twelve actions."""
+    mean, covariance = posterior(x, names, known)
+    design = columns(names)
+    variance = np.einsum("ni,ij,nj->n", design, covariance, design)
+    return design @ mean, np.sqrt(variance + NOISE**2)
+
+
+def crps(x, mean, sd):
+    """Return the energy score of a normal prediction of one number."""
+    z = (x - mean) / sd
+    return sd * (z * (2 * norm.cdf(z) - 1) + 2 * norm.pdf(z) - 1 / np.sqrt(np.pi))
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    some = rivals(X)
+    return traced(judged(some), None)
+
+
+def test_scores_before_and_after_are_those_of_the_normal_predictives(fitted):
+    tracing, some = fitted
+    made = evaluate_held_out(some, tracing, Trials(ACTION, OTHERS))
+    own = OTHERS[:, 0].double().numpy()
+    for scores, names in ((made.before, ()), (made.after, ("curve",))):
+        mean, sd = predictive(X, names)
+        inside = np.abs(own - mean) < 1.645 * sd
+        np.testing.assert_allclose(scores["rmse"], np.abs(own - mean), atol=0.02)
+        np.testing.assert_allclose(
+            scores["energy score"], crps(own, mean, sd), atol=0.02
+        )
+        np.testing.assert_allclose(
+            scores["log predictive density"], norm(mean, sd).logpdf(own), rtol=0.2
+        )
+        assert (scores["coverage"] != inside).sum() <= 1
+    assert made.scheme == "held out"
+    assert made.selected == 12 * ("curve",)
+
+
+def test_each_trial_is_predicted_from_the_others():
+    found = judged(rivals(X))
+    own = Trials(ACTION, X)
+    made = evaluate_left_out(found, found.models, own, num_draws=2000)
+    own = X[:, 0].double().numpy()
+    for scores, names in ((made.before, ()), (made.after, ("curve",))):
+        each = [predictive(X, names, np.arange(12) != t) for t in range(12)]
+        mean, sd = np.array([(m[t], s[t]) for t, (m, s) in enumerate(each)]).T
+        np.testing.assert_allclose(scores["rmse"], np.abs(own - mean), atol=0.02)
+        np.testing.assert_allclose(
+            scores["log predictive density"],
+            norm(mean, sd).logpdf(own),
+            rtol=0.2,
+            atol=0.1,
+        )
+    assert made.scheme == "leave one out"
+    assert made.selected == 12 * ("curve",)
+
+
+def test_errors_of_some_trials_are_those_of_a_verdict_on_them():
+    """A smooth function of the action is one of them; without it scatter took over."""
+    x, keep = measured(curve=0.1), np.arange(12) != 4
+    whole = judged(rivals(x)).states.joint(ModelKey(), keep)
+    part = judged(rivals(x[keep], action=ACTION[keep])).states.joint(ModelKey())
+    assert [*whole] == [*part]
+    for key, log_p in part.items():
+        assert whole[key] == pytest.approx(log_p, abs=0.3), key
+
+
+@pytest.mark.parametrize("names", [(), ("curve",)])
+def test_residuals_are_standardized_by_the_normal_predictive(fitted, names):
+    made = find_residuals(fitted[1], ModelKey(names))
+    mean, sd = predictive(X, names)
+    own = X[:, 0].double().numpy()
+    np.testing.assert_allclose(made.mean[:, 0], mean, atol=0.02)
+    np.testing.assert_allclose(made.sd[:, 0], sd, rtol=0.1)
+    np.testing.assert_allclose(
+        made.refitted[:, 0], (own - made.mean[:, 0]) / made.sd[:, 0], rtol=1e-6
+    )
+    assert made.noise == "declared"
+    assert made.correlation == 0

@@ -2,20 +2,57 @@
 
 from __future__ import annotations
 
+import math
 import pickle
+from collections.abc import Callable
 
 import pytest
 import torch
+from sbi.utils import BoxUniform
 from torch import Tensor
+from torch.distributions import Distribution, MultivariateNormal
 
 from sbi_active.inference import RefinementOptions, refine
 from sbi_active.inference.engine.learned import LearnedBelief
+from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.seeding import forked_generators
-from tests.inference.refinement.refined_worlds import BOX, draws, numerical, observe
+from sbi_active.tasks.numerical.exact import ExactPosterior
 from tests.oracles.judging import Found, judged
 from tests.oracles.problems import PROBLEMS
 from tests.oracles.reference import answers
 from tests.oracles.ways import trials_of
+
+BOX = BoxUniform(-5 * torch.ones(2), 5 * torch.ones(2))
+CURVES: dict[str, Callable[[Tensor], Tensor]] = {
+    "linear": lambda t: t,
+    "sinh": lambda t: 5 * torch.sinh(t / 2.5) / math.sinh(2),
+    "square": lambda t: t**2 / 2.5 - 5,
+    "sine": lambda t: 5 * torch.sin(1.5 * t),
+}
+
+
+def numerical(variant: str = "linear", noise: str = "gaussian"):
+    def simulator(theta: Tensor, action: Tensor) -> Tensor:
+        mean = CURVES[variant](theta[:, :1]) * torch.exp(3 - action)
+        mean = mean + theta[:, 1:] * action
+        if noise == "uniform":
+            return mean + math.sqrt(12) * (torch.rand_like(mean) - 0.5)
+        return mean + torch.randn_like(mean)
+
+    return simulator
+
+
+def observe(simulator, theta: Tensor, action: Tensor, seed: int) -> Tensor:
+    with forked_generators(seed):
+        return simulator(theta.double().expand(len(action), -1), action.double())
+
+
+def draws(belief: Distribution, num: int, seed: int = 0) -> Tensor:
+    with forked_generators(seed):
+        return belief.sample((num,))
+
+
+# Refined beliefs against closed forms, oracles and worlds that must be flagged
 
 
 @pytest.fixture(scope="module")
@@ -111,3 +148,126 @@ def test_draws_on_a_curved_ridge_are_not_a_few_heavy_ones(seed: int):
     belief = refine(simulator, own.prior, *trials_of(own), settings=settings, seed=seed)
     theta = belief.sample((5_000,)).double().numpy()
     assert judged(own, known, Found(theta=theta)).kl < 0.03
+
+
+# What a refinement takes: priors, outcomes, settings, earlier simulations
+
+
+def test_a_constant_channel_does_no_harm():
+    def simulator(theta: Tensor, action: Tensor) -> Tensor:
+        return torch.cat([numerical()(theta, action), torch.full_like(action, 3.0)], 1)
+
+    action = torch.tensor([[-5.0], [5.0]])
+    x = observe(simulator, torch.tensor([[-3.0, 1.0]]), action, 0)
+    belief = refine(simulator, BOX, action, x, seed=0)
+    exact = ExactPosterior(action.double(), x[:, :1])
+    theta = exact.sample(1_000, seed=0)
+    log_ratio = exact.log_prob(theta) - belief.log_prob(theta).double()
+    assert float(log_ratio.mean()) < 0.1
+    assert belief.diagnostics.trustworthy, belief.diagnostics.warnings
+
+
+def test_deterministic_simulator_is_refused():
+    with pytest.raises(ValueError, match="expected a simulator with noise"):
+        refine(
+            lambda theta, action: theta[:, :1] * action,
+            BOX,
+            torch.ones(1, 1),
+            torch.ones(1, 1),
+            seed=0,
+        )
+
+
+def test_a_lack_of_memory_is_said(monkeypatch):
+    def lacking(*_):
+        raise RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried")
+
+    monkeypatch.setattr("sbi_active.inference.refinement.refining._learned", lacking)
+    one = torch.ones(1, 1)
+    with pytest.raises(MemoryError, match="belief of 2 parameters; got none left"):
+        refine(numerical().__call__, BOX, one, one, seed=0)
+
+
+# Refined beliefs of many parameters against closed forms
+
+
+def refined(dim: int, num: int, seed: int, num_histories: int):
+    """Return (KL(exact, belief), belief) of a trial of x = A theta + .5 e."""
+    with forked_generators(seed):
+        weight = torch.randn(num, dim) / dim**0.5
+        x = torch.randn(1, dim) @ weight.T + 0.5 * torch.randn(1, num)
+
+    def simulator(theta: Tensor, action: Tensor) -> Tensor:
+        return theta @ weight.T + 0.5 * torch.randn(len(theta), num)
+
+    prior = MultivariateNormal(torch.zeros(dim), torch.eye(dim))
+    settings = RefinementOptions(num_histories=num_histories, num_effective=75)
+    belief = refine(
+        simulator, prior, torch.zeros(1, 1), x, settings=settings, seed=seed
+    )
+    design = weight.double()
+    precision = torch.eye(dim).double() + design.T @ design / 0.25
+    mean = torch.linalg.solve(precision, design.T @ x[0].double() / 0.25)
+    exact = MultivariateNormal(mean, precision_matrix=precision)
+    with forked_generators(0):
+        theta = exact.sample(torch.Size([2_000]))
+    log_ratio = exact.log_prob(theta) - belief.log_prob(theta.float()).double()
+    return float(log_ratio.mean()), belief
+
+
+def test_twenty_parameters():
+    divergence, _ = refined(20, 2, seed=0, num_histories=200)
+    assert -0.02 < divergence < 0.3
+
+
+@pytest.mark.parametrize(("num", "num_histories"), [(2, 600), (80, 400)])
+def test_trust_follows_the_error_and_not_the_dimension(num: int, num_histories: int):
+    divergence, belief = refined(10, num, seed=1, num_histories=num_histories)
+    diagnostics = belief.diagnostics
+    assert diagnostics.error_nats == pytest.approx(divergence, rel=0.7, abs=0.05)
+    assert diagnostics.trustworthy == (diagnostics.error_nats < 0.1)
+    # What is off by more than a tenth of a nat is not to be trusted; the estimate of it
+    # errs by a third.
+    if not 0.07 < divergence < 0.15:
+        assert diagnostics.trustworthy == (divergence < 0.1)
+
+
+def refine_two_of(dim: int):
+    """Return the belief of many parameters, of which a trial tells of two."""
+    prior = BoxUniform(torch.zeros(dim), torch.ones(dim))
+
+    def simulator(theta: Tensor, action: Tensor) -> Tensor:
+        return theta[:, :2] + 0.5 * torch.randn(len(theta), 2)
+
+    settings = RefinementOptions(num_histories=200, num_effective=25)
+    x = torch.full((1, 2), 0.5)
+    return refine(simulator, prior, torch.zeros(1, 1), x, settings=settings, seed=0)
+
+
+def test_too_few_histories_are_no_unexplained_outcome():
+    with pytest.raises(ValueError, match=r"at least 342 histories for 150") as error:
+        refine_two_of(150)
+    assert not isinstance(error.value, UnexplainedOutcomeError)
+
+
+# Tail probabilities of the observations are those of further simulations
+
+
+@pytest.mark.parametrize("lost", [0, 30])
+def test_many_correlated_numbers_of_the_right_simulator_are_not_unlike_it(lost):
+    def simulator(theta, action):
+        noise = torch.randn(len(theta), 150).cumsum(1) / 10
+        return theta * action + noise
+
+    prior = MultivariateNormal(torch.zeros(1), torch.eye(1))
+    tails = []
+    for seed in range(3):
+        torch.manual_seed(seed)
+        x = simulator(prior.sample((1,)), torch.ones(1, 1))
+        x[:, torch.randperm(150)[:lost]] = torch.nan
+        settings = RefinementOptions(num_histories=300, num_effective=25)
+        belief = refine(
+            simulator, prior, torch.ones(1, 1), x, settings=settings, seed=seed
+        )
+        tails.append(belief.diagnostics.tail_probability)
+    assert min(tails) > 0.01

@@ -11,13 +11,14 @@ import cloudpickle
 import pytest
 import sbi.neural_nets
 import torch
-from sbi.inference import NLE_A, NPE_C, NRE_B, NRE_C
+from sbi.inference import NLE_A, NPE_C, NRE_B, NRE_C, DirectPosterior
 from sbi.inference.trainers._contracts import StartIndexContext, TrainConfig
 from sbi.inference.trainers.npe.npe_base import PosteriorEstimatorTrainer
 from sbi.neural_nets import posterior_nn
 from sbi.utils import BoxUniform, RestrictedPrior
 
 from sbi_active import ALHI, ASBI, SeqBED, SeqBED_B, simulate
+from sbi_active.inference import ActionEmbedding
 from sbi_active.inference.trainers.action_rounds import SilentTracker
 
 # A worker cannot import a test module.
@@ -175,19 +176,50 @@ def test_contracts_of_sbi():
 
 
 @pytest.mark.filterwarnings("ignore:.*Maximum number of epochs")
-@pytest.mark.parametrize("trainer", [*PARENTS][1:])
-def test_without_actions_two_rounds_are_numerically_sbi_s(trainer):
-    nets = []
+@pytest.mark.parametrize(
+    ("trainer", "estimator"),
+    [(ASBI, "mdn"), (ASBI, "maf"), *((t, None) for t in [*PARENTS][1:])],
+)
+def test_without_actions_two_rounds_are_numerically_sbi_s(trainer, estimator):
+    runs = []
     for cls in (trainer, PARENTS[trainer]):
         torch.manual_seed(1)
-        inference = cls(PRIOR, tracker=SilentTracker(), show_progress_bars=False)
+        given = () if estimator is None else (estimator,)
+        quiet = {"tracker": SilentTracker(), "show_progress_bars": False}
+        inference, proposal = cls(PRIOR, *given, **quiet), PRIOR
         for index in range(2):
-            theta = PRIOR.sample((300,))
+            theta = proposal.sample((300,))
             x = theta + 0.1 * torch.randn_like(theta)
-            inference.append_simulations(theta, x, from_round=index)
+            told = {"proposal": proposal} if given else {"from_round": index}
+            inference.append_simulations(theta, x, **told)
             net = inference.train(max_num_epochs=2, training_batch_size=50)
-        nets.append((net.state_dict(), inference.summary["validation_loss"]))
-    (ours, our_loss), (theirs, their_loss) = nets
+            if given:  # the next round is of the posterior
+                proposal = inference.build_posterior().set_default_x(torch.zeros(1, 1))
+        runs.append((net.state_dict(), inference.summary["validation_loss"], proposal))
+    (ours, our_loss, own), (theirs, their_loss, other) = runs
     assert our_loss == their_loss
     assert ours.keys() == theirs.keys()
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+    if estimator is not None:
+        assert type(own) is DirectPosterior
+        drawn = []
+        for posterior in (own, other):
+            torch.manual_seed(2)
+            drawn.append((posterior.log_prob(theta[:10]), posterior.sample((5,))))
+        assert all(torch.equal(*pair) for pair in zip(*drawn, strict=True))
+
+
+def test_embedding_sees_x_in_its_own_shape():
+    seen = []
+
+    class Net(torch.nn.Module):
+        def forward(self, x):
+            seen.append(x.shape)
+            return x.flatten(1).sum(1, keepdim=True)
+
+    embedding = ActionEmbedding(Net(), x_shape=(1, 4, 4), action_dim=2)
+    out = embedding(torch.ones(3, 18))
+    assert seen == [(3, 1, 4, 4)]
+    assert out.tolist() == [[16.0, 1.0, 1.0]] * 3
+    with pytest.raises(ValueError, match="expected a packed condition of 18 numbers"):
+        embedding(torch.ones(3, 17))

@@ -1,15 +1,19 @@
-"""Rounds with actions: Algorithm 1."""
+"""ASBI: rounds with actions, Algorithm 1, and updates from the original prior."""
 
 import pickle
+import re
+import warnings
 
 import pytest
 import torch
 from sbi.neural_nets import posterior_nn
 from sbi.utils import BoxUniform, RestrictedPrior, get_density_thresholder
-from torch.distributions import Distribution
+from torch.distributions import Distribution, MultivariateNormal
 
-from sbi_active import ASBI, Belief, MixtureDensity
+from sbi_active import ASBI, Belief, MixtureDensity, RefinementOptions
 from sbi_active.inference import ActionEmbedding, ActionPosterior
+from sbi_active.inference.beliefs.belief import compare
+from sbi_active.inference.rounds.rows import Observation
 from tests.linear_gaussian import DIM, PRIOR, moments, simulator
 
 SMALL = MixtureDensity(hidden_features=(32, 32), num_components=2, num_iterations=600)
@@ -17,13 +21,13 @@ QUICK = MixtureDensity(hidden_features=(8,), num_iterations=20)
 BOX = BoxUniform(-2 * torch.ones(DIM), 2 * torch.ones(DIM))
 
 
-def rows(n=1_000, prior=PRIOR):
+def rows_of(n=1_000, prior=PRIOR):
     theta, action = prior.sample((n,)), 3 * torch.rand(n, 1)
     return theta, simulator(theta, action), action
 
 
 def trained(density_estimator=SMALL, prior=PRIOR, n=1_000, data=None, **train):
-    theta, x, action = rows(n, prior) if data is None else data
+    theta, x, action = rows_of(n, prior) if data is None else data
     inference = ASBI(prior, density_estimator, show_progress_bars=False)
     inference.append_simulations(theta, x, action=action).train(**train)
     return inference
@@ -32,7 +36,7 @@ def trained(density_estimator=SMALL, prior=PRIOR, n=1_000, data=None, **train):
 def test_the_posterior_meets_the_closed_form_at_every_action():
     settings = MixtureDensity(hidden_features=(32, 32), num_iterations=600)
     posterior = trained(settings, n=4_000).build_posterior()
-    theta, x, action = rows(4_000)
+    theta, x, action = rows_of(4_000)
     mean, variance = moments(x, action)
     exact = torch.distributions.Normal(mean, variance.sqrt()).log_prob(theta).sum(1)
     gap = exact - posterior.log_posterior(theta, x, action)
@@ -68,7 +72,7 @@ def test_two_rounds_chain_to_the_exact_posterior():
 
 
 def test_invalid_rows_are_kept_by_ours_and_dropped_for_sbi_s():
-    theta, x, action = rows(1_500)
+    theta, x, action = rows_of(1_500)
     x[theta[:, 0] > 1] = torch.nan
     inference = ASBI(PRIOR, SMALL)
     inference.append_simulations(theta, x, action=action).train()
@@ -91,7 +95,7 @@ def test_invalid_rows_are_kept_by_ours_and_dropped_for_sbi_s():
 
 def test_the_posterior_takes_outcomes_without_a_measurement():
     """x is missing where theta_1 > 1, its second number alone where theta_2 > 1."""
-    theta, x, action = rows(3_000)
+    theta, x, action = rows_of(3_000)
     complete = x.clone()
     x[theta[:, 0] > 1] = torch.nan
     x[theta[:, 1] > 1, 1] = torch.nan
@@ -112,8 +116,8 @@ def test_the_posterior_takes_outcomes_without_a_measurement():
     assert torch.allclose(batch, single, atol=1e-4)
     best = posterior.map(num_iter=5, num_to_optimize=5, **at[2])
     assert float(best.reshape(-1)[0]) > 0.5
-    # the same network, had it seen complete rows alone, says so
-    data = tuple(rows[:300] for rows in (theta, complete, action))
+    # the same network, had it seen complete rows_of alone, says so
+    data = tuple(rows_of[:300] for rows_of in (theta, complete, action))
     other = trained(QUICK, data=data).build_posterior()
     with pytest.warns(UserWarning, match="has never seen an outcome like this"):
         other.sample((2,), **at[2])
@@ -183,7 +187,7 @@ def test_action_posterior_offers_what_sbi_s_do():
 
 
 def test_truncated_proposals_of_the_belief_pass_and_others_do_not():
-    theta, x, action = rows(200, BOX)
+    theta, x, action = rows_of(200, BOX)
     inference = trained(QUICK, prior=BOX)
     packed = inference.build_posterior().packed()
     packed.set_default_x(torch.tensor([[0.0, 0.0, 1.0]]))
@@ -191,3 +195,166 @@ def test_truncated_proposals_of_the_belief_pass_and_others_do_not():
     inference.append_simulations(theta, x, proposal=restricted, action=action)
     with pytest.raises(ValueError, match="expected proposal to be the belief"):
         inference.append_simulations(theta, x, proposal=packed, action=action)
+
+
+# Bad input gets a clear error that says what to do
+
+
+UNIT = BoxUniform(-torch.ones(2), torch.ones(2))
+SMALLEST = MixtureDensity(hidden_features=(8,), num_iterations=10)
+
+
+def unit_rows(n=50):
+    theta = UNIT.sample((n,))
+    return theta, theta + 0.1 * torch.randn(n, 2), torch.rand(n, 1)
+
+
+def with_round():
+    theta, x, action = unit_rows()
+    inference = ASBI(UNIT, SMALLEST, show_progress_bars=False)
+    return inference.append_simulations(theta, x, action=action)
+
+
+def raises(text, error=ValueError):
+    return pytest.raises(error, match=re.escape(text))
+
+
+def test_rounds_with_and_without_action_do_not_mix():
+    theta, x, action = unit_rows()
+    with raises("expected action=, since belief= was given"):
+        ASBI(UNIT).append_simulations(theta, x, belief=UNIT)
+    inference = ASBI(UNIT, "mdn").append_simulations(theta, x)
+    with raises("start a new ASBI(prior) for rounds with actions"):
+        inference.append_simulations(theta, x, action=action)
+
+
+def test_what_a_trained_round_refuses():
+    inference = with_round()
+    with raises("expected a network trained under the current belief", RuntimeError):
+        inference.update(torch.zeros(2), action=torch.zeros(1))
+    with raises("expected a network trained under the current belief", RuntimeError):
+        inference.build_posterior()
+    with raises("expected resume_training after train() on the same rows"):
+        inference.train(resume_training=True)
+    inference.train()
+    with raises("expected action of shape (1, 1) or (1,); got (3,)"):
+        inference.update(torch.zeros(2), action=torch.zeros(3))
+    with raises("expected one outcome; got 2 rows"):
+        inference.update(torch.zeros(2, 2), action=torch.zeros(1))
+    posterior = inference.build_posterior()
+    with raises("expected x= and action= together; got x without action"):
+        posterior.sample((3,), x=torch.zeros(2))
+    with raises("expected x= and action= together; got neither"):
+        posterior.map()
+    inference.update(torch.zeros(2), action=torch.zeros(1))
+    with raises("append simulations of the belief with action=", RuntimeError):
+        inference.update(torch.zeros(2), action=torch.zeros(1))
+
+
+# Updates with a simulator: the posterior of all trials from the original prior
+
+
+TRIALS = [
+    Observation(torch.tensor([2.0]), torch.tensor([1.0, -1.5])),
+    Observation(torch.tensor([1.0]), torch.tensor([0.2, 0.1])),
+    Observation(torch.tensor([3.0]), torch.tensor([1.2, -2.0])),
+]
+REFINEMENT = RefinementOptions(num_histories=600)
+COST = 0.1  # nats: four times what 600 noisy histories cost in the mean of 24 seeds
+
+
+def exact(trials):
+    """Precision 1 + sum a^2, mean sum a x / precision."""
+    precision = 1 + sum(t.action**2 for t in trials)
+    mean = sum(t.action * t.x for t in trials) / precision
+    return MultivariateNormal(mean, torch.eye(2) / precision)
+
+
+def divergence(belief, truth):
+    theta = truth.sample((4_000,))
+    return float((truth.log_prob(theta) - belief.log_prob(theta)).mean())
+
+
+def test_errors_of_a_chained_belief_do_not_stay():
+    """A wrong belief in between: chained it would stay, refined it is gone."""
+    wrong = MultivariateNormal(torch.tensor([2.0, 2.0]), 0.01 * torch.eye(2))
+    inference = ASBI(PRIOR, MixtureDensity(hidden_features=(16,), num_iterations=100))
+    theta, action = wrong.sample((500,)), 3 * torch.rand(500, 1)
+    x = simulator(theta, action)
+    inference.append_simulations(theta, x, action=action, belief=wrong).train()
+    trial = TRIALS[0]
+    belief = inference.update(
+        trial.x, action=trial.action, simulator=simulator, refinement=REFINEMENT, seed=0
+    )
+    assert divergence(belief, exact(TRIALS[:1])) < COST
+    assert belief.diagnostics.chained_loss > 5
+
+
+def test_update_all_starts_from_scratch_and_order_does_not_matter():
+    inference = ASBI(PRIOR)
+    inference.update(torch.ones(2), action=torch.ones(1), simulator=simulator, seed=0)
+    beliefs = [
+        inference.update_all(trials, simulator, refinement=REFINEMENT, seed=1)
+        for trials in (TRIALS, TRIALS[::-1])
+    ]
+    assert inference.trials == TRIALS[::-1]
+    for belief in beliefs:
+        assert divergence(belief, exact(TRIALS)) < COST
+
+
+def hides(theta, action):
+    """No measurement where the first parameter is above .5."""
+    return torch.where(theta[:, :1] > 0.5, torch.nan, simulator(theta, action))
+
+
+def test_invalid_trials_count_whatever_their_place():
+    """Known to 1 / sqrt(15) around .35 by measurements; above .5, by one without."""
+    measured = [Observation(t.action, torch.tensor([0.4, -0.7])) for t in TRIALS[:1]]
+    invalid = Observation(torch.tensor([1.0]), torch.full((2,), torch.nan))
+    # Contradictory but for chance: measurements say below .5, the other above.
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        inference = ASBI(PRIOR)
+        belief = inference.update_all([invalid], hides, seed=0)
+    # .988 in the mean of ten seeds: who measures is regressed as well.
+    assert float((belief.sample((2_000,))[:, 0] > 0.5).float().mean()) > 0.975
+    for trials in ([invalid, *measured], [*measured, invalid]):
+        both = inference.update_all(trials, hides, refinement=REFINEMENT, seed=0)
+        assert not both.diagnostics.trustworthy  # no parameter explains both
+
+
+class _Network:
+    """A stand-in for a chained belief: the exact posterior, scaled and moved."""
+
+    def __init__(self, spread, shift=0.0):
+        mean, cov = exact(TRIALS).mean, exact(TRIALS).covariance_matrix
+        self.normal = MultivariateNormal(mean + shift, spread**2 * cov)
+
+    def sample(self, shape):
+        return self.normal.sample(shape)
+
+    def log_prob(self, theta):
+        return self.normal.log_prob(theta)
+
+
+@pytest.mark.parametrize(
+    ("network", "kind"),
+    [
+        (_Network(6.0), "under-confident"),
+        (_Network(0.2), "overconfident"),
+        (_Network(1.0, shift=1.0), "misplaced"),
+        (_Network(1.1), None),
+    ],
+)
+def test_a_blunt_and_an_overconfident_network_are_told_apart(network, kind):
+    """Blunt by a factor 6 in two dimensions: 2 log 6 = 3.6 nats of entropy."""
+    belief = ASBI(PRIOR).update_all(TRIALS, simulator, refinement=REFINEMENT, seed=0)
+    compare(belief, network)
+    warnings = belief.diagnostics.network_warnings
+    if kind is None:
+        assert not warnings
+    else:
+        assert kind in warnings[0]
+    if kind == "under-confident":
+        expected = 2 * torch.tensor(6.0).log()
+        assert abs(belief.diagnostics.chained_bluntness - expected) < 0.3

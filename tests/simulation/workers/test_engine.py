@@ -165,15 +165,6 @@ def test_an_interrupted_simulation_keeps_what_is_finished(rows):
     assert torch.equal(resumed.x, expected)
 
 
-@pytest.fixture
-def _interruptible():
-    """A shell's background jobs ignore SIGINT, and tests may be one."""
-    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, handler)
-
-
-@pytest.mark.usefixtures("_interruptible")
 def test_an_interrupt_ends_the_workers(rows):
     def simulator(theta, action, seeds):
         time.sleep(0.02 if theta[0] < 0.9 else 30)

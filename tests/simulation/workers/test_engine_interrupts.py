@@ -1,10 +1,7 @@
 """What an interrupt costs in this process: about a second, and what cutting costs."""
 
 import gc
-import pickle
 import signal
-import subprocess
-import sys
 import time
 
 import pytest
@@ -12,81 +9,52 @@ import torch
 
 from sbi_active import SimulatorModel, simulate
 from sbi_active.seeding import row_normals
-from sbi_active.simulation import Outcome
+from sbi_active.simulation import Outcome, SimulationInterrupted
 from sbi_active.simulation.workers.schedule import Pace, pace_of
 
-SCRIPT = """
-import pickle, sys, time, torch
-from sbi_active import SimulatorModel, simulate
-from sbi_active.seeding import row_normals
-from sbi_active.simulation import SimulationInterrupted
 
-def seeded(theta, action, seeds):
-    time.sleep(0.002 * len(theta))
-    return theta + row_normals(seeds, 1).float()
-
-def blocks(theta, action):
-    time.sleep(0.002 * len(theta))
-    return theta + torch.randn_like(theta)
-
-def row(theta, action, rng):
-    time.sleep(0.002)
-    return theta + rng.normal(size=1)
-
-simulator = {
-    "seeded": seeded, "blocks": blocks, "row": SimulatorModel(row, batched=False)
-}[sys.argv[1]]
-theta = torch.rand(20_000, 1, generator=torch.Generator().manual_seed(0))
-print("ready", flush=True)
-try:
-    simulate(simulator, theta, torch.zeros_like(theta), seed=3)
-except SimulationInterrupted as error:
-    rows = error.simulations
-    with open(sys.argv[2], "wb") as file:
-        pickle.dump((rows.theta, rows.x, rows.status), file)
-"""
-
-
-def expected_rows(kind, theta):
-    def blocks(theta, action):
-        return theta + torch.randn_like(theta)
+def made(kind, spend=lambda num: None):
+    """Return a simulator of a kind that spends time on each call's rows."""
 
     def seeded(theta, action, seeds):
+        spend(len(theta))
         return theta + row_normals(seeds, 1).float()
 
-    row = SimulatorModel(
-        lambda theta, action, rng: theta + rng.normal(size=1), batched=False
-    )
-    simulator = {"seeded": seeded, "blocks": blocks, "row": row}[kind]
-    return simulate(simulator, theta, torch.zeros_like(theta), seed=3).x
+    def blocks(theta, action):
+        spend(len(theta))
+        return theta + torch.randn_like(theta)
+
+    def row(theta, action, rng):
+        spend(1)
+        return theta + rng.normal(size=1)
+
+    if kind == "row":
+        return SimulatorModel(row, batched=False)
+    return {"seeded": seeded, "blocks": blocks}[kind]
 
 
-SLOW = pytest.mark.slow
+@pytest.mark.parametrize("kind", ["seeded", "blocks", "row"])
+def test_an_interrupt_in_the_default_setting_keeps_finished_rows(kind):
+    begun = []
 
+    def spend(num):
+        begun.append(num)
+        if sum(begun) > 1_000:  # after a second of 20
+            signal.raise_signal(signal.SIGINT)
+        time.sleep(0.001 * num)
 
-@pytest.mark.parametrize(
-    "kind",
-    ["seeded", pytest.param("blocks", marks=SLOW), pytest.param("row", marks=SLOW)],
-)
-def test_an_interrupt_in_the_default_setting_keeps_finished_rows(kind, tmp_path):
-    script, out = tmp_path / "script.py", tmp_path / "rows.pickle"
-    script.write_text(SCRIPT)
-    process = subprocess.Popen(
-        [sys.executable, script, kind, out],
-        stdout=subprocess.PIPE,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    )
-    assert process.stdout.readline() == b"ready\n"
-    time.sleep(2.0)  # of some 40
-    process.send_signal(signal.SIGINT)
-    assert process.wait(10) == 0
-    process.stdout.close()
-    theta, x, status = pickle.loads(out.read_bytes())
-    finished = status == Outcome.OK
-    assert finished.sum() >= 200  # of some 1,200, on a busy machine fewer
-    assert (status[~finished] == Outcome.MISSING).all()
-    assert x[~finished].isnan().all()
-    assert torch.equal(x[finished], expected_rows(kind, theta)[finished])
+    theta = torch.rand(20_000, 1, generator=torch.Generator().manual_seed(0))
+    with pytest.raises(SimulationInterrupted) as raised:
+        simulate(made(kind, spend), theta, torch.zeros_like(theta), seed=3)
+    rows = raised.value.simulations
+    finished = rows.status == Outcome.OK
+    assert sum(begun) - finished.sum() < 1_600  # of some 1,000 a second
+    assert finished.sum() > 200
+    assert (rows.status[~finished] == Outcome.MISSING).all()
+    assert rows.x[~finished].isnan().all()
+    assert torch.equal(rows.theta, theta)
+    expected = simulate(made(kind), theta, torch.zeros_like(theta), seed=3).x
+    assert torch.equal(rows.x[finished], expected[finished])
 
 
 def sizes_of(seconds, num_rows, pace):

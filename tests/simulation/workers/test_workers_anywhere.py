@@ -17,12 +17,13 @@ theta = torch.rand(20, 1)
 def simulator(theta, action, seeds):
     return theta * scale
 
-def go(shift=0.0):
+def go(shift=None):
     x = simulate(simulator, theta, theta, seed=0, workers=2).x
     assert torch.equal(x, theta * 2)
-    shifted = lambda theta, action, seeds: theta + shift
-    x = simulate(shifted, theta, theta, seed=0, workers=2).x
-    assert torch.equal(x, theta + shift)
+    if shift is not None:
+        shifted = lambda theta, action, seeds: theta + shift
+        x = simulate(shifted, theta, theta, seed=0, workers=2).x
+        assert torch.equal(x, theta + shift)
 
 go()
 """

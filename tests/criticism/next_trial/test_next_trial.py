@@ -1,0 +1,224 @@
+"""The next action: what tells models apart, and what would show an alias."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from scipy.stats import entropy
+from torch.distributions import Normal
+
+from sbi_active import DiscreteActions, GaussianNoise, SimulatorModel
+from sbi_active.criticism import Criticism, Trials
+from sbi_active.criticism.next_trial import next_action
+from sbi_active.criticism.next_trial.candidates import extrapolated
+from sbi_active.criticism.next_trial.next_action import PredictedRival, choose_action
+from sbi_active.criticism.results import ModelKey
+from sbi_active.design.estimators.model_index import ModelIndexGain, RivalSampler
+from tests.criticism.misfit.oscillator import ACTION, EFFECTS, trials
+from tests.criticism.misfit.oscillator import MODEL as OSCILLATOR
+from tests.criticism.misfit.oscillator import PRIOR as RATES
+from tests.effects import on_outcomes
+
+NOISE = 0.1
+PRIOR = BoxUniform(-3 * torch.ones(1), 3 * torch.ones(1))
+FORWARD = DiscreteActions([1.0, 1.5, 2.0, 2.5, 3.0])
+BOTH = DiscreteActions([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0])
+MODEL = SimulatorModel(
+    lambda theta, xi: theta * xi + 0 * xi, noise=GaussianNoise(NOISE)
+)
+
+
+#: Forward, a slope by distance is a slope.
+TILT = on_outcomes("tilt", lambda x, phi, action, context: x + phi * action.abs())
+BIAS = on_outcomes("bias", lambda x, phi, action, context: x + phi)
+GAIN = on_outcomes("gain", lambda x, phi, action, context: x * (1 + phi))
+
+
+def criticism(action, x, effects, actions, seed=0):
+    gen = torch.Generator().manual_seed(0)
+    action = torch.tensor(action)
+    x = torch.as_tensor(x) + NOISE * torch.randn(len(action), generator=gen)
+    own = Trials(action, x)
+    return Criticism(MODEL, PRIOR, own, effects=effects, actions=actions, seed=seed)
+
+
+def only(c, *names):
+    """Return the tracing with these rivals alone."""
+    tracing = c.trace()
+    kept = {k: p for k, p in tracing.probabilities.items() if k in names}
+    return replace(tracing, probabilities=kept)
+
+
+def test_rivals_predict_their_posterior_predictive():
+    action = torch.tensor([1.0, 2.0, 3.0, 2.0])
+    c = criticism(action.tolist(), 0.7 * action, [BIAS], FORWARD)
+    c.trace()
+    rival = PredictedRival(c.rivals, ModelKey(), 0.5, FORWARD.values)
+    x = rival.predict(torch.tensor([2.5]), 4_000, 3)
+    assert x.shape == (4_000, 1)
+    assert torch.equal(x, rival.predict(torch.tensor([2.5]), 4_000, 3))
+    assert not torch.equal(x, rival.predict(torch.tensor([2.5]), 4_000, 4))
+    # Least squares in one parameter; errors of the mean and of the deviation.
+    fit = c.rivals.trials
+    square = float((fit.action**2).sum())
+    slope = float((fit.action * fit.x).sum()) / square
+    sd = NOISE * (1 + 2.5**2 / square) ** 0.5
+    assert float(x.mean()) == pytest.approx(2.5 * slope, abs=5 * sd / 4_000**0.5)
+    assert float(x.std()) == pytest.approx(sd, rel=5 / 8_000**0.5 + 0.02)
+
+
+def test_the_gain_is_that_of_two_known_densities():
+    """Bias free against none, at two actions, beside a numerical integral."""
+    c = criticism([1.0, 2.0, 3.0, 2.0], [0.7, 1.4, 2.1, 1.4], [BIAS], BOTH)
+    c.trace()
+    names = ("none", "bias")
+    candidates = BOTH.values[[0, 3]]
+    rivals = [PredictedRival(c.rivals, ModelKey.of(n), 0.5, candidates) for n in names]
+    sampler = RivalSampler(rivals, 0)
+    simulations = sampler.draw(1_000, candidates, replicates=False)
+    gain = ModelIndexGain(sampler.probability)(None, simulations, None)
+    for a, rows in enumerate(gain):
+        draws = [r.predict(candidates[a], 10_000, 9)[:, 0].double() for r in rivals]
+        grid = torch.linspace(-15, 15, 20_001).double()
+        p = [Normal(d.mean(), d.std()).log_prob(grid).exp() for d in draws]
+        middle = (p[0] + p[1]) / 2
+        exact = sum(0.5 * q * (q / middle).log().nan_to_num(0, 0, 0) for q in p)
+        exact = float(torch.trapezoid(exact, grid))
+        error = float(rows.std()) / len(rows) ** 0.5
+        assert float(rows.mean()) < exact + 4 * error + 0.01
+        assert float(rows.mean()) > 0.8 * exact - 4 * error - 0.03
+
+
+def test_pushed_one_way_the_other_way_separates_a_tilt():
+    action = [1.0, 2.0, 3.0, 2.0, 1.5]
+    c = criticism(action, 0.7 * torch.tensor(action), [TILT], FORWARD)
+    chosen = c.next_action()
+    assert frozenset({"none", "tilt"}) in chosen.inseparable
+    assert float(chosen.outside[0]) < 0
+    assert {*chosen.outside_separates} == {"none", "tilt"}
+    assert chosen.outside_gain > 0.1
+
+
+def test_where_rivals_predict_the_same_it_stops():
+    action = [1.0, 2.0, 3.0, 2.0, 1.5]
+    c = criticism(action, 0.7 * torch.tensor(action), [TILT], FORWARD, seed=2)
+    chosen = choose_action(c.rivals, only(c, "none", "tilt"), FORWARD)
+    assert chosen.action is None
+    assert chosen.information_gain.max() < 0.02
+    assert {*chosen.separates} == {"none", "tilt"}
+    assert chosen.outside is not None
+
+
+def test_pushed_both_ways_the_other_way_is_chosen():
+    action = [1.0, 2.0, 3.0, 2.0, 1.5]
+    c = criticism(action, 0.7 * torch.tensor(action), [TILT], BOTH)
+    chosen = c.next_action()
+    assert float(chosen.action[0]) < 0
+    assert chosen.inseparable == ()
+    assert chosen.outside is None
+
+
+def test_where_no_action_separates_none_is_named():
+    action = [-3.0, 2.0, 3.0, -2.0]
+    c = criticism(action, 0.7 * torch.tensor(action), [GAIN], BOTH)
+    assert frozenset({"none", "gain"}) in c.trace().equivalent
+    chosen = choose_action(c.rivals, only(c, "none", "gain"), BOTH)
+    assert chosen.action is None
+    assert chosen.inseparable == (frozenset({"none", "gain"}),)
+    assert chosen.outside is None
+
+
+def test_a_simulator_that_fails_outside_its_range_names_nothing():
+    def forward_only(theta, xi):
+        if bool((xi <= 0).any()):
+            raise ValueError("the gripper pushes forward")
+        return theta * xi
+
+    model = SimulatorModel(forward_only, noise=GaussianNoise(NOISE))
+    action = torch.tensor([1.0, 2.0, 3.0, 2.0])
+    c = Criticism(
+        model, PRIOR, Trials(action, 0.7 * action), effects=[TILT], actions=FORWARD
+    )
+    chosen = c.next_action()
+    assert chosen.action is None
+    assert chosen.outside is None or float(chosen.outside[0]) > 0
+
+
+# Actions beyond the permitted ones
+
+
+@pytest.mark.parametrize(
+    ("values", "farthest"),
+    [
+        ([0.5, 1.0, 3.0], 4.25),  # a speed has no other sign
+        ([-0.5, -1.0, -3.0], -4.25),
+        ([-1.0, 0.0, 1.0], 2.0),
+    ],
+)
+def test_extrapolated_actions_keep_their_sign_where_there_is_one(values, farthest):
+    actions = DiscreteActions(values)
+    found = extrapolated(actions, actions.values, limit=16)[:, 0]
+    assert not bool(actions.contains(found[:, None]).any())
+    assert abs(farthest) == pytest.approx(float(found.abs().max()))
+    if min(values) >= 0:
+        assert float(found.min()) >= 0
+    if max(values) <= 0:
+        assert float(found.max()) <= 0
+
+
+# The next action where every model misses
+
+
+LARGER = DiscreteActions(torch.cat([ACTION, torch.tensor([[3.0], [4.0]])]))
+
+
+@pytest.fixture(scope="module")
+def missed():
+    return Criticism(
+        OSCILLATOR, RATES, trials(hidden=0.6), effects=EFFECTS, actions=LARGER, seed=0
+    )
+
+
+def test_rivals_count_by_what_they_predict_and_not_by_evidence(missed):
+    tracing, chosen = missed.trace(), missed.next_action()
+    weights = tracing.misfit.weights
+    assert chosen.separates == (*weights,)
+    assert len(weights) > 2
+    # The evidence alone would leave two or three.
+    number = [np.exp(entropy([*p.values()])) for p in (weights, tracing.probabilities)]
+    assert number[0] > 1.5 * number[1]
+    assert max(weights.values()) < max(tracing.probabilities.values()) - 0.1
+    assert {*weights} <= {*tracing.evidences}
+    assert chosen.action is not None
+
+
+def test_trials_unlike_those_at_hand_tell_most(missed):
+    chosen = missed.next_action()
+    assert float(chosen.action[0]) >= 3
+    gain = chosen.information_gain
+    assert gain[-2:].min() > gain[:-2].max()
+    assert gain[-2:].max() > 0.2
+
+
+def test_an_action_that_some_draws_alone_chose_is_chosen_again(missed, monkeypatch):
+    """Its report is of other draws, and there it may tell nothing."""
+    select, calls = next_action._Choosing.select, []
+
+    def unlucky(self, names, p, candidates, **options):
+        design = select(self, names, p, candidates, **options)
+        calls.append(len(candidates))
+        if options:
+            return design
+        gain = design.expected_information_gain.clone()
+        gain[design.index] = 0.0
+        return replace(design, expected_information_gain=gain)
+
+    first = missed.next_action()
+    monkeypatch.setattr(next_action._Choosing, "select", unlucky)
+    chosen = missed.next_action()
+    assert calls[0] == len(LARGER.values)
+    assert 0 < calls[1] < calls[0]
+    assert chosen.action is not None
+    assert chosen.action[0] != first.action[0]

@@ -1,0 +1,224 @@
+"""Tables, notebooks and pages that travel, with names that a user chose."""
+
+import re
+from dataclasses import replace
+
+import matplotlib
+import pandas as pd
+import pytest
+import torch
+from sbi.utils import BoxUniform
+
+from sbi_active import (
+    Campaign,
+    DiscreteActions,
+    GaussianNoise,
+    RandomDesigner,
+    SimulatorModel,
+)
+from sbi_active.campaign.display.page import page as campaign_page
+from sbi_active.campaign.display.page import write_page
+from sbi_active.display import Page, Section, Table
+from sbi_active.display.notebook import badge, card, facts, items, table
+from tests.campaign.storage.campaigns import MODEL, OPTIONS, PRIOR, go_on, new, outcome
+from tests.criticism.report.reports import report
+from tests.display.browser import CHROMIUM, assert_reads_well, look
+from tests.display.parsed import Parsed
+
+TABLE = Table(("model", "P"), [("bare", 0.25), ("drag|lift", "0.7")])
+
+
+def test_a_table_stands_in_columns():
+    head, rule, *rows = TABLE.text().splitlines()
+    assert {*rule} == {"-", " "}
+    edges = [i + 1 for i, a in enumerate(rule) if rule[i + 1 : i + 2] in ("", " ")]
+    assert edges[-1] == len(rule)
+    for line, cells in zip([head, *rows], [TABLE.header, *TABLE.rows], strict=True):
+        assert line.split() == [*map(str, cells)]
+        assert line.startswith(str(cells[0]))
+        assert len(line) == len(rule)
+
+
+def test_a_data_frame_is_shown_without_what_is_not_known():
+    frame = pd.DataFrame(
+        {"trial": [0, 1], "gain": [0.123456, float("nan")], "none": [float("nan")] * 2}
+    )
+    table = Table.of(frame)
+    assert table.header == ["trial", "gain"]
+    assert table.rows == [["0", "0.1235"], ["1", ""]]
+
+
+def test_parameters_have_mean_deviation_and_interval():
+    draws = torch.linspace(0.0, 1.0, 101)[:, None]
+    ((name, mean, sd, interval),) = Table.of_parameters(["mass"], draws).rows
+    assert (name, float(mean), float(sd)) == ("mass", 0.5, 0.29)
+    assert interval == "0.05 to 0.95"
+
+
+# Names that a user chose: money, control marks and halves of pairs
+
+
+matplotlib.use("Agg")
+NAMES = ["cost [$] \x07", "half \ud800", "a$b$c\\frac{"]
+
+
+def test_any_name_can_be_drawn_and_read(tmp_path):
+    model = SimulatorModel(
+        lambda theta, action: theta * action,
+        noise=GaussianNoise(0.1),
+        parameter_names=NAMES,
+        channel_names=NAMES,
+    )
+    prior = BoxUniform(torch.zeros(3), torch.ones(3))
+    actions = DiscreteActions(torch.eye(3) + 1, names=NAMES, units=["$"] * 3)
+    options = replace(OPTIONS, network="on demand")
+    c = Campaign(model, prior, actions, seed=0, options=options)
+    c.tell([0.5] * 3, trial=c.ask())
+    c.update()
+    page = write_page(c, tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "\x07" not in page
+    c.plot().savefig(tmp_path / "plot.svg")
+    c.history[0].design.plot().figure.savefig(tmp_path / "design.png")
+
+
+def test_a_page_holds_no_control_marks():
+    assert "a\ufffdb" in Page("a\x00b", []).html()
+
+
+# The small pages that notebooks show
+
+
+EVIL = '<script>alert("&")</script>'
+
+
+def shown(html):
+    """Return a piece that a notebook shows, which brings no color of its own page."""
+    page = Parsed(html)
+    assert "script" not in {tag for tag, _ in page.elements}
+    for _, attributes in page.elements:
+        assert {*attributes} <= {"style", "title"}
+        # On a dark page nothing may be black, on a light one nothing white.
+        style = attributes.get("style", "")
+        colors = re.findall(r"(?:color|background):([^;]*)", style)
+        assert not {*colors} & {"black", "white", "#000", "#fff"}
+    return page
+
+
+def page_of(thing):
+    html = thing._repr_html_()
+    assert len(html) < 20_000
+    assert "http" not in html
+    return shown(html)
+
+
+@pytest.fixture(scope="module")
+def campaign():
+    model = SimulatorModel(
+        MODEL.fn, noise=MODEL.noise, parameter_names=["mass", EVIL[:8]]
+    )
+    actions = DiscreteActions([0.5, 2.0], names=[f"speed {EVIL}"], units=["m/s"])
+    options = replace(OPTIONS, network="on demand")
+    c = Campaign(model, PRIOR, actions, options=options)
+    c.ask()
+    c.tell(outcome(c.pending.action, 0))
+    c.update()
+    c.ask()
+    return c
+
+
+def test_a_campaign_has_its_health_belief_and_trials(campaign):
+    page = page_of(campaign)
+    assert "Campaign: asbi, 1 trials, trial 1 pending" in " ".join(page.texts)
+    assert "health ok" in page.texts
+    assert "mass" in page.texts
+    assert EVIL[:8] in page.texts
+    assert any(text.startswith(f"speed {EVIL}") for text in page.texts)
+    mean = f"{campaign.belief.quick_sample(2_000, seed=0)[:, 0].double().mean():.4g}"
+    assert mean in page.texts
+
+
+def test_looking_at_a_belief_draws_nothing_from_the_global_generator(campaign):
+    before = torch.get_rng_state()
+    campaign.belief._repr_html_()
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_a_design_has_the_chosen_and_the_best_candidates(campaign):
+    design = campaign.pending.design
+    page = page_of(design)
+    assert page.texts.count("chosen") == 1
+    assert f"{float(design.expected_information_gain[design.index]):.3g}" in page.texts
+    pairs = DiscreteActions([[0.0, 1.0], [1.0, 2.0]], names=["a", "b"])
+    page = page_of(RandomDesigner(pairs).select(seed=0))
+    assert {"a", "b", "chosen"} <= {*page.texts}
+
+
+def test_pieces_are_escaped():
+    pieces = [
+        card(EVIL),
+        card("title", EVIL),
+        table(Table([EVIL], [[EVIL]])),
+        badge(EVIL),
+        facts([(EVIL, EVIL)]),
+        items([EVIL]),
+        table(Table.of_parameters([EVIL], torch.randn(20, 1))),
+    ]
+    for piece in pieces:
+        assert EVIL in shown(piece).texts
+
+
+# Pages that travel: what is on them, and what a browser makes of them
+
+
+NUMBERS = Table(
+    ("name", "value"), [("b", "10"), ("a", "-2.5"), ("d", ""), ("c", "1e3")]
+)
+
+
+def test_all_text_is_escaped():
+    table = Table(("<p>",), [("&",)])
+    sections = [Section("<b>", text=["<i>"], items=["<u>"], table=table)]
+    made = Page("<h>", sections, ["<q>"], badge=("<x>", "bad"), footer="<y>").html()
+    for tag in ["<b>", "<i>", "<u>", "<h>", "<q>", "<x>", "<y>"]:
+        assert tag not in made
+        assert tag.replace("<", "&lt;").replace(">", "&gt;") in made
+    assert "<td>&amp;</td>" in made
+
+
+def test_tables_are_sorted_by_a_click_numbers_as_numbers(tmp_path):
+    made = Page("Sorted", [Section("numbers", table=NUMBERS)]).html()
+    frames, console = look(made, tmp_path)
+    assert console == []
+    ((up, down, state),) = frames["390"]["sorted"]
+    assert up == ["-2.5", "10", "1e3", ""]
+    assert down == ["1e3", "10", "-2.5", ""]
+    assert state == "descending"
+    assert frames["390"]["buttons"] == 2
+
+
+def test_the_browser_sees_what_is_wrong(tmp_path):
+    """Gray on gray, a word wider than the screen, and an error are found."""
+    made = Page("Bad", [Section("words", text=["gray"])]).html()
+    made = made.replace("<p>gray", '<p style="color:#888;background:#999">gray')
+    made = made.replace("</h2>", '</h2><pre style="width:900px">wide</pre>')
+    made = made.replace("<script>", "<script>console.error('broken');")
+    frames, console = look(made, tmp_path)
+    assert [low[0] for low in frames["390"]["low"]] == ["P"]
+    assert "PRE" in frames["390"]["wide"]
+    assert frames["1280"]["wide"] == []
+    assert any("broken" in line for line in console)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+def test_a_criticism_reads_well_in_a_browser(tmp_path):
+    assert_reads_well(report().to_html(), tmp_path)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+@pytest.mark.filterwarnings("ignore")
+def test_a_campaign_reads_well_in_a_browser(tmp_path):
+    campaign = go_on(new(simulator=MODEL), 2)
+    made = campaign_page(campaign)
+    assert_reads_well(made, tmp_path)
+    assert "2 trials told" in made
+    assert made.count("<td>") >= 2 * len(campaign.history)

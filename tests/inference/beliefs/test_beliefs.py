@@ -1,0 +1,271 @@
+"""Beliefs: the priors they begin from, discrete values, and what is known of them."""
+
+import json
+import math
+
+import pytest
+import torch
+from sbi.utils import BoxUniform, MultipleIndependent
+from sbi.utils.torchutils import set_validate_args
+from torch.distributions import (
+    Bernoulli,
+    Categorical,
+    Cauchy,
+    Dirichlet,
+    Distribution,
+    Independent,
+    MixtureSameFamily,
+    Normal,
+    Poisson,
+    TransformedDistribution,
+    Uniform,
+    VonMises,
+)
+from torch.distributions.transforms import AffineTransform, ExpTransform
+
+from sbi_active import BoxActions, Campaign, GaussianNoise, SimulatorModel
+from sbi_active.inference import refine
+from sbi_active.inference.beliefs.diagnostics import Assumption, Diagnostics
+from sbi_active.inference.beliefs.enumerated import EnumeratedBelief
+from sbi_active.inference.beliefs.priors import require_support
+from sbi_active.seeding import forked_generators
+
+KNOWN = Diagnostics(
+    trustworthy=True,
+    assumptions={"settled": Assumption(False, 0.3)},
+    num_simulations=300,
+    tail_probability=0.4,
+    tail_probability_of_trial=(0.4, 0.6),
+    error_nats=0.02,
+).extended(bandwidth=0.1, num_missing=2)
+
+
+def test_as_plain_data():
+    plain = KNOWN.to_dict()
+    assert json.loads(json.dumps(plain)) == plain
+    assert plain["assumptions"] == {"settled": {"holds": False, "figure": 0.3}}
+    assert plain["bandwidth"] == 0.1
+    assert "effective_sample_size" not in plain  # not known
+
+
+# Discrete parameters beside continuous ones, against the exact posterior
+
+
+SD = 0.3
+ACTION, X = torch.tensor([[1.0], [2.0]]), torch.tensor([[1.2], [1.9]])
+#: A gear of three, a slope, a switch.
+PRIOR = MultipleIndependent(
+    [
+        Categorical(torch.tensor([[0.5, 0.3, 0.2]])),
+        BoxUniform(torch.tensor([-3.0]), torch.tensor([3.0])),
+        Bernoulli(torch.tensor([0.25])),
+    ],
+    validate_args=False,
+)
+
+
+def line(theta, action):
+    return theta[:, 1:2] * action * (1 + theta[:, :1]) + theta[:, 2:]
+
+
+def drawn(theta, action):
+    return line(theta, action) + SD * torch.randn(len(theta), 1)
+
+
+def exact():
+    """Return probabilities of gear and switch, by a sum over a fine grid."""
+    slope = torch.linspace(-3, 3, 20_001).double()
+    log_mass = torch.zeros(3, 2).double()
+    for gear in range(3):
+        for switch in range(2):
+            mean = slope * ACTION.double() * (1 + gear) + switch
+            log_l = Normal(mean, SD).log_prob(X.double()).sum(0)
+            prior = math.log((0.5, 0.3, 0.2)[gear] * (0.75, 0.25)[switch])
+            log_mass[gear, switch] = log_l.logsumexp(0) + prior
+    step = float(slope[1] - slope[0])
+    log_evidence = log_mass.flatten().logsumexp(0) + math.log(step / 6)
+    return log_mass.flatten().softmax(0), float(log_evidence)
+
+
+@pytest.mark.parametrize(
+    "simulator",
+    [SimulatorModel(line, noise=GaussianNoise(SD)), drawn],
+    ids=["declared", "drawn"],
+)
+def test_values_get_their_probabilities(simulator):
+    belief = refine(simulator, PRIOR, ACTION, X, seed=0)
+    assert isinstance(belief, EnumeratedBelief)
+    probability, log_evidence = exact()
+    assert belief.values.tolist() == [[g, s] for g in range(3) for s in range(2)]
+    assert belief.probability.numpy() == pytest.approx(probability.numpy(), abs=0.04)
+    assert belief.diagnostics.log_evidence == pytest.approx(log_evidence, abs=0.15)
+    assert belief.diagnostics.trustworthy
+    torch.manual_seed(0)
+    theta = belief.sample((6_000,))
+    assert theta[:, [0, 2]].frac().abs().max() == 0
+    share = (2 * theta[:, 0] + theta[:, 2]).long().bincount(minlength=6) / 6_000
+    assert share.double().numpy() == pytest.approx(probability.numpy(), abs=0.05)
+    # A density over the slope at each pair of values, which all integrate to one.
+    slope = torch.linspace(-3, 3, 3_001)
+    total = 0.0
+    for gear, switch in belief.values.tolist():
+        rows = torch.stack(
+            [torch.full_like(slope, gear), slope, torch.full_like(slope, switch)], 1
+        )
+        total += float(belief.smooth_log_prob(rows).double().exp().sum() * 6 / 3_000)
+    assert total == pytest.approx(1, abs=0.02)
+    assert belief.log_prob(torch.tensor([0.5, 0.0, 1.0])) == -torch.inf
+
+
+def test_noise_is_not_inflated_for_a_value_that_trials_rule_out():
+    def offset(theta, action):
+        return theta[:, :1] * action + 3 * theta[:, 1:]
+
+    switch = Bernoulli(torch.tensor([1e-3]))
+    prior = MultipleIndependent(
+        [BoxUniform(torch.tensor([-3.0]), torch.tensor([3.0])), switch],
+        validate_args=False,
+    )
+    action = torch.tensor([[1.0], [1.0], [-1.0], [-1.0]])
+    x = 0.5 * action + 3 + torch.tensor([[0.1], [-0.1], [0.1], [-0.1]])
+    model = SimulatorModel(offset, noise=GaussianNoise(SD))
+    belief = refine(model, prior, action, x, seed=0)
+    # Off, they miss by ten deviations each: e^-200, whatever the prior.
+    assert belief.probability.tolist() == pytest.approx([0.0, 1.0], abs=1e-9)
+    assert belief.diagnostics.trustworthy
+
+
+def test_a_campaign_designs_and_comes_back(tmp_path):
+    model = SimulatorModel(line, noise=GaussianNoise(SD))
+    campaign = Campaign(
+        model,
+        PRIOR,
+        [0.5, 1.0, 2.0],
+        seed=0,
+        directory=tmp_path / "campaign",
+        options={"num_samples": 100, "num_scored": 100},
+    )
+    trial = campaign.ask()
+    assert 0.5 <= float(trial.action) <= 2.0
+    campaign.tell([1.2])
+    mean = campaign.update().mean
+    assert campaign.history[0].network_used_by == ()
+    assert "training" not in campaign.history[0].cpu_seconds
+    campaign.close()
+    again = Campaign.load(tmp_path / "campaign", simulator=model, prior=PRIOR)
+    assert again.belief.mean.tolist() == mean.tolist()
+    again.attach([2.0], [1.9])
+    assert isinstance(again.update(), EnumeratedBelief)
+
+
+# Which priors a belief can begin from, and that those give the right posterior
+
+
+TWO = torch.ones(2)
+
+
+def independent(prior: Distribution) -> Independent:
+    return Independent(prior, 1)
+
+
+@pytest.mark.parametrize(
+    ("prior", "message"),
+    [
+        (independent(Poisson(3 * TWO)), "continuous parameters; got a discrete one"),
+        (independent(Bernoulli(0.5 * TWO)), "declare the choice as an Effect"),
+        (Dirichlet(TWO), "may vary one by one; got Dirichlet"),
+        (Normal(0.0, 1.0), r"event shape \(theta_dim,\); got Normal"),
+    ],
+)
+def test_what_is_discrete_or_tied_is_refused(prior, message):
+    with pytest.raises(ValueError, match=message):
+        require_support(prior)
+    with pytest.raises(ValueError, match=message):
+        campaign(prior)
+
+
+def test_draws_that_repeat_are_refused():
+    class Rounded(Normal):
+        def sample(self, sample_shape=torch.Size()):  # noqa: B008
+            return super().sample(sample_shape).round()
+
+    with pytest.raises(ValueError, match="got parameter 0, of which draws repeat"):
+        campaign(independent(Rounded(0 * TWO, TWO)))
+
+
+def scaled(theta, action):
+    return theta * action
+
+
+def campaign(prior: Distribution, method: str = "asbi", **options) -> Campaign:
+    return Campaign(
+        SimulatorModel(scaled, noise=GaussianNoise(0.2)),
+        prior,
+        BoxActions([0.5], [2.0]),
+        method=method,
+        seed=0,
+        options={
+            "num_simulations": 300,
+            "num_samples": 100,
+            "num_scored": 100,
+            **options,
+        },
+    )
+
+
+NETWORKS = {True: "each round", False: "on demand"}
+
+
+@pytest.mark.parametrize(
+    "prior",
+    [
+        independent(Cauchy(0 * TWO, TWO)),
+        TransformedDistribution(
+            independent(Normal(0 * TWO, TWO)),
+            [ExpTransform(), AffineTransform(0.2, 1.0)],
+        ),
+        MixtureSameFamily(
+            Categorical(TWO),
+            independent(Uniform(torch.tensor([[0.0], [0.2]]).expand(2, 2), 1.0)),
+        ),
+        independent(VonMises(0 * TWO, TWO)),
+    ],
+    ids=["Cauchy", "shifted log-normal", "mixture of bounds", "angle"],
+)
+def test_heavy_tails_and_mixtures_give_the_right_posterior(prior):
+    set_validate_args(prior, True)  # as after an import of pyro, which says so for all
+    is_mixed = isinstance(prior, MixtureSameFamily)
+    c, x = campaign(prior, network=NETWORKS[is_mixed]), torch.tensor([0.6, 0.5])
+    if is_mixed:
+        c.ask()  # the network is trained and asked as well
+    c.tell(x, action=[1.0])
+    belief = c.update()
+    drawn = belief.sample((4_000,)).double()
+    with forked_generators(0):
+        theta = prior.sample((200_000,)).double()
+    square = (((theta - x) / 0.2) ** 2).sum(1)
+    weight = torch.softmax(-0.5 * square, 0)[:, None]
+    mean = (weight * theta).sum(0)
+    sd = (weight * (theta - mean) ** 2).sum(0).sqrt()
+    # The reference has some 5,000 effective draws, the belief's own error is below .1.
+    assert bool(((drawn.mean(0) - mean).abs() < 0.2 * sd).all())
+    assert bool((drawn.std(0) / sd - 1).abs().max() < 0.2)
+    assert bool(belief.log_prob(theta[:100].float()).isfinite().all())
+
+
+def test_a_belief_is_the_prior_of_the_next_campaign():
+    def slide(theta, action):
+        return action**2 / (2 * 9.81 * theta)
+
+    model = SimulatorModel(slide, noise=GaussianNoise(0.02))
+    prior = BoxUniform(torch.tensor([0.2]), torch.tensor([1.0]))
+    rest = {"seed": 0, "options": {"network": "on demand"}}
+    belief, both = prior, Campaign(model, prior, BoxActions([0.5], [3.0]), **rest)
+    for x in (0.60, 0.62):
+        c = Campaign(model, belief, BoxActions([0.5], [3.0]), **rest)
+        c.attach([3.0], [x])
+        both.attach([3.0], [x])
+        belief = c.update()
+    together = both.update()
+    assert float(belief.mean) == pytest.approx(float(together.mean), abs=0.004)
+    assert float(belief.stddev) == pytest.approx(float(together.stddev), rel=0.15)

@@ -1,0 +1,240 @@
+"""Posteriors of densities whose normalizers are known."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from sbi.utils import BoxUniform
+from scipy.integrate import quad
+from scipy.special import logsumexp
+from scipy.stats import norm
+
+from sbi_active.inference.engine import SimulatedPotential, infer, search
+from sbi_active.inference.engine.importance import _largest_power, pareto_shape
+from sbi_active.inference.engine.learned import learned_fit
+from sbi_active.inference.engine.settings import Settings
+from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.inference.sampling.weights import effective_sample_size
+
+
+class Given(SimulatedPotential):
+    """Residuals in deviations of a Gaussian error.
+
+    Args:
+        function: From places (n, dim) to residuals (n, observed).
+        dim: Number of coordinates.
+        observed: Number of residuals.
+        sd: Deviation of the error, for the likelihood's constant.
+    """
+
+    def __init__(self, function, dim, observed, *, sd=1.0):
+        bound = np.full(dim, 8.0)
+        self.coordinates = SimpleNamespace(
+            dim=dim,
+            precision=np.ones(dim),
+            center=np.zeros(dim),
+            low=-bound,
+            high=bound,
+            sample=lambda n, rng: rng.standard_normal((n, dim)),
+        )
+        self.dim, self.searched = dim, np.ones(dim, dtype=bool)
+        self.function, self.num_observed, self.step = function, observed, 3e-3
+        self.sd, self.num_trials, self.num_rows = sd, 1, 0
+
+    @property
+    def num_simulations(self):
+        return self.num_rows
+
+    def residual(self, u):
+        self.num_rows += len(u)
+        return (self.function(u),)
+
+    def simulated(self, u):
+        return u
+
+    def log_prior(self, u):
+        return -0.5 * (u**2).sum(1) - 0.5 * self.dim * np.log(2 * np.pi)
+
+    def log_likelihood(self, u, *, floor=-np.inf, first=0, last=None):
+        square = (self.residual(u)[0] ** 2).sum(1)
+        return -0.5 * square - self.num_observed * np.log(self.sd * np.sqrt(2 * np.pi))
+
+    def splits_off(self, axes, rng):
+        return False
+
+
+# Proposals along ridges, and powers of a likelihood that leave draws effective
+
+
+SETTINGS = Settings(num_effective=100, num_draws=200, share_of_plenty=0)
+X, SLOPE = 1.0, 0.4
+
+
+def product(sd=1e-3):
+    """One number that is the product of a parameter and a gain: a hyperbola."""
+    return Given(lambda u: (X - u[:, :1] * np.exp(SLOPE * u[:, 1:])) / sd, 2, 1, sd=sd)
+
+
+def evidence():
+    """Return the log evidence of an error that is small beside the prior."""
+
+    def density(gain):
+        scale = np.exp(SLOPE * gain)
+        return norm.pdf(gain) * norm.pdf(X / scale) / scale
+
+    return np.log(quad(density, -8, 8)[0])
+
+
+def spread():
+    """Return the standard deviation of the gain."""
+    gain = np.linspace(-8, 8, 4_001)
+    scale = np.exp(SLOPE * gain)
+    weight = norm.pdf(gain) * norm.pdf(X / scale) / scale
+    mean = np.average(gain, weights=weight)
+    return np.sqrt(np.average((gain - mean) ** 2, weights=weight))
+
+
+def test_a_thin_ridge_has_the_right_evidence():
+    own, rng = product(), np.random.default_rng(1)
+    found = infer(own, rng, found=search(own, rng), settings=SETTINGS)
+    assert found.method == "importance"
+    assert found.effective_sample_size >= 100
+    assert found.log_evidence == pytest.approx(evidence(), abs=4 * found.standard_error)
+    assert own.num_rows < 12_000
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_ridge_is_followed_however_thin(seed):
+    """At 1e-4 of the prior few normals along it left gaps, and particles half a nat."""
+    own, rng = product(1e-4), np.random.default_rng(seed)
+    found = infer(own, rng, found=search(own, rng))
+    assert found.method == "importance"
+    assert found.log_evidence == pytest.approx(evidence(), abs=0.1)
+    gain = found.draws(4_000, rng)[:, 1]
+    assert gain.std() == pytest.approx(spread(), rel=0.1)
+    assert own.num_rows < 30_000
+
+
+def test_the_largest_power_is_found_where_lower_ones_leave_fewer_draws():
+    """A hundred draws at the peak, and those of the prior that outweigh them at .1."""
+    at_peak = np.linspace(-0.5, 0.5, 100)
+    at_peak[:4] += 3.0  # so that at power 1 few are effective
+    log_new = np.concatenate([at_peak, -400.0 - 100.0 * np.arange(200)])
+    log_rest = np.concatenate([np.zeros(100), np.full(200, 60.0)])
+    for power in (0.1, 1.0):
+        assert effective_sample_size(log_rest + power * log_new) < 60
+    power = _largest_power(log_rest, log_new, 60.0)
+    assert 0.4 < power < 1
+    assert effective_sample_size(log_rest + power * log_new) == pytest.approx(60)
+
+
+# Modes and widths by Gauss-Newton steps, where both are known
+
+
+def test_where_nothing_fits_there_is_a_best_place():
+    """Beside a sum of squares of 1e18 some nats are lost in the rounding."""
+    own = Given(lambda u: 1e9 + np.stack([u[:, 0], 3 * u[:, 1]], 1), 2, 2)
+    found = search(own, np.random.default_rng(0))
+    assert len(found.modes) >= 1
+    assert np.isfinite(found.guess.factors).all()
+
+
+# The posterior of a learned likelihood, on densities with known normalizers
+
+
+def likelihood_of(dim: int, log_likelihood: Any) -> Any:
+    """Return a likelihood over a box prior between -1 and 1."""
+    prior = BoxUniform(-torch.ones(dim), torch.ones(dim))
+    coordinates = PriorCoordinates(prior, np.random.default_rng(0))
+    return SimpleNamespace(coordinates=coordinates, log_likelihood=log_likelihood)
+
+
+def peaks(centers: np.ndarray, sd: np.ndarray) -> Any:
+    """Return a log density of integral len(centers) in the plane."""
+
+    def log_density(z: np.ndarray) -> np.ndarray:
+        square = (((z[:, None] - centers) / sd) ** 2).sum(-1)
+        log_peak = -0.5 * square - np.log(2 * np.pi * sd.prod())
+        return np.asarray(logsumexp(log_peak, axis=1))
+
+    return log_density
+
+
+@pytest.mark.parametrize(
+    ("centers", "sd"),
+    [
+        ([[0.2, -0.3]], [1e-4, 1e-4]),
+        ([[0.3, 0.0]], [1e-4, 0.2]),
+        ([[-0.7, 0.2], [0.7, -0.2]], [1e-3, 1e-2]),
+        ([[-0.8, 0.2], [-0.3, 0.2], [0.2, 0.2], [0.7, 0.2]], [0.01, 0.1]),
+    ],
+)
+def test_finds_narrow_peaks(centers: list, sd: list):
+    rng = np.random.default_rng(0)
+    place, width = np.array(centers), np.array(sd)
+    found = learned_fit(likelihood_of(2, peaks(place, width)), rng)
+    effective = found.effective_sample_size
+    assert effective > 2_900
+    assert found.efficiency > 0.2
+    error = 1 / effective**0.5
+    exact = np.log(len(place)) - 2 * np.log(2)
+    assert found.log_evidence == pytest.approx(exact, abs=4 * error)
+    draws = found.draws(4_000, rng)
+    nearest = ((draws[:, None] - place) ** 2).sum(-1).argmin(1)
+    share = np.bincount(nearest, minlength=len(place)) / 4_000
+    assert abs(share - 1 / len(place)).max() < 4 * error
+
+
+@pytest.mark.parametrize("dim", [12])
+def test_a_density_cut_at_many_edges(dim: int):
+    # A normal density about a corner of the box, 1 in 2^d of which is within.
+    def log_density(z: np.ndarray) -> np.ndarray:
+        log_prob = -0.5 * (((z - 1) / 0.2) ** 2).sum(1) - dim * np.log(0.2)
+        return log_prob - 0.5 * dim * np.log(np.pi / 2)
+
+    own = likelihood_of(dim, log_density)
+    found = learned_fit(own, np.random.default_rng(0), num_effective=1_000)
+    assert found is not None
+    effective = found.effective_sample_size
+    assert effective > 990
+    exact = -dim * np.log(2)
+    assert found.log_evidence == pytest.approx(exact, abs=4 / effective**0.5)
+
+
+PLATEAU = -20.0  # log likelihood where nothing is known
+DIM = 4
+
+
+# A needle that nothing points at is for no sampler.
+@pytest.mark.parametrize(
+    ("is_known", "width"), [(True, 0.003), (True, 0.05), (False, 0.05)]
+)
+def test_a_peak_on_a_plateau_is_not_lost(is_known: bool, width: float):
+    rng, center = np.random.default_rng(0), np.array([0.5, -0.2, 0.1, 0.6])
+
+    def log_likelihood(z: np.ndarray) -> np.ndarray:
+        square = ((z - center) ** 2).sum(1) / (2 * width**2)
+        peak = -square - DIM * np.log(width * np.sqrt(2 * np.pi))
+        return np.logaddexp(peak, PLATEAU)
+
+    known = center + 5 * width * rng.standard_normal((400, DIM))
+    own = likelihood_of(DIM, log_likelihood)
+    near = known if is_known else own.coordinates.sample_prior(400, rng)
+    found = learned_fit(own, rng, near=near)
+    assert found.log_evidence == pytest.approx(-DIM * np.log(2), abs=0.1)
+    draws = found.draws(500, rng)
+    assert draws.mean(0) == pytest.approx(center, abs=0.3 * width)
+
+
+@pytest.mark.parametrize("shape", [0.5, 1.0])
+def test_pareto_shape_is_that_of_arviz(shape: float):
+    arviz = pytest.importorskip("arviz")
+    rng = np.random.default_rng(int(10 * shape))
+    log_weight = np.log(rng.pareto(1 / shape, 4_000) + 1)
+    other = float(arviz.psislw(log_weight)[1])
+    assert pareto_shape(log_weight) == pytest.approx(other, abs=0.02)
+    assert pareto_shape(log_weight) == pytest.approx(shape, abs=0.25)
