@@ -28,6 +28,7 @@ from dataclasses import dataclass, field, replace
 from typing import cast
 
 import numpy as np
+from scipy.special import entr
 
 from sbi_active.arrays import Array
 from sbi_active.inference.engine.pool import Pool
@@ -70,6 +71,7 @@ class ImportanceSampling:
         num_tempered: Number of those to a power of it.
         ridge: Places along ridges, of the last proposal there.
         is_along: Whether the last proposal was along ridges; None before any.
+        best: Largest share of a proposal's draws that were effective.
         efficiency: Share of the draws that were effective of the last proposal along
             ridges, and of the last other one.
     """
@@ -84,6 +86,7 @@ class ImportanceSampling:
     num_tempered: int = 0
     ridge: Ridge | None = None
     is_along: bool | None = None
+    best: float = 0.0
     efficiency: dict[bool, float] = field(default_factory=dict)
 
     @property
@@ -91,11 +94,18 @@ class ImportanceSampling:
         """Whether the likelihood had to be tempered often."""
         return self.num_tempered > self.settings.few_tempered
 
+    @property
+    def num_modes(self) -> float:
+        """The number of modes, by the entropy of their weights; 1 if not known."""
+        if self.found is None:
+            return 1.0
+        return float(np.exp(entr(self.found.guess.weights).sum()))
+
     def run(self) -> None:
         """Draw until enough are effective, or the budget is spent."""
         pool, potential, own = self.pool, self.potential, self.settings
         budget, start = own.budget(potential.dim), potential.num_simulations
-        proposal, best, latched, heavy, least = pool.final, 0.0, 0.0, 0, 0.0
+        proposal, latched, heavy, least = pool.final, 0.0, 0, 0.0
         kept: Proposal | None = None  # the best
         most = pool.rest
         for _ in range(own.max_rounds):
@@ -103,7 +113,8 @@ class ImportanceSampling:
             power = _largest_power(*self._logs(), own.fewest)
             effective = pool.effective_sample_size
             is_cheap = left > (1 - own.share_of_plenty) * budget and not self.is_rough
-            wanted = own.asked(effective, pool.divergence, is_cheap=is_cheap)
+            divergence = self.num_modes * pool.divergence
+            wanted = own.asked(effective, divergence, is_cheap=is_cheap)
             wanted = max(wanted, least)
             if not len(pool.u) or left <= 0:
                 break
@@ -123,7 +134,7 @@ class ImportanceSampling:
             is_good = power == 1 and efficiency >= own.efficient
             is_good |= is_known and own.affords(missing, potential.dim)
             # It no longer gets better by being fitted again.
-            is_good |= self.num_full >= own.max_fits and efficiency >= 0.5 * best
+            is_good |= self.num_full >= own.max_fits and efficiency >= 0.5 * self.best
             is_good |= efficiency >= 0.5 * latched > 0  # what was drawn is not lost
             few = min(wanted, own.few_for_fit(potential.dim))
             to_fit = (few - effective) / efficiency
@@ -137,15 +148,15 @@ class ImportanceSampling:
                 latched = latched or is_good * efficiency
                 size = 1.1 * (missing if is_good else to_fit)
                 size = int(np.clip(size, 0.2 * own.num_draws, 4 * own.num_draws))
-            elif kept is not None and self._returns(efficiency, best, wanted, left):
+            elif kept is not None and self._returns(efficiency, wanted, left):
                 pool.restart()  # what was fitted since is worse
-                proposal, latched, kept = kept, best, None
+                proposal, latched, kept = kept, self.best, None
             else:
-                if efficiency > best and effective >= own.seen:
+                if efficiency > self.best and effective >= own.seen:
                     kept = proposal
                 if pool.num_past and kept is None and self.num_full > own.max_fits:
                     break  # modes are found again, and particles led from there
-                best, latched = max(best, efficiency), 0.0
+                self.best, latched = max(self.best, efficiency), 0.0
                 pool.restart()
                 proposal = self._fitted(power, efficiency)
             floor = float(pool.log_likelihood.max()) - own.negligible / power
@@ -153,21 +164,18 @@ class ImportanceSampling:
         if most.effective > pool.effective_sample_size:
             pool.rest_on(most)
 
-    def _returns(
-        self, efficiency: float, best: float, wanted: float, left: float
-    ) -> bool:
+    def _returns(self, efficiency: float, wanted: float, left: float) -> bool:
         """Return whether the best proposal goes on in place of another fit.
 
         Args:
             efficiency: Share of the last proposal's draws that were effective.
-            best: Share of those of the best proposal.
             wanted: Effective draws to end with.
             left: Rows that are left to spend.
         """
-        own, num = self.settings, wanted / best
+        own, num = self.settings, wanted / self.best
         is_affordable = own.affords(num / 4, self.potential.dim)
         is_affordable &= num * self.pool.num_trials <= left
-        is_lost = efficiency < own.lost * best
+        is_lost = efficiency < own.lost * self.best
         return self.num_full >= own.max_fits or (is_lost and is_affordable)
 
     def _fitted(self, power: float, efficiency: float) -> Proposal:

@@ -19,11 +19,7 @@ from sbi_active.inference.engine.potential import Potential
 from sbi_active.inference.engine.search import Found
 from sbi_active.inference.engine.settings import Settings
 from sbi_active.inference.sampling.least_squares import descend, floored
-from sbi_active.inference.sampling.mixtures import (
-    StudentMixture,
-    lower_factors,
-    wider,
-)
+from sbi_active.inference.sampling.mixtures import StudentMixture, lower_factors
 from sbi_active.inference.sampling.weights import systematic
 
 
@@ -50,12 +46,11 @@ class Ridge:
     @cached_property
     def mixture(self) -> StudentMixture:
         """A t distribution at each place, along the ridge as long as they are apart."""
-        own, (num, dim) = self.settings, self.means.shape
+        own, num = self.settings, len(self.means)
         width = min(own.reach * num ** (-1 / self.num_open), 1.0)
         local = self.curvature + np.diag(self.precision / width**2)
-        factors = wider(own.laplace_wider, dim) * lower_factors(np.linalg.inv(local))
-        freedom = max(own.freedom, float(dim))
-        return StudentMixture(self.means, factors, self.weights, freedom)
+        factors = own.laplace_wider * lower_factors(np.linalg.inv(local))
+        return StudentMixture(self.means, factors, self.weights)
 
     def grown(self, u: Array, weight: Array, rng: np.random.Generator) -> Ridge:
         """Return the places whose draws count, and draws that count as further ones.
