@@ -96,8 +96,8 @@ class ImportanceSampling:
 
     @property
     def num_modes(self) -> float:
-        """The number of modes, by the entropy of their weights; 1 if not known."""
-        if self.found is None:
+        """The number of modes, by the entropy of their weights; 1 along a ridge."""
+        if self.found is None or self.ridge is not None:
             return 1.0
         return float(np.exp(entr(self.found.guess.weights).sum()))
 
