@@ -34,8 +34,8 @@ from sbi_active.cli.record import (
 from sbi_active.cli.trusted import read_declared, write_declared
 
 #: What a command works on: trials without torch where these suffice; the campaign as it
-#: is read; one that simulates; one that is mended.
-Need = Literal["record", "reader", "simulator", "repair"]
+#: is read; one that simulates.
+Need = Literal["record", "reader", "simulator"]
 #: Commands on a campaign by name, which a request may call too.
 ON_CAMPAIGN: dict[str, click.Command] = {}
 
@@ -104,15 +104,19 @@ class Session:
         # A report or an export shows more with a simulator.
         simulates = need == "simulator" or need == "reader" and (trust or simulator)
         lacks = simulates and getattr(campaign, "simulator", None) is None
+        if campaign is None and not simulates:
+            from sbi_active import Campaign
+            from sbi_active.campaign.storage.codec import NotStorableError
+
+            try:
+                campaign = Campaign.load(self.folder)
+            except NotStorableError:  # a prior that only a program can make
+                lacks = True
         if lacks or simulator_changed:
             from sbi_active.cli.problem import open_campaign
 
             how = {"trust": trust, "simulator_changed": simulator_changed}
             campaign = open_campaign(self.folder, simulator=simulator, **how)
-        elif campaign is None or need == "repair":
-            from sbi_active import Campaign
-
-            campaign = Campaign.load(self.folder, repair=need == "repair")
         with campaign:  # then others may write
             answer = function(campaign, **options)
             if need == "simulator":
@@ -237,12 +241,6 @@ def _confirmed(campaign: Any, trial: Any) -> Answer:
 @on_campaign(need="record")
 def status(campaign: Any) -> Answer:
     """Show the trials, the belief and the health."""
-    return answer_of(campaign)
-
-
-@on_campaign(need="repair")
-def repair(campaign: Any) -> Answer:
-    """Give up what is damaged, and say what that is."""
     return answer_of(campaign)
 
 

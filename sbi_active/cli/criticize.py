@@ -67,11 +67,10 @@ def criticize(trials: Path, **given: Any) -> Answer:
     campaign, which knows its simulator and its prior, or of recordings, with trials.csv
     or one file *.csv a trial.
     """
-    from sbi_active.campaign.storage.directory import has_manifest
-
     if given["out"] is not None:  # else all is computed before this fails
         given["out"].mkdir(parents=True, exist_ok=True)
-    if not (trials.is_dir() and has_manifest(trials)):
+    own = (trials / name for name in ("store.db", "campaign.json"))
+    if not any(path.exists() for path in own):
         return _compared(trials, given)
     source = click.get_current_context().get_parameter_source
     for name in {*given} - {*OF_CAMPAIGN}:

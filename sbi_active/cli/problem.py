@@ -25,6 +25,7 @@ from sbi_active.cli.trusted import names_object, read_declared, require_trust
 from sbi_active.criticism import Effect, generic_effects
 from sbi_active.expected import require
 from sbi_active.simulation import GaussianNoise, SimulatorModel
+from sbi_active.simulation.bank.store import Store
 from sbi_active.tasks import Task, get_task  # pyright: ignore
 
 #: Actions of one space. A choice: each is stored in the campaign's folder and takes
@@ -311,13 +312,15 @@ def open_campaign(
         ValueError: If there is no campaign, or its simulator is not known, or
             only the folder says so.
     """
-    reader, declared = Campaign.load(folder), read_declared(folder)
+    Store(folder, "campaign")  # where there is none, this is said first
+    declared = read_declared(folder)
     if simulator is not None:
         declared |= {"simulator": None, "task": None, "option": []}
     require_trust(folder, declared, trusts=trust)
     sys.path += filter(None, [declared.get("folder")])  # where modules were found
     own = {} if simulator is None else {"simulator": simulator}
     model, prior, actions, effects = problem_of({**declared, **own}, needs=())
+    reader = Campaign.load(folder, prior=prior, actions=actions)
     if reader.state.version.effects:
         effects = with_generic(effects, model, reader.actions, reader.first_prior)
     return Campaign.load(

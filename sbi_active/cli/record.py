@@ -113,8 +113,11 @@ class Record(Telling[Any]):
     def _record(self, event: str, facts: Facts) -> Any:
         line = event_of(event, facts)
         with _stored(self.directory) as store, store.writing():
-            if store.append(LOG, line) != self._num + 1:  # another process was faster
-                raise Unsure
+            is_known = store.length(LOG) == self._num  # else another process was faster
+            if is_known:
+                store.append(LOG, line)
+        if not is_known:
+            raise Unsure
         self._take(line)
         return self._kept[facts.index]
 

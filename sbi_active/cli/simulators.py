@@ -170,12 +170,15 @@ def inspect(folder: Path) -> int:
         return 1
     header = made.header
     shapes = (header["shapes"] or {}).items()
+    model: Any = header["simulator"]
+    name = model["name"] if isinstance(model, dict) and "name" in model else str(model)
+    num_bytes = sum(path.stat().st_size for path in folder.glob("store.db*"))
     for line in (
-        f"simulator: {shown(made.simulator_name)} {shown(header['version'])}".rstrip(),
+        f"simulator: {shown(name)} {shown(header['version'])}".rstrip(),
         f"created: {shown(header['created'] or 'not noted')}",
         *(f"{name}: {' x '.join(map(str, shape))} a row" for name, shape in shapes),
         f"parameters: {', '.join(map(shown, header['parameter_names'] or ['?']))}",
-        f"rows: {made.counts}; on disk: {made.num_bytes / 2**20:.2f} MiB",
+        f"rows: {made.counts}; on disk: {num_bytes / 2**20:.2f} MiB",
         f"drawn from: {', '.join(shown(label or '?') for label in made.labels)}",
         "checksums: ok",
     ):

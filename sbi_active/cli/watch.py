@@ -6,7 +6,6 @@ imported. Requests from other machines, or for anything else, are refused.
 
 from __future__ import annotations
 
-import contextlib
 import sys
 import threading
 from html import escape
@@ -18,8 +17,6 @@ from click import IntRange
 
 from sbi_active.cli import declare as cli
 from sbi_active.cli.record import digest
-from sbi_active.simulation.bank.sqlite import is_locked
-from sbi_active.simulation.bank.store import Store
 
 HOST = "127.0.0.1"
 #: What a browser lets the page do: show itself, and ask for its version.
@@ -52,10 +49,8 @@ class Watched:
         self._page = self._version = ""
 
     def version(self) -> str:
-        """Text that changes with the store and with whoever begins or ends to write."""
-        with contextlib.suppress(ValueError, OSError):  # of a lock that is none
-            return f"{digest(self._folder)}-{is_locked(self._folder):d}"
-        return "unknown"
+        """Text that changes with the store."""
+        return digest(self._folder) or "unknown"
 
     def page(self) -> str:
         """Return the page, which asks for newer ones."""
@@ -79,7 +74,7 @@ class Watched:
         from sbi_active.campaign.display.page import page
 
         with Campaign.load(self._folder) as campaign:
-            return _with_news(page(campaign), _news(campaign, self._folder))
+            return _with_news(page(campaign), _news(campaign))
 
 
 @cli.command(
@@ -164,7 +159,7 @@ class _Answering(BaseHTTPRequestHandler):
         """Say nothing of each request."""
 
 
-def _news(campaign: Any, folder: Path) -> str:
+def _news(campaign: Any) -> str:
     """Return what is being computed, as far as the folder says."""
     from sbi_active.progress import in_words
 
@@ -178,10 +173,7 @@ def _news(campaign: Any, folder: Path) -> str:
     took = [(t.index, t.seconds[stage]) for t in campaign.history if stage in t.seconds]
     for index, seconds in took[-1:]:
         doing += f" ({stage} of trial {index}: {in_words(seconds)})"
-    if not is_locked(folder):
-        return f"No process writes to {folder}; {doing}."
-    writer = Store(folder, "campaign").json("writer") or {}
-    return f"Process {writer.get('pid')} on {writer.get('host')} writes; {doing}."
+    return f"{campaign.directory}: {doing}."
 
 
 def _with_news(text: str, news: str) -> str:

@@ -13,18 +13,17 @@ from pathlib import Path
 from typing import Any
 
 from sbi_active.campaign.storage.codec import decode, encode
-from sbi_active.campaign.storage.directory import BELIEF
-from sbi_active.campaign.storage.loading import FOR_PEOPLE, write_campaign
+from sbi_active.campaign.storage.directory import BELIEF, FOR_PEOPLE, write_campaign
 from sbi_active.campaign.telling import LOG, STATE
 from sbi_active.migration.described import actions_from, options_from, prior_from
 from sbi_active.migration.segments import copy_bank
-from sbi_active.simulation.bank.sqlite import (
+from sbi_active.simulation.bank.store import (
     NAME,
     TEMPORARY,
     CorruptSegmentError,
+    Store,
     synchronize,
 )
-from sbi_active.simulation.bank.store import Store
 
 BEFORE = "version-1"  # gets the files of before
 #: What release 0.1 wrote into a folder.

@@ -90,7 +90,6 @@ CALLS = [
     (2, "", ["status", "a\0b"]),
     (2, "choose another folder", [*INIT, "sled.py:slide"]),
     (2, "No such file", "report camp --out no/such/folder/page.html"),
-    (0, "", "repair camp --json"),
     (2, "expected --simulator or --task", "criticize bom.csv"),
     # A campaign has its own of these.
     (2, "for a campaign", "criticize camp --noise 0.1"),

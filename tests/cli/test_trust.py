@@ -34,26 +34,29 @@ prior = Mine(Uniform(torch.tensor([0.2, 0.0]), torch.ones(2)), 1)
 speeds = Speeds([1.0, 2.0], names=["speed"], units=["m/s"])
 """
 RUN = "Path('{}').write_text('ran')"
+IMPORTING = "\nfrom pathlib import Path\n", "\n"
 READING = [
     ["status", "camp", "--json"],
     ["tell", "camp", "0.3", "--action", "1"],
     ["correct", "camp", "0", "0.31"],
     ["withdraw", "camp", "0"],
-    ["report", "camp"],
-    ["repair", "camp"],
 ]
 
 
 @pytest.fixture
-def mine(tmp_path, monkeypatch):
-    """A campaign whose simulator, prior and actions are programs."""
+def mine(tmp_path, monkeypatch, request):
+    """A campaign whose simulator, prior and actions are programs, or only the first."""
     monkeypatch.setattr(sys, "path", [*sys.path])
     ran = tmp_path / "ran"
     forget(ran)
     (tmp_path / "sled.py").write_text(SIMULATOR)
     (tmp_path / "mine.py").write_text(MINE.format(run=RUN.format(ran)))
-    words = ["--simulator", "sled.py:slide", "--prior", "mine.py:prior"]
-    assert main(["init", "camp", *words, "--actions", "mine.py:speeds", *SMALL]) == 0
+    own = ["--prior", "mine.py:prior", "--actions", "mine.py:speeds"]
+    if getattr(request, "param", None) == "stored":
+        own = ["--theta-low=0.2,0", "--theta-high=1,1", "--actions", "0.5:3"]
+        (tmp_path / "sled.py").write_text(SIMULATOR + RUN.format(ran).join(IMPORTING))
+    words = ["--simulator", "sled.py:slide", *own]
+    assert main(["init", "camp", *words, *SMALL]) == 0
     main(["tell", "camp", "0.3", "--action", "1"])
     forget(ran)
     return ran
@@ -66,6 +69,7 @@ def forget(ran):
     ran.unlink(missing_ok=True)
 
 
+@pytest.mark.parametrize("mine", ["stored"], indirect=True)
 @pytest.mark.parametrize("words", READING, ids=lambda w: w[0])
 def test_reading_imports_nothing(mine, words):
     assert main(words) == 0
@@ -99,6 +103,8 @@ def test_what_somebody_else_declared_is_not_imported(
     assert not mine.exists()
     assert main(["status", "camp"]) == 0
     assert not mine.exists()
+    assert main(["report", "camp"]) == 2  # whose prior only a program can make
+    assert not mine.exists()
 
 
 def test_trust_is_remembered_outside_of_the_folder(mine, tmp_path, monkeypatch):
@@ -131,6 +137,7 @@ def test_a_file_that_the_command_line_did_not_write(mine, capsys, content):
     assert main(["status", "camp"]) == 0  # which needs none of it
 
 
+@pytest.mark.parametrize("mine", ["stored"], indirect=True)
 def test_what_stands_beside_somebody_is_not_imported(mine, tmp_path):
     """A file called as a library, in a folder that somebody has just entered."""
     for name in ("torch", "sqlite3", "sled"):

@@ -15,9 +15,8 @@ import math
 import pkgutil
 import zlib
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -39,22 +38,21 @@ DEPTH = 5
 LEAST_LIMIT, MOST_SHRUNK = 16 * 2**20, 100
 TAG = "!"  # of whatever JSON does not hold by itself
 SCALARS = (type(None), bool, int, float, str, Message)
-SEQUENCES: dict[str, Any] = {
-    **{kind.__name__: kind for kind in (list, tuple, set, frozenset)},
-    "size": torch.Size,
+KINDS: dict[str, Any] = {
+    **{kind.__name__: kind for kind in (list, tuple, set, frozenset, dict)},
+    **{"size": torch.Size, "ordered": OrderedDict},
 }
-MAPPINGS = {"dict": dict, "ordered": OrderedDict}
-NAMES = {kind: name for name, kind in (SEQUENCES | MAPPINGS).items()}
+NAMES = {kind: name for name, kind in KINDS.items()}
+
+
+class NotStorableError(Explained, ValueError):
+    """Something in an object is neither of this library nor given again."""
+
+    code = "SA609"
 
 
 class Absent:
     """Stands for what a reader does not have, and for whatever hangs from it."""
-
-
-class NotStorableError(Explained, TypeError):
-    """Something in an object is neither of this library nor given again."""
-
-    code = "SA609"
 
 
 def encode(value: Any, *, known: Mapping[str, Any]) -> bytes:
@@ -70,9 +68,8 @@ def encode(value: Any, *, known: Mapping[str, Any]) -> bytes:
     Raises:
         NotStorableError: If there is anything else in it.
     """
-    writer = _Writer(known)
+    writer, buffer = _Writer(known), io.BytesIO()
     structure = json.dumps(writer.node(value), allow_nan=False)
-    buffer = io.BytesIO()
     torch.save({"structure": structure, "arrays": writer.arrays}, buffer)
     return zlib.compress(buffer.getvalue(), 1)
 
@@ -90,13 +87,10 @@ def decode(content: bytes, *, known: Mapping[str, Any]) -> Any:
     Raises:
         ValueError: If the content is nothing that :func:`encode` writes.
     """
+    # What was written shrinks less: a small file that fills memory was crafted.
+    limit, reader = LEAST_LIMIT + MOST_SHRUNK * len(content), zlib.decompressobj()
     try:
-        # What was written shrinks less: a small file that fills memory was crafted.
-        limit = LEAST_LIMIT + MOST_SHRUNK * len(content)
-        reader = zlib.decompressobj()
         plain = reader.decompress(content, limit)
-        if not reader.eof:
-            raise ValueError(f"expected a whole file of {limit} bytes at most")
         stored = torch.load(io.BytesIO(plain), weights_only=True)
         return _Reader(known, stored["arrays"]).value(json.loads(stored["structure"]))
     except Exception as error:  # each library has its own
@@ -111,39 +105,33 @@ class _Writer:
 
     def __init__(self, known: Mapping[str, Any]) -> None:
         self.arrays: list[Tensor] = []
-        self._places = {id(value): path for path, value in _places(known)}
+        places = reversed(_places(known).items())  # the nearest last, which stays
+        self._places = {id(value): path for path, value in places}
         self._seen: dict[int, tuple[int, Any]] = {}  # kept, as identities are of these
 
     def node(self, value: Any) -> Any:
         """Return a value as JSON."""
-        if type(value) in SCALARS:
+        kind, path = type(value), self._places.get(id(value), ())
+        if kind in SCALARS:
             is_plain = not isinstance(value, float) or math.isfinite(value)
             return value if is_plain else {TAG: "float", "value": str(value)}
-        path = self._places.get(id(value), ())
         if len(path) == 1:
             return {TAG: "known", "path": path}
         if id(value) in self._seen:
             return {TAG: "seen", "number": self._seen[id(value)][0]}
         self._seen[id(value)] = len(self._seen), value
-        kind = NAMES.get(type(value), "")
-        if kind in SEQUENCES:
-            return {TAG: kind, "items": [self.node(item) for item in value]}
-        if kind in MAPPINGS:
-            pairs = [[self.node(k), self.node(v)] for k, v in value.items()]
-            return {TAG: kind, "items": pairs}
-        if isinstance(value, MappingProxyType):
-            return {TAG: "proxy", "of": self.node({**value})}
-        if isinstance(value, torch.dtype | torch.device):
-            name = str(value).removeprefix("torch.")
-            return {TAG: type(value).__name__, "name": name}
+        if kind in NAMES:
+            items = value.items() if isinstance(value, dict) else [[v] for v in value]
+            nodes = [[self.node(part) for part in item] for item in items]
+            nodes = nodes if isinstance(value, dict) else [node for (node,) in nodes]
+            return {TAG: NAMES[kind], "items": nodes}
         if isinstance(value, Tensor | np.ndarray | np.generic):
             return self._array(value)
-        kind = type(value)
         name = f"{kind.__module__}:{kind.__qualname__}"
         if _class(name) is not kind or not hasattr(value, "__dict__"):
-            if path:
-                return {TAG: "known", "path": path}
-            raise NotStorableError(f"{kind.__module__}.{kind.__qualname__}")
+            if not path:
+                raise NotStorableError(name)
+            return {TAG: "known", "path": path}
         if isinstance(value, RowCache):  # what it lacks is simulated again
             value = RowCache(value.most)
         state = [[name, self.node(part)] for name, part in vars(value).items()]
@@ -155,12 +143,12 @@ class _Writer:
             more: dict[str, Any] = {"gradient": value.requires_grad}
             stored = value.detach().cpu().clone()
         else:
-            array = np.ascontiguousarray(value)
+            array = np.array(value, order="C")
             if array.dtype.kind not in "biufc":
                 raise NotStorableError(f"an array of {array.dtype}")
             kind = "array" if isinstance(value, np.ndarray) else "number"
-            more = {"shape": [*np.shape(value)], "dtype": array.dtype.str}
-            stored = torch.from_numpy(array.copy())
+            more = {"shape": [*array.shape], "dtype": array.dtype.str}
+            stored = torch.from_numpy(array)
         self.arrays.append(stored)
         return {TAG: kind, "array": len(self.arrays) - 1, **more}
 
@@ -169,7 +157,7 @@ class _Reader:
     """Turns JSON back into values."""
 
     def __init__(self, known: Mapping[str, Any], arrays: list[Tensor]) -> None:
-        self._known, self._arrays = known, arrays
+        self._places, self._arrays = _places(known), arrays
         self._seen: list[Any] = []
 
     def value(self, node: Any) -> Any:
@@ -182,39 +170,28 @@ class _Reader:
         if kind == "seen":
             return self._seen[node["number"]]
         if kind == "known" and len(node["path"]) == 1:  # not counted by the writer
-            return self._known[node["path"][0]]
+            return self._places[node["path"][0],]
         number = len(self._seen)
-        made: Any = _blank(kind, node)
-        self._seen.append(made)  # before what it holds, which may be itself
-        if kind in MAPPINGS:
-            made.update((self.value(k), self.value(v)) for k, v in node["items"])
-        elif kind == "list":
-            made.extend(self.value(item) for item in node["items"])
-        elif kind == "object":
+        # An object is there before its attributes, which may lead to it.
+        self._seen.append(_blank(node["class"]) if kind == "object" else None)
+        if kind == "object":
             for name, part in node["state"]:
                 # Frozen dataclasses refuse to be changed, and modules look first.
-                object.__setattr__(made, name, self.value(part))
-            if isinstance(made, Diagnostics):  # whose messages are stored as texts
-                made.__post_init__()
+                object.__setattr__(self._seen[number], name, self.value(part))
+            if isinstance(self._seen[number], Diagnostics):  # messages were texts
+                self._seen[number].__post_init__()
         else:
-            made = self._seen[number] = self._whole(kind, node)
-        return made
+            self._seen[number] = self._whole(kind, node)
+        return self._seen[number]
 
     def _whole(self, kind: str, node: dict[str, Any]) -> Any:
-        """Return what cannot contain itself."""
+        """Return what is made at once of what it holds."""
         if kind == "known":
-            return _at(self._known, node["path"])
-        if kind in SEQUENCES:
-            return SEQUENCES[kind]([self.value(item) for item in node["items"]])
-        if kind == "proxy":
-            return MappingProxyType(self.value(node["of"]))
-        if kind == "dtype":
-            found = getattr(torch, node["name"])
-            if not isinstance(found, torch.dtype):
-                raise TypeError(f"no dtype {node['name']!r}")
-            return found
-        if kind == "device":
-            return torch.device(node["name"])
+            return self._places.get((*node["path"],), Absent())
+        if kind in KINDS and issubclass(KINDS[kind], dict):
+            return KINDS[kind]([map(self.value, pair) for pair in node["items"]])
+        if kind in KINDS:
+            return KINDS[kind](map(self.value, node["items"]))
         tensor = self._arrays[node["array"]]
         if kind == "parameter":
             return torch.nn.Parameter(tensor, requires_grad=node["gradient"])
@@ -235,13 +212,11 @@ def _class(name: str) -> Any:
     return found if getattr(found, "__module__", None) == module else None
 
 
-def _blank(kind: str, node: Mapping[str, Any]) -> Any:
-    """Return what is filled later; of an object with defaults of fields added since."""
-    if kind != "object":
-        return MAPPINGS.get(kind, list)()
-    found = _class(node["class"])
+def _blank(name: str) -> Any:
+    """Return what is filled later, with defaults of fields that came since."""
+    found = _class(name)
     if not isinstance(found, type):
-        raise TypeError(f"no class {node['class']!r} that is stored")
+        raise TypeError(f"no class {name!r} that is stored")
     made = object.__new__(found)
     for entry in dataclasses.fields(found) if dataclasses.is_dataclass(found) else ():
         if entry.default_factory is not dataclasses.MISSING:
@@ -249,35 +224,19 @@ def _blank(kind: str, node: Mapping[str, Any]) -> Any:
     return made
 
 
-def _places(known: Mapping[str, Any]) -> Iterator[tuple[list[Any], Any]]:
-    """Yield what is known, and where each object below it hangs, the nearest first."""
-    level: list[tuple[list[Any], Any]] = [([n], value) for n, value in known.items()]
-    seen = {id(value) for _, value in level}
-    yield from level
+def _places(known: Mapping[str, Any]) -> dict[tuple[Any, ...], Any]:
+    """Return what is known, and what hangs from it, by place, the nearest first."""
+    found: dict[tuple[Any, ...], Any] = {
+        (name,): value for name, value in known.items()
+    }
+    level = dict(found)
     for _ in range(DEPTH):
-        below = ((p, n, part) for p, value in level for n, part in _parts(value))
-        level = []
-        for path, name, part in below:
-            if type(part) not in SCALARS and id(part) not in seen:
-                seen.add(id(part))
-                level.append(([*path, name], part))
-        yield from level
-
-
-def _parts(value: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield what hangs from an object: attributes by name, items by number or key."""
-    if isinstance(value, list | tuple):
-        yield from enumerate(value)
-    elif isinstance(value, dict):
-        yield from ((k, v) for k, v in value.items() if isinstance(k, str))
-    elif not isinstance(value, type | Tensor | np.ndarray):
-        yield from getattr(value, "__dict__", {}).items()
-
-
-def _at(known: Mapping[str, Any], path: list[Any]) -> Any:
-    found: Any = known[path[0]]
-    for name in path[1:]:
-        if isinstance(found, Absent):
-            return found
-        found = dict(_parts(found))[name]
+        seen, below = {*map(id, found.values())}, {}
+        for path, value in level.items():
+            own = value if isinstance(value, dict) else getattr(value, "__dict__", {})
+            parts: Any = [] if isinstance(value, type | Tensor) else own.items()
+            parts = enumerate(value) if isinstance(value, list | tuple) else parts
+            fresh = {n: p for n, p in parts if id(p) not in seen}
+            below |= {(*path, n): p for n, p in fresh.items() if type(p) not in SCALARS}
+        found |= (level := below)
     return found

@@ -9,9 +9,9 @@ from typing import Any, TypeVar
 
 from sbi_active.campaign.isolation import guarded, isolated
 from sbi_active.campaign.learning.indexed import IndexedSimulator
+from sbi_active.expected import require
 from sbi_active.simulation.bank.bank import Bank
-from sbi_active.simulation.bank.sqlite import NAME
-from sbi_active.simulation.bank.store import Store
+from sbi_active.simulation.bank.store import NAME, Store
 from sbi_active.simulation.model import SimulatorModel
 from sbi_active.simulation.workers.store import metering
 
@@ -31,10 +31,13 @@ def stored(method: Method) -> Method:
     def kept(campaign: Any, *arguments: Any, **options: Any) -> Any:
         storage, current = campaign._storage, campaign._learner.simulator
         version = campaign.state.version.number
+        expected = "the simulator, which is not stored with a campaign"
+        advice = "pass it: Campaign.load(directory, simulator=...)"
+        require(current is not None, expected, "none", advice)
         storage.acquire()
 
         def find(simulator: Callable[..., Any]) -> Bank | None:
-            return storage.find_bank(simulator, current, version)
+            return storage.find_bank(form_of(simulator, current), simulator, version)
 
         with metering(campaign.state.meter, find):
             return apart(campaign, *arguments, **options)
@@ -54,7 +57,7 @@ def num_rows(folder: str | None) -> int:
     return len(Bank(store, name=OWN)) if f"bank {OWN}" in store.catalog else 0
 
 
-def form_of(simulator: Any, own: Any) -> Any:
+def form_of(simulator: Any, own: Any) -> str | None:
     """Return the name of a form of the current simulator; None for another one.
 
     Args:
@@ -67,8 +70,8 @@ def form_of(simulator: Any, own: Any) -> Any:
         return "by-index" if simulator.simulator is own else None
     if not (isinstance(simulator, SimulatorModel) and isinstance(own, SimulatorModel)):
         return None
-    mine, yours = ([*map(id, getattr(m, "effects", ()))] for m in (simulator, own))
-    if simulator.fn is not own.fn or mine != yours:
+    mine, yours = ([m.fn, *getattr(m, "effects", ())] for m in (simulator, own))
+    if [*map(id, mine)] != [*map(id, yours)]:
         return None
     if simulator.noise is None and own.noise is not None:
         return "noise-free"

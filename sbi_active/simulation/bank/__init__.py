@@ -13,7 +13,7 @@ from sbi_active.renamed import lazy_names
 if TYPE_CHECKING:
     from sbi_active.simulation.bank.bank import Bank
     from sbi_active.simulation.bank.reweighting import ReusedRows, reuse
-    from sbi_active.simulation.bank.sqlite import CorruptSegmentError, LockedError
+    from sbi_active.simulation.bank.store import CorruptSegmentError, LockedError
 
 __all__ = [
     "Bank",
@@ -28,6 +28,6 @@ __getattr__ = lazy_names(
     {
         "bank": "Bank",
         "reweighting": "ReusedRows reuse",
-        "sqlite": "CorruptSegmentError LockedError",
+        "store": "CorruptSegmentError LockedError",
     },
 )
