@@ -21,9 +21,13 @@ from sbi_active.campaign.learning.pooled import make_learner
 from sbi_active.campaign.learning.revision import recompute, revise
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.state import CampaignState, Trial
-from sbi_active.campaign.storage.directory import Storage, make_campaign
+from sbi_active.campaign.storage.directory import (
+    Storage,
+    make_campaign,
+    num_rows,
+    stored,
+)
 from sbi_active.campaign.storage.loading import load
-from sbi_active.campaign.storage.simulations import num_rows, stored
 from sbi_active.campaign.trials import CampaignTrials
 from sbi_active.design.target import Target
 from sbi_active.renamed import set_later

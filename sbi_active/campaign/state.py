@@ -279,7 +279,7 @@ class CampaignState:
         elif what == "examined":
             self.examined(event["digest"])
         elif what == "adopted":
-            version = {
+            version: dict[str, Any] = {
                 name: tuple(part) if isinstance(part, list) else part
                 for name, part in event["version"].items()
             }

@@ -97,7 +97,8 @@ class Session:
             **options: Options of the command.
         """
         is_known = self._opened == (simulator, digest(self.folder))
-        campaign, self._campaign = self._campaign if is_known else None, None
+        campaign: Any = self._campaign if is_known else None
+        self._campaign = None
         if need == "record" and campaign is None:
             with contextlib.suppress(Unsure):
                 return function(Record(self.folder), **options)

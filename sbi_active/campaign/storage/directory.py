@@ -8,14 +8,17 @@ simulator's. ``campaign.toml`` says what the campaign is, for people alone.
 
 from __future__ import annotations
 
+import functools
 import json
 import platform
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+from sbi_active.campaign.isolation import guarded, isolated
+from sbi_active.campaign.learning.indexed import IndexedSimulator
 from sbi_active.campaign.state import CampaignState
 from sbi_active.campaign.storage.codec import NotStorableError, encode
 from sbi_active.campaign.telling import LOG, STATE, SUMMARY, event_of, now
@@ -24,13 +27,16 @@ from sbi_active.messages import Explained
 from sbi_active.simulation.bank.bank import Bank
 from sbi_active.simulation.bank.fingerprint import fingerprint
 from sbi_active.simulation.bank.store import NAME, Store
+from sbi_active.simulation.model import SimulatorModel
+from sbi_active.simulation.workers.store import metering
 
 FORMAT, SCHEMA = "sbi-active campaign", 3  # schema 1 was a folder of files
-MANIFEST, BELIEF = "campaign", "belief"
-FOR_PEOPLE = "campaign.toml"
-UNTOLD = ("packages", "simulator", "own")  # what people are not told
+MANIFEST, BELIEF, FOR_PEOPLE = "campaign", "belief", "campaign.toml"
+OWN = "drawn"  # rows of the simulator itself
+PACKAGES = "sbi-active", "sbi", "torch", "numpy"
 #: What a state holds beside the settings of the campaign.
 SAVED = ("trials", "processed", "draws", "versions", "is_stale", "batches")
+Method = TypeVar("Method", bound=Callable[..., Any])
 
 
 class LogChangedError(Explained, ValueError):
@@ -66,56 +72,49 @@ class Storage:
     def __init__(self, path: Path | None = None, *, prior: Any = None) -> None:
         self.path, self.prior = path, prior
         self.manifest: dict[str, Any] = {}
-        self.bank: str | None = None
         self.events: list[dict[str, Any]] = []
+        self.bank: str | None = None
         self._written: Any = None  # the belief that is on the disk
         self._banks: dict[str, Bank] = {}
-        self._shared: Store | None = None  # the file of ``bank``
+        self._shared: Any = None  # the file of ``bank``
         self.store: Any = None
         if path is not None:
             self.store = Store(path, "campaign")
-            self._require_campaign()
             with self.store.reading():
+                self.manifest = self.store.json(MANIFEST) or {}
                 for number in range(1, self.store.length(LOG) + 1):
                     self.events.append({**self.store.json(LOG, number), "line": number})
                     _ = self.events[-1]["event"]
+            form, packages = map(self.manifest.get, ("schema", "packages"))
+            expected, got = f"a campaign of schema {SCHEMA}", f"{form} in {path}"
+            advice = f"use the release that wrote it, {packages}, or make a campaign"
+            require(form == SCHEMA, expected, got, advice)
 
-    def _require_campaign(self) -> None:
-        found = self.store.json(MANIFEST) or {}
-        self.manifest, form = found, (found.get("format"), found.get("schema"))
-        require(
-            form == (FORMAT, SCHEMA),
-            f"a campaign of schema {SCHEMA} in {self.store.path}",
-            f"{form[1]} of {found.get('packages')}" if found else "none",
-            "use the release of sbi-active that wrote it, or make one by directory=",
-        )
-
-    def find_bank(
-        self, name: str | None, simulator: Callable[..., Any], version: int
-    ) -> Bank | None:
+    def find_bank(self, name: str, simulator: Any, version: int) -> Bank | None:
         """Return the bank of a form of the current simulator, open for writing.
 
         Args:
-            name: Name of the form; None for another simulator, which has no bank.
+            name: Name of the form; "" for another simulator, which has no bank.
             simulator: Simulator whose rows are to be kept.
             version: Number of the current simulator.
         """
-        if name is None or self.store is None and self.bank is None:
+        if not name or self.store is None and self.bank is None:
             return None
         changes = 0 if self.bank is not None else len(self.changes)
         name += f"-model-{version}" * (version > 0)
         name += f"-changed-{changes}" * (changes > 0)
-        if self.bank is not None and self._shared is None:
-            self._shared = Store(Path(self.bank), make=True)
         if name not in self._banks:
-            place = self._shared or self.store
+            if self.bank is not None and self._shared is None:
+                self._shared = Store(Path(self.bank), make=True)
+            place: Any = self._shared or self.store
             self._banks[name] = Bank(place, simulator=simulator, name=name)
         return self._banks[name]
 
     @property
-    def changes(self) -> list[dict[str, Any]]:
-        """The events by which the simulator was changed."""
-        return [event for event in self.events if event["event"] == "simulator changed"]
+    def changes(self) -> list[Any]:
+        """Fingerprints of the simulators that took the place of the one before."""
+        found = [event for event in self.events if "simulator" in event]
+        return [event["simulator"] for event in found]
 
     def write(self, event: str, trial: Any = None, **entries: Any) -> None:
         """Add to the log; it is on the disk when this returns.
@@ -143,17 +142,14 @@ class Storage:
         if self.store is None:
             return
         belief = None if learner.belief is learner.prior else learner.belief
-        known = {"simulator": learner.simulator, "prior": self.prior}
-        saved = {
-            **{name: getattr(state, name) for name in SAVED},
-            **{"lines": len(self.events), "num_simulated": state.meter.spent},
-            "belief": belief is not None,
-        }
+        saved = {name: getattr(state, name) for name in SAVED}
+        saved |= {"lines": len(self.events), "num_simulated": state.meter.spent}
+        saved["belief"] = belief is not None
         contents = {STATE: encode(saved, known={}), SUMMARY: b"{}"}
         if belief is not self._written:
-            contents[BELIEF] = b""
+            known, contents[BELIEF] = {"simulator": learner.simulator}, b""
             with suppress(NotStorableError):
-                contents[BELIEF] = encode(belief, known=known)
+                contents[BELIEF] = encode(belief, known={**known, "prior": self.prior})
         with self._writing():
             for kind, content in contents.items():
                 self.store.put(kind, 0, content)
@@ -202,11 +198,7 @@ class Storage:
 
 
 def make_campaign(
-    folder: Path,
-    state: CampaignState,
-    given: Mapping[str, Any],
-    simulator: Callable[..., Any],
-    **facts: Any,
+    folder: Path, state: Any, given: Mapping[str, Any], simulator: Any, **facts: Any
 ) -> None:
     """Write what a new campaign is.
 
@@ -221,24 +213,22 @@ def make_campaign(
         ValueError: If the folder holds anything.
         OSError: If it cannot be written.
     """
+    packages = {name: version(name) for name in PACKAGES}
+    packages["python"] = platform.python_version()
+    manifest = {
+        name: getattr(state, name) for name in ("method", "seed", "num_earlier")
+    }
+    manifest |= {"created": now(), "packages": packages}
+    manifest["simulator"] = fingerprint(simulator)
+    for name in ("parameter_names", "channel_names"):
+        found = getattr(simulator, name, None)
+        manifest[name] = found if found is None else [*found]
     objects = {}
     for what, thing in given.items():
+        manifest[f"{what}_text"] = repr(thing)
         with suppress(NotStorableError):
             objects[what] = encode(thing, known={})
-    names = ("sbi-active", "sbi", "torch", "numpy")
-    declared = ("parameter_names", "channel_names")
-    own = {name: getattr(simulator, name, None) for name in declared}
-    manifest = {
-        "created": now(),
-        "packages": {"python": platform.python_version()}
-        | {n: version(n) for n in names},
-        **{name: getattr(state, name) for name in ("method", "seed", "num_earlier")},
-        **{name: found if found is None else [*found] for name, found in own.items()},
-        **facts,
-        **{f"{what}_text": repr(thing) for what, thing in given.items()},
-        "simulator": fingerprint(simulator),
-    }
-    write_campaign(folder, manifest, objects)
+    write_campaign(folder, manifest | facts, objects)
 
 
 def write_campaign(
@@ -251,19 +241,76 @@ def write_campaign(
         OSError: If it cannot be written.
     """
     store = Store(folder, "campaign", make=True)
-    if store.catalog:
-        raise ValueError(
-            f"expected an empty folder for a new campaign; got {folder} with a "
-            "campaign; go on with it by Campaign.load(directory, simulator=...), or "
-            "choose another folder"
-        )
+    expected, got = "an empty folder for a new campaign", f"{folder} with one"
+    advice = "go on with it by Campaign.load(directory, simulator=...), or take another"
+    require(not store.catalog, expected, got, advice)
     with store.writing():
+        store.put(MANIFEST, 0, {**manifest, "format": FORMAT, "schema": SCHEMA})
         for kind, content in objects.items():
             store.put(kind, 0, content)
-        store.put(MANIFEST, 0, {**manifest, "format": FORMAT, "schema": SCHEMA})
     store.close()
     lines = [f"# What this campaign is, for people. {NAME} has all; this is not read."]
-    # A text of JSON is one of TOML.
-    plain = {k: v for k, v in manifest.items() if v is not None and k not in UNTOLD}
-    lines += [f"{k.removesuffix('_text')} = {json.dumps(v)}" for k, v in plain.items()]
+    for key, value in manifest.items():  # a text of JSON is one of TOML
+        if value is not None and key not in ("packages", "simulator", "own"):
+            lines.append(f"{key.removesuffix('_text')} = {json.dumps(value)}")
     (folder / FOR_PEOPLE).write_text("\n".join([*lines, ""]), encoding="utf-8")
+
+
+def stored(method: Method) -> Method:
+    """Return a method that simulates: its rows are kept, apart from global state.
+
+    See :func:`.isolated`.
+    """
+    apart = isolated(method)
+
+    @guarded
+    @functools.wraps(method)
+    def kept(campaign: Any, *arguments: Any, **options: Any) -> Any:
+        storage, own = campaign._storage, campaign._learner.simulator
+        version = campaign.state.version.number
+        expected = "the simulator, which is not stored with a campaign"
+        advice = "pass it: Campaign.load(directory, simulator=...)"
+        require(own is not None, expected, "none", advice)
+        storage.acquire()
+
+        def find(simulator: Any) -> Bank | None:
+            return storage.find_bank(form_of(simulator, own), simulator, version)
+
+        with metering(campaign.state.meter, find):
+            return apart(campaign, *arguments, **options)
+
+    return kept  # type: ignore[return-value]
+
+
+def form_of(simulator: Any, own: Any) -> str:
+    """Return the name of a form of the current simulator; "" for another one.
+
+    Args:
+        simulator: Simulator that may be such a form.
+        own: The current simulator.
+    """
+    if simulator is own:
+        return OWN
+    if isinstance(simulator, IndexedSimulator):
+        return "by-index" * (simulator.simulator is own)
+    if not (isinstance(simulator, SimulatorModel) and isinstance(own, SimulatorModel)):
+        return ""
+    parts = [(m.fn, *getattr(m, "effects", ())) for m in (simulator, own)]
+    if [*map(id, parts[0])] != [*map(id, parts[1])]:
+        return ""
+    if simulator.noise is None and own.noise is not None:
+        return "noise-free"
+    index = getattr(simulator, "next_index", None)
+    return "" if index is None else f"drawn-trial-{index}"
+
+
+def num_rows(folder: str | None) -> int:
+    """Return how many rows of the simulator itself a bank of campaigns has.
+
+    Args:
+        folder: Folder of the bank; None for none.
+    """
+    if folder is None or not Path(folder, NAME).exists():
+        return 0
+    store = Store(Path(folder))
+    return len(Bank(store, name=OWN)) if f"bank {OWN}" in store.catalog else 0

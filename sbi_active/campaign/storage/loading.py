@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
@@ -14,14 +14,11 @@ from sbi_active.campaign.learning.revision import rebuilt, require_effects
 from sbi_active.campaign.state import CampaignState
 from sbi_active.campaign.storage.codec import Absent, NotStorableError, decode
 from sbi_active.campaign.storage.directory import BELIEF, SAVED, Storage
-from sbi_active.campaign.telling import LOG, STATE
+from sbi_active.campaign.telling import STATE
 from sbi_active.expected import require
 from sbi_active.messages import warn
 from sbi_active.simulation.bank.fingerprint import fingerprint, require_same
 from sbi_active.simulation.bank.store import whole
-
-if TYPE_CHECKING:
-    from sbi_active.criticism import Effect
 
 
 def load(
@@ -29,7 +26,7 @@ def load(
     simulator: Callable[..., Any] | None,
     *,
     given: Mapping[str, Any],
-    effects: Sequence[Effect],
+    effects: Sequence[Any],
     limits: Mapping[str, Any],
     simulator_changed: bool,
 ) -> Any:
@@ -44,30 +41,29 @@ def load(
         simulator_changed: Whether the simulator takes the place of the one before.
 
     Raises:
-        ValueError: If they are not what it was made with.
+        NotStorableError: If it was made with anything that only its author can make
+            again, and that is not given.
+        ValueError: If these are not what it was made with.
     """
-    manifest, store = storage.manifest, storage.store
+    manifest, store, found = storage.manifest, storage.store, dict(given)
     with store.reading():
         kept = {what: _decoded(store.get(what)) for what in given}
-        objects = {w: kept[w] if thing is None else thing for w, thing in given.items()}
-        facts = manifest["method"], manifest["seed"], objects["options"]
+        facts = {name: manifest[name] for name in ("method", "seed", "num_earlier")}
         shape = torch.Size(manifest["x_shape"])
-    for what, thing in objects.items():
-        if thing is None:
-            raise NotStorableError(
-                f"expected {what}=, which only its author can make again; got None; "
-                f"pass what the campaign was made with: {manifest[f'{what}_text']:.200}"
-            )
-    prior, space, options = objects["prior"], objects["actions"], objects["options"]
-    storage.prior = prior
-    if kept["options"] not in (None, options):
-        warn(
-            f"SA604 options= hold for this process: the campaign in {storage.path} "
-            f"keeps {manifest['options_text']}; pass them at each load",
-            stacklevel=4,
-        )
-    state = CampaignState(*facts, num_earlier=manifest["num_earlier"])
-    content = restore(state, storage)
+    for what, thing in kept.items():
+        found[what] = thing if given[what] is None else given[what]
+        if found[what] is None:
+            text = f"expected {what}=, which only its author can make again; got None"
+            made = f"{manifest[f'{what}_text']:.200}"
+            raise NotStorableError(f"{text}; pass what it was made with: {made}")
+    with store.reading():
+        state = CampaignState(**facts, options=found["options"])
+        content = restore(state, storage)
+    if kept["options"] not in (None, found["options"]):
+        text = f"the campaign in {storage.path} keeps {manifest['options_text']}"
+        text = f"SA604 options= hold for this process: {text}; pass them at each load"
+        warn(text, stacklevel=4)
+    storage.prior = prior = found["prior"]
 
     def saved(model: Any) -> Any:
         known = {"simulator": model, "prior": prior}
@@ -76,10 +72,10 @@ def load(
         return belief or prior
 
     if simulator is None:
-        belief = saved(Absent()) if content else prior
-        facts = {"simulator": None, "prior": getattr(belief, "prior", prior)}
-        facts |= {"belief": belief, "actions": space, "state": state}
-        return SimpleNamespace(**facts, x_shape=shape, _saved=None)
+        own = {"simulator": None, "belief": saved(Absent()) if content else prior}
+        own |= {"prior": getattr(own["belief"], "prior", prior), "x_shape": shape}
+        own |= {"actions": found["actions"], "state": state, "_saved": None}
+        return SimpleNamespace(**own)
     for what, limit in limits.items():
         as_before = (limit is not None) == manifest[f"has_{what}"]
         expected = f"{what}= {'as declared' if limit is None else 'left out'}"
@@ -91,10 +87,10 @@ def load(
         storage.write("simulator changed", simulator=mine)
         state.apply(storage.events[-1])
     else:
-        before = [e["simulator"] for e in storage.changes] or [manifest["simulator"]]
-        require_same("the campaign", before[-1], mine)
-    model, joint = rebuilt(state, simulator, prior, space, effects)
-    learner = make_learner(model, joint, space, state, x_shape=shape)
+        before = [manifest["simulator"], *storage.changes][-1]
+        require_same("the campaign", before, mine)
+    model, joint = rebuilt(state, simulator, prior, found["actions"], effects)
+    learner = make_learner(model, joint, found["actions"], state, x_shape=shape)
     if content and not state.is_stale:
         learner.resume(functools.partial(saved, model))
     return learner
@@ -108,20 +104,19 @@ def restore(state: CampaignState, storage: Storage) -> bytes | None:
             computed again.
         storage: Storage with the log.
     """
-    store, events = storage.store, storage.events
-    with store.reading():
-        saved = _again(STATE, lambda: _decoded(store.get(STATE))) or {}
-        num = saved.get("lines", 0)
-        whole(store.path, num <= len(events), f"no {LOG!r} {num}: a gap")
-        for name in SAVED if saved else ():
-            setattr(state, name, saved[name])
-        state.meter.spent = saved.get("num_simulated", 0)
-        for event in events[num:]:
-            state.apply(event)
-        content = _again(BELIEF, lambda: store.get(BELIEF))
-    content = content if saved.get("belief") else None
-    lacks = saved.get("belief") and not content and state.processed
-    state.is_stale |= bool(lacks or not saved and len(state.versions) > 1)
+    store = storage.store
+    saved = _again(STATE, lambda: _decoded(store.get(STATE))) or {}
+    num = saved.get("lines", 0)
+    whole(store.path, num <= len(storage.events), f"no 'log' {num}: a gap")
+    for name in SAVED if saved else ():
+        setattr(state, name, saved[name])
+    state.meter.spent = saved.get("num_simulated", 0)
+    for event in storage.events[num:]:
+        state.apply(event)
+    has_belief = saved.get("belief")
+    content = _again(BELIEF, lambda: store.get(BELIEF)) if has_belief else None
+    lost = has_belief and not content and state.processed
+    state.is_stale |= bool(lost or not saved and len(state.versions) > 1)
     return content
 
 
@@ -134,5 +129,5 @@ def _again(what: str, read: Callable[[], Any]) -> Any:
     try:
         return read()
     except (OSError, ValueError) as error:
-        warn(f"SA601 the {what} has to be computed again: {error}", stacklevel=4)
+        warn(f"SA601 the {what} has to be computed again: {error}", stacklevel=5)
         return None
