@@ -122,23 +122,22 @@ def reuse(
     column = bank.columns("theta", "action", "status", "label", "log_proposal")
     usable = (column["status"] != Outcome.MISSING) & column["log_proposal"].isfinite()
     rows = usable.nonzero()[:, 0]
+    expected = f"rows of {bank} from a known proposal, within the support of the target"
+    advice = "simulate from it with store=bank.drawn_from(prior, label='prior')"
+    require(len(rows) > 0, expected, "none whose proposal is known", advice)
     known = {name: values[rows] for name, values in column.items()}
     log_denominator = known["log_proposal"]
     if proposals is not None:
         log_denominator = _log_mixture(known, proposals, bank.labels)
     log_weight = log_density(target, known["theta"]) - log_denominator
-    usable = bool((log_weight > -torch.inf).any())
-    expected = f"rows of {bank} from a known proposal, within the support of the target"
-    advice = "simulate from it with store=bank.drawn_from(prior, label='prior')"
-    require(usable, expected, f"{len(rows)} rows, all of density 0", advice)
+    is_covered = bool((log_weight > -torch.inf).any())
+    require(is_covered, expected, f"{len(rows)} rows, all of density 0", advice)
     result = ReusedRows(bank, rows, log_weight.softmax(0))
     worth = result.effective_sample_size
     if worth < FEW:
-        text = (
-            f"SA304 {len(rows)} rows of the bank are worth {worth:.1f} draws from the"
-        )
+        text = f"SA304 {len(rows)} rows of the bank are worth {worth:.1f} draws"
         advice = "simulate more rows from it or near it, or give all proposals="
-        warn(f"{text} target, fewer than {FEW}: {advice}", stacklevel=2)
+        warn(f"{text} from the target, fewer than {FEW}: {advice}", stacklevel=2)
     return result
 
 

@@ -125,3 +125,8 @@ def test_a_target_elsewhere(bank):
     empty = Bank(bank.path.parent / "empty", simulator=simulator)
     with pytest.raises(ValueError, match=r"expected rows in .*; got none"):
         reuse(empty, TARGET)
+    with empty:
+        empty.append(bank.read(slice(0, 9)), seed=0)
+        for proposals in (None, PROPOSALS):
+            with pytest.raises(ValueError, match="got none whose proposal is known"):
+                reuse(empty, TARGET, proposals=proposals)
