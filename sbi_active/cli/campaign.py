@@ -118,6 +118,7 @@ class Session:
 
             how = {"trust": trust, "simulator_changed": simulator_changed}
             campaign = open_campaign(self.folder, simulator=simulator, **how)
+        assert campaign is not None
         with campaign:  # then others may write
             answer = function(campaign, **options)
             if need == "simulator":

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 
 from sbi_active.simulation.bank.bank import SHAPED, Bank
-from sbi_active.simulation.bank.store import CorruptSegmentError, Store, whole
+from sbi_active.simulation.bank.errors import CorruptSegmentError, whole
+from sbi_active.simulation.bank.store import Store
 
 COLUMNS = (*SHAPED, "status", "index", "log_proposal")
 NAME = re.compile(r"(\d{8})-(\d{8})\.h5")

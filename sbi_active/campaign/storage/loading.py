@@ -17,8 +17,8 @@ from sbi_active.campaign.storage.directory import BELIEF, SAVED, Storage
 from sbi_active.campaign.telling import STATE
 from sbi_active.expected import require
 from sbi_active.messages import warn
+from sbi_active.simulation.bank.errors import whole
 from sbi_active.simulation.bank.fingerprint import fingerprint, require_same
-from sbi_active.simulation.bank.store import whole
 
 
 def load(

@@ -7,6 +7,6 @@ simulate. Names are imported when they are used: a store needs no torch.
 from sbi_active.renamed import lazy_names
 
 HOMES = {"bank": "Bank", "reweighting": "ReusedRows reuse"}
-HOMES["store"] = "CorruptSegmentError LockedError"
+HOMES["errors"] = "CorruptSegmentError LockedError"
 
 __getattr__ = lazy_names(__name__, HOMES)

@@ -19,8 +19,9 @@ from torch.distributions import Distribution
 from sbi_active.arrays import Array, own_tensor
 from sbi_active.expected import require
 from sbi_active.messages import warn
+from sbi_active.simulation.bank.errors import CorruptSegmentError, whole
 from sbi_active.simulation.bank.fingerprint import fingerprint, require_same
-from sbi_active.simulation.bank.store import CorruptSegmentError, Store, whole
+from sbi_active.simulation.bank.store import Store
 from sbi_active.simulation.outcomes import Outcome, Simulations
 from sbi_active.simulation.workers.store import run_digest
 from sbi_active.support import log_density
@@ -50,7 +51,6 @@ class Bank:
         simulator: Simulator of these rows. Its name, settings and source are compared
             with those in the bank.
         version: Version of the simulator, yours; given, it stands for the source code.
-        parameter_names: Names of the parameters; None takes those of the simulator.
         created: Date to note in a new bank.
         name: Name of the bank in its file, which may hold several, as a campaign's
             does.
@@ -83,7 +83,6 @@ class Bank:
         *,
         simulator: Callable[..., Any] | None = None,
         version: str = "",
-        parameter_names: Sequence[str] | None = None,
         created: str | None = None,
         name: str = "rows",
     ) -> None:
@@ -95,10 +94,10 @@ class Bank:
         self._last = -1, np.zeros(0)  # the segment whose x was read last
         self._proposal: tuple[Distribution | None, str] = (None, "")
         if simulator is not None:
-            names = parameter_names or getattr(simulator, "parameter_names", None)
-            names = None if names is None else [*names]
-            mine = {"created": created, "parameter_names": names, "shapes": None}
-            mine |= fingerprint(simulator, version=version)
+            names = getattr(simulator, "parameter_names", None)
+            mine = fingerprint(simulator, version=version)
+            mine |= {"created": created, "shapes": None}
+            mine["parameter_names"] = names and [*names]
             if self._store.json(self._key) is None:
                 with self._store.writing():
                     if self._store.json(self._key) is None:  # nobody was faster

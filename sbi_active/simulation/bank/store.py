@@ -13,11 +13,9 @@ of its log alone.
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import os
-import re
 import secrets
 import sqlite3
 import threading
@@ -29,7 +27,7 @@ from typing import Any
 from urllib.parse import quote
 
 from sbi_active.expected import require
-from sbi_active.messages import Explained
+from sbi_active.simulation.bank.errors import sensible, whole
 
 NAME, FORMAT = "store.db", 3  # format 1 was folders of HDF5, 2 had three tables
 LOCK = "store.lock"  # empty: who writes holds SQLite's lock on it
@@ -44,8 +42,6 @@ SCHEMA = (
 SETTINGS = ("trusted_schema = OFF", "cell_size_check = ON", "journal_mode = WAL")
 SETTINGS += ("synchronous = FULL", "secure_delete = OFF")
 SETTINGS += (f"journal_size_limit = {64 * 2**20}",)
-#: SQLite's errors that say nothing against the file.
-OF_THE_DISK = re.compile("locked|full|readonly|disk I/O|unable to open|too big")
 #: Seconds to wait for a moment in which another process tidies up. A choice.
 PATIENCE = 10.0
 OTHERWISE = "or bring what is there from before up to date by: sbi-active migrate"
@@ -53,38 +49,6 @@ OTHERWISE = "or bring what is there from before up to date by: sbi-active migrat
 #: One thread at a time reads or writes, and none while the process forks.
 _GUARD = threading.RLock()
 _STORES: weakref.WeakSet[Store] = weakref.WeakSet()
-
-
-class CorruptSegmentError(Explained, OSError):
-    """A file of a bank or campaign that does not hold what was written to it.
-
-    Attributes:
-        path: The file.
-        reason: Text that says what is wrong with it.
-    """
-
-    code = "SA605"
-
-    def __init__(self, path: Path, reason: str) -> None:
-        self.path, self.reason = path, reason
-        text = f"expected {path} as it was written; got {reason}"
-        super().__init__(f"{text}; restore it from a copy")
-
-
-class LockedError(Explained, OSError):
-    """Somebody else is writing."""
-
-    code = "SA608"
-
-
-def whole(path: Path, holds: bool, reason: str) -> None:
-    """Raise if something does not hold of a file.
-
-    Raises:
-        CorruptSegmentError: If it does not hold, with the reason.
-    """
-    if not holds:
-        raise CorruptSegmentError(path, reason)
 
 
 class Store:
@@ -143,7 +107,7 @@ class Store:
             try:
                 if opens:
                     self._open()
-                with _sense(self.path):
+                with sensible(self.path):
                     yield self._connection
                 keeps = self.held
             finally:
@@ -178,7 +142,7 @@ class Store:
             LockedError: If another writer, in this process or another, has it.
             OSError: If the folder cannot be written.
         """
-        with _GUARD, _sense(self.folder / LOCK):
+        with _GUARD, sensible(self.folder / LOCK):
             if self.held:
                 return
             self._lock = _connected(self.folder / LOCK, "rwc", timeout=0.1)
@@ -280,7 +244,7 @@ class Store:
         fresh, name = folder / f"{TEMPORARY}{os.getpid()}-{NAME}", secrets.randbits(31)
         fresh.unlink(missing_ok=True)
         made = sqlite3.connect(fresh, isolation_level=None)
-        with _sense(fresh), closing(made):
+        with sensible(fresh), closing(made):
             for setting in (f"user_version = {FORMAT}", f"application_id = {name}"):
                 made.execute(f"PRAGMA {setting}")
             made.execute("PRAGMA journal_mode = WAL")
@@ -302,7 +266,7 @@ class Store:
         self._connection = _connected(path, mode, timeout=PATIENCE)
         whole(path, path.stat().st_size > 0, "an empty file")
         execute = self._connection.execute
-        with _sense(path):
+        with sensible(path):
             for setting in SETTINGS:
                 execute(f"PRAGMA {setting}")
             execute("BEGIN")
@@ -339,31 +303,6 @@ def synchronize(folder: Path) -> None:
         descriptor = os.open(folder, os.O_RDONLY)
         os.fsync(descriptor)
         os.close(descriptor)
-
-
-@contextmanager
-def _sense(path: Path) -> Iterator[None]:
-    """Turn errors of SQLite, and of content without sense, into this library's."""
-    try:
-        yield
-    except OSError:
-        raise
-    except Exception as error:  # what a crafted file leads to has no end
-        text = f"{type(error).__name__}: {error!s:.200}"
-        if not (isinstance(error, sqlite3.Error) and OF_THE_DISK.search(text)):
-            raise CorruptSegmentError(path, f"content that leads to {text}") from error
-        if "locked" in text:
-            raise LockedError(
-                f"expected no other writer of {path.parent}; got one; wait for it, "
-                "call close() there, or write to a folder of your own: any number of "
-                "readers may go on"
-            ) from error
-        raise OSError(
-            errno.ENOSPC if "full" in text else errno.EIO,
-            f"expected to read and write; got {text!r}; make room or choose a place "
-            "that can be written, and run again: what was stored before is whole",
-            str(path),
-        ) from error
 
 
 def _connected(path: Path, mode: str, *, timeout: float) -> sqlite3.Connection:
