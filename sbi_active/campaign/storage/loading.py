@@ -47,7 +47,8 @@ def load(
     """
     manifest, store, found = storage.manifest, storage.store, dict(given)
     with store.reading():
-        kept = {what: _decoded(store.get(what)) for what in given}
+        lost = manifest.get("own", ())  # there draws stand for them, as they did once
+        kept = {w: None if w in lost else _decoded(store.get(w)) for w in given}
         facts = {name: manifest[name] for name in ("method", "seed", "num_earlier")}
         shape = torch.Size(manifest["x_shape"])
     for what, thing in kept.items():
