@@ -242,7 +242,7 @@ def write_campaign(
     """
     store = Store(folder, "campaign", make=True)
     expected, got = "an empty folder for a new campaign", f"{folder} with one"
-    advice = "go on with it by Campaign.load(directory, simulator=...), or take another"
+    advice = "go on by Campaign.load(directory, simulator=...) or choose another folder"
     require(not store.catalog, expected, got, advice)
     with store.writing():
         store.put(MANIFEST, 0, {**manifest, "format": FORMAT, "schema": SCHEMA})

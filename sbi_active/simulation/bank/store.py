@@ -79,7 +79,11 @@ class Store:
         with _GUARD:
             _STORES.add(self)
         if make and not os.path.lexists(self.path):
-            self._make()
+            try:
+                self._make()
+            except OSError:  # unless somebody was faster, and tidied up
+                if not self.path.exists():
+                    raise
         with self.reading():
             pass
 

@@ -154,7 +154,7 @@ def test_one_writer_any_number_of_readers(tmp_path):
 
 def test_a_new_campaign_wants_an_empty_directory(tmp_path):
     new(tmp_path / "c").close()
-    with pytest.raises(ValueError, match=r"go on with it by Campaign\.load"):
+    with pytest.raises(ValueError, match=r"go on by Campaign\.load"):
         new(tmp_path / "c")
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.tex").touch()
