@@ -21,9 +21,13 @@ from sbi_active.campaign.learning.pooled import make_learner
 from sbi_active.campaign.learning.revision import recompute, revise
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.state import CampaignState, Trial
-from sbi_active.campaign.storage.directory import Storage
-from sbi_active.campaign.storage.loading import load, make_campaign
-from sbi_active.campaign.storage.simulations import num_rows, stored
+from sbi_active.campaign.storage.directory import (
+    Storage,
+    make_campaign,
+    num_rows,
+    stored,
+)
+from sbi_active.campaign.storage.loading import load
 from sbi_active.campaign.trials import CampaignTrials
 from sbi_active.design.target import Target
 from sbi_active.renamed import set_later
@@ -151,7 +155,6 @@ class Campaign(CampaignTrials):
         options: CampaignOptions | Mapping[str, Any] | None = None,
         show_progress: bool = False,
         simulator_changed: bool = False,
-        repair: bool = False,
     ) -> Campaign:
         """Return the campaign in a directory, where it was left or killed.
 
@@ -176,8 +179,6 @@ class Campaign(CampaignTrials):
             show_progress: Whether to draw a progress bar.
             simulator_changed: Whether to take another simulator than the campaign was
                 made with, and compute everything again with it.
-            repair: Whether to drop damaged records. The former files are kept beside,
-                and a warning names each trial that has to be told again.
 
         Raises:
             ValueError: If there is no campaign, or one of another simulator or schema.
@@ -189,7 +190,7 @@ class Campaign(CampaignTrials):
             "options": None if options is None else CampaignOptions.of(options),
         }
         limits: Any = {"cost": cost, "constraint": constraint}
-        storage = Storage(Path(directory), repair=repair)
+        storage = Storage(Path(directory))
         learner = load(
             storage,
             simulator,

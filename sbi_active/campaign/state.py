@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -15,7 +15,7 @@ from torch.distributions import Distribution
 
 from sbi_active import progress
 from sbi_active.campaign.options import CampaignOptions
-from sbi_active.campaign.telling import Facts, Status
+from sbi_active.campaign.telling import Facts, Status, facts_in
 from sbi_active.design.design import Design
 from sbi_active.display.notebook import card, facts
 from sbi_active.display.table import number
@@ -26,8 +26,6 @@ from sbi_active.simulation.workers.store import Meter
 #: Ranges of the simulations from the prior beyond all of them at which an outcome is no
 #: longer used: no simulator that is worth refining is that far off.
 FAR = 5.0
-LOST = "its record was lost"  # reason of a trial that a repair gave up
-MOST_LOST = 10_000  # trials that a repair gives up at once; the index is damaged beyond
 
 
 @dataclass(frozen=True)
@@ -257,15 +255,11 @@ class CampaignState:
         """
         index, num = facts.index, len(self.trials)
         action = tensor_of(facts.action)
-        if index > num + MOST_LOST:
+        if index > num:
             raise ValueError(f"expected a trial after {num}; got {index}")
-        for gap in range(num, index):  # what a repair of the log gave up
-            lost = torch.full_like(action, torch.nan)
-            self.trials.append(Trial(gap, lost, status="withdrawn", reason=LOST))
-            self.is_stale |= gap in self.processed
         x = None if facts.x is None else tensor_of(facts.x)
         known: dict[str, Any] = {**vars(facts), "action": action, "x": x}
-        if index >= num:
+        if index == num:
             self.trials.append(Trial(**known))
         else:
             before = self.trials[index]
@@ -274,6 +268,24 @@ class CampaignState:
             self.trials[index] = replace(before, **known)
         self.is_stale |= index in self.processed
         return self.trials[index]
+
+    def apply(self, event: Mapping[str, Any]) -> None:
+        """Change by a line of the log, as the campaign did when it was written."""
+        what, facts = event["event"], facts_in(event)
+        if facts is not None:
+            self.record(facts)
+        elif what == "simulator changed":
+            self.is_stale = bool(self.processed)  # until an update is saved
+        elif what == "examined":
+            self.examined(event["digest"])
+        elif what == "adopted":
+            version: dict[str, Any] = {
+                name: tuple(part) if isinstance(part, list) else part
+                for name, part in event["version"].items()
+            }
+            self.versions.append(ModelVersion(**version))
+            self.processed[:] = version["trials"]
+            self.is_stale = True
 
     def examined(self, digest: str) -> None:
         """Note that the current model was compared with the trials.

@@ -145,7 +145,7 @@ class CampaignTrials(Telling[Trial]):
     @property
     def events(self) -> Sequence[Mapping[str, Any]]:
         """The lines of the log on the disk so far, without one in memory alone."""
-        return self._storage.events
+        return (*self._storage.events,)
 
     def contains(self, trial: Trial) -> bool:
         """Return whether the belief takes account of a trial as it is recorded now."""

@@ -88,15 +88,19 @@ class Session:
             with contextlib.suppress(record.Unsure):
                 return function(record.Record(self.folder), **options)
         simulates = need == "simulator" or need == "reader" and self._place[1]
+        if campaign is None and not simulates:
+            from sbi_active import Campaign
+            from sbi_active.campaign.storage.codec import NotStorableError
+
+            with contextlib.suppress(
+                NotStorableError
+            ):  # if a program alone can make it
+                campaign = Campaign.load(self.folder)
         lacks = simulates and getattr(campaign, "simulator", None) is None
-        if lacks or simulator_changed:
+        if campaign is None or lacks or simulator_changed:
             from sbi_active.cli.problem import open_campaign
 
             campaign = open_campaign(*self._place, simulator_changed)
-        elif campaign is None:
-            from sbi_active import Campaign
-
-            campaign = Campaign.load(self.folder)
         with campaign:  # then others may write
             answer = function(campaign, **options)
             if need == "simulator":

@@ -31,6 +31,7 @@ from sbi_active.cli.declare import located, misuse, number_of, pairs_of
 from sbi_active.criticism import Effect, generic_effects
 from sbi_active.expected import require
 from sbi_active.simulation import GaussianNoise, SimulatorModel
+from sbi_active.simulation.bank.store import Store
 from sbi_active.tasks import Task, get_task  # pyright: ignore
 
 #: Actions of one space. A choice: each is stored in the campaign's folder and takes
@@ -228,9 +229,10 @@ def open_campaign(
     Raises:
         ValueError: If there is no campaign, or its simulator is not known.
     """
-    reader, named = Campaign.load(folder), {"simulator": simulator, "noise": noise}
-    known = named if simulator else _remembered(folder)
+    Store(folder, "campaign")  # where there is none, this is said first
+    known = {"simulator": simulator, "noise": noise} if simulator else _named(folder)
     model, prior, actions, effects = problem_of(known, needs=())
+    reader = Campaign.load(folder, prior=prior, actions=actions)
     if reader.state.version.effects:
         effects = with_generic(effects, model, reader.actions, reader.first_prior)
     how = {"simulator": model, "prior": prior, "actions": actions, "effects": effects}
@@ -250,7 +252,7 @@ def remember(folder: Path, /, **options: Any) -> None:
         path.write_text(json.dumps({"folder": os.getcwd(), **options}))
 
 
-def _remembered(folder: Path) -> dict[str, Any]:
+def _named(folder: Path) -> dict[str, Any]:
     found: Any = {}
     with suppress(OSError, ValueError):
         found = json.loads(_path_of(folder).read_text())

@@ -56,9 +56,8 @@ class Record(Telling[Any]):
         try:
             with _stored(folder) as store:
                 self._known = json.loads(store.get(telling.SUMMARY) or b"{}")
-                self._kept: list[Any] = [
-                    SimpleNamespace(**trial) for trial in self._known["trials"]
-                ]
+                trials = self._known["trials"]
+                self._kept: list[Any] = [SimpleNamespace(**facts) for facts in trials]
                 self.actions = SimpleNamespace(**self._known["actions"])
                 self._num: int = self._known["lines"]
                 for number in range(self._num + 1, store.length(telling.LOG) + 1):
@@ -105,8 +104,11 @@ class Record(Telling[Any]):
     def _record(self, event: str, facts: Facts) -> Any:
         line = telling.event_of(event, facts)
         with _stored(self.directory) as store, store.writing():
-            if store.append(telling.LOG, line) != self._num + 1:  # others were faster
-                raise Unsure
+            is_known = store.length(telling.LOG) == self._num  # else others were faster
+            if is_known:
+                store.append(telling.LOG, line)
+        if not is_known:
+            raise Unsure
         self._take(line)
         return self._kept[facts.index]
 

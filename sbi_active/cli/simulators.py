@@ -42,11 +42,9 @@ def criticize(trials: Path, **given: Any) -> Answer:
     campaign, which knows its simulator and its prior, or of recordings, with trials.csv
     or one file *.csv a trial.
     """
-    from sbi_active.campaign.storage.directory import has_manifest
-
     if given["out"] is not None:  # else all is computed before this fails
         given["out"].mkdir(parents=True, exist_ok=True)
-    if not (trials.is_dir() and has_manifest(trials)):
+    if not any((trials / name).exists() for name in ("store.db", "campaign.json")):
         return _compared(trials, given)
     own = (*("task", "theta_low", "theta_high", "actions"), "columns", "inputs", "set")
     wrong = ", ".join(name for name in own if given[name])

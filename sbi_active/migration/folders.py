@@ -13,18 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from sbi_active.campaign.storage.codec import decode, encode
-from sbi_active.campaign.storage.directory import BELIEF
-from sbi_active.campaign.storage.loading import FOR_PEOPLE, write_campaign
+from sbi_active.campaign.storage.directory import BELIEF, FOR_PEOPLE, write_campaign
 from sbi_active.campaign.telling import LOG, STATE
 from sbi_active.migration.described import actions_from, options_from, prior_from
 from sbi_active.migration.segments import copy_bank
-from sbi_active.simulation.bank.sqlite import (
-    NAME,
-    TEMPORARY,
-    CorruptSegmentError,
-    synchronize,
-)
-from sbi_active.simulation.bank.store import Store
+from sbi_active.simulation.bank.errors import CorruptSegmentError
+from sbi_active.simulation.bank.store import NAME, TEMPORARY, Store, synchronize
 
 BEFORE = "version-1"  # gets the files of before
 #: What release 0.1 wrote into a folder.
@@ -153,7 +147,7 @@ def _entries(path: Path) -> list[Mapping[str, Any]]:
         text = head + b"}"
         if tail != f'{zlib.crc32(text):08x}"}}'.encode():
             raise CorruptSegmentError(
-                path, f"line {number} with another checksum: repair it by release 0.1"
+                path, f"line {number} with another checksum: open it by release 0.1"
             )
         entries.append(json.loads(text))
     return entries

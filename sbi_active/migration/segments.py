@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from sbi_active.simulation.bank.rows import COLUMNS, Rows
-from sbi_active.simulation.bank.sqlite import CorruptSegmentError, require, sensible
+from sbi_active.simulation.bank.bank import SHAPED, Bank
+from sbi_active.simulation.bank.errors import CorruptSegmentError, whole
 from sbi_active.simulation.bank.store import Store
 
+COLUMNS = (*SHAPED, "status", "index", "log_proposal")
 NAME = re.compile(r"(\d{8})-(\d{8})\.h5")
 
 
@@ -36,14 +37,16 @@ def copy_bank(folder: Path, store: Store, name: str) -> int:
         ImportError: If there are rows, and no h5py.
     """
     path = folder / "bank.json"
-    with sensible(path):
+    try:
         header = dict(json.loads(path.read_bytes()))
+    except (ValueError, TypeError) as error:
+        raise CorruptSegmentError(path, f"no header ({error})") from error
     kept = ("created", "version", "simulator", "parameter_names", "shapes")
     lacking = [key for key in kept if key not in header]
-    require(path, not lacking and header.get("format") == 1, "no header of release 0.1")
-    into, total = Rows(store, name), 0
+    whole(path, not lacking and header.get("format") == 1, "no header of release 0.1")
     with store.writing():
-        store.put(into._key, 0, {key: header[key] for key in kept})
+        store.put(f"bank {name}", 0, {key: header[key] for key in kept})
+    into, total = Bank(store, name=name), 0
     for file in _files(folder, header):
         columns, runs = _read(file)
         run = columns.pop("run")
@@ -73,7 +76,7 @@ def _files(folder: Path, header: dict[str, Any]) -> Iterator[Path]:
     numbers += [*range(end + 1, header.get("num_segments", 0) + 1)]
     lost = [n for a, b in header.get("lost", []) for n in range(a, b + 1)]
     gone = sorted({*numbers} - {*lost})
-    require(folder / "segments", not gone, f"a gap: segments {gone} are not there")
+    whole(folder / "segments", not gone, f"a gap: segments {gone} are not there")
 
 
 def _read(path: Path) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
@@ -89,13 +92,13 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
         with open(path, "rb") as opened, h5py.File(opened, "r") as file:
             text = _plain(h5py, file, "meta", path).tobytes()
             same = hashlib.sha256(text).hexdigest() == str(file.attrs["sha256"])
-            require(path, same, "meta data with another checksum")
+            whole(path, same, "meta data with another checksum")
             meta = json.loads(text)
             names = [*COLUMNS, "log_action", "run"]
             columns = {name: _plain(h5py, file, name, path) for name in names}
         for name, column in columns.items():
             same = _checksum(column) == meta["checksums"][name]
-            require(path, same, f"{name!r} with another checksum")
+            whole(path, same, f"{name!r} with another checksum")
     except CorruptSegmentError:
         raise
     except Exception as error:  # HDF5 has many
@@ -107,7 +110,7 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], list[dict[str, Any]]]:
 def _plain(h5py: Any, file: Any, name: str, path: Path) -> np.ndarray:
     """Return a dataset: plain numbers within this very file, no larger than it."""
     is_here = isinstance(file.get(name, getlink=True), h5py.HardLink)
-    require(path, is_here, f"{name!r} in another place")
+    whole(path, is_here, f"{name!r} in another place")
     dataset = file[name]
     plan = dataset.id.get_create_plist()
     is_plain = (
@@ -116,7 +119,7 @@ def _plain(h5py: Any, file: Any, name: str, path: Path) -> np.ndarray:
         and dataset.dtype.kind in "iuf"
         and dataset.nbytes <= path.stat().st_size
     )
-    require(path, is_plain, f"{name!r} of another kind")
+    whole(path, is_plain, f"{name!r} of another kind")
     return dataset[()]
 
 

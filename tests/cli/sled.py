@@ -58,9 +58,7 @@ def forked(words, place="", **options):
 def forget(folder, content=None):
     """Have a folder's summary be another one, or none."""
     with contextlib.closing(Store(folder, "campaign")) as store, store.writing():
-        store.delete(SUMMARY)
-        if content is not None:
-            store.put(SUMMARY, 0, content)
+        store.put(SUMMARY, 0, content or b"{}")
 
 
 def read(text):

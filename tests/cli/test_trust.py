@@ -46,12 +46,16 @@ NAMED = ["--simulator", "mine.py:slide"]
 
 
 @pytest.fixture
-def mine(tmp_path, monkeypatch):
-    """A campaign whose simulator, prior and actions are programs."""
+def mine(tmp_path, monkeypatch, request):
+    """A campaign whose simulator, prior and actions are programs, or only the first."""
     monkeypatch.setattr(sys, "path", [*sys.path])
     ran = tmp_path / "ran"
     forget(ran)
-    (tmp_path / "mine.py").write_text(MINE.format(run=RUN.format(ran)))
+    program = MINE.format(run=RUN.format(ran))
+    if getattr(request, "param", None) == "stored":
+        program = program.replace("= Mine(", "= Independent(")
+        program = program.replace("= Speeds(", "= DiscreteActions(")
+    (tmp_path / "mine.py").write_text(program)
     assert main(["init", "camp", *NAMED, *SMALL]) == 0
     main(["tell", "camp", "0.3", "--action", "1"])
     forget(ran)
@@ -64,6 +68,7 @@ def forget(ran):
     ran.unlink(missing_ok=True)
 
 
+@pytest.mark.parametrize("mine", ["stored"], indirect=True)
 @pytest.mark.parametrize("words", READING, ids=lambda w: w[0])
 def test_reading_imports_nothing(mine, words):
     assert main(words) == 0
@@ -95,6 +100,8 @@ def test_nothing_that_a_folder_says_is_imported(mine, tmp_path, capsys, command)
     assert main([command, "other"]) == 2
     assert "expected --simulator; got none" in capsys.readouterr().err
     assert not mine.exists()
+    assert main(["report", "other"]) == 2  # whose prior only a program can make
+    assert not mine.exists()
 
 
 def test_named_once_it_is_known_again(mine):
@@ -114,6 +121,7 @@ def test_a_home_that_cannot_be_written_remembers_nothing(mine, capsys, monkeypat
     assert "expected --simulator; got none" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("mine", ["stored"], indirect=True)
 def test_what_stands_beside_somebody_is_not_imported(mine, tmp_path):
     """A file called as a library, in a folder that somebody has just entered."""
     for name in ("torch", "sqlite3", "mine"):

@@ -6,9 +6,6 @@ infer or design.
 
 from sbi_active.renamed import former_names
 
-__all__: list[str] = []
+FORMER = {"DamagedCampaignError": "sbi_active.simulation.bank:CorruptSegmentError"}
 
-__getattr__ = former_names(
-    __name__,
-    {"DamagedCampaignError": "sbi_active.simulation.bank:CorruptSegmentError"},
-)
+__getattr__ = former_names(__name__, FORMER)

@@ -8,49 +8,41 @@ simulator's. ``campaign.toml`` says what the campaign is, for people alone.
 
 from __future__ import annotations
 
+import functools
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import platform
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from sbi_active.campaign.state import CampaignState, ModelVersion
-from sbi_active.campaign.storage.codec import NotStorableError, decode, encode
-from sbi_active.campaign.storage.simulations import form_of
-from sbi_active.campaign.telling import LOG, STATE, SUMMARY, event_of, facts_in
+from sbi_active.campaign.isolation import guarded, isolated
+from sbi_active.campaign.learning.indexed import IndexedSimulator
+from sbi_active.campaign.state import CampaignState
+from sbi_active.campaign.storage.codec import NotStorableError, encode
+from sbi_active.campaign.telling import LOG, STATE, SUMMARY, event_of, now
+from sbi_active.expected import require
 from sbi_active.messages import Explained
 from sbi_active.simulation.bank.bank import Bank
-from sbi_active.simulation.bank.sqlite import (
-    NAME,
-    CorruptSegmentError,
-    require,
-    sensible,
-)
-from sbi_active.simulation.bank.store import Store
+from sbi_active.simulation.bank.fingerprint import fingerprint
+from sbi_active.simulation.bank.store import NAME, Store
+from sbi_active.simulation.model import SimulatorModel
+from sbi_active.simulation.workers.store import metering
 
 FORMAT, SCHEMA = "sbi-active campaign", 3  # schema 1 was a folder of files
-#: Records: what a campaign is, with a copy, and what was computed.
-MANIFEST, COPY, BELIEF = "campaign", "campaign copy", "belief"
+MANIFEST, BELIEF, FOR_PEOPLE = "campaign", "belief", "campaign.toml"
+OWN = "drawn"  # rows of the simulator itself
+PACKAGES = "sbi-active", "sbi", "torch", "numpy"
 #: What a state holds beside the settings of the campaign.
 SAVED = ("trials", "processed", "draws", "versions", "is_stale", "batches")
+Method = TypeVar("Method", bound=Callable[..., Any])
 
 
 class LogChangedError(Explained, ValueError):
-    """Another writer added to a campaign since it was loaded here.
-
-    Attributes:
-        path: The file.
-    """
+    """Another writer added to a campaign since it was loaded here."""
 
     code = "SA607"
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        super().__init__(
-            f"expected the campaign in {path.parent} as it was loaded; got trials that "
-            "another process told since; load it again, and tell this once more: "
-            "nothing was written"
-        )
 
 
 class Storage:
@@ -63,14 +55,11 @@ class Storage:
 
     Args:
         path: Folder with a campaign; None keeps it in memory alone.
-        repair: Whether to give up what is damaged.
         prior: Prior that the campaign began with; it may be set later.
 
     Attributes:
         path: The folder.
-        store: Store of the campaign's records; None without a folder.
         manifest: Description of the campaign.
-        notes: Notes on what was given up, a sentence each.
         bank: Folder of the simulations, to be set; None keeps them in the campaign's
             file.
         prior: Prior that the campaign began with.
@@ -80,52 +69,38 @@ class Storage:
         CorruptSegmentError: If the file does not hold what was written.
     """
 
-    def __init__(
-        self, path: Path | None = None, *, repair: bool = False, prior: Any = None
-    ) -> None:
+    def __init__(self, path: Path | None = None, *, prior: Any = None) -> None:
         self.path, self.prior = path, prior
-        self.notes: list[str] = []
         self.manifest: dict[str, Any] = {}
+        self.events: list[dict[str, Any]] = []
         self.bank: str | None = None
-        self._entries: list[dict[str, Any]] = []
-        self._saved: dict[str, Any] | None = None
         self._written: Any = None  # the belief that is on the disk
         self._banks: dict[str, Bank] = {}
-        self._shared: Store | None = None  # the file of ``bank``
+        self._shared: Any = None  # the file of ``bank``
         self.store: Any = None
         if path is not None:
             self.store = Store(path, "campaign")
-            if repair and self.store.problems():
-                self._give_up()
             with self.store.reading():
-                self._read(repair=repair)
+                self.manifest = self.store.json(MANIFEST) or {}
+                for number in range(1, self.store.length(LOG) + 1):
+                    self.events.append({**self.store.json(LOG, number), "line": number})
+                    _ = self.events[-1]["event"]
+            form, packages = map(self.manifest.get, ("schema", "packages"))
+            expected, got = f"a campaign of schema {SCHEMA}", f"{form} in {path}"
+            advice = f"use the release that wrote it, {packages}, or make a campaign"
+            require(form == SCHEMA, expected, got, advice)
 
-    def _read(self, *, repair: bool) -> None:
-        store = self.store
-        self.manifest = read_manifest(store)
-        self._entries = [self._line(k + 1) for k in range(store.length(LOG))]
-        self._saved = self._kept(STATE, lambda content: decode(content, known={}))
-        if self._saved is not None:
-            with sensible(store.path):
-                self._require_whole(self._saved, repair=repair)
-        for entry in self._changes:
-            self.manifest["simulator"] = entry["simulator"]
-
-    def find_bank(
-        self, simulator: Callable[..., Any], current: Any, version: int
-    ) -> Bank | None:
+    def find_bank(self, name: str, simulator: Any, version: int) -> Bank | None:
         """Return the bank of a form of the current simulator, open for writing.
 
         Args:
+            name: Name of the form; "" for another simulator, which has no bank.
             simulator: Simulator whose rows are to be kept.
-            current: The current simulator of the campaign.
-            version: Number of its version.
+            version: Number of the current simulator.
         """
-        is_kept = self.store is not None or self.bank is not None
-        name = form_of(simulator, current) if is_kept and current is not None else None
-        if name is None:
+        if not name or self.store is None and self.bank is None:
             return None
-        changes = len(self._changes) if self.bank is None else 0
+        changes = 0 if self.bank is not None else len(self.changes)
         name += f"-model-{version}" * (version > 0)
         name += f"-changed-{changes}" * (changes > 0)
         if name not in self._banks:
@@ -135,6 +110,12 @@ class Storage:
             self._banks[name] = Bank(place, simulator=simulator, name=name)
         return self._banks[name]
 
+    @property
+    def changes(self) -> list[Any]:
+        """Fingerprints of the simulators that took the place of the one before."""
+        found = [event for event in self.events if "simulator" in event]
+        return [event["simulator"] for event in found]
+
     def write(self, event: str, trial: Any = None, **entries: Any) -> None:
         """Add to the log; it is on the disk when this returns.
 
@@ -143,38 +124,16 @@ class Storage:
             trial: The trial as it is afterwards, or its facts.
             **entries: JSON data.
         """
-        if self.store is None:
-            return
-        line = json.loads(json.dumps(event_of(event, trial, **entries)))
-        with self._writing():
-            number = self.store.append(LOG, line)
-        self._entries.append({**line, "line": number})  # as it is read again
-
-    @property
-    def events(self) -> Sequence[Mapping[str, Any]]:
-        """The lines of the log so far."""
-        return (*self._entries,)
-
-    def given(self, what: str, *, reads: bool) -> Any:
-        """Return the prior, the actions or the options; None if they are not stored.
-
-        Args:
-            what: Name of one of these.
-            reads: Whether draws that stand for it do.
-
-        Raises:
-            CorruptSegmentError: If they are not what was written.
-        """
-        content = self.store.get(what)
-        with sensible(self.store.path):
-            if content is None or what in self.manifest["own"] and not reads:
-                return None
-            return decode(content, known={})
+        if self.store is not None:
+            line = json.loads(json.dumps(event_of(event, trial, **entries)))
+            with self._writing():
+                number = self.store.append(LOG, line)
+            self.events.append({**line, "line": number})  # as it is read again
 
     def save(self, state: CampaignState, learner: Any) -> None:
         """Write what follows from the log so far.
 
-        A belief that cannot be stored is computed again after :meth:`restore`.
+        A belief that cannot be stored is computed again by who loads the campaign.
 
         Args:
             state: State of the campaign.
@@ -183,20 +142,15 @@ class Storage:
         if self.store is None:
             return
         belief = None if learner.belief is learner.prior else learner.belief
-        saved = {
-            "lines": len(self._entries),
-            **{name: getattr(state, name) for name in SAVED},
-            "num_simulated": state.meter.spent,
-            "belief": belief is not None,
-        }
-        contents = {STATE: encode(saved, known={})}
-        if belief is not None and belief is not self._written:
-            contents[BELIEF] = b""  # computed again, unless it can be stored
+        saved = {name: getattr(state, name) for name in SAVED}
+        saved |= {"lines": len(self.events), "num_simulated": state.meter.spent}
+        saved["belief"] = belief is not None
+        contents = {STATE: encode(saved, known={}), SUMMARY: b"{}"}
+        if belief is not self._written:
+            known, contents[BELIEF] = {"simulator": learner.simulator}, b""
             with suppress(NotStorableError):
-                known = {"simulator": learner.simulator, "prior": self.prior}
-                contents[BELIEF] = encode(belief, known=known)
+                contents[BELIEF] = encode(belief, known={**known, "prior": self.prior})
         with self._writing():
-            self.store.delete(SUMMARY)  # which is of the state before
             for kind, content in contents.items():
                 self.store.put(kind, 0, content)
         self._written = belief
@@ -207,40 +161,14 @@ class Storage:
         Args:
             known: Facts, as JSON data with NaN.
         """
-        content = json.dumps({"lines": len(self._entries), **known}).encode()
+        content = json.dumps({"lines": len(self.events), **known}).encode()
         with self._writing():
             self.store.put(SUMMARY, 0, content)
 
-    def restore(self, state: CampaignState) -> bytes | None:
-        """Bring a new state to where the log ends.
-
-        Args:
-            state: State that is changed in place; ``is_stale`` where beliefs must be
-                computed again.
-
-        Returns:
-            The belief, encoded; None if it is the prior, or to be computed.
-        """
-        saved, self._saved = self._saved or {}, None
-        with sensible(self.store.path):
-            for name in SAVED if saved else ():
-                setattr(state, name, saved[name])
-            state.meter.spent = saved.get("num_simulated", 0)
-            for entry in self._entries[saved.get("lines", 0) :]:
-                apply(state, entry)
-        if not saved:
-            state.is_stale |= len(state.versions) > 1
-        if saved.get("belief") in (None, False):
-            return None
-        belief = self._kept(BELIEF, bytes)
-        state.is_stale |= not belief and bool(state.processed)
-        return belief or None
-
     def close(self) -> None:
         """Let others write."""
-        for store in (self._shared, self.store):
-            if store is not None:
-                store.close()
+        for store in filter(None, (self._shared, self.store)):
+            store.close()
         self._banks.clear()
 
     def acquire(self) -> None:
@@ -256,124 +184,133 @@ class Storage:
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
-        num, is_known = len(self._entries), self.store.held
         with self.store.writing():
-            same = self.store.length(LOG) == num
-            if same and num and not is_known:  # others may have written since
-                same = self._line(num) == self._entries[-1]
+            same = self.store.length(LOG) == len(self.events)
             if same:
                 yield
-                return
-        self.store.close()
-        raise LogChangedError(self.store.path)
-
-    @property
-    def _changes(self) -> list[dict[str, Any]]:
-        return [e for e in self._entries if e["event"] == "simulator changed"]
-
-    def _line(self, number: int) -> dict[str, Any]:
-        line = {**(self.store.json(LOG, number) or {}), "line": number}
-        is_own = isinstance(line.get("event"), str)
-        require(self.store.path, is_own, f"a line {number} of the log that none writes")
-        return line
-
-    def _give_up(self) -> None:
-        """Give up damaged records, and note what is left of lines of the log."""
-        store = self.store
-        with suppress(CorruptSegmentError):  # how many there were
-            for number in range(1, store.length(LOG) + 1):
-                try:
-                    self._line(number)
-                except CorruptSegmentError as error:
-                    left = store.remains(LOG, number) or error.reason
-                    self.notes.append(f"SA603 given up, tell it again: {left}")
-        store.salvage()
-        with store.writing():
-            store.delete(SUMMARY)
-        store.close()
-
-    def _kept(self, what: str, read: Callable[[bytes], Any]) -> Any:
-        """Return what was computed; None where it has to be computed again."""
-        try:
-            content = self.store.get(what)
-            return None if content is None else read(content)
-        except (CorruptSegmentError, ValueError) as error:
-            self.notes.append(f"SA601 the {what} is computed again: {error}")
-            return None
-
-    def _require_whole(self, saved: Mapping[str, Any], *, repair: bool) -> None:
-        """Raise if the log lacks lines that the saved state has counted.
-
-        A repair takes their trials from the state, and has all else computed again.
-        """
-        given_up = any(note.startswith("SA603") for note in self.notes)
-        if saved["lines"] <= len(self._entries) and not given_up:
-            return
-        told = [t for t in saved["trials"] if t.status != "pending"]
-        reason = f"{len(self._entries)} lines of the log; the state counts"
-        reason = f"{reason} {saved['lines']} with {len(told)} trials that were told"
-        require(self.store.path, repair, reason)
-        facts = filter(None, map(facts_in, self._entries))
-        last = {f.index: f.status for f in facts}
-        self._saved = None
-        with self.store.writing():
-            self.store.delete(STATE)
-        for trial in told:
-            if last.get(trial.index, "pending") == "pending":
-                self.write("restored", trial)
-                self.notes.append(
-                    f"SA603 restored from {STATE}: trial {trial.index}, x = {trial.x}"
-                )
-        self.close()
+        if not same:
+            self.store.close()
+            raise LogChangedError(
+                f"expected the campaign in {self.path} as it was loaded; got trials "
+                "that another process told since; load it again, and tell this once "
+                "more: nothing was written"
+            )
 
 
-def has_manifest(folder: Path) -> bool:
-    """Return whether a folder holds a campaign, damaged or of before or not."""
-    if not (folder / NAME).exists():
-        return (folder / "campaign.json").exists()
-    try:
-        return MANIFEST in Store(folder, "campaign").catalog
-    except OSError:
-        return True
+def make_campaign(
+    folder: Path, state: Any, given: Mapping[str, Any], simulator: Any, **facts: Any
+) -> None:
+    """Write what a new campaign is.
 
-
-def read_manifest(store: Store) -> dict[str, Any]:
-    """Return what a campaign is; from the copy where a repair gave up the first.
+    Args:
+        folder: Folder, which is made where there is none.
+        state: State of the campaign.
+        given: Prior, actions and options.
+        simulator: Simulator of the campaign.
+        **facts: Facts to note, as JSON data.
 
     Raises:
-        ValueError: If there is none, or one of another schema.
-        CorruptSegmentError: If it does not hold what was written.
+        ValueError: If the folder holds anything.
+        OSError: If it cannot be written.
     """
-    manifest = store.json(MANIFEST) or store.json(COPY)
-    if manifest is None:
-        raise ValueError(
-            f"expected a folder with a campaign; got {store.folder} without one; make "
-            "it by Campaign(..., directory=...)"
-        )
-    if (manifest.get("format"), manifest.get("schema")) != (FORMAT, SCHEMA):
-        with sensible(store.path):
-            release = manifest["packages"]["sbi-active"]
-        raise ValueError(
-            f"expected a campaign of schema {SCHEMA}; got {manifest.get('schema')} in "
-            f"{store.path}; use the release of sbi-active that wrote it: {release}"
-        )
-    return manifest
+    packages = {name: version(name) for name in PACKAGES}
+    packages["python"] = platform.python_version()
+    manifest = {
+        name: getattr(state, name) for name in ("method", "seed", "num_earlier")
+    }
+    manifest |= {"created": now(), "packages": packages}
+    manifest["simulator"] = fingerprint(simulator)
+    for name in ("parameter_names", "channel_names"):
+        found = getattr(simulator, name, None)
+        manifest[name] = found if found is None else [*found]
+    objects = {}
+    for what, thing in given.items():
+        manifest[f"{what}_text"] = repr(thing)
+        with suppress(NotStorableError):
+            objects[what] = encode(thing, known={})
+    write_campaign(folder, manifest | facts, objects)
 
 
-def apply(state: CampaignState, entry: Mapping[str, Any]) -> None:
-    """Change a state by a line of the log, as the campaign did when it was written."""
-    event, facts = entry["event"], facts_in(entry)
-    if facts is not None:
-        state.record(facts)
-    elif event == "simulator changed":
-        state.is_stale = bool(state.processed)  # until an update is saved
-    elif event == "examined":
-        state.examined(entry["digest"])
-    elif event == "adopted":
-        version: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value
-            for name, value in entry["version"].items()
-        }
-        state.versions.append(ModelVersion(**version))
-        state.processed[:] = version["trials"]
-        state.is_stale = True
+def write_campaign(
+    folder: Path, manifest: Mapping[str, Any], objects: Mapping[str, bytes]
+) -> None:
+    """Write a manifest, the objects beside it, and a text for people.
+
+    Raises:
+        ValueError: If the folder holds anything.
+        OSError: If it cannot be written.
+    """
+    store = Store(folder, "campaign", make=True)
+    expected, got = "an empty folder for a new campaign", f"{folder} with one"
+    advice = "go on by Campaign.load(directory, simulator=...) or choose another folder"
+    require(not store.catalog, expected, got, advice)
+    with store.writing():
+        store.put(MANIFEST, 0, {**manifest, "format": FORMAT, "schema": SCHEMA})
+        for kind, content in objects.items():
+            store.put(kind, 0, content)
+    store.close()
+    lines = [f"# What this campaign is, for people. {NAME} has all; this is not read."]
+    for key, value in manifest.items():  # a text of JSON is one of TOML
+        if value is not None and key not in ("packages", "simulator", "own"):
+            lines.append(f"{key.removesuffix('_text')} = {json.dumps(value)}")
+    (folder / FOR_PEOPLE).write_text("\n".join([*lines, ""]), encoding="utf-8")
+
+
+def stored(method: Method) -> Method:
+    """Return a method that simulates: its rows are kept, apart from global state.
+
+    See :func:`.isolated`.
+    """
+    apart = isolated(method)
+
+    @guarded
+    @functools.wraps(method)
+    def kept(campaign: Any, *arguments: Any, **options: Any) -> Any:
+        storage, own = campaign._storage, campaign._learner.simulator
+        version = campaign.state.version.number
+        expected = "the simulator, which is not stored with a campaign"
+        advice = "pass it: Campaign.load(directory, simulator=...)"
+        require(own is not None, expected, "none", advice)
+        storage.acquire()
+
+        def find(simulator: Any) -> Bank | None:
+            return storage.find_bank(form_of(simulator, own), simulator, version)
+
+        with metering(campaign.state.meter, find):
+            return apart(campaign, *arguments, **options)
+
+    return kept  # type: ignore[return-value]
+
+
+def form_of(simulator: Any, own: Any) -> str:
+    """Return the name of a form of the current simulator; "" for another one.
+
+    Args:
+        simulator: Simulator that may be such a form.
+        own: The current simulator.
+    """
+    if simulator is own:
+        return OWN
+    if isinstance(simulator, IndexedSimulator):
+        return "by-index" * (simulator.simulator is own)
+    if not (isinstance(simulator, SimulatorModel) and isinstance(own, SimulatorModel)):
+        return ""
+    parts = [(m.fn, *getattr(m, "effects", ())) for m in (simulator, own)]
+    if [*map(id, parts[0])] != [*map(id, parts[1])]:
+        return ""
+    if simulator.noise is None and own.noise is not None:
+        return "noise-free"
+    index = getattr(simulator, "next_index", None)
+    return "" if index is None else f"drawn-trial-{index}"
+
+
+def num_rows(folder: str | None) -> int:
+    """Return how many rows of the simulator itself a bank of campaigns has.
+
+    Args:
+        folder: Folder of the bank; None for none.
+    """
+    if folder is None or not Path(folder, NAME).exists():
+        return 0
+    store = Store(Path(folder))
+    return len(Bank(store, name=OWN)) if f"bank {OWN}" in store.catalog else 0

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
+from sbi_active.expected import require
 from sbi_active.messages import warn
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation.bank.bank import Bank
@@ -121,30 +122,22 @@ def reuse(
     column = bank.columns("theta", "action", "status", "label", "log_proposal")
     usable = (column["status"] != Outcome.MISSING) & column["log_proposal"].isfinite()
     rows = usable.nonzero()[:, 0]
-    if not len(rows):
-        raise ValueError(
-            f"expected rows of a known proposal in {bank}; got none; simulate with "
-            "store=bank.drawn_from(prior, label='prior')"
-        )
+    expected = f"rows of {bank} from a known proposal, within the support of the target"
+    advice = "simulate from it with store=bank.drawn_from(prior, label='prior')"
+    require(len(rows) > 0, expected, "none whose proposal is known", advice)
     known = {name: values[rows] for name, values in column.items()}
     log_denominator = known["log_proposal"]
     if proposals is not None:
         log_denominator = _log_mixture(known, proposals, bank.labels)
     log_weight = log_density(target, known["theta"]) - log_denominator
-    if not bool((log_weight > -torch.inf).any()):
-        raise ValueError(
-            f"expected rows within the support of the target; got {len(rows)} rows, all"
-            " of density 0; simulate from the target"
-        )
+    is_covered = bool((log_weight > -torch.inf).any())
+    require(is_covered, expected, f"{len(rows)} rows, all of density 0", advice)
     result = ReusedRows(bank, rows, log_weight.softmax(0))
     worth = result.effective_sample_size
     if worth < FEW:
-        warn(
-            f"SA304 {len(rows)} rows of the bank are worth {worth:.1f} draws from the "
-            f"target, fewer than {FEW}: simulate more rows from it, "
-            + ("or give proposals=" if proposals is None else "or from nearer to it"),
-            stacklevel=2,
-        )
+        text = f"SA304 {len(rows)} rows of the bank are worth {worth:.1f} draws"
+        advice = "simulate more rows from it or near it, or give all proposals="
+        warn(f"{text} from the target, fewer than {FEW}: {advice}", stacklevel=2)
     return result
 
 
@@ -152,27 +145,24 @@ def _log_mixture(
     known: Mapping[str, Tensor], proposals: Mapping[str, Distribution], names: list[str]
 ) -> Tensor:
     """Return log sum_k n_k / n q_k of rows, counted among those of each action."""
-    theta, label, log_own = known["theta"], known["label"], known["log_proposal"]
-    lacking = [n for k in label.unique() if (n := names[k]) not in proposals]
-    if lacking:
-        raise ValueError(
-            f"expected proposals for all labels in the bank, {names}; got none for "
-            f"{lacking}; give them, or none at all for weights by each row's own "
-            "proposal"
-        )
+    label, log_own = known["label"], known["log_proposal"]
     strata = torch.unique(known["action"], dim=0, return_inverse=True)[1]
     sizes = torch.bincount(strata).double()
     terms = []
     for code in label.unique():
         own, name = label == code, names[code]
-        log_prob = log_density(proposals[name], theta)
-        gap = (log_prob[own] - log_own[own]).abs().median()
-        if not gap <= TOLERANCE:
+        if name not in proposals:
             raise ValueError(
-                f"expected proposals[{name!r}] to be what its rows were drawn from; got"
-                f" log densities that differ by {gap:.3g} nats (median) from those in "
-                "the bank; give the distribution that was passed to drawn_from"
+                f"expected proposals for all labels in the bank, {names}; got none for "
+                f"{name!r}; give it, or none at all for weights by each row's own "
+                "proposal"
             )
+        log_prob = log_density(proposals[name], known["theta"])
+        gap = (log_prob[own] - log_own[own]).abs().median()
+        expected = f"proposals[{name!r}] to be what its rows were drawn from"
+        got = f"log densities {gap:.3g} nats (median) from those in the bank"
+        advice = "give the distribution that was passed to drawn_from"
+        require(bool(gap <= TOLERANCE), expected, got, advice)
         share = torch.bincount(strata[own], minlength=len(sizes)) / sizes
         terms.append(log_prob + share.log()[strata])
     return torch.stack(terms).logsumexp(0)

@@ -1,4 +1,8 @@
-"""A store of sealed records, with one writer at a time: of banks and of campaigns.
+"""A store of sealed records in a folder: of banks and of campaigns.
+
+It is one SQLite file, which may come from anybody: nothing in it is executed. Its table
+is compared with that of a store before anything is read from it, no journal is played
+back that none leaves, and no link is followed.
 
 A record has a kind, a number, a head and a body, which is read apart: that of rows is
 what they measure. Records of a series are numbered from 1, and a catalog says which
@@ -10,46 +14,47 @@ of its log alone.
 from __future__ import annotations
 
 import hashlib
-import itertools
 import json
 import os
-import platform
-import shutil
+import secrets
 import sqlite3
 import threading
 import weakref
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
-from sbi_active.simulation.bank.sqlite import (
-    CATALOG,
-    INSERT,
-    LOCK,
-    NAME,
-    TEMPORARY,
-    CorruptSegmentError,
-    LockedError,
-    connected,
-    digest_of,
-    explained,
-    make_store,
-    opened,
-    require,
-    sealed,
-    sensible,
-    synchronize,
-    written,
+from sbi_active.expected import require
+from sbi_active.simulation.bank.errors import sensible, whole
+
+NAME, FORMAT = "store.db", 3  # format 1 was folders of HDF5, 2 had three tables
+LOCK = "store.lock"  # empty: who writes holds SQLite's lock on it
+TEMPORARY = ".writing-"
+CATALOG = "catalog"  # the last number of each kind
+#: Digests stand before the body, whose pages are then read only for the body.
+SCHEMA = (
+    "CREATE TABLE records (kind TEXT NOT NULL, number INTEGER NOT NULL, head BLOB NOT "
+    "NULL, head_digest BLOB NOT NULL, body_digest BLOB NOT NULL, body BLOB NOT NULL, "
+    "PRIMARY KEY (kind, number))"
 )
+SETTINGS = ("trusted_schema = OFF", "cell_size_check = ON", "journal_mode = WAL")
+SETTINGS += ("synchronous = FULL", "secure_delete = OFF")
+SETTINGS += (f"journal_size_limit = {64 * 2**20}",)
+#: Seconds to wait for a moment in which another process tidies up. A choice.
+PATIENCE = 10.0
+OTHERWISE = "or bring what is there from before up to date by: sbi-active migrate"
 
-MOST_LISTED = 1_000  # records of a kind; a catalog may be made up
-
+#: One thread at a time reads or writes, and none while the process forks.
+_GUARD = threading.RLock()
 _STORES: weakref.WeakSet[Store] = weakref.WeakSet()
 
 
 class Store:
     """A file of records in a folder. Any number of processes read, and one writes.
+
+    Who reads has the file open for a look alone; who writes, until it is closed.
 
     Args:
         folder: Folder that has or gets the file.
@@ -69,14 +74,16 @@ class Store:
 
     def __init__(self, folder: Path, what: str = "bank", *, make: bool = False) -> None:
         self.folder, self.path, self._what = folder, folder / NAME, what
-        self._guard, self._depth = threading.RLock(), 0
         self._connection: Any = None
-        self._is_alone = False
-        self._lock: sqlite3.Connection | None = None
-        self._signature: tuple[int, ...] = ()
-        _STORES.add(self)
+        self._lock: Any = None
+        with _GUARD:
+            _STORES.add(self)
         if make and not os.path.lexists(self.path):
-            make_store(folder, what)
+            try:
+                self._make()
+            except OSError:  # unless somebody was faster, and tidied up
+                if not self.path.exists():
+                    raise
         with self.reading():
             pass
 
@@ -89,84 +96,95 @@ class Store:
         """Whether this object has the right to write, in this process."""
         return self._lock is not None
 
-    @property
-    def generation(self) -> int:
-        """Another number where the file was replaced, as by a repair."""
-        return self._signature[0]
-
-    @property
-    def num_bytes(self) -> int:
-        """Size on the disk."""
-        files = (self.path.with_name(NAME + suffix) for suffix in ("", "-wal"))
-        return sum(file.stat().st_size for file in files if file.exists())
-
     @contextmanager
-    def reading(self) -> Iterator[sqlite3.Connection]:
-        """Yield the connection, in this thread alone; its errors become this library's.
+    def reading(self) -> Iterator[Any]:
+        """Yield the connection for a look at one state, in this thread alone.
 
         Raises:
-            CorruptSegmentError: If SQLite finds the file damaged.
+            CorruptSegmentError: If the file is damaged, or anything fails while its
+                content is made sense of in the block.
             LockedError: If another process holds it for longer than it takes to read.
-            OSError: If the disk is full or cannot be read or written.
+            OSError: If the disk is full or cannot be read.
         """
-        with self._guard:
-            is_outer, self._depth = not self._depth, self._depth + 1
+        with _GUARD:
+            opens, keeps = self._connection is None, False
             try:
-                is_same = self.held or self._found()[:1] == self._signature[:1]
-                if is_outer and not is_same:
-                    self._disconnect()
-                if self._connection is None:
-                    self._connection, self._is_alone = opened(self.path, self._what)
-                    name = self._connection.execute("PRAGMA application_id")
-                    self._id, self._signature = name.fetchone()[0], self._found()
-                if is_outer and not self.held:
-                    self._connection.execute("BEGIN")  # sees one state of the file
-                yield self._connection
-            except (sqlite3.Error, UnicodeDecodeError) as error:  # it quotes the file
-                if "locked" in str(error):
-                    raise LockedError(self.folder, *self._holder()) from error
-                raise explained(error, self.path, self._what) from error
+                if opens:
+                    self._open()
+                with sensible(self.path):
+                    yield self._connection
+                keeps = self.held
             finally:
-                self._depth -= 1
-                if is_outer and not self.held and self._connection is not None:
-                    self._connection.rollback()
-                    if self._is_alone:
-                        self._disconnect()
+                if opens and not keeps:
+                    self._disconnect()
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Write all that is put in the block, or nothing; on the disk at its end.
+
+        Raises:
+            LockedError: If somebody else has the right to write.
+            OSError: If the disk is full or cannot be written.
+        """
+        with _GUARD:
+            self.acquire()
+            with self.reading() as connection:
+                is_left = self._state() == self._left
+                whole(self.path, is_left, "another file; nothing was written to it now")
+                connection.execute("BEGIN IMMEDIATE")
+                try:
+                    yield
+                    connection.commit()
+                finally:
+                    connection.rollback()  # of what was not committed
+                self._left = self._state()
+
+    def acquire(self) -> None:
+        """Take the right to write, which ends with :meth:`close` or the process.
+
+        Raises:
+            LockedError: If another writer, in this process or another, has it.
+            OSError: If the folder cannot be written.
+        """
+        with _GUARD, sensible(self.folder / LOCK):
+            if self.held:
+                return
+            self._lock = _connected(self.folder / LOCK, "rwc", timeout=0.1)
+            try:
+                self._lock.execute("PRAGMA journal_mode = MEMORY")  # nothing is written
+                self._lock.execute("BEGIN EXCLUSIVE")
+            except BaseException:
+                self._unlock()
+                raise
+            for left in self.folder.glob(f"{TEMPORARY}*{NAME}*"):  # by the killed
+                left.unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Let others write. The next call opens the file again."""
+        with _GUARD:
+            if self._connection is not None:
+                with suppress(sqlite3.Error):  # a full disk must not keep the lock
+                    self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            self._disconnect()
+            self._unlock()
 
     def get(self, kind: str, number: int = 0, *, part: str = "head") -> bytes | None:
         """Return the head or the body of a record; None if there is none."""
+        read = f"SELECT {part}, {part}_digest FROM records WHERE kind = ? AND number ="
         with self.reading() as connection:
-            found = connection.execute(
-                f"SELECT {part}, {part}_digest FROM records WHERE kind = ? AND number "
-                "= ?",
-                (kind, number),
-            ).fetchone()
+            found = connection.execute(f"{read} ?", (kind, number)).fetchone()
             if found is None:
                 listed = kind == CATALOG or number <= self.catalog.get(kind, -1)
-                require(self.path, not listed, f"no {kind!r} {number}: a gap")
+                whole(self.path, not listed, f"no {kind!r} {number}: a gap")
                 return None
-            same = found[1] == digest_of(self._id, part, kind, number, found[0])
-        require(self.path, same, f"{kind!r} {number} with another checksum")
-        return found[0]
-
-    def body(self, kind: str, number: int = 0) -> bytes:
-        """Return the body of a record that is there."""
-        content = self.get(kind, number, part="body")
-        require(self.path, content is not None, f"no {kind!r} {number}")
-        return content or b""
-
-    def remains(self, kind: str, number: int) -> str:
-        """Return what is left of the head of a damaged record, for people."""
-        with suppress(Exception), self.reading() as connection:
-            read = "SELECT head FROM records WHERE kind = ? AND number = ?"
-            found = connection.execute(read, (kind, number)).fetchone()
-            return found[0].decode(errors="replace")
-        return ""
+            same = found[1] == _digest(self._id, part, kind, number, found[0])
+            whole(self.path, same, f"{kind!r} {number} with another checksum")
+            return found[0]
 
     def json(self, kind: str, number: int = 0) -> dict[str, Any] | None:
         """Return the JSON object in a record; None if there is none."""
-        content = self.get(kind, number)
-        with sensible(self.path):
+        with self.reading():
+            content = self.get(kind, number)
             return None if content is None else dict(json.loads(content))
 
     @property
@@ -174,7 +192,7 @@ class Store:
         """The last number of each kind."""
         found = self.json(CATALOG) or {}
         own = all(type(number) is int for number in found.values())
-        require(self.path, own, "a catalog that none writes")
+        whole(self.path, own, "a catalog that none writes")
         return found
 
     def length(self, series: str) -> int:
@@ -185,8 +203,7 @@ class Store:
         """Return a text that changes with the last record of each of some kinds."""
         read = "SELECT max(number), head_digest FROM records WHERE kind = ?"
         with self.reading() as connection:
-            last = [connection.execute(read, (kind,)).fetchone() for kind in kinds]
-        return hashlib.sha256(repr(last).encode()).hexdigest()
+            return str([connection.execute(read, (k,)).fetchone() for k in kinds])
 
     def put(self, kind: str, number: int, head: Any, body: Any = b"") -> None:
         """Write a record in place of another; for use in :meth:`writing`.
@@ -199,7 +216,7 @@ class Store:
         """
         if kind != CATALOG and number > (catalog := self.catalog).get(kind, -1):
             self.put(CATALOG, 0, {**catalog, kind: number})
-        self._connection.execute(INSERT, sealed(self._id, kind, number, head, body))
+        _insert(self._connection, self._id, kind, number, head, body)
 
     def append(self, series: str, head: Any, body: Any = b"") -> int:
         """Write the next record of a series, in :meth:`writing`; return its number."""
@@ -207,168 +224,145 @@ class Store:
         self.put(series, number, head, body)
         return number
 
-    def delete(self, kind: str) -> None:
-        """Remove the records of a kind; for use in :meth:`writing`."""
-        self._connection.execute("DELETE FROM records WHERE kind = ?", (kind,))
-        kept = {name: last for name, last in self.catalog.items() if name != kind}
-        self.put(CATALOG, 0, kept)
-
-    @contextmanager
-    def writing(self) -> Iterator[None]:
-        """Write all that is put in the block, or nothing; on the disk at its end.
+    def verify(self) -> None:
+        """Read every byte of the file.
 
         Raises:
-            LockedError: If somebody else has the right to write.
-            OSError: If the disk is full or cannot be written.
+            CorruptSegmentError: If it does not hold what was written.
         """
-        with self._guard:
-            self.acquire()
-            with self.reading() as connection:
-                if connection.in_transaction:  # of one that writes more
-                    yield
-                    return
-                same = self._found() == self._signature
-                require(self.path, same, "another file; nothing was written to it now")
-                connection.execute("BEGIN IMMEDIATE")
-                try:
-                    yield
-                    connection.commit()
-                    self._signature = self._found()
-                finally:
-                    connection.rollback()  # of what was not committed
-
-    def acquire(self) -> None:
-        """Take the right to write, which ends with :meth:`close` or the process.
-
-        Raises:
-            LockedError: If another writer, in this process or another, has it.
-            OSError: If the folder cannot be written.
-        """
-        with self._guard, self.reading():
-            if self.held:
-                return
-            lock = connected(self.folder / LOCK, "rwc", timeout=0.1)
-            try:
-                lock.execute("PRAGMA journal_mode = MEMORY")  # nothing is written
-                lock.execute("BEGIN EXCLUSIVE")
-                self._lock = lock
-                self._disconnect()  # nothing old may be remembered
-                for left in self.folder.glob(f"{TEMPORARY}*{NAME}*"):  # by the killed
-                    left.unlink(missing_ok=True)
-                # Only a note; and a file that cannot be written to may be repaired.
-                with suppress(CorruptSegmentError), self.writing():
-                    self.put("writer", 0, {"pid": os.getpid(), "host": platform.node()})
-            except BaseException:
-                self._lock = None
-                lock.close()
-                raise
-
-    def close(self) -> None:
-        """Let others write. The next call opens the file again."""
-        with self._guard:
-            lock, self._lock = self._lock, None
-            if lock is not None and self._connection is not None:
-                with suppress(sqlite3.Error):  # a full disk must not keep the lock
-                    self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-            self._disconnect()
-            if lock is not None:
-                lock.close()
-
-    def problems(self) -> list[str]:
-        """Return the problems of the file and its records, one line each."""
-        try:
-            with self.reading() as connection:
-                found = connection.execute("PRAGMA integrity_check(9)").fetchall()
-                wrong = [str(row[0]) for row in found if row[0] != "ok"]
-                whole = self._whole(connection)
-                for kind, last in self.catalog.items():
-                    numbers = range(min(last, 1), last + 1)
-                    lost = (n for n in numbers if (kind, n) not in whole)
-                    some = itertools.islice(lost, MOST_LISTED)
-                    wrong += [f"{kind!r} {n} changed or lost" for n in some]
-        except CorruptSegmentError as error:
-            return [error.reason]
-        return wrong
-
-    def _whole(self, connection: sqlite3.Connection) -> dict[tuple[str, int], int]:
-        """Return where the records stand that are as they were written."""
-        whole: dict[tuple[str, int], int] = {}
-        for order in ("", "DESC"):  # from both ends up to what is damaged
-            with suppress(sqlite3.Error):
-                for found in connection.execute(
-                    f"SELECT rowid, * FROM records NOT INDEXED ORDER BY rowid {order}"
-                ):
-                    rowid, kind, number, head, _, _, body = found
-                    if found[1:] == sealed(self._id, kind, number, head, body):
-                        whole[kind, number] = rowid
-                return whole
-        return whole
-
-    def salvage(self) -> None:
-        """Write the file anew from the records that are whole, and number them anew.
-
-        The former file is kept, its name ending in ".damaged".
-        """
-        self.acquire()
         with self.reading() as connection:
-            catalog: dict[str, int] = {}
+            found = connection.execute("PRAGMA integrity_check(1)").fetchone()[0]
+            whole(self.path, found == "ok", found)
+            for kind, last in self.catalog.items():
+                for number in range(min(last, 1), last + 1):
+                    self.get(kind, number)
+                    self.get(kind, number, part="body")
 
-            def renumbered() -> Iterator[tuple[Any, ...]]:
-                for (kind, number), rowid in sorted(self._whole(connection).items()):
-                    read = "SELECT head, body FROM records WHERE rowid = ?"
-                    head, body = connection.execute(read, (rowid,)).fetchone()
-                    if kind != CATALOG:
-                        catalog[kind] = number and catalog.get(kind, 0) + 1
-                        yield sealed(self._id, kind, catalog[kind], head, body)
-                yield sealed(self._id, CATALOG, 0, catalog)
+    def _make(self) -> None:
+        """Make the file in a folder of its own, which is made where there is none."""
+        folder, own = self.folder, (".", NAME, LOCK)  # of writers that were killed
+        folder.mkdir(parents=True, exist_ok=True)
+        other = sorted(p.name for p in folder.iterdir() if not p.name.startswith(own))
+        expected, got = f"an empty folder for a {self._what}", f"{folder} with {other}"
+        require(not other, expected, got, f"choose another folder, {OTHERWISE}")
+        fresh, name = folder / f"{TEMPORARY}{os.getpid()}-{NAME}", secrets.randbits(31)
+        fresh.unlink(missing_ok=True)
+        made = sqlite3.connect(fresh, isolation_level=None)
+        with sensible(fresh), closing(made):
+            for setting in (f"user_version = {FORMAT}", f"application_id = {name}"):
+                made.execute(f"PRAGMA {setting}")
+            made.execute("PRAGMA journal_mode = WAL")
+            made.execute(SCHEMA)
+            _insert(made, name, CATALOG, 0, {}, b"")
+        if not self.path.exists():  # nobody was faster
+            os.replace(fresh, self.path)
+            synchronize(folder)
 
-            fresh = written(self.folder, self._id, renumbered())
-        self.close()
-        names = (f"{NAME}.damaged" + f"-{n}" * (n > 1) for n in itertools.count(1))
-        copies = (self.path.with_name(name) for name in names)
-        copy = next(copy for copy in copies if not os.path.lexists(copy))
-        shutil.copy2(self.path, copy)
-        os.replace(fresh, self.path)
-        synchronize(self.folder)
+    def _open(self) -> None:
+        """Open the file, whose table must be that of a store."""
+        path, expected, got = self.path, f"a {self._what}", f"no {self.path}"
+        advice = f"give simulator= or directory= to make one, {OTHERWISE}"
+        require(os.path.lexists(path), expected, got, advice)
+        # Where no notes of a reader can be written, the file is read as it is.
+        is_still = not os.access(path.parent, os.W_OK)
+        is_still &= not path.with_name(f"{NAME}-wal").exists()
+        mode = "ro&immutable=1" if is_still else "rw"
+        self._connection = _connected(path, mode, timeout=PATIENCE)
+        whole(path, path.stat().st_size > 0, "an empty file")
+        execute = self._connection.execute
+        with sensible(path):
+            for setting in SETTINGS:
+                execute(f"PRAGMA {setting}")
+            execute("BEGIN")
+            form = execute("PRAGMA user_version").fetchone()[0]
+            self._id = execute("PRAGMA application_id").fetchone()[0]
+            tables = execute("SELECT sql FROM sqlite_master").fetchall()
+            if self.held:
+                execute("COMMIT")
+        expected, got = f"{expected} of format {FORMAT}", f"{form} in {path}"
+        require(form == FORMAT, expected, got, "use the release that wrote it")
+        is_own = tables == [(SCHEMA,), (None,)]  # the table, and the index of its key
+        whole(path, is_own, "tables that are not those of a store")
+        self._left = self._state()
 
-    def _found(self) -> tuple[int, ...]:
+    def _state(self) -> Any:
         """Return a value that changes if the file is another one, or is changed."""
-        with suppress(OSError):
-            state = self.path.stat()
-            return state.st_ino, state.st_size, state.st_mtime_ns
-        return ()
-
-    def _holder(self) -> tuple[int | None, str]:
-        with suppress(Exception):  # it locked a moment ago, or the file is damaged
-            found = self.json("writer") or {}
-            return int(found["pid"]), str(found["host"])
-        return None, platform.node()
+        state = self.path.stat() if self.path.exists() else None
+        return state and (state.st_ino, state.st_size, state.st_mtime_ns)
 
     def _disconnect(self) -> None:
         if self._connection is not None:
             self._connection.close()
-        self._connection, self._signature = None, ()
+        self._connection = None
+
+    def _unlock(self) -> None:
+        if self._lock is not None:
+            self._lock.close()
+        self._lock = None
+
+
+def synchronize(folder: Path) -> None:
+    """Make the names in a folder durable; file systems differ in whether they are."""
+    if os.name == "posix":  # elsewhere a folder cannot be opened, nor needs it
+        descriptor = os.open(folder, os.O_RDONLY)
+        os.fsync(descriptor)
+        os.close(descriptor)
+
+
+def _connected(path: Path, mode: str, *, timeout: float) -> sqlite3.Connection:
+    """Return a connection that begins no transaction by itself.
+
+    Args:
+        path: The file.
+        mode: Mode as SQLite names it, "rw" or "rwc".
+        timeout: Seconds to wait for others.
+
+    Raises:
+        CorruptSegmentError: If it is a link, which leads elsewhere, or a pipe or a
+            folder; or there is a journal, which SQLite would write back, here and to
+            whatever else it names.
+    """
+    for end in ("", "-wal", "-shm", "-journal"):
+        file = path.with_name(path.name + end)
+        plain = file.is_file() and not file.is_symlink() and end != "-journal"
+        reason = f"{file.name}, a link, no file, or a journal, which none leaves"
+        whole(path, plain or not os.path.lexists(file), reason)
+    place = f"file:{quote(str(path.absolute()))}?mode={mode}"
+    how: Any = {"isolation_level": None, "check_same_thread": False}
+    return sqlite3.connect(place, uri=True, timeout=timeout, **how)
+
+
+def _insert(at: Any, name: int, kind: str, number: int, head: Any, body: Any) -> None:
+    """Write a record with its digests, in a store of a name."""
+    if isinstance(head, dict):
+        head = json.dumps(head, allow_nan=False).encode()
+    parts = {"head": head, "body": body}
+    digests = [_digest(name, part, kind, number, c) for part, c in parts.items()]
+    row = (kind, number, head, *digests, body)
+    at.execute("INSERT OR REPLACE INTO records VALUES (?, ?, ?, ?, ?, ?)", row)
+
+
+def _digest(name: int, part: str, kind: str, number: int, content: bytes) -> bytes:
+    """Return the checksum of a part of a record, in a store of a name."""
+    digest = hashlib.sha256(f"{name} {part} {kind} {number} ".encode())
+    digest.update(content)
+    return digest.digest()
 
 
 def _before_fork() -> None:
     """Close connections, which a child must not have, once they are not in use."""
-    for store in [*_STORES]:
-        store._guard.acquire()
+    _GUARD.acquire()
+    for store in _STORES:
         store._disconnect()
 
 
-def _after_fork(*, child: bool = False) -> None:
-    for store in [*_STORES]:
-        if child and store._lock is not None:  # a child has no right of its parent's
-            store._lock.close()
-            store._lock = None
-        with suppress(RuntimeError):  # made meanwhile
-            store._guard.release()
+def _in_child() -> None:
+    """Give back what a child has no right to: that of its parent to write."""
+    for store in _STORES:
+        store._unlock()
+    _GUARD.release()
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(
-        before=_before_fork,
-        after_in_parent=_after_fork,
-        after_in_child=lambda: _after_fork(child=True),
-    )
+    os.register_at_fork(before=_before_fork, after_in_parent=_GUARD.release)
+    os.register_at_fork(after_in_child=_in_child)

@@ -1,6 +1,7 @@
 """Full disks, flipped bits, files of others: a clear error, and nothing lost."""
 
 import contextlib
+import json
 import os
 import pickle
 import resource
@@ -84,38 +85,13 @@ def test_every_byte_of_the_log_is_looked_at(folder, number):
     Campaign.load(folder)
 
 
-def test_a_damaged_line_is_given_up_by_name(made, folder):
+def test_a_damaged_line_is_named_and_the_others_can_be_read(made, folder):
     flip_line(folder, 2)  # the first tell
-    with pytest.raises(CorruptSegmentError, match="'log' 2 with .*repair=True"):
+    with pytest.raises(CorruptSegmentError, match="'log' 2 with .*from a copy"):
         Campaign.load(folder)
-    with pytest.warns(UserWarning, match="given up, tell it again: .*told"):
-        campaign = Campaign.load(folder, simulator=MODEL, repair=True)
-    assert (folder / "store.db.damaged").exists()
-    assert campaign.history[-1].x is not None
-    campaign.tell(made[1].history[0].x, trial=0)
-    campaign.update()
-    assert torch.equal(draws(campaign), draws(made[1]))
-
-
-def test_a_trial_without_any_line_leaves_a_gap(tmp_path):
-    campaign = new(tmp_path / "c")
-    for action, x in (([0.8], 0.3), ([1.0], 0.4), ([1.9], 0.6)):
-        campaign.attach(action, [x] * 4)
-    campaign.close()
-    flip_line(tmp_path / "c", 1)
-    with pytest.warns(UserWarning, match="given up, tell it again: .*attached"):
-        again = Campaign.load(tmp_path / "c", simulator=MODEL, repair=True)
-    assert [t.status for t in again.history] == ["withdrawn", "ok", "ok"]
-    assert again.history[0].reason == "its record was lost"
-    again.correct(0, [0.3] * 4, action=[0.8])
-    again.update()
-    apart = new()
-    for trial in campaign.history:
-        apart.attach(trial.action, trial.x)
-    apart.update()
-    assert torch.equal(draws(again), draws(apart))
-    again.close()
-    assert Campaign.load(tmp_path / "c", repair=True).history[0].status == "ok"
+    kept = execute(folder, "SELECT head FROM records WHERE kind = 'log'")
+    told = [json.loads(text) for (text,) in kept[2:]]
+    assert told[-2]["trial"]["x"] == made[1].history[1].x.tolist()
 
 
 @pytest.mark.parametrize("name", ["state", "belief"])
@@ -132,20 +108,17 @@ def test_what_can_be_computed_again_is(made, folder, name):
         campaign.close()
 
 
-def test_a_manifest_has_a_copy(made, folder):
+def test_a_damaged_manifest_is_named(folder):
     execute(folder, "UPDATE records SET head = x'00' WHERE kind = 'campaign'")
     with pytest.raises(CorruptSegmentError, match="'campaign' 0 with another checksum"):
         Campaign.load(folder)
-    campaign = Campaign.load(folder, simulator=MODEL, repair=True)
-    assert facts(campaign) == facts(made[1])
-    Campaign.load(folder)
 
 
 def test_another_schema_names_the_release(folder):
     manifest = {**Campaign.load(folder)._storage.manifest, "schema": 9}
     manifest["packages"]["sbi-active"] = "9.9"
     crafted(folder, "campaign", 0, manifest)
-    with pytest.raises(ValueError, match=r"schema 3; got 9 in .*9\.9"):
+    with pytest.raises(ValueError, match=r"schema 3; got 9 .*9\.9"):
         Campaign.load(folder)
 
 

@@ -154,11 +154,11 @@ def test_one_writer_any_number_of_readers(tmp_path):
 
 def test_a_new_campaign_wants_an_empty_directory(tmp_path):
     new(tmp_path / "c").close()
-    with pytest.raises(ValueError, match=r"go on with it by Campaign\.load"):
+    with pytest.raises(ValueError, match=r"go on by Campaign\.load"):
         new(tmp_path / "c")
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.tex").touch()
-    with pytest.raises(ValueError, match=r"with 'thesis\.tex'; choose another"):
+    with pytest.raises(ValueError, match=r"with \['thesis\.tex'\]; choose another"):
         new(tmp_path / "other")
     with pytest.raises(ValueError, match=r"expected a campaign; got no .*store\.db"):
         Campaign.load(tmp_path / "other")
@@ -204,13 +204,10 @@ def test_what_only_its_author_can_make_is_asked_for(tmp_path):
     campaign.close()
     with pytest.raises(ValueError, match="expected prior=, which only its author"):
         Campaign.load(tmp_path / "c", simulator=MODEL, cost=price)
-    reader = Campaign.load(tmp_path / "c")  # by the draws that are kept
-    scale = campaign.belief.variance.sqrt()
-    assert ((reader.belief.mean - campaign.belief.mean).abs() < 0.2 * scale).all()
-    assert reader.belief.diagnostics == campaign.belief.diagnostics
-    assert torch.equal(reader.prior.mean, prior.mean)
-    with pytest.raises(ValueError, match="load the campaign with prior="):
-        reader.belief.log_prob(torch.zeros(2))
+    with pytest.raises(ValueError, match="expected prior=, which only its author"):
+        Campaign.load(tmp_path / "c")
+    reader = Campaign.load(tmp_path / "c", prior=prior)
+    assert torch.equal(draws(reader), draws(campaign))
     with pytest.raises(ValueError, match="expected cost= as declared; got none"):
         Campaign.load(tmp_path / "c", simulator=MODEL, prior=prior)
     again = Campaign.load(tmp_path / "c", simulator=MODEL, prior=prior, cost=price)

@@ -51,9 +51,8 @@ def crafted(folder, kind, number, head, body=None):
     """Put a record with the right checksum."""
     store = Store(folder)
     with store.writing():
-        store.put(
-            kind, number, head, store.body(kind, number) if body is None else body
-        )
+        before = store.get(kind, number, part="body")
+        store.put(kind, number, head, before if body is None else body)
     store.close()
 
 

@@ -10,7 +10,7 @@ from sbi_active import Bank, simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import Simulations
 from sbi_active.simulation.bank import LockedError
-from sbi_active.simulation.bank import rows as module
+from sbi_active.simulation.bank import bank as module
 
 
 def simulator(theta, action, seeds):
@@ -62,7 +62,7 @@ def test_part_of_a_run_is_completed(bank):
     theta, action = draw(300)
     whole = simulate(simulator, theta, action, seed=0)
     with_store = simulate(simulator, theta, action, seed=0, store=bank)
-    run = bank._segments()[0].run
+    run = bank._segments()[0][1]["run"]
     other = Bank(bank.path.parent / "other", simulator=simulator)
     some = torch.arange(0, 300, 7)
     rows = {k: getattr(whole, k)[some] for k in ("theta", "action", "x", "status")}
@@ -83,10 +83,8 @@ def test_rows_by_position_slice_and_mask(bank, monkeypatch):
     mask = rows.theta[:, 0] > 0.5
     assert torch.equal(bank.read(mask).theta, rows.theta[mask])
     assert len(bank.read(slice(0, 0))) == 0
-    chunks = [*bank.chunks(33)]
-    assert max(map(len, chunks)) == 33
-    assert torch.equal(torch.cat([c.theta for c in chunks]), rows.theta)
-    for bad in ([200], [-1], [0.5]):
+    assert torch.equal(bank.read([-1, 0]).x, rows.x[[-1, 0]])
+    for bad in ([200], [-201], [0.5]):
         with pytest.raises(ValueError, match=r"positions of rows within \[0, 200\)"):
             bank.read(bad)
 
@@ -133,7 +131,7 @@ def test_several_banks_in_one_file(tmp_path):
 def test_second_writer_is_told_who_writes_and_readers_go_on(bank):
     simulate(simulator, *draw(10), seed=0, store=bank)
     second = Bank(bank.path, simulator=simulator)
-    with pytest.raises(LockedError, match=r"got process \d+ \(this one\)"):
+    with pytest.raises(LockedError, match="expected no other writer"):
         second.append(SOME, seed=0)
     assert len(Bank(bank.path).read()) == 10
     bank.close()
@@ -189,12 +187,10 @@ def test_the_lock_goes_with_its_process(bank):
 
     with forked(hold) as is_running:
         other = Bank(bank.path, simulator=simulator)
-        while (other._store.json("writer") or {}).get("pid") != is_running.pid:
+        while not len(other):
             assert is_running()
-        text = f"got process {is_running.pid} on"
-        with pytest.raises(LockedError, match=text) as raised:
+        with pytest.raises(LockedError, match="expected no other writer"):
             other.append(SOME, seed=0)
-        assert raised.value.pid == is_running.pid
         os.kill(is_running.pid, signal.SIGKILL)
         assert is_running.join() == -signal.SIGKILL
         other.append(SOME, seed=0)
@@ -209,7 +205,7 @@ def test_a_forked_child_reads_and_has_no_right_to_write(bank):
     def work():
         assert same(reader.read(), rows)
         assert same(bank.read(), rows)
-        with pytest.raises(LockedError, match=f"got process {os.getppid()} on"):
+        with pytest.raises(LockedError, match="expected no other writer"):
             bank.append(rows, seed=1)
 
     with forked(work) as is_running:

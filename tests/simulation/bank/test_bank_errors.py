@@ -10,7 +10,7 @@ import torch
 from sbi_active import Bank, GaussianNoise, SimulatorModel, simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import Simulations
-from sbi_active.simulation.bank.fingerprint import differences, fingerprint
+from sbi_active.simulation.bank.fingerprint import fingerprint, require_same
 from tests.simulation.bank.filled import execute
 
 
@@ -62,7 +62,7 @@ def bank(tmp_path):
 def test_a_bank_of_another_simulator(first, second, text, tmp_path):
     Bank(tmp_path / "bank", simulator=first)
     Bank(tmp_path / "bank", simulator=first)
-    with pytest.raises(ValueError, match=f"got another: .*{text}.*; make a bank"):
+    with pytest.raises(ValueError, match=f"got another: .*{text}.*; give the one"):
         Bank(tmp_path / "bank", simulator=second)
 
 
@@ -79,10 +79,11 @@ def test_version_stands_for_the_source(tmp_path):
     before = make("def f(theta, action):\n    return theta\n")
     old, old_version = fingerprint(before), fingerprint(before, version="1")
     after = make("def f(theta, action):\n    return theta + 1\n")
-    assert "simulator.source" in differences(old, fingerprint(after))[0]
-    assert differences(old_version, fingerprint(after, version="1")) == []
-    (line,) = differences(old_version, fingerprint(after, version="2"))
-    assert line == "version '1' there, '2' here"
+    with pytest.raises(ValueError, match="of it; got another: simulator.source"):
+        require_same("it", old, fingerprint(after))
+    require_same("it", old_version, fingerprint(after, version="1"))
+    with pytest.raises(ValueError, match="another: version '1' there, '2' here;"):
+        require_same("it", old_version, fingerprint(after, version="2"))
 
 
 def test_other_formats_and_folders(bank, tmp_path):
@@ -95,7 +96,7 @@ def test_other_formats_and_folders(bank, tmp_path):
     assert not (tmp_path / "none").exists()
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").touch()
-    with pytest.raises(ValueError, match=r"an empty folder; got .* with 'thesis.tex'"):
+    with pytest.raises(ValueError, match=r"an empty folder .* with \['thesis.tex'\]"):
         Bank(tmp_path / "full", simulator=simulator)
 
 
@@ -122,7 +123,7 @@ def test_a_full_disk(small_disk):
     few = Simulations(theta[:100], action[:100], theta[:100])
     with Bank(small_disk / "bank", simulator=simulator) as bank:
         bank.append(few, seed=0)
-        text = "expected to write .* got 'database or disk is full'; make room"
+        text = "expected to read and write; got '.*database or disk is full'; make room"
         with pytest.raises(OSError, match=text) as raised:
             simulate(simulator, theta, action, seed=1, store=bank)
         assert raised.value.errno == errno.ENOSPC
@@ -138,7 +139,7 @@ def test_a_limit_on_file_sizes(bank):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
     try:
-        with pytest.raises(OSError, match="got 'disk I/O error'; make room"):
+        with pytest.raises(OSError, match="got '.*disk I/O error'; make room"):
             bank.append(rows(5_000), seed=3)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -156,7 +157,7 @@ def test_a_folder_that_cannot_be_written(small_disk):
     assert len(Bank(small_disk / "bank").read()) == 100
     with pytest.raises(OSError, match=r"got '.*read.*only.*'; make room or choose"):
         Bank(small_disk / "bank", simulator=simulator).append(rows(), seed=1)
-    with pytest.raises(OSError, match="to write to the bank; got 'Read-only file"):
+    with pytest.raises(OSError, match="Read-only file"):
         Bank(small_disk / "new", simulator=simulator)
 
 

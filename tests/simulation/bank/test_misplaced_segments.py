@@ -10,9 +10,7 @@ from tests.simulation.bank.filled import (
     FILE,
     crafted,
     execute,
-    fill,
     filled,
-    flip,
     remove,
     simulator,
 )
@@ -83,47 +81,6 @@ def test_misplaced_segments_are_named(folder, misplace):
     assert Bank(folder).verify()
     with pytest.raises(CorruptSegmentError):  # still
         Bank(folder).read()
-
-
-def test_repair_gives_up_what_is_lost_and_no_more(folder):
-    before = (folder / FILE).read_bytes()
-    remove(folder, 2)
-    execute(
-        folder, "UPDATE records SET body = x'00' WHERE kind = 'rows' AND number = 3"
-    )
-    reader = Bank(folder)
-    with Bank(folder, simulator=simulator) as bank:
-        assert len(bank.repair()) == 2
-        assert bank.read().theta[:, 0].tolist() == [0.0] * 5 + [3.0] * 5
-        assert bank.verify() == []
-        fill(bank, (1, 2))  # simulated again
-    assert reader.columns("seed")["seed"][::5].tolist() == [0, 3, 1, 2]
-    assert len((folder / f"{FILE}.damaged").read_bytes()) == len(before)
-    assert Bank(folder).verify() == []
-    remove(folder, 4)
-    with Bank(folder, simulator=simulator) as again:
-        assert len(again.repair()) == 1
-        assert again.columns("seed")["seed"][::5].tolist() == [0, 3, 1]
-
-
-def test_repair_of_pages_that_sqlite_cannot_read(folder):
-    with Bank(folder, simulator=simulator) as bank:
-        fill(bank, range(10, 160), num=100)
-        expected = bank.read()
-    size = (folder / FILE).stat().st_size
-    assert size > 80 * 4_096  # the first eight pages hold what all else rests on
-    for position in (size // 2, 3 * size // 4):
-        for k in range(200):
-            flip(folder / FILE, position // 4_096 * 4_096 + k)
-    with pytest.raises(CorruptSegmentError):
-        Bank(folder).read()
-    with Bank(folder, simulator=simulator) as bank:
-        assert bank.repair()
-        assert bank.verify() == []
-        kept = bank.columns("seed", "theta")
-    assert 0 < len(kept["seed"]) < len(expected)
-    assert (kept["theta"][:, 0] == kept["seed"]).all()
-    assert (folder / f"{FILE}.damaged").exists()
 
 
 def test_a_bank_of_an_earlier_release_is_named(tmp_path):
