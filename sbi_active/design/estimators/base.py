@@ -158,7 +158,7 @@ class InformationGainEstimator(Shown, ABC):
 
         Raises:
             ValueError: If shapes do not fit, or the noise is neither declared nor
-                replicated where it is needed.
+                replicated where it is needed, or the model gives NaN for an outcome.
         """
         theta, action, x = simulations.theta, simulations.action, simulations.x
         if x.ndim < 3 or x.shape[:2] != (len(action), len(theta)):
@@ -176,6 +176,12 @@ class InformationGainEstimator(Shown, ABC):
             )
         with torch.no_grad():
             gain = self._contributions(model, simulations, belief).double()
+        lost = int((gain.isnan() & simulations.counted).sum())
+        if self.needs_model and lost:  # a mean of the others would hide it
+            raise ValueError(
+                f"expected densities of the learned model; got NaN at {lost} of "
+                f"{gain.numel()} outcomes; train it again, or leave out what overflows"
+            )
         return gain.masked_fill(~simulations.counted, torch.nan)
 
     def bound_on(self, model: Any) -> Bound:
