@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from sbi_active.design import LikelihoodGain, PosteriorGain
+from sbi_active.design import PosteriorGain
 from sbi_active.design.estimators.base import CandidateSimulations
 from tests.linear_gaussian import PRIOR, ExactModel, information, simulator
 
@@ -33,13 +33,10 @@ def test_a_model_of_the_wrong_spread_loses_what_the_divergence_says():
     assert (distance < 4 * error).all()
 
 
-@pytest.mark.parametrize("estimator", [PosteriorGain, LikelihoodGain])
-def test_outcomes_without_a_density_are_not_left_out_of_the_mean(estimator):
+def test_outcomes_without_a_density_are_not_left_out_of_the_mean():
     class Overflows(ExactModel):
         def log_posterior(self, theta, x, action):
-            return torch.where(theta[:, 0] > 2, torch.nan, theta[:, 0])
-
-        log_likelihood = log_posterior
+            return torch.where(theta[:, 0] > 0, torch.nan, theta[:, 0])
 
     with pytest.raises(ValueError, match=r"densities of the learned model; got NaN at"):
-        estimator()(Overflows(), simulations(n=64), PRIOR)
+        PosteriorGain()(Overflows(), simulations(n=64), PRIOR)
