@@ -271,8 +271,8 @@ class Telling(Generic[Kept]):
             if replace(last, x=outcome, status=status).tells == last.tells:
                 return last
         raise ValueError(
-            "expected a pending trial; got none; ask() first, pass action= to record a "
-            "trial that was not asked for, or trial= to correct one"
+            "expected a pending trial; got none; ask first, or give the action "
+            "of a trial that was not asked for, or the trial to correct"
         )
 
 

@@ -113,7 +113,7 @@ TARGET = cli.option("--target", "theta, model or a parameter", default="auto")
 CHANGED = cli.option("--simulator-changed", "take another, compute all again", None)
 PAGE = cli.option("--out", "where to", cli.FILE, "PAGE.html")
 NETCDF = cli.option("--netcdf", "where to", cli.FILE, "FILE.nc", required=True)
-AT = cli.option("--trial", "None is the pending one, or a new one", int, "K")
+AT = cli.option("--trial", "by default the pending one, or a new one", int, "K")
 TRIAL = cli.argument("trial", "TRIAL", int)
 REASON = cli.option("--reason", "kept with the trial", default="")
 OUTCOME = [

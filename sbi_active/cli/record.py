@@ -199,7 +199,8 @@ def answer_of(campaign: Any) -> Answer:
     trials = [trial_of(campaign, trial) for trial in campaign._trials]
     data = {**summary_of(campaign), "trials": trials}
     belief, waiting = data["belief"], data["not_in_belief"]
-    lines = [f"{data['method']}, {len(trials)} trials, health {data['health']}"]
+    many = "s" * (len(trials) != 1)
+    lines = [f"{data['method']}, {len(trials)} trial{many}, health {data['health']}"]
     lines += map(_line_of, trials)
     for name, entry in belief["parameters"].items():
         lines.append(f"{name:>12} = {entry['mean']:.4g} +- {entry['sd']:.2g}")

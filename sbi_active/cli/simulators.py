@@ -37,10 +37,10 @@ def criticize(trials: Path, **given: Any) -> Answer:
     TRIALS.csv has one row a trial, with columns action_* and x_* and optionally role
     (fit or 'held out'), index and repeat_of; or one row a sample, with columns trial
     and time besides, and with input_* in place of actions that vary in time. start_* is
-    a measured start state. Units stand in brackets, as in x_height[m], and are those of
-    the simulator. An empty cell is what was not measured. In its place a folder: of a
-    campaign, which knows its simulator and its prior, or of recordings, with trials.csv
-    or one file *.csv a trial.
+    a measured start state. Units stand in brackets, as in x_height[m], and become SI.
+    An empty cell is what was not measured. In its place a folder: of a campaign, which
+    knows its simulator and its prior, or of recordings, with trials.csv or one file
+    *.csv a trial.
     """
     if given["out"] is not None:  # else all is computed before this fails
         given["out"].mkdir(parents=True, exist_ok=True)

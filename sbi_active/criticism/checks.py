@@ -15,6 +15,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.callers import stack_level
 from sbi_active.criticism.data.input_series import require_covered
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.data.units import split
 from sbi_active.criticism.effects.augmented import NUM_CHECKED, AugmentedSimulator
 from sbi_active.criticism.effects.declarations import require_distinct, require_nested
 from sbi_active.criticism.effects.effect import Effect
@@ -117,6 +118,14 @@ def require_fitting(
         dim, own_dim = actions.action_dim, trials.action.shape[1]
         expected = f"actions of dimension {own_dim}, that of the trials"
         require(dim == own_dim, expected, dim, "give the space they were drawn from")
+    labels = model.channel_names, trials.channel_labels
+    names, given = ([split(label)[0] for label in own or ()] for own in labels)
+    require(
+        names == given or sorted(names) != sorted(given),
+        f"x in the order of the simulator's channels, {', '.join(names)}",
+        ", ".join(given),
+        "name the columns in that order",
+    )
     for name in ("inputs", "start"):
         if getattr(trials, name) is not None and name not in model.conditions:
             warn(

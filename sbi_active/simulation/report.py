@@ -80,7 +80,8 @@ class SimulatorReport:
     def __str__(self) -> str:
         lines = []
         if self.x_shape is not None:
-            seeds = "one a row" if self.takes_seeds else "none taken, blocks of 256"
+            none = "none taken (one seeds 256 rows)"
+            seeds = "one a row" if self.takes_seeds else none
             lines += [
                 f"x: shape (n, {', '.join(map(str, self.x_shape))}), {self.output}",
                 f"seeds: {seeds}",

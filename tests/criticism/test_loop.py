@@ -292,3 +292,18 @@ def test_what_cannot_be_compared(message, changes):
     given = {"model": MODEL, "trials": measured(1, {}), **changes}
     with pytest.raises(ValueError, match=message):
         Criticism(prior=PRIOR, **given)
+
+
+def test_channels_in_another_order_are_refused():
+    def both(theta, action):
+        return torch.cat([response(theta, action), 10 * action], 1)
+
+    model = SimulatorModel(
+        both, noise=GaussianNoise(NOISE), channel_names=["rail [m]", "swing"]
+    )
+    x = both(torch.ones(4, 2), action := torch.arange(4.0)[:, None])
+    labels = ["swing [rad]", "rail [m]"]
+    trials = Trials(action, x.flip(1), channel_labels=labels)
+    with pytest.raises(ValueError, match="channels, rail, swing; got swing, rail"):
+        Criticism(model, PRIOR, trials)
+    Criticism(model, PRIOR, Trials(action, x, channel_labels=labels[::-1]))

@@ -96,7 +96,7 @@ def require_columns(
         f"columns {', '.join(names)}",
         f"{', '.join(there) or 'none of these'} in {source}",
         "name them, as in action_speed, x_distance[m] (action_none, of ones, where "
-        "nothing was set), or say which columns are what",
+        "nothing was set), or say which are what by columns= (--columns x=NAME)",
     )
 
 
@@ -114,7 +114,8 @@ def _by_name(headers: Sequence[str], source: str) -> dict[str, list[str]]:
         f"columns {', '.join(f'{prefix}*' for prefix in PREFIXES.values())}, {TRIAL}, "
         f"{TIME}, {', '.join(OPTIONAL)}",
         f"{', '.join(unknown)} in {source}",
-        "rename or remove what is none of these, or say which columns are what",
+        "rename or remove what is none of these, or say which are what by columns= "
+        "(--columns x=NAME)",
     )
     return found
 

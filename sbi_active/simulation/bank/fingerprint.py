@@ -61,8 +61,9 @@ def require_same(what: str, before: Mapping[str, Any], now: Mapping[str, Any]) -
     if lines:
         raise ValueError(
             f"expected the simulator of {what}; got another: {'; '.join(lines)}; give "
-            "the one that it was made with, or, where x is the same, the same version="
-            " of a bank; a campaign takes another by simulator_changed=True"
+            "the one that it was made with, and its noise (--noise), or, where x is "
+            "the same, the same version= of a bank; a campaign takes another by "
+            "simulator_changed=True"
         )
 
 

@@ -261,7 +261,8 @@ class Store:
     def _open(self) -> None:
         """Open the file, whose table must be that of a store."""
         path, expected, got = self.path, f"a {self._what}", f"no {self.path}"
-        advice = f"give simulator= or directory= to make one, {OTHERWISE}"
+        make = "give simulator= or directory=, or run sbi-active init, to make one"
+        advice = f"{make}, {OTHERWISE}"
         require(os.path.lexists(path), expected, got, advice)
         # Where no notes of a reader can be written, the file is read as it is.
         is_still = not os.access(path.parent, os.W_OK)
