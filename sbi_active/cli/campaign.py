@@ -297,8 +297,17 @@ def _called(session: Session, command: Any = None, **given: Any) -> Answer:
     require(not wrong, f"options among {', '.join(sorted(names))}", wrong, "correct it")
     if given.get("x") is not None:  # numbers of any shape, null for one not measured
         given["x"] = ["nan" if v is None else v for v in flat(given["x"])]
-    values = {name: value for name, value in given.items() if value is not None}
+    values = {name: _word(value) for name, value in given.items() if value is not None}
     root: Any = click.get_current_context().find_root()
     how: Any = {"parent": root, "default_map": {**values, "folder": session.folder}}
-    with found.make_context(command, [], obj=session, **how) as context:
+    with cli.misuse(f"options of {command}"):  # a number in place of a flag, say
+        made = found.make_context(command, [], obj=session, **how)
+    with made as context:
         return found.invoke(context)
+
+
+def _word(value: Any) -> Any:
+    """Return a value of a request as it would be typed, 1 of 1.0; lists as they are."""
+    if isinstance(value, float):
+        return f"{value:.17g}"
+    return value if isinstance(value, list) else str(value)

@@ -106,6 +106,10 @@ WRONG = [
     ({"command": "tell", "x": [None], "action": 1}, "one of them measured"),
     ({"command": "tell", "x": 1}, "expected a pending trial; got none"),
     ({"command": "withdraw"}, "Missing argument 'TRIAL'"),
+    ({"command": "withdraw", "trial": 0.5}, "'0.5' is not a valid integer"),
+    ({"command": "withdraw", "trial": False}, "'False' is not a valid integer"),
+    ({"command": "tell", "missing": [1], "action": 1}, "expected options of tell"),
+    ({"command": "tell", "file": 5, "action": 1}, "No such file"),
 ]
 
 

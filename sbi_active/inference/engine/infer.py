@@ -87,6 +87,9 @@ def infer(
         moved = modes.led_particles(none)
         if moved is not None and moved.effective_sample_size > effective:
             return modes.fit_of(moved, none)
+    shape = np.inf  # as where draws of another proposal outweigh these
+    if final.any() and pool.missed <= settings.most_missed:
+        shape = pareto_shape(pool.log_weight[final])
     return Fit(
         u=pool.u[final],
         weight=normalized(pool.log_weight[final]) if final.any() else np.zeros(0),
@@ -94,7 +97,7 @@ def infer(
         log_evidence=pool.log_evidence,
         standard_error=pool.standard_error,
         effective_sample_size=effective,
-        tail_shape=pareto_shape(pool.log_weight[final]) if final.any() else np.inf,
+        tail_shape=shape,
         method="importance",
         is_rough=sampling.is_rough,
         free=none,

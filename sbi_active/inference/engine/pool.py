@@ -141,6 +141,15 @@ class Pool:
         return max(least, float(weight**2 @ terms) / dim)
 
     @property
+    def missed(self) -> float:
+        """Share of the posterior, by all draws, where each final one is outweighed."""
+        if self.final is None:
+            return 0.0
+        log_weight = self.log_prior + self.log_likelihood - self.final.log_prob(self.u)
+        beyond = ~self.is_final & (log_weight > self.log_weight.max())
+        return float(normalized(self.log_mixture_weight)[beyond].sum())
+
+    @property
     def standard_error(self) -> float:
         """Standard error of log_evidence."""
         effective, num = self.effective_sample_size, max(self.num_final, 1)

@@ -62,6 +62,9 @@ class Settings:
         negligible: Nats below the best draw beyond which a draw counts for nothing.
         largest_shape: Largest shape of the weights' tail that is trusted: beyond .7
             their mean hardly settles (Vehtari et al., JMLR 2024).
+        most_missed: Share of the posterior, by the draws of all proposals, where those
+            that it rests on may be outweighed: .04 to .4 of four to eight modes on
+            circles, of which a third is missed, and .000 where all are drawn.
         max_heavy: Times at most that another proposal is fitted for a heavier tail.
         per_parameter: Particles a parameter of sequential Monte Carlo, in effective
             draws.
@@ -119,6 +122,7 @@ class Settings:
     valley: float = 8.0
     negligible: float = 25.0
     largest_shape: float = 0.7
+    most_missed: float = 0.03
     max_heavy: int = 3
     per_parameter: float = 0.8
     fewest_particles: int = 400

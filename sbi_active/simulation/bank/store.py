@@ -264,8 +264,9 @@ class Store:
         make = "give simulator= or directory=, or run sbi-active init, to make one"
         advice = f"{make}, {OTHERWISE}"
         require(os.path.lexists(path), expected, got, advice)
-        # Where no notes of a reader can be written, the file is read as it is.
-        is_still = not os.access(path.parent, os.W_OK)
+        # Where no notes of a reader can be written, or would be another user's and keep
+        # the owner from writing, the file is read as it is.
+        is_still = not all(os.access(p, os.W_OK) for p in (path, path.parent))
         is_still &= not path.with_name(f"{NAME}-wal").exists()
         mode = "ro&immutable=1" if is_still else "rw"
         self._connection = _connected(path, mode, timeout=PATIENCE)

@@ -188,6 +188,13 @@ def test_a_full_disk_refuses_and_loses_nothing(made, folder):
     campaign.tell([0.1, 0.2, 0.3, 0.4])
 
 
+def test_who_may_not_write_the_file_leaves_no_notes_beside_it(folder, monkeypatch):
+    # They would be another user's, and keep its owner from writing.
+    monkeypatch.setattr(os, "access", lambda path, mode: path.name != FILE)
+    with Store(folder).reading():
+        assert [*folder.glob(f"{FILE}-*")] == []
+
+
 def test_a_directory_that_cannot_be_written(made, folder, monkeypatch):
     campaign = Campaign.load(folder, simulator=MODEL)
     if os.geteuid() == 0:  # whom no permission stops

@@ -16,8 +16,10 @@ from scipy.stats import norm
 from sbi_active.inference.engine import SimulatedPotential, infer, search
 from sbi_active.inference.engine.importance import _largest_power, pareto_shape
 from sbi_active.inference.engine.learned import learned_fit
+from sbi_active.inference.engine.pool import Pool
 from sbi_active.inference.engine.settings import Settings
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
+from sbi_active.inference.sampling.mixtures import StudentMixture
 from sbi_active.inference.sampling.weights import effective_sample_size
 
 
@@ -141,6 +143,19 @@ def test_where_nothing_fits_there_is_a_best_place():
     found = search(own, np.random.default_rng(0))
     assert len(found.modes) >= 1
     assert np.isfinite(found.guess.factors).all()
+
+
+@pytest.mark.parametrize(("width", "missed"), [(0.1, 0.5), (1.5, 0.0)])
+def test_a_mode_that_draws_miss_is_told_by_those_of_other_proposals(width, missed):
+    rng, pool = np.random.default_rng(0), Pool.empty(1, 1)
+    given = Given(lambda u: 40 * (u**2 - 1), 1, 1)  # modes at -1 and 1
+    for place, scale in ((1.0, width), (-1.0, 1.0)):
+        drawn_from = StudentMixture(
+            np.full((1, 1), place), np.full((1, 1, 1), scale), np.ones(1), np.inf
+        )
+        drawn = drawn_from.sample(4_000, rng)
+        pool.add(drawn_from, drawn, given, is_final=place == 1)
+    assert pool.missed == pytest.approx(missed, abs=0.1)
 
 
 # The posterior of a learned likelihood, on densities with known normalizers
