@@ -161,8 +161,10 @@ class ImportanceSampling:
                 proposal = self._fitted(power, efficiency)
             floor = float(pool.log_likelihood.max()) - own.negligible / power
             pool.add(proposal, proposal.sample(size, self.rng), potential, floor)
-        if most.effective > pool.effective_sample_size:
+        if most.effective > (last := pool.rest).effective:
             pool.rest_on(most)
+            if pool.missed > own.most_missed:  # what was drawn since has refuted it
+                pool.rest_on(last)
 
     def _returns(self, efficiency: float, wanted: float, left: float) -> bool:
         """Return whether the best proposal goes on in place of another fit.
