@@ -8,6 +8,9 @@ import torch
 # inherit: those that a test interrupts would never end.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# Before OpenMP has threads of its own, for which a forked child would wait forever.
+torch.set_num_threads(1)
+
 
 def pytest_collection_finish():
     """Have the collector pass over what was imported: a million objects, each time."""

@@ -14,6 +14,7 @@ from sbi_active.design.estimators.base import Bound
 from sbi_active.display.figures import legible
 from sbi_active.display.notebook import card, facts, items, table
 from sbi_active.display.table import Table, number
+from sbi_active.messages import warn
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -83,6 +84,12 @@ class Design:
         if self.cost is None:
             return self.expected_information_gain
         return self.expected_information_gain / self.cost
+
+    @property
+    def name(self) -> str:
+        """Former name of the label, where there is one."""
+        warn("SA701 Design.name goes in the next version: use labels", stacklevel=2)
+        return self.labels[0] if len(self.labels) == 1 else "action"
 
     @property
     def joint_information_gain(self) -> float:

@@ -34,6 +34,14 @@ def test_it_finds_the_action_that_tells_most():
     assert (design.probability_valid == 1).all()
 
 
+def test_the_former_name_of_a_design_warns():
+    designer = InformationGainDesigner(ACTIONS, num_samples=64, estimator="posterior")
+    design = designer.select(ExactModel(), simulator, seed=0)
+    assert design.labels == ("push [m/s]",)
+    with pytest.warns(FutureWarning, match="use labels"):
+        assert design.name == "push [m/s]"
+
+
 def test_the_choice_and_the_report_use_separate_simulations():
     """With equal candidates the best of the choosing half regresses in the report."""
     equal = DiscreteActions(torch.full((40,), 1.0))
