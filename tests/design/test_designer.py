@@ -2,6 +2,7 @@ import pytest
 import torch
 
 from sbi_active import DiscreteActions, InformationGainDesigner
+from sbi_active.messages import RenamedWarning
 from sbi_active.simulation import GaussianNoise, SimulatorModel
 from sbi_active.tasks.numerical.exact import ExactPosterior
 from sbi_active.tasks.numerical.task import NumericalTask
@@ -38,7 +39,7 @@ def test_the_former_name_of_a_design_warns():
     designer = InformationGainDesigner(ACTIONS, num_samples=64, estimator="posterior")
     design = designer.select(ExactModel(), simulator, seed=0)
     assert design.labels == ("push [m/s]",)
-    with pytest.warns(FutureWarning, match="use labels"):
+    with pytest.warns(RenamedWarning, match="use labels"):
         assert design.name == "push [m/s]"
 
 

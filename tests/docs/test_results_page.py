@@ -43,7 +43,7 @@ def test_columns_end_where_their_rule_does(page):
 
 def test_each_section_shows_its_tables(page):
     text = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
-    included = re.findall(r"{include} reference/api/page/(.+)", text)
+    included = re.findall(r"{include} reference/api/results/(.+)", text)
     assert included == [
         page.file_of(t).name for t in re.findall("## (.+)", text) if t in page.TABLES
     ]
