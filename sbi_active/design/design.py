@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -85,7 +86,7 @@ class Design:
             return self.expected_information_gain
         return self.expected_information_gain / self.cost
 
-    @property
+    @cached_property  # not a property: designs that were stored have it as a field
     def name(self) -> str:
         """Former name of the label, where there is one."""
         warn("SA701 Design.name goes in the next version: use labels", stacklevel=2)
