@@ -175,7 +175,7 @@ class ImportanceSampling:
             left: Rows that are left to spend.
         """
         own, num = self.settings, wanted / self.best
-        is_affordable = own.affords(num / 4, self.potential.dim)
+        is_affordable = own.affords(num / own.max_fits, self.potential.dim)
         is_affordable &= num * self.pool.num_trials <= left
         is_lost = efficiency < own.lost * self.best
         return self.num_full >= own.max_fits or (is_lost and is_affordable)

@@ -19,7 +19,7 @@ class Settings:
         divergence: Divergence of a normal fit to the draws, in nats a parameter, that
             is asked while they are cheap, and three times that always. n normal draws
             of d parameters are (d + 3) / 4 n off. Half asks for twice as many from ten
-            parameters on; with twice every second belief of ten is off by .05 nats.
+            parameters on; from twice on ``plenty`` decides up to ten.
         num_simulations: Simulated rows to spend, each at one action; None is no bound.
             More of more than ``few`` parameters, in proportion.
         share_of_plenty: Share of these within which draws are cheap, unless the
@@ -46,7 +46,8 @@ class Settings:
             3) / 2 numbers of a normal density, if they are affordable. Without it, fits
             of ten parameters lose nine tenths of the efficiency before.
         lost: Share of the best efficiency below which a proposal is given up for the
-            best one, if that is affordable: with half of it or twice, few are.
+            best one, if that takes no more draws than ``max_fits`` times those that are
+            affordable. A choice: fits that collapse lose nine tenths and more.
         max_fits: Fits to the whole likelihood at most, unless the last is half as
             efficient as the best.
         wider: Factor of the draws' widths in a proposal of one parameter; less of more.
