@@ -44,10 +44,12 @@ class Settings:
             modes of ten parameters are drawn from to the end, and tails are missed.
         per_number: Effective draws that a proposal is fitted to, for each of the d (d +
             3) / 2 numbers of a normal density, if they are affordable. Without it, fits
-            of ten parameters lose nine tenths of the efficiency before.
+            of ten parameters lose nine tenths of the efficiency before; half of it and
+            twice change their rows by a fifth either way.
         lost: Share of the best efficiency below which a proposal is given up for the
             best one, if that takes no more draws than ``max_fits`` times those that are
-            affordable. A choice: fits that collapse lose nine tenths and more.
+            affordable. A choice: fits that collapse lose nine tenths, and half of it
+            and twice gave the same draws of ten parameters.
         max_fits: Fits to the whole likelihood at most, unless the last is half as
             efficient as the best.
         wider: Factor of the draws' widths in a proposal of one parameter; less of more.
