@@ -258,8 +258,6 @@ class _Rewritten(ConditionalDensityEstimator):
         rows: Function of conditions (n, *shape) and that, to (n, packed_dim).
     """
 
-    known: Tensor
-
     def __init__(
         self,
         packed: ConditionalDensityEstimator,
@@ -269,7 +267,7 @@ class _Rewritten(ConditionalDensityEstimator):
     ) -> None:
         super().__init__(nn.Identity(), packed.input_shape, shape)
         self.packed, self.rows = packed, rows
-        self.register_buffer("known", known)
+        self.known = nn.Buffer(known)
 
     def _pack(self, given: Tensor) -> Tensor:
         rows = self.rows(given.reshape(-1, *self.condition_shape), self.known)

@@ -29,17 +29,13 @@ class Polynomials(nn.Module):
         exponents: :math:`j`, shape (p, d).
     """
 
-    center: Tensor
-    half_width: Tensor
-    exponents: Tensor
-
     def __init__(self, rows: Tensor, exponents: Tensor) -> None:
         super().__init__()
         low, high = rows.min(0).values.double(), rows.max(0).values.double()
         half = 0.5 * (high - low)
-        self.register_buffer("center", 0.5 * (high + low))
-        self.register_buffer("half_width", torch.where(half > 0, half, 1.0))
-        self.register_buffer("exponents", exponents)
+        self.center = nn.Buffer(0.5 * (high + low))
+        self.half_width = nn.Buffer(torch.where(half > 0, half, 1.0))
+        self.exponents = nn.Buffer(exponents)
 
     def forward(self, rows: Tensor) -> Tensor:
         """Return the polynomials, (..., d) -> (..., p)."""
@@ -251,13 +247,6 @@ class ActionScaling(nn.Module):
         max_noise_degree: Largest degree of the noise.
     """
 
-    mean: Tensor
-    scale: Tensor
-    beta: Tensor
-    gamma: Tensor
-    log_low: Tensor
-    log_high: Tensor
-
     def __init__(
         self,
         y: Tensor,
@@ -280,22 +269,20 @@ class ActionScaling(nn.Module):
             design, sizes, noise, sizes[:degrees], (y - mean) / scale, test
         )
         log_scale = (noise @ gamma).clamp_min(math.log(SMALLEST_SCALE))
-        self.register_buffer("mean", mean)
-        self.register_buffer("scale", scale)
-        self.register_buffer("beta", beta)
-        self.register_buffer("gamma", gamma)
-        self.register_buffer("log_low", log_scale.min(0).values)
-        self.register_buffer("log_high", log_scale.max(0).values)
+        self.mean = nn.Buffer(mean)
+        self.scale = nn.Buffer(scale)
+        self.beta = nn.Buffer(beta)
+        self.gamma = nn.Buffer(gamma)
+        self.log_low = nn.Buffer(log_scale.min(0).values)
+        self.log_high = nn.Buffer(log_scale.max(0).values)
 
     def location_and_scale(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return location and scale of y, each (n, m), in float64."""
         design = self.polynomials(action)
         log_scale = design[:, : len(self.gamma)] @ self.gamma
-        log_scale = torch.minimum(torch.maximum(log_scale, self.log_low), self.log_high)
-        return (
-            self.mean + self.scale * (design @ self.beta),
-            self.scale * log_scale.exp(),
-        )
+        log_scale = log_scale.clamp(self.log_low, self.log_high)
+        location = self.mean + self.scale * (design @ self.beta)
+        return location, self.scale * log_scale.exp()
 
     def forward(self, y: Tensor, action: Tensor) -> Tensor:
         """Return y standardized, (n, m) and (n, action_dim) -> (n, m), in float64."""

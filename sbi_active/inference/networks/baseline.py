@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from sbi_active.inference.networks.action_scaling import ActionScaling, held_out
 from sbi_active.inference.networks.response import Response
@@ -23,6 +23,18 @@ class Frames(NamedTuple):
     mean: Tensor
     factor: Tensor
     misfit: Tensor
+
+    @staticmethod
+    def trivial(rows: Tensor, dim: int) -> Frames:
+        """Return a frame of each row (n, ...) that changes nothing."""
+        n, eye = len(rows), torch.eye(dim, dtype=rows.dtype, device=rows.device)
+        zero, nothing = rows.new_zeros(n, 1, dim), rows.new_zeros(n, 1)
+        return Frames(zero, eye.expand(n, 1, dim, dim), nothing)
+
+    def with_global(self) -> Frames:
+        """Return these and, last, the trivial one."""
+        last = Frames.trivial(self.mean, self.mean.shape[-1])
+        return Frames(*(torch.cat(pair, 1) for pair in zip(self, last, strict=True)))
 
     @property
     def log_det(self) -> Tensor:
@@ -54,8 +66,6 @@ class Baseline(Response):
         num_scaled: Number of rows of a curved baseline that standardize v.
     """
 
-    centers: Tensor
-
     def __init__(
         self,
         u: Tensor,
@@ -68,7 +78,7 @@ class Baseline(Response):
     ) -> None:
         super().__init__(u, y, action, kind=kind)
         test = held_out(len(u))
-        self.register_buffer("centers", u[~test][:num_centers].clone())
+        self.centers = nn.Buffer(u[~test][:num_centers].clone())
 
         self.residual_scaling: ActionScaling | None = None
         some = slice(num_scaled if kind == "curved" else None)

@@ -13,7 +13,6 @@ from sbi_active.arrays import finite
 from sbi_active.inference.networks.action_scaling import ActionScaling, held_out
 from sbi_active.inference.networks.baseline import Baseline, Frames, local
 
-BaselineKind = Literal["none", "linear", "curved"]
 KINDS: tuple[Literal["linear", "curved"], ...] = ("linear", "curved")
 
 
@@ -29,6 +28,43 @@ def can_regress(
         most: Number of numbers at most: each has coefficients of its own.
     """
     return int(valid.sum()) >= fewest and num_outcomes <= most
+
+
+class Whitening(nn.Module):
+    r"""Parameters of no mean and unit covariance, :math:`u = L^{-1} (\theta - m)`.
+
+    Args:
+        theta: Parameters that give the moments, shape (n, d).
+        full: Whether correlations count, or each parameter is only scaled.
+    """
+
+    def __init__(self, theta: Tensor, *, full: bool) -> None:
+        super().__init__()
+        theta = theta.double()
+        mean, scale = theta.mean(0), scale_of(theta)
+        factor = scale.diag()
+        if full and len(theta) > len(scale):
+            z = (theta - mean) / scale
+            correlation = z.mT @ z / len(z)
+            # A constant parameter keeps the scale one.
+            correlation = correlation + torch.diag((correlation.diagonal() < 0.5).to(z))
+            tiny = 1e-12 * torch.eye(len(scale), dtype=z.dtype)
+            factor = scale[:, None] * torch.linalg.cholesky(correlation + tiny)
+        self.mean, self.factor = nn.Buffer(mean), nn.Buffer(factor)
+
+    def forward(self, theta: Tensor) -> Tensor:
+        """Return u, (..., d) -> (..., d), in float64."""
+        step = (theta.double() - self.mean)[..., None]
+        return torch.linalg.solve_triangular(self.factor, step, upper=False)[..., 0]
+
+    def inverse(self, u: Tensor) -> Tensor:
+        """Return theta, (..., d) -> (..., d)."""
+        return (self.factor @ u[..., None])[..., 0] + self.mean
+
+    @property
+    def log_det(self) -> Tensor:
+        r""":math:`\log |\mathrm d u / \mathrm d \theta|`."""
+        return -self.factor.diagonal().log().sum()
 
 
 class Directions(nn.Module):
@@ -48,10 +84,6 @@ class Directions(nn.Module):
             directions.
     """
 
-    mean: Tensor
-    scale: Tensor
-    rows: Tensor
-
     def __init__(
         self, u: Tensor, x: Tensor, action: Tensor, *, num: int, block: int = 512
     ) -> None:
@@ -60,8 +92,8 @@ class Directions(nn.Module):
         mean = torch.from_numpy(x.cpu().numpy().mean(0, dtype=np.float64)).to(x.device)
         scale = x.std(0).double()
         scale = torch.where(scale > 1e-12 * (1 + mean.abs()), scale, 1.0)
-        self.register_buffer("mean", mean)
-        self.register_buffer("scale", scale)
+        self.mean = nn.Buffer(mean)
+        self.scale = nn.Buffer(scale)
         features = _products(u, action)
         moved = x.new_zeros(features.shape[1], x.shape[1]).double()
         for row in range(0, len(x), block):
@@ -72,7 +104,7 @@ class Directions(nn.Module):
         rest = rest - (rest @ rows.T) @ rows
         largest = torch.linalg.svd(rest, full_matrices=False)[2][: num - len(rows)]
         rows = torch.linalg.qr(torch.cat([rows, largest]).T).Q.T
-        self.register_buffer("rows", rows.contiguous())
+        self.rows = nn.Buffer(rows.contiguous())
 
     def forward(self, x: Tensor, *, block: int = 512) -> Tensor:
         """Return summaries, shape (n, k).
@@ -138,16 +170,8 @@ class Conditioning(nn.Module):
             and what the network sees of them are more to overfit.
 
     Attributes:
-        baseline_kind: The baseline in use.
-        scores: Held-out log score of each candidate, in nats.
+        baseline: The baseline in use; None if there is none.
     """
-
-    theta_mean: Tensor
-    theta_factor: Tensor
-    action_mean: Tensor
-    action_scale: Tensor
-    y_mean: Tensor
-    y_scale: Tensor
 
     def __init__(
         self,
@@ -164,10 +188,7 @@ class Conditioning(nn.Module):
     ) -> None:
         super().__init__()
         self.x_dim = condition.shape[1] - action_dim
-        theta = theta.double()
-        self.register_buffer("theta_mean", theta.mean(0))
-        self.register_buffer("theta_factor", covariance_factor(theta, whiten))
-
+        self.whiten = Whitening(theta, full=whiten)
         x, action = condition.split([self.x_dim, action_dim], 1)
         valid = finite(x).all(1)
         self.directions: Directions | None = None
@@ -177,18 +198,16 @@ class Conditioning(nn.Module):
             self.directions = Directions(*own, num=num_directions)
         x, action = self._summarized(x), action.double()
         few = not can_regress(valid, x.shape[1])
-        self.register_buffer("action_mean", action.mean(0))
-        self.register_buffer("action_scale", scale_of(action))
+        self.action_mean = nn.Buffer(action.mean(0))
+        self.action_scale = nn.Buffer(scale_of(action))
         columns = [x[row, j] for j, row in enumerate(x.isfinite().mT)]
         center = [c.mean() if len(c) else x.new_zeros(()) for c in columns]
         spread = [scale_of(c) if len(c) else x.new_ones(()) for c in columns]
-        self.register_buffer("y_mean", torch.stack(center))
-        self.register_buffer("y_scale", torch.stack(spread))
+        self.y_mean = nn.Buffer(torch.stack(center))
+        self.y_scale = nn.Buffer(torch.stack(spread))
         y = (x[valid] - self.y_mean) / self.y_scale
 
         self.baseline: Baseline | None = None
-        self.baseline_kind: BaselineKind = "none"
-        self.scores: dict[str, float] = {}
         if baseline != "none" and not few:
             u = self.whiten(theta[valid])
             self._choose(u, y, action[valid], baseline, margin)
@@ -209,39 +228,26 @@ class Conditioning(nn.Module):
         baseline: Literal["best", "linear", "curved"],
         margin: float,
     ) -> None:
-        test = held_out(len(u))
-        best = -math.inf
+        test, best = held_out(len(u)), -math.inf
         if baseline == "best":
-            best = self.scores["none"] = float(log_normal(u[test]).mean())
+            best = float(log_normal(u[test]).mean())
         for kind in KINDS if baseline == "best" else (baseline,):
             bends = self.baseline is None or self.baseline.bends(u, y, action)
-            if kind == "curved" and baseline == "best" and not bends:
+            is_further = baseline == "best" and kind == "curved"
+            if is_further and not bends:
                 continue
             candidate = Baseline(u, y, action, kind=kind)
-            frames = _with_global(candidate(y[test], action[test]))
+            frames = candidate(y[test], action[test]).with_global()
             score = float(_log_mixture(u[test], frames).mean())
-            self.scores[kind] = score
-            is_margin = baseline == "best" and kind == "curved"
-            if score > best + is_margin * margin:
-                best, self.baseline, self.baseline_kind = score, candidate, kind
+            if score > best + is_further * margin:
+                best, self.baseline = score, candidate
 
     @property
     def num_frames(self) -> int:
         """Local frames of each row, and the global one."""
-        return {"none": 1, "linear": 2, "curved": 3}[self.baseline_kind]
-
-    def whiten(self, theta: Tensor) -> Tensor:
-        """Return u, (..., d) -> (..., d)."""
-        return whitened(theta.double() - self.theta_mean, self.theta_factor)
-
-    def unwhiten(self, u: Tensor) -> Tensor:
-        """Return theta, the inverse of :meth:`whiten`."""
-        return (self.theta_factor @ u[..., None])[..., 0] + self.theta_mean
-
-    @property
-    def log_det(self) -> Tensor:
-        r""":math:`\log |\mathrm d u / \mathrm d \theta|`."""
-        return -self.theta_factor.diagonal().log().sum()
+        if self.baseline is None:
+            return 1
+        return {"linear": 2, "curved": 3}[self.baseline.kind]
 
     def forward(
         self, condition: Tensor, *, largest: float = 20.0
@@ -259,12 +265,7 @@ class Conditioning(nn.Module):
         scaled = y if self.x_scaling is None else self.x_scaling(y, action)
         scaled = torch.where(missing, 0.0, scaled)
         seen = [scaled, (action - self.action_mean) / self.action_scale]
-        d = len(self.theta_mean)
-        trivial = Frames(
-            y.new_zeros(len(y), 1, d),
-            torch.eye(d, dtype=y.dtype, device=y.device).expand(len(y), 1, d, d),
-            y.new_zeros(len(y), 1),
-        )
+        trivial = Frames.trivial(y, len(self.whiten.mean))
         if self.baseline is None:
             return torch.cat(seen, 1), trivial
         frames = self.baseline(y, action)
@@ -277,22 +278,7 @@ class Conditioning(nn.Module):
         if frames.misfit.shape[1] > 1:
             excess = frames.misfit - frames.misfit.min(1, keepdim=True).values
             seen.append(torch.tanh(excess / largest))
-        return torch.cat(seen, 1), _with_global(frames)
-
-
-def _with_global(frames: Frames) -> Frames:
-    n, _, d = frames.mean.shape
-    eye = torch.eye(d, dtype=frames.mean.dtype, device=frames.mean.device)
-    return Frames(
-        torch.cat([frames.mean, frames.mean.new_zeros(n, 1, d)], 1),
-        torch.cat([frames.factor, eye.expand(n, 1, d, d)], 1),
-        torch.cat([frames.misfit, frames.misfit.new_zeros(n, 1)], 1),
-    )
-
-
-def whitened(step: Tensor, factor: Tensor) -> Tensor:
-    """Return steps (..., d) in units of a lower factor (d, d) of their covariance."""
-    return torch.linalg.solve_triangular(factor, step[..., None], upper=False)[..., 0]
+        return torch.cat(seen, 1), frames.with_global()
 
 
 def log_normal(u: Tensor) -> Tensor:
@@ -312,16 +298,3 @@ def scale_of(rows: Tensor) -> Tensor:
     """Return the columns' standard deviations, one where a column is constant."""
     scale, mean = rows.std(0, correction=0), rows.mean(0)
     return torch.where(scale > 1e-12 * (1.0 + mean.abs()), scale, 1.0)
-
-
-def covariance_factor(theta: Tensor, whiten: bool) -> Tensor:
-    """Return the lower factor of the covariance, shape (d, d), or its diagonal's."""
-    scale = scale_of(theta)
-    if not whiten or len(theta) <= theta.shape[1]:
-        return scale.diag()
-    z = (theta - theta.mean(0)) / scale
-    correlation = z.mT @ z / len(z)
-    # A constant parameter keeps the scale one.
-    correlation = correlation + torch.diag((correlation.diagonal() < 0.5).to(z))
-    tiny = 1e-12 * torch.eye(len(scale), dtype=z.dtype)
-    return scale[:, None] * torch.linalg.cholesky(correlation + tiny)

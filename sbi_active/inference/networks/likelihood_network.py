@@ -13,11 +13,10 @@ from typing_extensions import override
 
 from sbi_active.inference.networks.action_scaling import ActionScaling
 from sbi_active.inference.networks.conditioning import (
+    Whitening,
     can_regress,
-    covariance_factor,
     log_normal,
     scale_of,
-    whitened,
 )
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.inference.networks.mixture_network import log_prob_of_batch
@@ -100,12 +99,6 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         is_gaussian: Whether the residual's density is the standard normal one.
     """
 
-    theta_mean: Tensor
-    theta_factor: Tensor
-    y_mean: Tensor
-    y_scale: Tensor
-    is_gaussian: Tensor
-
     def __init__(
         self, settings: MixtureDensity, x: Tensor, condition: Tensor, action_dim: int
     ) -> None:
@@ -114,18 +107,17 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         self._theta_dim = condition.shape[1] - action_dim
         theta, action = condition.double().split([self._theta_dim, action_dim], 1)
         valid = _valid(x)
-        self.register_buffer("theta_mean", theta.mean(0))
-        self.register_buffer("theta_factor", covariance_factor(theta, details.whiten))
+        self.whiten = Whitening(theta, full=details.whiten)
         known = x[valid].double()
         if len(known) < 2:
             raise ValueError(
                 f"expected at least two simulations with a measurement; got "
                 f"{len(known)} of {len(x)}; check the simulator, or the belief"
             )
-        self.register_buffer("y_mean", known.mean(0))
-        self.register_buffer("y_scale", scale_of(known))
+        self.y_mean = nn.Buffer(known.mean(0))
+        self.y_scale = nn.Buffer(scale_of(known))
         y = (known - self.y_mean) / self.y_scale
-        rows = self._whiten(theta[valid]), y, action[valid]
+        rows = self.whiten(theta[valid]), y, action[valid]
 
         self.response: Response | None = None
         self.x_scaling: ActionScaling | None = None
@@ -145,7 +137,7 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         self.mixture = plain(z.float(), seen[valid])
         self.validity = None if bool(valid.all()) else ValidityNetwork(seen, valid)
         self._log_unseen = -math.log(len(x) + 2)
-        self.register_buffer("is_gaussian", torch.tensor(False))
+        self.is_gaussian = nn.Buffer(torch.tensor(False))
 
     @property
     @override
@@ -231,7 +223,7 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
     def _location_and_whitener(self, condition: Tensor) -> tuple[Tensor, Tensor]:
         theta, action = condition.double().tensor_split([self._theta_dim], 1)
         if self.response is not None:
-            return self.response.mean_and_whitener(self._whiten(theta), action)
+            return self.response.mean_and_whitener(self.whiten(theta), action)
         if self.x_scaling is not None:
             mean, scale = self.x_scaling.location_and_scale(action)
             return mean, (1 / scale).diag_embed()
@@ -241,10 +233,7 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
     def _see(self, condition: Tensor) -> Tensor:
         """Return whitened parameters and the action, shape (n, c), float32."""
         theta, action = condition.double().tensor_split([self._theta_dim], 1)
-        return torch.cat([self._whiten(theta), action], 1).float()
-
-    def _whiten(self, theta: Tensor) -> Tensor:
-        return whitened(theta - self.theta_mean, self.theta_factor)
+        return torch.cat([self.whiten(theta), action], 1).float()
 
 
 def _valid(x: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from typing_extensions import override
 
 from sbi_active.arrays import finite
 from sbi_active.inference.networks.baseline import Frames, local
-from sbi_active.inference.networks.conditioning import BaselineKind, Conditioning
+from sbi_active.inference.networks.conditioning import Conditioning
 
 ACTIVATIONS = {"silu": nn.SiLU, "relu": nn.ReLU}
 
@@ -80,12 +80,6 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
             thousands of rows do not tell how each depends on the condition.
     """
 
-    condition_mean: Tensor
-    condition_scale: Tensor
-    theta_mean: Tensor
-    theta_scale: Tensor
-    strict_upper: Tensor
-
     def __init__(
         self,
         theta: Tensor,
@@ -151,12 +145,12 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
                 last.bias[num - 1] = global_logit
         some = slice(0 if conditioning is not None else None)  # else not used
         mean, scale = _location_and_scale(condition[some], ~missing[some])
-        self.register_buffer("condition_mean", mean)
-        self.register_buffer("condition_scale", scale)
+        self.condition_mean = nn.Buffer(mean)
+        self.condition_scale = nn.Buffer(scale)
         mean, scale = _location_and_scale(theta, torch.ones_like(theta).bool())
-        self.register_buffer("theta_mean", mean)
-        self.register_buffer("theta_scale", scale)
-        self.register_buffer("strict_upper", torch.ones(dim, dim).triu(1))
+        self.theta_mean = nn.Buffer(mean)
+        self.theta_scale = nn.Buffer(scale)
+        self.strict_upper = nn.Buffer(torch.ones(dim, dim).triu(1))
 
     @property
     @override
@@ -185,11 +179,6 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         return self.conditioning is not None and isinstance(
             self._embedding, nn.Identity
         )
-
-    @property
-    def baseline_kind(self) -> BaselineKind:
-        """The Gaussian posterior that the network corrects."""
-        return "none" if self.conditioning is None else self.conditioning.baseline_kind
 
     def loss(self, input: Tensor, condition: Tensor, **kwargs: object) -> Tensor:
         """Return -log q, shape (n,), for rows (n, theta_dim) and (n, condition_dim)."""
@@ -226,7 +215,7 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
             return v * self.theta_scale + self.theta_mean
         frame = torch.tensor(self._frame_of, device=logits.device)[component]
         u = frames.mean[row, frame] + _solved(frames.factor, row, frame, v.double())
-        return self.conditioning.unwhiten(u).to(logits.dtype)
+        return self.conditioning.whiten.inverse(u).to(logits.dtype)
 
     def prepare(
         self, theta: Tensor, condition: Tensor, *, most_factors: int = 10_000_000
@@ -267,7 +256,7 @@ class MixtureDensityNetwork(ConditionalDensityEstimator):
         """Return v (..., n, J, d) and log |dv / dtheta| (n, J)."""
         assert self.conditioning is not None
         v = local(self.conditioning.whiten(theta), frames)
-        log_det = frames.log_det + self.conditioning.log_det
+        log_det = frames.log_det + self.conditioning.whiten.log_det
         dtype = self.strict_upper.dtype
         return v.to(dtype), log_det.to(dtype)
 

@@ -11,10 +11,9 @@ from torch import Tensor, nn
 from sbi_active.expected import require, require_least
 from sbi_active.inference.networks.action_scaling import ActionScaling
 from sbi_active.inference.networks.conditioning import (
+    Whitening,
     can_regress,
-    covariance_factor,
     scale_of,
-    whitened,
 )
 from sbi_active.inference.networks.response import Response
 
@@ -67,13 +66,6 @@ class RatioNetwork(RatioEstimator):
         action_dim: Numbers in an action.
     """
 
-    theta_mean: Tensor
-    theta_factor: Tensor
-    y_mean: Tensor
-    y_scale: Tensor
-    action_mean: Tensor
-    action_scale: Tensor
-
     def __init__(
         self,
         settings: RatioClassifier,
@@ -98,22 +90,18 @@ class RatioNetwork(RatioEstimator):
             last.weight.mul_(0.1)
             last.bias.zero_()
         self._x_dim = x_dim
-        theta = theta.double()
-        self.register_buffer("theta_mean", theta.mean(0))
-        self.register_buffer("theta_factor", covariance_factor(theta, True))
-        self.register_buffer("action_mean", action.mean(0))
-        self.register_buffer("action_scale", scale_of(action))
+        self.whiten = Whitening(theta, full=True)
+        self.action_mean = nn.Buffer(action.mean(0))
+        self.action_scale = nn.Buffer(scale_of(action))
         known = x[valid]
         enough = len(known) > 1
-        self.register_buffer("y_mean", known.mean(0) if enough else torch.zeros(x_dim))
-        self.register_buffer(
-            "y_scale", scale_of(known) if enough else torch.ones(x_dim)
-        )
+        self.y_mean = nn.Buffer(known.mean(0) if enough else torch.zeros(x_dim))
+        self.y_scale = nn.Buffer(scale_of(known) if enough else torch.ones(x_dim))
         self.response: Response | None = None
         self.x_scaling: ActionScaling | None = None
         if with_baseline:
             y = (known - self.y_mean) / self.y_scale
-            self.response = Response.best(self._whiten(theta[valid]), y, action[valid])
+            self.response = Response.best(self.whiten(theta[valid]), y, action[valid])
             self.x_scaling = ActionScaling(y, action[valid])
 
     def unnormalized_log_ratio(self, theta: Tensor, x: Tensor) -> Tensor:
@@ -129,7 +117,7 @@ class RatioNetwork(RatioEstimator):
         x, action = condition.double().tensor_split([self._x_dim], 1)
         valid = x.isfinite().all(1)
         y = (torch.where(valid[:, None], x, self.y_mean) - self.y_mean) / self.y_scale
-        u = self._whiten(theta.double())
+        u = self.whiten(theta)
         seen = [u, (action - self.action_mean) / self.action_scale]
         base = torch.zeros(len(theta), dtype=torch.float64)
         if self.response is None or self.x_scaling is None:
@@ -145,6 +133,3 @@ class RatioNetwork(RatioEstimator):
         parts = torch.cat([*seen[:2], inside, valid[:, None].double()], 1)
         correction = self.net(parts.float())[:, 0]
         return torch.where(valid, base, 0.0).float() + correction
-
-    def _whiten(self, theta: Tensor) -> Tensor:
-        return whitened(theta - self.theta_mean, self.theta_factor)

@@ -39,12 +39,6 @@ class Response(nn.Module):
         max_noise_degree: Largest degree of the noise.
     """
 
-    beta: Tensor
-    gamma: Tensor
-    whitener: Tensor
-    log_low: Tensor
-    log_high: Tensor
-
     def __init__(
         self,
         u: Tensor,
@@ -98,13 +92,11 @@ class Response(nn.Module):
         used = dense.ne(0).any(-1).any(0)
         used[: 1 + dim] = True
         self.parameter_basis = Polynomials(u, inner[used])
-        self.register_buffer("beta", dense[:, used])
-        self.register_buffer("gamma", gamma)
-        self.register_buffer("log_low", log_sigma.min(0).values)
-        self.register_buffer("log_high", log_sigma.max(0).values)
-        self.register_buffer(
-            "whitener", torch.linalg.solve_triangular(root, eye, upper=False)
-        )
+        self.beta = nn.Buffer(dense[:, used])
+        self.gamma = nn.Buffer(gamma)
+        self.log_low = nn.Buffer(log_sigma.min(0).values)
+        self.log_high = nn.Buffer(log_sigma.max(0).values)
+        self.whitener = nn.Buffer(torch.linalg.solve_triangular(root, eye, upper=False))
 
     @staticmethod
     def best(u: Tensor, y: Tensor, action: Tensor) -> Response:
@@ -130,7 +122,7 @@ class Response(nn.Module):
         """
         phi = self.action_basis(action)
         log_sigma = phi[:, : len(self.gamma)] @ self.gamma
-        log_sigma = torch.minimum(torch.maximum(log_sigma, self.log_low), self.log_high)
+        log_sigma = log_sigma.clamp(self.log_low, self.log_high)
         whitener = self.whitener / log_sigma.exp()[:, None, :]
         return whitener, (phi @ self.beta.flatten(1)).unflatten(1, self.beta.shape[1:])
 

@@ -238,7 +238,7 @@ def test_a_network_of_many_numbers_comes_near_the_exact_posterior():
             batch_size=200,
             anneal=True,
         )
-    assert network.baseline_kind == "linear"
+    assert network.conditioning.baseline.kind == "linear"
     theta, condition = rows(2_000, 2)
     with torch.no_grad():
         score = network.log_prob(theta[None], condition).mean()
