@@ -141,7 +141,8 @@ class ScaleNoise(NoiseModel):
 
     This class has the checks and shapes, and sums over a posterior; its noise is
     independent and Gaussian. Another kind implements ``_draw`` and ``_log_density``
-    given parameters, and ``_log_evidence`` given a cell of what channels share.
+    given parameters, and ``_log_evidence`` given a cell of what channels share if it is
+    Gaussian.
 
     Args:
         sd: Standard deviation, in the units of x; a number, or one a channel (the last
@@ -151,6 +152,8 @@ class ScaleNoise(NoiseModel):
             :func:`.estimate_noise` did not make is represented by 256 fixed draws of
             equal weight.
     """
+
+    _is_gaussian = True
 
     def __init__(
         self,
@@ -188,7 +191,7 @@ class ScaleNoise(NoiseModel):
     @property
     def is_known_gaussian(self) -> bool:  # pyright: ignore
         """Whether it is Gaussian and nothing of it is unknown."""
-        return self.posterior is None
+        return self._is_gaussian and self.posterior is None
 
     @override
     def sample(
@@ -246,10 +249,11 @@ class ScaleNoise(NoiseModel):
     def _marginal(self, residual: Tensor) -> Tensor:
         """Return log densities (n,) averaged over the posterior.
 
-        It is exact for a posterior of this library, and else by fixed draws.
+        It is exact for Gaussian noise and a posterior of this library, else by fixed
+        draws.
         """
         posterior = self.posterior
-        if isinstance(posterior, NoisePosterior):
+        if self._is_gaussian and isinstance(posterior, NoisePosterior):
             terms = [
                 self._log_evidence(residual, posterior, k).sum(1) + log_p
                 for k, (_, log_p) in enumerate(posterior.cells)

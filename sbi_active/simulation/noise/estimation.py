@@ -9,9 +9,9 @@ from typing import Literal, TypeVar
 import numpy as np
 import torch
 from scipy.linalg import helmert
-from scipy.special import chdtri
 from torch import Tensor
 
+from sbi_active.expected import require
 from sbi_active.messages import warn
 from sbi_active.simulation.noise.autocorrelated import (
     AutocorrelatedNoise,
@@ -24,16 +24,10 @@ from sbi_active.simulation.noise.posterior import (
     Cells,
     InverseChiSquare,
     NoisePosterior,
-    SdGrid,
 )
-from sbi_active.simulation.noise.student import StudentTNoise, log_student
 
 Kind = TypeVar("Kind", bound=NoiseModel)
-NoiseKind = Literal["gaussian", "autocorrelated", "student"]
-
-#: A choice: from a variance that hardly exists to nearly Gaussian, each cell a factor
-#: of 1.27 wide.
-DF_EDGES = torch.logspace(math.log10(2.05), 2, 17, dtype=torch.float64)
+NoiseKind = Literal["gaussian", "autocorrelated"]
 
 Array = Tensor | np.ndarray
 
@@ -61,8 +55,6 @@ def estimate_noise(
       on a grid, with R the correlation of the contrasts between repeats and Q their
       whitened sum of squares. The prior is uniform in :math:`\log \tau` from a tenth of
       the shortest time step to three times the recording.
-    * "student": a grid over the degrees of freedom, prior Gamma(2, 0.1) within [2.05,
-      100], and the standard deviations; means are integrated by quadrature.
 
     The point values in ``noise.parameters`` are s and medians.
 
@@ -83,8 +75,7 @@ def estimate_noise(
         ValueError: If there are fewer than two repeats, or all are identical.
 
     References:
-        Gelman et al., Bayesian Data Analysis, 3rd edition, section 3.2; Juarez & Steel,
-        JBES 28 (2010), for the prior of the degrees of freedom.
+        Gelman et al., Bayesian Data Analysis, 3rd edition, section 3.2.
 
     Example:
         >>> x = torch.tensor([[1.0], [2.0], [4.0]])
@@ -92,21 +83,20 @@ def estimate_noise(
         >>> noise.parameters, noise.posterior.sample((5,)).shape
         (tensor([1.5275], dtype=torch.float64), torch.Size([5, 1]))
     """
-    if kind not in ("gaussian", "autocorrelated", "student"):
-        raise ValueError(
-            "expected kind among 'gaussian', 'autocorrelated', 'student'; got "
-            f"{kind!r}; choose one of these"
-        )
+    require(
+        kind in ("gaussian", "autocorrelated"),
+        "kind among 'gaussian', 'autocorrelated'",
+        repr(kind),
+        "choose one of these, or declare StudentTNoise(sd, df)",
+    )
     groups = _groups(repeats)
     shape = groups[0].shape[1:]
     trajectory = kind == "autocorrelated" and len(shape) == 1
     num_sd = 1 if pooled or trajectory else shape[-1]
     if kind == "gaussian":
         noise = _gaussian(groups, num_sd)
-    elif kind == "autocorrelated":
-        noise = _autocorrelated(groups, num_sd, times)
     else:
-        noise = _student(groups, num_sd)
+        noise = _autocorrelated(groups, num_sd, times)
     return noise if times is None else noise.at(times)
 
 
@@ -181,11 +171,13 @@ def _autocorrelated(
     cells: int = 96,
     shortest: float = 0.1,
     longest: float = 3.0,
+    negligible: float = 1e-7,
 ) -> AutocorrelatedNoise:
     """Return noise by a grid of the correlation time.
 
     It has ``cells`` between ``shortest`` times the shortest step, below which no
-    correlation could be seen, and ``longest`` times the recording.
+    correlation could be seen, and ``longest`` times the recording. Cells at its ends of
+    less than a ``negligible`` share of the largest weight are left out.
     """
     # Contrasts are independent, of mean zero, and have the noise's own covariance.
     # A number missing in one repeat is missing in all contrasts of its group.
@@ -217,85 +209,16 @@ def _autocorrelated(
         log_weight.append(
             -0.5 * log_factor.sum() - 0.5 * (freedom * square.log()).sum()
         )
-    shared, kept = _heavy(edges, torch.stack(log_weight))
+    weight = torch.stack(log_weight)
+    heavy = (weight > weight.max() + math.log(negligible)).nonzero()[:, 0]
+    kept = slice(int(heavy[0]), int(heavy[-1]) + 1)
+    shared = Cells(edges[kept.start : kept.stop + 1], weight[kept].log_softmax(0))
     sd = InverseChiSquare(freedom, torch.stack(squares)[kept] / freedom)
     return _noise(AutocorrelatedNoise, sd, shared)
 
 
-def _heavy(
-    edges: Tensor, log_weight: Tensor, *, negligible: float = 1e-7
-) -> tuple[Cells, slice]:
-    """Return the range of cells that carry weight, normalized."""
-    heavy = torch.nonzero(log_weight > log_weight.max() + math.log(negligible))[:, 0]
-    first, last = int(heavy[0]), int(heavy[-1])
-    kept = slice(first, last + 1)
-    weight = log_weight[kept].log_softmax(0)
-    return Cells(edges[first : last + 2], weight), kept
-
-
-def _student(
-    groups: list[Tensor], num_sd: int, *, cells: int = 48, tail: float = 1e-4
-) -> StudentTNoise:
-    """Return noise by a grid, which cuts off ``tail`` of a Gaussian's posterior."""
-    square, freedom = _sums_of_squares(groups, num_sd)
-    # The Gaussian's range, wider: an outlier or df near 2 moves the posterior.
-    low, high = (
-        (square / torch.from_numpy(chdtri(freedom.numpy(), level))).sqrt()
-        for level in (tail, 1 - tail)
-    )
-    share = torch.linspace(0, 1, cells + 1, dtype=torch.float64)
-    edges = (low[:, None] / 3) * (9 * high / low)[:, None] ** share
-    nodes = (edges[:, 1:] * edges[:, :-1]).sqrt()  # (channels, s)
-    df_nodes = (DF_EDGES[1:] * DF_EDGES[:-1]).sqrt()
-    log_p = torch.zeros(len(df_nodes), num_sd, cells, dtype=torch.float64)
-    for group in groups:
-        numbers = group.reshape(len(group), -1, num_sd)
-        for channel in range(num_sd):
-            column = numbers[:, :, channel]
-            column = column[:, (~column.isnan()).sum(0) > 1]
-            for i, df in enumerate(df_nodes):
-                scale = nodes[channel] * ((df - 2) / df).sqrt()
-                log_p[i, channel] += _log_evidence(column, scale, df)
-    # The prior of sd is uniform over cells, each as wide in its logarithm.
-    log_prior = df_nodes.log() - 0.1 * df_nodes + torch.log(DF_EDGES.diff())
-    shared, kept = _heavy(DF_EDGES, log_prior + log_p.logsumexp(2).sum(1))
-    sd = SdGrid(edges, log_p[kept].log_softmax(2))
-    return _noise(StudentTNoise, sd, shared)
-
-
-def _log_evidence(
-    x: Tensor,
-    scale: Tensor,
-    df: Tensor,
-    *,
-    num_nodes: int = 129,
-    margins: float = 10.0,
-    chunk: int = 4_000_000,
-) -> Tensor:
-    """Return the log evidence of repeats (k, j) with means integrated out, (s,)."""
-    total = torch.zeros(len(scale), dtype=torch.float64)
-    low, high = x.nan_to_num(torch.inf).amin(0), x.nan_to_num(-torch.inf).amax(0)
-    share = torch.linspace(0, 1, num_nodes, dtype=torch.float64)
-    margin = margins * scale[:, None]
-    size = max(1, chunk // (len(scale) * len(x) * num_nodes))
-    for rows in torch.arange(x.shape[1]).split(size):
-        start = low[rows] - margin  # (s, j)
-        width = high[rows] + margin - start
-        mean = start[..., None] + width[..., None] * share  # (s, j, m)
-        density = torch.zeros_like(mean)
-        for repeat in x[:, rows]:
-            z = (repeat[:, None] - mean) / scale[:, None, None]
-            term = log_student(z, df) - scale.log()[:, None, None]
-            density += torch.where(repeat.isnan()[:, None], 0.0, term)
-        step = (width / (num_nodes - 1)).log()
-        total += (density.logsumexp(-1) + step).sum(1)
-    return total
-
-
 def _noise(
-    kind: Callable[..., Kind],
-    sd: InverseChiSquare | SdGrid,
-    shared: Cells | None = None,
+    kind: Callable[..., Kind], sd: InverseChiSquare, shared: Cells | None = None
 ) -> Kind:
     """Return noise with a posterior, at s and the median of what channels share."""
     cell, values = torch.tensor(0), list[Tensor]()

@@ -10,7 +10,6 @@ from torch.distributions import Distribution
 
 from sbi_active.seeding import row_uniforms
 from sbi_active.simulation.noise.base import ScaleNoise, observed_terms
-from sbi_active.simulation.noise.posterior import NoisePosterior, SdGrid
 
 
 class StudentTNoise(ScaleNoise):
@@ -26,8 +25,7 @@ class StudentTNoise(ScaleNoise):
         sd: Standard deviation :math:`\sigma`, in the units of x; a number, or one a
             channel (the last axis of x).
         df: Degrees of freedom :math:`\nu > 2`, of all channels.
-        posterior: Posterior of (sd, df), event shape (p,). That of
-            :func:`.estimate_noise` is a grid, over which densities are summed.
+        posterior: Posterior of (sd, df), event shape (p,).
 
     Raises:
         ValueError: If a standard deviation is negative, or df is not above 2, where
@@ -51,7 +49,7 @@ class StudentTNoise(ScaleNoise):
     ) -> None:
         super().__init__(sd, shared={"df": df}, posterior=posterior)
 
-    is_known_gaussian = False  # type: ignore[assignment]
+    _is_gaussian = False
 
     def _check(self, parameters: Tensor) -> None:
         super()._check(parameters)
@@ -81,16 +79,6 @@ class StudentTNoise(ScaleNoise):
         df = df.reshape(-1, *[1] * (residual.ndim - 1))
         density = log_student(residual / scale, df) - scale.log()
         return observed_terms(density, residual).flatten(1).sum(1)
-
-    def _log_evidence(self, residual: Tensor, p: NoisePosterior, cell: int) -> Tensor:
-        assert isinstance(p.sd, SdGrid)
-        e = residual.reshape(len(residual), -1, self._num_sd)
-        df = torch.tensor(p.cells[cell][0], dtype=torch.float64, device=e.device)
-        log_p = [
-            observed_terms(log_student(e / s, df) - s.log(), e).sum(1)
-            for s in _scale(p.sd.nodes.to(e.device), df).T
-        ]
-        return (torch.stack(log_p, -1) + p.sd.log_weight[cell].to(e)).logsumexp(-1)
 
 
 def log_student(z: Tensor, df: Tensor) -> Tensor:
