@@ -176,8 +176,8 @@ def simulated(
     theta = torch.from_numpy(bare.parameters)[None].expand(len(r), -1)
     mean = task.angles(theta, torch.from_numpy(r.action))
     seeds = torch.arange(len(r)) + 1_000 * seed
-    noise = AutocorrelatedNoise(sd, tau)
-    x = noise.sample(mean, seeds, times=torch.from_numpy(r.times))
+    noise = AutocorrelatedNoise(sd, tau).at(torch.from_numpy(r.times))
+    x = noise.sample(mean, seeds)
     angle = np.round(x.numpy() / QUANTUM) * QUANTUM
     return ServoPendulumTask(data=replace(r, angle=angle), noise=task.noise)
 

@@ -69,7 +69,7 @@ class RulerNoise(NoiseModel):
     def __init__(self, mark):
         self.mark = mark
 
-    def sample(self, mean, seeds=None, *, times=None, parameters=None):
+    def sample(self, mean, seeds=None):
         if seeds is None:
             share = torch.rand(mean.shape, dtype=mean.dtype)
         else:
@@ -82,7 +82,7 @@ class RulerNoise(NoiseModel):
             share = torch.stack(draws).to(mean.dtype)
         return mean + self.mark * (share - 0.5)
 
-    def log_prob(self, x, mean, *, times=None, parameters=None):
+    def log_prob(self, x, mean):
         inside = ((x - mean).abs() <= self.mark / 2).flatten(1)
         density = torch.where(inside, -math.log(self.mark), -torch.inf)
         return density.double().sum(1)

@@ -118,12 +118,12 @@ class _JointNoise(NoiseModel):
     def __init__(self, each: NoiseModel) -> None:
         self.each = each
 
-    def sample(self, mean: Tensor, seeds: Tensor | None = None, **given: Any) -> Tensor:
-        return self.each.sample(mean.flatten(0, 1), seeds, **given).reshape(mean.shape)
+    def sample(self, mean: Tensor, seeds: Tensor | None = None) -> Tensor:
+        return self.each.sample(mean.flatten(0, 1), seeds).reshape(mean.shape)
 
-    def log_prob(self, x: Tensor, mean: Tensor, **given: Any) -> Tensor:
+    def log_prob(self, x: Tensor, mean: Tensor) -> Tensor:
         stacked = x.flatten(0, 1), mean.expand_as(x).flatten(0, 1)
-        return self.each.log_prob(*stacked, **given).reshape(x.shape[:2]).sum(1)
+        return self.each.log_prob(*stacked).reshape(x.shape[:2]).sum(1)
 
     def whiten(self, value: Tensor) -> Tensor:
         return self.each.whiten(value.flatten(0, 1)).reshape(value.shape)

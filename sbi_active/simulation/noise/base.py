@@ -33,15 +33,15 @@ class NoiseModel(ABC):
         p(x | \mu) = \int p(x | \mu, \eta) \, p(\eta | D) \, d\eta
 
     of every row by itself: each has a draw of its own. Where several rows share one
-    unknown :math:`\eta`, draw it from ``posterior`` and give it as ``parameters``.
+    unknown :math:`\eta`, draw it from ``posterior`` and declare the noise with it.
 
     Attributes:
         parameter_names: Names of the parameters.
         parameters: Values of the parameters in natural units, shape (p,), float64.
         posterior: Posterior of the parameters, event shape (p,); None if they are
             declared exactly.
-        times: Time stamps of the first axis of x in seconds, shape (T,); None if
-            they were not given.
+        times: Time stamps of the first axis of x in seconds, shape (T,) or one set a
+            row (n, T); None if they were not given.
         measurement_sd: Known standard deviation of the measurement alone, where the
             noise also stands for what a simulator gets wrong; None if it does not.
         is_known_gaussian: Whether it is Gaussian and nothing of it is unknown.
@@ -55,7 +55,7 @@ class NoiseModel(ABC):
     is_known_gaussian: bool = False
 
     def at(self, times: Tensor | None) -> Self:
-        """Return the same noise at time stamps (T,), in seconds."""
+        """Return the same noise at time stamps, (T,) or one set a row, in seconds."""
         noise = copy.copy(self)
         noise.times = (
             None if times is None else own_tensor(times, torch.float64, name="times")
@@ -63,46 +63,25 @@ class NoiseModel(ABC):
         return noise
 
     @abstractmethod
-    def sample(
-        self,
-        mean: Tensor,
-        seeds: Tensor | None = None,
-        *,
-        times: Tensor | None = None,
-        parameters: Tensor | None = None,
-    ) -> Tensor:
+    def sample(self, mean: Tensor, seeds: Tensor | None = None) -> Tensor:
         """Return observations.
 
         Args:
             mean: Noise-free outputs, shape (n, *x_shape).
             seeds: Seeds, one a row, shape (n,), and row i depends on ``seeds[i]``
                 alone; None draws from torch's global generator.
-            times: Times of x's first axis in seconds, shape (T,) or one set a row (n,
-                T); None takes those of the model.
-            parameters: Parameters of the noise, shape (p,), or one set a row (n, p);
-                None takes the model's own, or for each row a draw from the posterior.
 
         Returns:
             Shape (n, *x_shape).
         """
 
     @abstractmethod
-    def log_prob(
-        self,
-        x: Tensor,
-        mean: Tensor,
-        *,
-        times: Tensor | None = None,
-        parameters: Tensor | None = None,
-    ) -> Tensor:
+    def log_prob(self, x: Tensor, mean: Tensor) -> Tensor:
         """Return the log density of observations.
 
         Args:
             x: Observations, shape (n, *x_shape); NaN where a number was not observed.
             mean: Noise-free outputs, broadcastable to x.
-            times: Times of x's first axis, as in :meth:`sample`.
-            parameters: Parameters of the noise, as in :meth:`sample`; None with a
-                posterior gives the marginal.
 
         Returns:
             Shape (n,), float64, nats.
@@ -194,46 +173,32 @@ class ScaleNoise(NoiseModel):
         return self._is_gaussian and self.posterior is None
 
     @override
-    def sample(
-        self,
-        mean: Tensor,
-        seeds: Tensor | None = None,
-        *,
-        times: Tensor | None = None,
-        parameters: Tensor | None = None,
-    ) -> Tensor:
-        shape, own = mean.shape, self if times is None else self.at(times)
+    def sample(self, mean: Tensor, seeds: Tensor | None = None) -> Tensor:
+        shape = mean.shape
         self._check_shape(shape)
-        if parameters is None and self.posterior is not None:
-            parameters = self._draw_parameters(seeds, shape)
-        noise = own._draw(seeds, shape, self._rows(parameters, len(mean)))
-        return mean + noise.to(mean)
+        rows = self.parameters.expand(len(mean), -1)
+        if self.posterior is not None:
+            rows = self._draw_parameters(seeds, shape)
+            self._check(rows)
+        return mean + self._draw(seeds, shape, rows).to(mean)
 
     @override
-    def log_prob(
-        self,
-        x: Tensor,
-        mean: Tensor,
-        *,
-        times: Tensor | None = None,
-        parameters: Tensor | None = None,
-    ) -> Tensor:
+    def log_prob(self, x: Tensor, mean: Tensor) -> Tensor:
         x, mean = _broadcast(x, mean)
         self._check_shape(x.shape)
         observed = ~x.isnan()
         impossible = observed & ~(x.isfinite() & mean.isfinite())
         residual = torch.where(observed & ~impossible, x - mean, torch.nan)
-        own = self if times is None else self.at(times)
-        if parameters is None and self.posterior is not None:
-            density = own._marginal(residual)
+        if self.posterior is not None:
+            density = self._marginal(residual)
         else:
-            rows = self._rows(parameters, len(x))
-            if not bool((rows[:, : self._num_sd] > 0).all()):
+            if not bool((self.parameters[: self._num_sd] > 0).all()):
                 raise ValueError(
                     "expected a standard deviation > 0 for a density; got 0, at which "
                     "there is none; give the noise of every channel"
                 )
-            density = own._log_density(residual, rows.to(x.device))
+            rows = self.parameters.expand(len(x), -1).to(x.device)
+            density = self._log_density(residual, rows)
         return density.masked_fill(impossible.flatten(1).any(1), -torch.inf)
 
     def _draw(self, seeds: Tensor | None, shape: torch.Size, rows: Tensor) -> Tensor:
@@ -287,21 +252,6 @@ class ScaleNoise(NoiseModel):
                 f"deviation a channel; got {tuple(shape)}; give one number, or one "
                 "an entry of the last axis"
             )
-
-    def _rows(self, parameters: Tensor | None, num_rows: int) -> Tensor:
-        """Return checked parameters, shape (n, p)."""
-        num = len(self.parameter_names)
-        if parameters is None:
-            return self.parameters.expand(num_rows, num)
-        parameters = torch.as_tensor(parameters, dtype=torch.float64)
-        if parameters.shape not in ((num,), (num_rows, num)):
-            raise ValueError(
-                f"expected parameters of shape ({num},) or ({num_rows}, {num}), for "
-                f"{', '.join(self.parameter_names)}; got {tuple(parameters.shape)}; "
-                "give one set, or one a row"
-            )
-        self._check(parameters)
-        return parameters.expand(num_rows, num)
 
     def _draw_parameters(self, seeds: Tensor | None, shape: torch.Size) -> Tensor:
         """Return one draw of the posterior a row, shape (n, p)."""
