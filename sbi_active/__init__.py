@@ -27,7 +27,6 @@ if TYPE_CHECKING:
         MixtureDensity,
         RefinementOptions,
         SeqBED,
-        SeqBED_B,
     )
     from sbi_active.simulation import (
         AutocorrelatedNoise,
@@ -58,7 +57,6 @@ __all__ = [
     "RandomDesigner",
     "RefinementOptions",
     "SeqBED",
-    "SeqBED_B",
     "SimulatorModel",
     "StopRules",
     "StudentTNoise",
@@ -76,7 +74,7 @@ _HOMES = {
     "design": "InformationGainDesigner RandomDesigner",
     "diagnostics": "",
     "export": "to_datatree to_inference_data",
-    "inference": "ALHI ASBI Belief MixtureDensity RefinementOptions SeqBED SeqBED_B",
+    "inference": "ALHI ASBI Belief MixtureDensity RefinementOptions SeqBED",
     "mujoco": "",
     "simulation": "AutocorrelatedNoise Bank GaussianNoise SimulatorModel StudentTNoise "
     "estimate_noise simulate",
@@ -94,6 +92,7 @@ _former = former_names(
         "ActiveInference": "sbi_active.inference:ActiveInference",
         "Design": "sbi_active.design:Design",
         "Refinement": "sbi_active:RefinementOptions",
+        "SeqBED_B": "sbi_active:SeqBED",
         "SeqBED_C": "sbi_active:SeqBED",
         "Simulations": "sbi_active.simulation:Simulations",
         "Trial": "sbi_active.campaign:Trial",

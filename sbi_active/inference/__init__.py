@@ -11,10 +11,9 @@ from sbi_active.inference.models.posterior import ActionPosterior
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.inference.refinement.refining import refine
 from sbi_active.inference.rounds.condition import ActionEmbedding
-from sbi_active.inference.trainers.alhi import ALHI
 from sbi_active.inference.trainers.asbi import ASBI
 from sbi_active.inference.trainers.base import ActiveInference
-from sbi_active.inference.trainers.ratio import SeqBED, SeqBED_B
+from sbi_active.inference.trainers.factored import ALHI, SeqBED
 from sbi_active.inference.trainers.seqbed import SeqBED_LFIRE
 from sbi_active.renamed import former_names
 
@@ -29,7 +28,6 @@ __all__ = [
     "MixtureDensity",
     "RefinementOptions",
     "SeqBED",
-    "SeqBED_B",
     "SeqBED_LFIRE",
     "refine",
 ]
@@ -50,6 +48,7 @@ __getattr__ = former_names(
         ),
         "RefinedBelief": "sbi_active.inference.engine.learned:LearnedBelief",
         "Refinement": "sbi_active:RefinementOptions",
+        "SeqBED_B": "sbi_active:SeqBED",
         "SeqBED_C": "sbi_active:SeqBED",
         "information_gained": "sbi_active.inference.beliefs.belief:information_gained",
     },

@@ -202,7 +202,7 @@ def filled_simulator(simulator: Any, enumeration: Enumeration, k: int) -> Any:
 
 
 def enumerated(
-    refine: Callable[[Any, Distribution, int], Any],
+    refine: Callable[..., Any],
     simulator: Callable[..., Any],
     prior: Distribution,
     enumeration: Enumeration,
@@ -213,7 +213,7 @@ def enumerated(
     Each is computed afresh; what was simulated for earlier trials is not kept.
 
     Args:
-        refine: From a simulator of continuous parameters, their prior and a seed to
+        refine: From a simulator of continuous parameters, their prior and ``seed=`` to
             their belief.
         simulator: Simulator of all parameters.
         prior: Original prior.
@@ -228,7 +228,7 @@ def enumerated(
     for k in range(len(enumeration.values)):
         own = filled_simulator(simulator, enumeration, k)
         try:
-            part = refine(own, enumeration.rest, derive_seed(seed, "values", k))
+            part = refine(own, enumeration.rest, seed=derive_seed(seed, "values", k))
         except UnexplainedOutcomeError as error:
             fault = error
             continue

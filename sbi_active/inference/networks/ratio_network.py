@@ -24,8 +24,6 @@ class RatioClassifier:
 
     Attributes:
         hidden_features: Width of each hidden layer.
-        baseline: Whether the classifier corrects the ratio of a regression of x on
-            parameters and action, or starts from nothing.
         batch_size: Rows a step.
         learning_rate: Learning rate of Adam.
         num_iterations: Steps of stochastic gradient descent, at most.
@@ -33,7 +31,6 @@ class RatioClassifier:
     """
 
     hidden_features: tuple[int, ...] = (64, 64)
-    baseline: bool = True
     batch_size: int = 200
     learning_rate: float = 2e-3
     num_iterations: int = 400
@@ -76,7 +73,7 @@ class RatioNetwork(RatioEstimator):
         x_dim, dim = condition.shape[1] - action_dim, theta.shape[1]
         x, action = condition.double().split([x_dim, action_dim], 1)
         valid = x.isfinite().all(1)
-        with_baseline = settings.baseline and can_regress(valid, x_dim)
+        with_baseline = can_regress(valid, x_dim)
         width = dim + action_dim + x_dim * (2 if with_baseline else 1) + 1
         layers: list[nn.Module] = []
         for hidden in settings.hidden_features:

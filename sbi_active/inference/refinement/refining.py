@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,6 @@ from sbi_active.inference.declared.refining import (
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.engine.learned import LearnedBelief
 from sbi_active.inference.refinement.regional import Regions
-from sbi_active.inference.refinement.stages import StageSettings
 from sbi_active.inference.regression.histories import HistoryRecord
 from sbi_active.seeding import derive_seed
 from sbi_active.support import parameter_dim
@@ -43,7 +43,6 @@ def refine(
     start: Distribution | Sequence[Distribution] | None = None,
     past: HistoryRecord | DeclaredRecord | None = None,
     settings: RefinementOptions | None = None,
-    stages: StageSettings | None = None,
     seed: int,
 ) -> LearnedBelief | SimulatedBelief | EnumeratedBelief:
     r"""Return the posterior of all trials given the original prior.
@@ -74,7 +73,6 @@ def refine(
         past: ``belief.histories`` of an earlier call whose trials are the first of
             these: what still lies in a region is simulated at the new actions only.
         settings: Budget; None is ``RefinementOptions()``.
-        stages: Settings of a likelihood that is learned; None is ``StageSettings()``.
         seed: Seed of everything random here.
 
     Returns:
@@ -105,11 +103,7 @@ def refine(
     action, outcome = _trials(action, x)
     enumeration = Enumeration.of(prior)
     if enumeration is not None:
-        own: Any = {"settings": settings, "stages": stages}
-
-        def of_others(simulator: Any, prior: Distribution, seed: int) -> Any:
-            return refine(simulator, prior, action, outcome, seed=seed, **own)
-
+        of_others = partial(refine, action=action, x=outcome, settings=settings)
         return enumerated(of_others, simulator, prior, enumeration, seed)
     hints = [] if start is None else start
     hints = [hints] if isinstance(hints, Distribution) else [*hints]
@@ -119,9 +113,8 @@ def refine(
         if belief is not None:
             return belief
         known = past if isinstance(past, HistoryRecord) else None
-        own = StageSettings() if stages is None else stages
         try:
-            return _learned(problem, own, known)
+            return _learned(problem, known)
         except RuntimeError as error:
             if "allocate memory" not in str(error):
                 raise
@@ -133,17 +126,13 @@ def refine(
 
 
 def _learned(
-    problem: Problem,
-    own: StageSettings,
-    past: HistoryRecord | None,
-    *,
-    max_inflations: int = 3,
+    problem: Problem, past: HistoryRecord | None, *, max_inflations: int = 3
 ) -> LearnedBelief:
     """Return the belief of a regression, of as wide a noise as the trials scatter.
 
     The noise is inflated at most ``max_inflations`` times.
     """
-    regions = Regions(problem, own, past=past)
+    regions = Regions(problem, past=past)
     belief, first = regions.run(), regions.contradiction()
     if first is None:
         return belief
@@ -153,7 +142,7 @@ def _learned(
         inflation *= now.inflation
         further_noise = np.sqrt(max(inflation**2 - 1, 0.0)) * sds
         again = replace(problem, seed=derive_seed(problem.seed, "inflated", number))
-        wider = Regions(again, own, further_noise=further_noise)
+        wider = Regions(again, further_noise=further_noise)
         belief, further = wider.run(), wider.contradiction()
         if further is None:
             break

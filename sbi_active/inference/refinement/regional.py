@@ -35,7 +35,6 @@ class Regions(Stages):
 
     Args:
         problem: The posterior that is asked for.
-        own: Settings of the stages.
         past: Histories of the first of its trials.
         further_noise: Standard deviations of noise to add, shape (t, q).
 
@@ -48,7 +47,6 @@ class Regions(Stages):
     def __init__(
         self,
         problem: Problem,
-        own: StageSettings,
         *,
         past: HistoryRecord | None = None,
         further_noise: Array | None = None,
@@ -56,9 +54,8 @@ class Regions(Stages):
         prior, settings, seed = problem.prior, problem.settings, problem.seed
         rng = np.random.default_rng(derive_seed(seed, "refine"))
         coordinates = PriorCoordinates(prior, rng)
-        super().__init__(
-            *(prior, settings, own, settings.num_histories, rng, coordinates)
-        )
+        own, budget = StageSettings(), settings.num_histories
+        super().__init__(prior, settings, own, budget, rng, coordinates)
         self.action, self.outcome = problem.action, problem.x
         self.histories = Histories(
             *(problem.simulator, self.action, self.outcome.flatten(1).numpy()),

@@ -17,8 +17,8 @@ from sbi_active.inference.regression.regions import Region
 from sbi_active.inference.regression.residuals import ShapeSettings
 from sbi_active.inference.regression.surrogate import (
     LocalRegression,
-    estimate_noise,
     fewest_rows,
+    noise_variance,
 )
 from sbi_active.inference.rounds.rows import rows_of
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
@@ -49,10 +49,6 @@ class HistoryRecord:
     x: Array
     present: NDArray[np.bool_]
     is_overview: NDArray[np.bool_]
-
-    def precedes(self, action: Tensor) -> bool:
-        """Whether these are the first trials of ``action``, shape (t', action_dim)."""
-        return torch.equal(self.action, action[: len(self.action)])
 
 
 class Histories:
@@ -107,8 +103,11 @@ class Histories:
         self.num_simulations = self.num_drawn = self.num_missing = 0
         self._theta = torch.zeros(0, coordinates.dim)
         self._is_overview = np.zeros(0, dtype=bool)
-        usable = past is not None and past.precedes(action)
-        self._past = past if usable else None
+        if past is not None and not torch.equal(
+            past.action, action[: len(past.action)]
+        ):
+            past = None  # its trials are not the first of these
+        self._past = past
         self._unused = np.ones(0 if past is None else len(past.theta), dtype=bool)
 
     def __len__(self) -> int:
@@ -320,7 +319,7 @@ class Histories:
         pairs = _nearest(np.where(both, distance[first], np.inf), min_pairs)
         scale = np.abs(self.x[rows] + self.observed).max(0)[self.used]
         one, other = (self.x[at[pairs]][:, self.used] for at in (first, second))
-        noise = estimate_noise(one, other, scale)
+        noise = noise_variance(one, other, scale)
         # Where all trials agree everywhere, or nowhere, there is nothing to compare.
         mixed = np.flatnonzero(agrees.any(0) & ~agrees.all(0))
         near = _nearest(distance, needed)
@@ -333,6 +332,7 @@ class Histories:
             self.z[rows],
             self.x[rows],
             noise=noise,
+            num_pairs=len(one),
             num_trials=len(self.action),
             outcomes=outcomes,
             used=self.used,

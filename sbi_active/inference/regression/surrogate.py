@@ -40,27 +40,15 @@ from sbi_active.inference.regression.residuals import (
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 
 
-@dataclass(frozen=True)
-class NoiseEstimate:
-    """Noise from pairs of outcomes at the same parameters.
+def noise_variance(first: Array, second: Array, scale: Array) -> Array:
+    """Return the variance of pairs of outcomes at the same parameters, shape (q,).
 
-    Attributes:
-        variance: Variance of each outcome, shape (q,).
-        num_pairs: Number of pairs behind it.
-    """
-
-    variance: Array
-    num_pairs: int
-
-
-def estimate_noise(first: Array, second: Array, scale: Array) -> NoiseEstimate:
-    """Return the noise of pairs of outcomes, each of shape (r, q).
-
-    The rounding of the largest size of each outcome, shape (q,), is a floor.
+    Each is of shape (r, q). The rounding of the largest size of each outcome, shape
+    (q,), is a floor.
     """
     variance = 0.5 * ((first - second) ** 2).mean(0)
     rounding = float(np.finfo(np.float32).eps) * scale  # outcomes are float32
-    return NoiseEstimate(variance + rounding**2 + 1e-300, len(first))
+    return variance + rounding**2 + 1e-300
 
 
 @dataclass(frozen=True)
@@ -116,7 +104,8 @@ class LocalRegression:
         z: Array,
         x: Array,
         *,
-        noise: NoiseEstimate,
+        noise: Array,
+        num_pairs: int,
         num_trials: int,
         outcomes: tuple[TrialOutcome, ...] = (),
         used: NDArray[np.bool_] | None = None,
@@ -131,7 +120,8 @@ class LocalRegression:
             region: Where the simulations lie.
             z: Their coordinates, shape (n, d).
             x: Their outcomes less the observed ones, shape (n, q).
-            noise: Noise in the region, of the outcomes in use.
+            noise: Variance of the noise in the region, of the outcomes in use.
+            num_pairs: Number of pairs of outcomes behind it.
             num_trials: Trials stacked in q.
             outcomes: Whether trials gave a measurement.
             used: Outcomes that were observed, shape (q,); None is all.
@@ -148,7 +138,7 @@ class LocalRegression:
         x = x[:, used]
         n, q = x.shape
         u = region.scaled(z)
-        scale = np.sqrt(noise.variance)
+        scale = np.sqrt(noise)
         best: tuple[float, Basis, Array, Array, Array, Array] | None = None
         roughness = 0.0
         is_inner = np.linalg.norm(u, axis=1) <= region.inner
@@ -173,18 +163,18 @@ class LocalRegression:
             variance = ((residual / scale) ** 2).sum(0) / (n - p) + 1e-12
             score = np.log(variance).sum() + q * np.log(n / (n - p))
             if not is_wave and q > 0:
-                missed = (residual**2).sum(0) / (n - p) - noise.variance
-                roughness = float((missed / x.var(0).clip(noise.variance)).max())
+                missed = (residual**2).sum(0) / (n - p) - noise
+                roughness = float((missed / x.var(0).clip(noise)).max())
             if best is None or score < best[0] - gain * q:
-                ratio = (residual**2).sum(0) / (n - p) / noise.variance
+                ratio = (residual**2).sum(0) / (n - p) / noise
                 best = (score, basis, root, residual, coefficient, ratio)
         if best is None:
             return None
         _, basis, root, residual, coefficient, ratio = best
         left = n - len(root)
-        deviation = np.sqrt((residual**2).sum(0) / left + 1e-9 * noise.variance)
+        deviation = np.sqrt((residual**2).sum(0) / left + 1e-9 * noise)
         standardized = residual / deviation
-        excess = _excess(ratio, alike(standardized, left), left, noise.num_pairs)
+        excess = _excess(ratio, alike(standardized, left), left, num_pairs)
         covariance = ResidualCovariance.of(standardized, deviation, left, trial)
         shape = None
         if shapes is not None and observed is not None:

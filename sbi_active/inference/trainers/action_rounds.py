@@ -7,7 +7,7 @@ import warnings
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from typing import Any, ClassVar, ParamSpec, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import cloudpickle
 import torch
@@ -19,28 +19,15 @@ from torch.distributions import Distribution
 from typing_extensions import Self
 
 from sbi_active.expected import require
-from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.rounds.condition import pack
-from sbi_active.inference.rounds.rows import check_proposal, round_rows
+from sbi_active.inference.rounds.rows import check_proposal
 from sbi_active.inference.trainers.base import ActiveInference
 from sbi_active.simulation.outcomes import Simulations
 from sbi_active.threads import single_thread
 
-P = ParamSpec("P")
-R = TypeVar("R")
 Ours = TypeVar("Ours", bound=Callable[..., Any])
 #: Number of epochs that sbi's own default allows.
 NEVER = 2**31 - 1
-
-
-def takes(theirs: Callable[P, R]) -> Callable[[Callable[..., Any]], Callable[P, R]]:
-    """Give a method of ours the signature of sbi's, which is then written once."""
-
-    def decorate(ours: Callable[..., Any]) -> Callable[P, R]:
-        ours.__signature__ = inspect.signature(theirs)  # pyright: ignore
-        return ours
-
-    return decorate
 
 
 def extends(theirs: Callable[..., Any]) -> Callable[[Ours], Ours]:
@@ -273,26 +260,14 @@ class ActionRounds(ActiveInference):
         data_device: str | None,
         proposal: Any = None,
     ) -> Self:
-        belief = self.belief if belief is None else belief
-        check_proposal(proposal, belief)
+        check_proposal(proposal, self.belief if belief is None else belief)
         if exclude_invalid_x is None:
             exclude_invalid_x = not self._has_settings
-        rows = round_rows(
-            theta,
-            x,
-            action,
-            prior=require_support(self._prior),
-            x_shape=self._outcome_shape,
-            action_dim=self._action_dim,
-            exclude_invalid=exclude_invalid_x,
-            may_be_invalid=bool(self.trials),
-        )
-        self._action_dim = rows.action.shape[1]
-        self._outcome_shape = rows.x.shape[1:]
+        own = theta, x, action, belief
+        rows, is_new = self._new_rows(*own, exclude_invalid=exclude_invalid_x)
         current = max(self._data_round_index, default=-1)
         device = self._device if data_device is None else data_device
-        if is_new := belief is not self._round_belief:
-            self._round_belief = belief
+        if is_new:
             current += 1
             # Nothing is trained on earlier rounds, which may be gigabytes.
             self._theta_roundwise, self._x_roundwise = [], []
@@ -301,7 +276,6 @@ class ActionRounds(ActiveInference):
             earlier, seen, _ = self.get_simulations()
             parameters = torch.cat([earlier, parameters])
             outcomes = torch.cat([seen, outcomes])
-        self._belief = belief
         self._trained_round = None
         self._theta_roundwise, self._x_roundwise = [parameters], [outcomes]
         self._prior_masks = [mask_sims_from_prior(current, len(parameters))]

@@ -33,7 +33,7 @@ from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
 from sbi_active.inference.refinement.refining import refine
 from sbi_active.inference.rounds.condition import pack
 from sbi_active.inference.rounds.rows import Observation
-from sbi_active.inference.trainers.action_rounds import takes
+from sbi_active.inference.trainers.action_rounds import extends
 from sbi_active.inference.trainers.base import Told, is_finite_somewhere
 from sbi_active.inference.trainers.mixture_rounds import MixtureRounds
 from sbi_active.messages import warn
@@ -98,7 +98,7 @@ class ASBI(MixtureRounds, NPE_C):
     _fused = True
     network_serves = ("start", "diagnostics")
 
-    @takes(NPE_C.__init__)
+    @extends(NPE_C.__init__)
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
 
@@ -150,7 +150,7 @@ class ASBI(MixtureRounds, NPE_C):
         self._proposal_roundwise.append(None)
         return self
 
-    @takes(NPE_C.train)
+    @extends(NPE_C.train)
     def train(self, *args: Any, **kwargs: Any) -> Any:
         """Train the density estimator, see :meth:`.ActionRounds.train`.
 

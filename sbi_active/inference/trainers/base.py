@@ -13,10 +13,12 @@ from torch.distributions import Distribution
 
 from sbi_active.expected import require
 from sbi_active.inference.beliefs.belief import Belief, named
+from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows
-from sbi_active.inference.rounds.rows import Observation
+from sbi_active.inference.rounds.rows import Observation, round_rows
 from sbi_active.seeding import forked_generators
+from sbi_active.simulation.outcomes import Simulations
 
 
 @dataclass(frozen=True)
@@ -204,6 +206,32 @@ class ActiveInference(ABC):
     @abstractmethod
     def _forget_round(self) -> None:
         """Have the next update do without what was learned in this round."""
+
+    def _new_rows(
+        self,
+        theta: Tensor,
+        x: Tensor,
+        action: Tensor,
+        belief: Distribution | None,
+        *,
+        exclude_invalid: bool,
+    ) -> tuple[Simulations, bool]:
+        """Return checked rows of a belief, and whether they begin another round."""
+        rows = round_rows(
+            theta,
+            x,
+            action,
+            prior=require_support(self._prior),
+            x_shape=self._outcome_shape,
+            action_dim=self._action_dim,
+            exclude_invalid=exclude_invalid,
+            may_be_invalid=bool(self.trials),
+        )
+        self._outcome_shape, self._action_dim = rows.x.shape[1:], rows.action.shape[1]
+        belief = self.belief if belief is None else belief
+        is_new = belief is not self._round_belief
+        self._belief = self._round_belief = belief
+        return rows, is_new
 
     def _observation(self, x_o: Tensor, action: Tensor) -> Observation:
         """Return the checked trial."""

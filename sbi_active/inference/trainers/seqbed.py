@@ -20,7 +20,6 @@ from sbi_active.inference.models.lfire import LFIRE, LFIREModel, fit_log_ratios
 from sbi_active.inference.rounds.rows import (
     Observation,
     require_whole,
-    round_rows,
     rows_of,
 )
 from sbi_active.inference.trainers.base import ActiveInference, Told
@@ -150,23 +149,11 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
                 "expected action=, since ratios belong to an action; got none; pass "
                 "the action of each row"
             )
-        belief = self.belief if belief is None else belief
         require_whole(x)
-        rows = round_rows(
-            theta,
-            x,
-            action,
-            prior=self._prior,
-            x_shape=self._outcome_shape,
-            action_dim=self._action_dim,
-            exclude_invalid=False,
-            may_be_invalid=bool(self.trials),
-        )
-        self._outcome_shape, self._action_dim = rows.x.shape[1:], rows.action.shape[1]
-        if belief is not self._round_belief:
-            self._round_belief, self._rows = belief, []
-        self._rows.append(replace(rows, x=rows.x.clone()))
-        self._belief, self._model = belief, None
+        rows, is_new = self._new_rows(theta, x, action, belief, exclude_invalid=False)
+        kept = [] if is_new else self._rows
+        self._rows = [*kept, replace(rows, x=rows.x.clone())]
+        self._model = None
         return self
 
     def train(self, *, seed: int | None = None) -> LFIREModel:
@@ -207,7 +194,6 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         if told.simulator is None:
             return self._weighted(self.build_posterior(), trials[-1], {})
         if not told.afresh:
-            assert self.belief is not None
             return self._simulated(told, self.belief, trials[-1], seed)
         beliefs: list[Any] = [self._prior]
         for k, trial in enumerate(trials):
@@ -221,7 +207,7 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         return beliefs[-1]
 
     def _simulated(
-        self, told: Told, belief: Distribution, trial: Observation, seed: int
+        self, told: Told, belief: Any, trial: Observation, seed: int
     ) -> Belief:
         """Weigh new particles of a belief, simulated at the executed action."""
         n = told.settings.num_histories

@@ -14,7 +14,7 @@ from sbi_active.inference.regression.regions import whole_space
 from sbi_active.inference.regression.surrogate import (
     LocalRegression,
     Surrogate,
-    estimate_noise,
+    noise_variance,
 )
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 
@@ -30,8 +30,10 @@ def surrogate_of(q: int, num: int, seed: int):
     z = coordinates.sample_prior(num, rng)
     x = z @ weight + rng.standard_normal((num, q))
     pairs = rng.standard_normal((2, 100, q))
-    noise = estimate_noise(pairs[0], pairs[1], np.ones(q))
-    fit = LocalRegression.fit(whole_space(DIM), z, x, noise=noise, num_trials=1)
+    noise = noise_variance(pairs[0], pairs[1], np.ones(q))
+    fit = LocalRegression.fit(
+        whole_space(DIM), z, x, noise=noise, num_pairs=len(pairs[0]), num_trials=1
+    )
     precision = weight @ weight.T + np.diag(coordinates._scale**2)
     return Surrogate(coordinates, [fit]), precision
 
@@ -105,9 +107,9 @@ def regress(curve, *, noise: float = 0.1, q: int = 3, num_trials: int = 1):
     weight = rng.standard_normal((2, q))
     x = curve(z) @ weight + noise * rng.standard_normal((NUM, q))
     pairs = noise * rng.standard_normal((2, 80, q))
-    estimate = estimate_noise(pairs[0], pairs[1], np.ones(q))
+    estimate = noise_variance(pairs[0], pairs[1], np.ones(q))
     fit = LocalRegression.fit(
-        whole_space(2), z, x, noise=estimate, num_trials=num_trials
+        whole_space(2), z, x, noise=estimate, num_pairs=80, num_trials=num_trials
     )
     return fit, weight
 

@@ -11,13 +11,13 @@ import cloudpickle
 import pytest
 import sbi.neural_nets
 import torch
-from sbi.inference import NLE_A, NPE_C, NRE_B, NRE_C, DirectPosterior
+from sbi.inference import NLE_A, NPE_C, NRE_C, DirectPosterior
 from sbi.inference.trainers._contracts import StartIndexContext, TrainConfig
 from sbi.inference.trainers.npe.npe_base import PosteriorEstimatorTrainer
 from sbi.neural_nets import posterior_nn
 from sbi.utils import BoxUniform, RestrictedPrior
 
-from sbi_active import ALHI, ASBI, SeqBED, SeqBED_B, simulate
+from sbi_active import ALHI, ASBI, SeqBED, simulate
 from sbi_active.inference import ActionEmbedding
 from sbi_active.inference.trainers.action_rounds import SilentTracker
 
@@ -44,7 +44,7 @@ def round_of(inference):
 @pytest.mark.filterwarnings("ignore:.*Maximum number of epochs")
 @pytest.mark.parametrize(
     ("trainer", "estimator"),
-    [*[(ASBI, "maf"), (ALHI, None)], *[(SeqBED, None), (SeqBED_B, "mlp")]],
+    [*[(ASBI, "maf"), (ALHI, None)], (SeqBED, None), (SeqBED, "mlp")],
 )
 def test_a_pickled_trainer_goes_on(trainer, estimator):
     whole = round_of(trainer(PRIOR, estimator, show_progress_bars=False))
@@ -97,7 +97,7 @@ def test_settings_of_sbi_build_the_network(trainer, recwarn):
     assert not [w for w in recwarn if w.category is FutureWarning]
 
 
-@pytest.mark.parametrize("trainer", [ASBI, ALHI, SeqBED, SeqBED_B])
+@pytest.mark.parametrize("trainer", [ASBI, ALHI, SeqBED])
 def test_a_round_is_kept_alone_and_shares_no_memory(trainer):
     """Rows of earlier rounds train nothing, and may be gigabytes."""
     inference = trainer(PRIOR, show_progress_bars=False)
@@ -115,7 +115,7 @@ def test_a_round_is_kept_alone_and_shares_no_memory(trainer):
     assert bool(rows.isfinite().all() and outcomes.isfinite().all())
 
 
-PARENTS = {ASBI: NPE_C, ALHI: NLE_A, SeqBED_B: NRE_B, SeqBED: NRE_C}
+PARENTS = {ASBI: NPE_C, ALHI: NLE_A, SeqBED: NRE_C}
 #: Private names of sbi that are overridden or called, with their parameters.
 HOOKS = {
     "_run_training_loop": "self train_loader val_loader train_config loss_args "
