@@ -17,6 +17,9 @@ from sbi_active.inference.networks.mixture_network import MixtureDensityNetwork
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows, pack
 from sbi_active.messages import warn
 
+#: What a posterior is given; None says that it is missing, which is an error.
+Given = Tensor | None
+
 
 class ActionPosterior:
     r"""Amortized posterior :math:`q(\theta | x, \xi)`.
@@ -51,8 +54,8 @@ class ActionPosterior:
     def sample(
         self,
         sample_shape: Shape = (),
-        x: Tensor | None = None,
-        action: Tensor | None = None,
+        x: Given = None,
+        action: Given = None,
         **kwargs: Any,
     ) -> Tensor:
         """Return draws given one outcome.
@@ -76,11 +79,7 @@ class ActionPosterior:
         return draws.reshape(*torch.Size(sample_shape), -1)
 
     def sample_batched(
-        self,
-        sample_shape: Shape,
-        x: Tensor | None = None,
-        action: Tensor | None = None,
-        **kwargs: Any,
+        self, sample_shape: Shape, x: Given = None, action: Given = None, **kwargs: Any
     ) -> Tensor:
         """Return draws given each of b outcomes, shape (*sample_shape, b, theta_dim).
 
@@ -95,11 +94,7 @@ class ActionPosterior:
         return posterior.sample_batched(sample_shape, x=condition, **kwargs)
 
     def log_prob(
-        self,
-        theta: Tensor,
-        x: Tensor | None = None,
-        action: Tensor | None = None,
-        **kwargs: Any,
+        self, theta: Tensor, x: Given = None, action: Given = None, **kwargs: Any
     ) -> Tensor:
         """Return the log density of parameters given one outcome.
 
@@ -117,11 +112,7 @@ class ActionPosterior:
         return posterior.log_prob(theta.float(), x=condition, **kwargs)
 
     def log_prob_batched(
-        self,
-        theta: Tensor,
-        x: Tensor | None = None,
-        action: Tensor | None = None,
-        **kwargs: Any,
+        self, theta: Tensor, x: Given = None, action: Given = None, **kwargs: Any
     ) -> Tensor:
         """Return log densities given each of several outcomes, shape (n, b).
 
@@ -135,9 +126,7 @@ class ActionPosterior:
         posterior, condition = self._given(x, action)
         return posterior.log_prob_batched(theta.float(), x=condition, **kwargs)
 
-    def map(
-        self, x: Tensor | None = None, action: Tensor | None = None, **kwargs: Any
-    ) -> Tensor:
+    def map(self, x: Given = None, action: Given = None, **kwargs: Any) -> Tensor:
         """Return the parameters of highest density, shape (1, theta_dim).
 
         Args:
@@ -188,7 +177,7 @@ class ActionPosterior:
             )
         return self._packed
 
-    def _given(self, x: Tensor | None, action: Tensor | None) -> tuple[Any, Tensor]:
+    def _given(self, x: Given, action: Given) -> tuple[Any, Tensor]:
         """Return a posterior of sbi's and the condition it takes.
 
         sbi refuses NaN, which here says that nothing was measured. A network that
@@ -211,7 +200,7 @@ class ActionPosterior:
             )
         return at_conditions(direct, condition)
 
-    def _condition(self, x: Tensor | None, action: Tensor | None) -> Tensor:
+    def _condition(self, x: Given, action: Given) -> Tensor:
         if x is None or action is None:
             given = "x without action" if action is None else "action without x"
             given = "neither" if x is action else given

@@ -166,9 +166,8 @@ def train_mixture_density(
     clip_max_norm: float | None = 5.0,
     anneal: bool = False,
     patience: int | None = None,
-    calibration_kernel: Callable[[Tensor], Tensor] | None = None,
 ) -> TrainingRecord:
-    r"""Minimize :math:`-\sum_n K(c_n) \log q(\theta_n | c_n)` over the training rows.
+    r"""Minimize :math:`-\sum_n \log q(\theta_n | c_n)` over the training rows.
 
     sbi's loop passes every row through a DataLoader, which costs more than the network;
     this one indexes tensors. Rows go through a network's conditioning once, and such a
@@ -187,7 +186,6 @@ def train_mixture_density(
         anneal: Whether the learning rate falls to zero along a cosine.
         patience: Epochs without improvement on held-out rows after which training
             stops and the best weights return; None spends the whole budget.
-        calibration_kernel: Weight K of a row; None is 1.
 
     Returns:
         The losses.
@@ -198,15 +196,9 @@ def train_mixture_density(
     row_loss: Callable[[Tensor, Tensor], Tensor] = network.loss
     if network.conditioning is not None and patience is None:
         patience = num_iterations  # never runs out
-    if network.can_prepare and calibration_kernel is None:
+    if network.can_prepare:
         theta, condition = network.prepare(theta, condition)
         row_loss = network.prepared_loss
-
-    def loss_of(theta: Tensor, condition: Tensor) -> Tensor:
-        loss = row_loss(theta, condition)
-        if calibration_kernel is not None:
-            loss = calibration_kernel(condition) * loss
-        return loss.mean()
 
     def height(step: int) -> float:
         return 1 + math.cos(math.pi * step / num_iterations)
@@ -226,7 +218,7 @@ def train_mixture_density(
         )
         for batch in batches:
             optimizer.forget_gradients()
-            loss = loss_of(*batch)
+            loss = row_loss(*batch).mean()
             loss.backward()
             if clip_max_norm is not None:
                 clip_grad_norm_(optimizer.parameters, clip_max_norm)
@@ -241,7 +233,7 @@ def train_mixture_density(
         if len(held_out_rows):
             with torch.no_grad():
                 held_out = theta[held_out_rows], condition[held_out_rows]
-                validation_loss = float(loss_of(*held_out))
+                validation_loss = float(row_loss(*held_out).mean())
         if not abs(validation_loss) < torch.inf:
             raise RuntimeError(
                 f"expected a finite loss; got {validation_loss} after {done} "

@@ -311,9 +311,6 @@ class Stages(ABC):
             error_nats_if_explained=last.error,
             figures={
                 "num_stages": num,
-                "num_regions": len(last.mass),
-                "region_mass": [float(mass) for mass in last.mass],
                 "prior_edge_mass": edge_mass,
-                "surrogate_kl_last_stage": change,
             },
         )

@@ -196,18 +196,15 @@ class GaussianProcess:
         mean, variance = self(torch.from_numpy(u))
         return mean.numpy(), variance.numpy()
 
-    def mean(self, u: Array) -> Array:
-        """Return the mean alone, which costs less, (m, D) -> (m, q)."""
-        at = torch.from_numpy(u)
-        return self._mean(at, self._cross(at)).numpy()
-
     def __call__(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and variance at inputs (m, D), both (m, q), differentiably."""
         cross, trend = self._cross(u), _features(u, self.settings)
         own = trend.square().sum(1) + self._kernel.amplitude().square()
         variance = own - ((cross @ self.precision) * cross).sum(1)
         variance = variance.clamp_min(self.settings.jitter)[:, None] * self.inflation
-        return self._mean(u, cross), variance * self.scale**2
+        beside = cross @ (self.precision @ self.values)
+        mean = self.shift + trend @ self.taken_off + beside * self.scale
+        return mean, variance * self.scale**2
 
     def covariance(self, u: Tensor) -> Tensor:
         """Return the posterior covariance of the first output at (m, D), (m, m)."""
@@ -231,11 +228,6 @@ class GaussianProcess:
 
     def _cross(self, u: Tensor) -> Tensor:
         return self._kernel(u, self.u)
-
-    def _mean(self, u: Tensor, cross: Tensor) -> Tensor:
-        taken_off = _features(u, self.settings) @ self.taken_off
-        beside = cross @ (self.precision @ self.values)
-        return self.shift + taken_off + beside * self.scale
 
 
 def num_features(dim: int) -> int:

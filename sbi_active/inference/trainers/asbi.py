@@ -156,12 +156,19 @@ class ASBI(MixtureRounds, NPE_C):
 
         Raises:
             ValueError: If with actions ``num_atoms``, ``discard_prior_samples`` or
-                ``use_combined_loss`` are given, which have no meaning there.
+                ``use_combined_loss`` are given, which have no meaning there, or
+                ``calibration_kernel`` for :class:`MixtureDensity`.
         """
         return super().train(*args, **kwargs)
 
     def _train_round(self, **arguments: Any) -> ConditionalDensityEstimator:
-        for name in ("discard_prior_samples", "use_combined_loss", "num_atoms"):
+        others = ["calibration_kernel"] if self._has_settings else []
+        for name in (
+            "discard_prior_samples",
+            "use_combined_loss",
+            "num_atoms",
+            *others,
+        ):
             default = signature(NPE_C.train).parameters[name].default
             value = arguments.pop(name, default)
             require(
@@ -177,20 +184,15 @@ class ASBI(MixtureRounds, NPE_C):
             self, **{**arguments, "force_first_round_loss": True}
         )
 
-    def _training_defaults(self, given: dict[str, Any]) -> dict[str, Any]:
-        return super()._training_defaults(given) | {"calibration_kernel": _all_alike}
-
     def _network(self, theta: Tensor, x: Tensor) -> MixtureDensityNetwork:
         # It does better where it knows which numbers are the action.
         return self._action_estimator.build(theta, x, self._action_dim)
 
-    def _train_mixture(self, config: TrainConfig, loss_args: Any) -> TrainingRecord:
-        kernel = loss_args.calibration_kernel
+    def _train_mixture(self, config: TrainConfig) -> TrainingRecord:
         return self._trained(
             *(self._neural_net, config, *self._round_rows()),
             train_rows=self.train_indices,
             held_out_rows=self.val_indices,
-            calibration_kernel=None if kernel is _all_alike else kernel,
         )
 
     def _resolve_prior(self, prior: Any, sample_with: Any) -> Any:
@@ -276,11 +278,6 @@ class ASBI(MixtureRounds, NPE_C):
             if not required:  # refinement repairs what the network misses
                 warnings.simplefilter("ignore")
             return ChainedBelief(deepcopy(network), condition, prior, previous)
-
-
-def _all_alike(condition: Tensor) -> Tensor:
-    """Return the weight of each row where none is given, shape (n,)."""
-    return torch.ones(len(condition), device=condition.device)
 
 
 def _fault(

@@ -100,7 +100,7 @@ class ALHI(ProductRounds, MixtureRounds, NLE_A):
         assert self._action_dim is not None
         return LikelihoodNetwork(self._action_estimator, x, theta, self._action_dim)
 
-    def _train_mixture(self, config: TrainConfig, loss_args: Any) -> TrainingRecord:
+    def _train_mixture(self, config: TrainConfig) -> TrainingRecord:
         network = self._neural_net
         condition, x = self._round_rows()
         rows = [

@@ -32,7 +32,7 @@ class MixtureRounds(ActionRounds):
     _fused = False  # whether Adam is one kernel
 
     @abstractmethod
-    def _train_mixture(self, config: TrainConfig, loss_args: Any) -> TrainingRecord:
+    def _train_mixture(self, config: TrainConfig) -> TrainingRecord:
         """Train the network on this round's rows."""
 
     def _training_defaults(self, given: dict[str, Any]) -> dict[str, Any]:
@@ -58,7 +58,7 @@ class MixtureRounds(ActionRounds):
                 train_loader, val_loader, train_config, loss_args, summarization_kwargs
             )
         self._neural_net.to(self._device)
-        record = self._train_mixture(train_config, loss_args)
+        record = self._train_mixture(train_config)
         # What sbi's own loop would write.
         trainer._best_val_loss = best = min(record.validation_loss)
         summary = trainer._summary

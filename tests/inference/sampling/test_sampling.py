@@ -94,7 +94,6 @@ def test_a_trend_of_ten_thousand_deviations_is_known_to_one():
     process = GaussianProcess.fit(u, f(u).astype(float), noise="none")
     mean, variance = process.predict(new)
     assert np.abs(mean - f(new)).max() < 0.5
-    assert np.array_equal(process.mean(new), mean)
     assert np.sqrt(variance).max() < 0.7
     assert np.abs(process.left_out).max() < 0.5
 
