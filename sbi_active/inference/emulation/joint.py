@@ -93,16 +93,8 @@ def candidate_gains(
         full = np.isfinite(numbers).all(1)
         if full.sum() < z.shape[1] + 4:
             continue
-        processes, roots = _learned(
-            inputs[full],
-            z[full],
-            numbers[full],
-            same[full],
-            noise,
-            raw.shape[1:],
-            rng,
-            seed,
-        )
+        own_rows = inputs[full], z[full], numbers[full], same[full]
+        processes, roots = _learned(*own_rows, noise, raw.shape[1:], rng, seed)
         normal = rng.standard_normal((num_outer, len(roots[0])))
         for a, own in enumerate(unit):
             tiled = np.broadcast_to(own, (len(draws), len(own)))

@@ -66,8 +66,8 @@ class TrialLikelihood:
     x_shape: tuple[int, ...]
     used: NDArray[np.bool_]
     root: Array
-    freedom: float
-    outcome: TrialOutcome | None
+    freedom: float = np.inf
+    outcome: TrialOutcome | None = None
 
     def log_likelihood(self, z: Array) -> Array:
         """Return log densities, (n, d) -> (n,)."""
@@ -79,7 +79,10 @@ class TrialLikelihood:
         noise = self.noise
         is_white = type(noise) is GaussianNoise and noise.posterior is None
         if noise is not None and not is_white:
-            return total + self._declared(self.predict(z)[0])
+            mean = self.predict(z)[0]
+            seen = self._full(np.broadcast_to(self.observed, mean.shape), np.nan)
+            declared = noise.log_prob(seen, self._full(mean, 0.0))
+            return total + declared.double().numpy()
         white, spread = self._whitened(z)
         log_volume = np.log(spread).sum(1) + np.log(np.diag(self.root)).sum()
         square, size = (white**2).sum(1), white.shape[1]
@@ -159,11 +162,6 @@ class TrialLikelihood:
         full[:, self.used] = numbers
         return torch.from_numpy(full).reshape(len(numbers), *self.x_shape)
 
-    def _declared(self, mean: Array) -> Array:
-        assert self.noise is not None
-        seen = self._full(np.broadcast_to(self.observed, mean.shape), np.nan)
-        return self.noise.log_prob(seen, self._full(mean, 0.0)).double().numpy()
-
 
 def declared_process(
     inputs: Array, numbers: Array, kinds: Sequence[Kind] = ("smooth", "rough")
@@ -227,10 +225,7 @@ class PooledLikelihood:
 
     def log_likelihood(self, z: Array) -> Array:
         """Return the log likelihood, (n, d) -> (n,)."""
-        total = np.zeros(len(z))
-        for trial in self.trials:
-            total = total + trial.log_likelihood(z)
-        return total
+        return np.sum([trial.log_likelihood(z) for trial in self.trials], axis=0)
 
 
 def mixture_gain(

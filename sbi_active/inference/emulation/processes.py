@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -30,7 +30,7 @@ from sbi_active.inference.regression.outcomes import TrialOutcome
 from sbi_active.inference.regression.regions import Region, whole_space
 from sbi_active.inference.rounds.rows import UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
-from sbi_active.inference.sampling.gaussian_process import GaussianProcess, num_features
+from sbi_active.inference.sampling.gaussian_process import num_features
 from sbi_active.inference.sampling.mixtures import Defended
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.noise.base import NoiseModel
@@ -175,55 +175,49 @@ class Processes(Stages):
         """
         rows = self.pool.at(trial.action)
         summary = next(s for s in self.summaries if s.label == label)
-        z = self.coordinates.to_z(rows.theta)
-        observed = summary(trial.x[None].float())[0]
-        numbers = summary(rows.x)
+        z, needed = self.coordinates.to_z(rows.theta), self.coordinates.dim + 4
+        observed, numbers = summary(trial.x[None].float())[0], summary(rows.x)
         # Where nothing was measured on one side, that is one NaN.
         width = max(numbers.shape[1], len(observed))
         numbers = np.broadcast_to(numbers, (len(numbers), width))
         observed = np.broadcast_to(observed, width)
-        used = np.isfinite(observed)
-        valid: NDArray[np.bool_] = np.asarray(
-            np.isfinite(numbers[:, used]).all(1) & used.any()
-        )
-        kind = np.isfinite(numbers)
+        used, kind = np.isfinite(observed), np.isfinite(numbers)
+        # As the trial had a measurement, or none.
         agrees = np.asarray(kind[:, used].all(1) if used.any() else ~kind.any(1))
-        outcome, region = None, whole_space(z.shape[1])
-        if not (agrees.all() and len(agrees)):  # as it had, or none
+        outcome, whole = None, whole_space(z.shape[1])
+        if not (agrees.all() and len(agrees)):
             none = np.zeros((0, 2), dtype=bool)
-            outcome = TrialOutcome.fit(region, 0, z, agrees, none)
-        processes: tuple[GaussianProcess, ...] = ()
-        root, freedom, seen = np.eye(used.sum()), np.inf, observed[used]
-        needed = z.shape[1] + 4
-        if used.any() and valid.sum() < needed:
+            outcome = TrialOutcome.fit(whole, 0, z, agrees, none)
+        own = TrialLikelihood(
+            *(whole, (), observed[used], self.noise, self.x_shape, used),
+            root=np.eye(used.sum()),
+            outcome=outcome,
+        )
+        if not used.any():
+            return own
+        if agrees.sum() < needed:
             raise UnexplainedOutcomeError(
                 f"expected at least {needed} simulations with a measurement at "
-                f"{trial.action.tolist()}; got {int(valid.sum())} of {len(rows)}; allow"
-                " more simulations, or leave the trial out"
+                f"{trial.action.tolist()}; got {int(agrees.sum())} of {len(rows)}; "
+                "allow more simulations, or leave the trial out"
             )
-        if used.any():
-            most = most_learned if self.noise is None else most_declared
-            near, region = nearest(z, valid, reference, most)
-            inputs, values = region.scaled(z[near]), numbers[near][:, used]
-            if self.noise is not None:
-                processes = (declared_process(inputs, values),)
-            else:
-                statistic, processes, left_out = learned_processes(
-                    inputs, values, z[near], seed=self.seed
-                )
-                seen = statistic(observed[used][None])[0]
-                root = correlation_root(left_out)
-                freedom = max(5.0, len(near) - 1.0 - z.shape[1])
-        return TrialLikelihood(
+        most = most_learned if self.noise is None else most_declared
+        near, region = nearest(z, agrees, reference, most)
+        inputs, values = region.scaled(z[near]), numbers[near][:, used]
+        if self.noise is not None:
+            return replace(
+                own, region=region, processes=(declared_process(inputs, values),)
+            )
+        statistic, processes, left_out = learned_processes(
+            inputs, values, z[near], seed=self.seed
+        )
+        return replace(
+            own,
             region=region,
             processes=processes,
-            observed=seen,
-            noise=self.noise,
-            x_shape=self.x_shape,
-            used=used,
-            root=root,
-            freedom=freedom,
-            outcome=outcome,
+            observed=statistic(observed[used][None])[0],
+            root=correlation_root(left_out),
+            freedom=max(5.0, len(near) - 1.0 - z.shape[1]),
         )
 
     def simulate(self, size: int, *, share_of_prior: float = 0.1) -> None:
