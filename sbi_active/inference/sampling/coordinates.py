@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -142,37 +141,6 @@ class PriorCoordinates:
         return np.where(self._side == 0, theta, logarithm)
 
 
-@dataclass(frozen=True)
-class Unbounding:
-    """Maps axes in [-1, 1] to the real line, where a uniform number is normal.
-
-    Otherwise nearly all draws of a density that is cut at many edges would miss it.
-
-    Attributes:
-        axes: Mask of the axes that are mapped, shape (d,); the others stay.
-    """
-
-    axes: NDArray[np.bool_]
-
-    def to_line(self, z: Array) -> Array:
-        """Return z on the real line, shape (n, d); what is outside goes to the end."""
-        y = z.copy()
-        share = 0.5 * (1 + z[:, self.axes])
-        y[:, self.axes] = ndtri(share.clip(1e-15, 1 - 1e-15))
-        return y
-
-    def from_line(self, y: Array) -> Array:
-        """Return z, shape (n, d)."""
-        z = y.copy()
-        z[:, self.axes] = 2 * ndtr(y[:, self.axes]) - 1
-        return z
-
-    def log_slope(self, y: Array) -> Array:
-        """Return log |dy / dz|, shape (n,)."""
-        square = y[:, self.axes] ** 2
-        return (0.5 * square + 0.5 * np.log(0.5 * np.pi)).sum(1)
-
-
 class NormalCoordinates:
     r"""Maps parameters to u, in which the prior has no mean and unit covariance.
 
@@ -212,12 +180,12 @@ class NormalCoordinates:
     ) -> None:
         self.base, self.dim = coordinates, coordinates.dim
         z, bounded = coordinates.sample_prior(num_draws, rng), coordinates.bounded
-        self.line = Unbounding(bounded)
-        correlation = _correlation(self.line.to_line(z), chance)
+        self._lined = bounded
+        correlation = _correlation(self._to_line(z), chance)
         apart = np.abs(correlation - np.eye(self.dim)).max(1) == 0
         kept = bounded & apart & keeps_edges
-        self.line = Unbounding(bounded & ~kept)
-        y = self.line.to_line(z)
+        self._lined = bounded & ~kept
+        y = self._to_line(z)
         shift, spread = y.mean(0), y.std(0)
         # The moments of a uniform number are known.
         error = UNIFORM * (0.2 / num_draws) ** 0.5  # of the deviation of its draws
@@ -234,12 +202,14 @@ class NormalCoordinates:
 
     def from_z(self, z: Array) -> Array:
         """Return u, shape (n, d), of the prior's coordinates, shape (n, d)."""
-        apart = self.line.to_line(z) - self._shift
+        apart = self._to_line(z) - self._shift
         return np.linalg.solve(self._factor, apart.T).T
 
     def to_z(self, u: Array) -> Array:
         """Return the prior's coordinates, shape (n, d)."""
-        return self.line.from_line(u @ self._factor.T + self._shift)
+        z = u @ self._factor.T + self._shift
+        z[:, self._lined] = 2 * ndtr(z[:, self._lined]) - 1
+        return z
 
     def to_theta(self, u: Array) -> Tensor:
         """Return float32 parameters, shape (n, d)."""
@@ -247,14 +217,23 @@ class NormalCoordinates:
 
     def log_prior(self, u: Array) -> Array:
         """Return the log density of u under the prior, shape (n,)."""
-        y = u @ self._factor.T + self._shift
-        slope = self.line.log_slope(y)
-        return self.base.log_prior(self.line.from_line(y)) - slope + self._log_volume
+        log_prior = self.base.log_prior(self.to_z(u))
+        return log_prior - self._line_slope(u) + self._log_volume
 
     def log_slope(self, u: Array) -> Array:
         """Return log |d u / d z|, shape (n,)."""
-        y = u @ self._factor.T + self._shift
-        return self.line.log_slope(y) - self._log_volume
+        return self._line_slope(u) - self._log_volume
+
+    def _to_line(self, z: Array) -> Array:
+        """Return z with some axes on the real line; what is outside goes to the end."""
+        y, share = z.copy(), 0.5 * (1 + z[:, self._lined])
+        y[:, self._lined] = ndtri(share.clip(1e-15, 1 - 1e-15))
+        return y
+
+    def _line_slope(self, u: Array) -> Array:
+        """Return the log slope of what goes to the line, shape (n,)."""
+        square = (u @ self._factor.T + self._shift)[:, self._lined] ** 2
+        return (0.5 * square + 0.5 * np.log(0.5 * np.pi)).sum(1)
 
     def sample(self, num: int, rng: np.random.Generator) -> Array:
         """Return draws of the prior, shape (n, d)."""
