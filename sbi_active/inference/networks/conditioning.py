@@ -13,8 +13,6 @@ from sbi_active.arrays import finite
 from sbi_active.inference.networks.action_scaling import ActionScaling, held_out
 from sbi_active.inference.networks.baseline import Baseline, Frames, local
 
-KINDS: tuple[Literal["linear", "curved"], ...] = ("linear", "curved")
-
 
 def can_regress(
     valid: Tensor, num_outcomes: int, *, fewest: int = 40, most: int = 32
@@ -160,8 +158,8 @@ class Conditioning(nn.Module):
         scaling: Whether x, without a baseline, is standardized given the action or over
             all rows.
         whiten: Whether theta is whitened by its full covariance or only scaled.
-        baseline: Baseline whose frames are used; "best" compares Gaussian log scores on
-            held-out rows.
+        baseline: Whether a baseline's frames are used; "best" compares Gaussian log
+            scores on held-out rows, without one among them.
         most_numbers: Number of an outcome's numbers beyond which
             :class:`.Directions` stand for them. Half of it summarizes what a network
             learns as well in ten times the time.
@@ -180,7 +178,7 @@ class Conditioning(nn.Module):
         action_dim: int,
         scaling: Literal["action", "global"],
         whiten: bool,
-        baseline: Literal["best", "none", "linear", "curved"],
+        baseline: Literal["best", "none"],
         *,
         most_numbers: float = 200,
         num_directions: int = 32,
@@ -208,9 +206,8 @@ class Conditioning(nn.Module):
         y = (x[valid] - self.y_mean) / self.y_scale
 
         self.baseline: Baseline | None = None
-        if baseline != "none" and not few:
-            u = self.whiten(theta[valid])
-            self._choose(u, y, action[valid], baseline, margin)
+        if baseline == "best" and not few:
+            self._choose(self.whiten(theta[valid]), y, action[valid], margin)
         self.x_scaling: ActionScaling | None = None
         if scaling == "action" and not few and self.baseline is None:
             self.x_scaling = ActionScaling(y, action[valid])
@@ -220,26 +217,19 @@ class Conditioning(nn.Module):
         own = getattr(self, "directions", None)  # none in networks of earlier versions
         return x.double() if own is None else own(x)
 
-    def _choose(
-        self,
-        u: Tensor,
-        y: Tensor,
-        action: Tensor,
-        baseline: Literal["best", "linear", "curved"],
-        margin: float,
-    ) -> None:
-        test, best = held_out(len(u)), -math.inf
-        if baseline == "best":
-            best = float(log_normal(u[test]).mean())
-        for kind in KINDS if baseline == "best" else (baseline,):
-            bends = self.baseline is None or self.baseline.bends(u, y, action)
-            is_further = baseline == "best" and kind == "curved"
-            if is_further and not bends:
+    def _choose(self, u: Tensor, y: Tensor, action: Tensor, margin: float) -> None:
+        """Take the baseline that predicts held-out rows best, if one does better."""
+        test = held_out(len(u))
+        best = float(log_normal(u[test]).mean())
+        kinds: list[tuple[Literal["linear", "curved"], float]]
+        kinds = [("linear", 0.0), ("curved", margin)]
+        for kind, least in kinds:
+            if self.baseline is not None and not self.baseline.bends(u, y, action):
                 continue
             candidate = Baseline(u, y, action, kind=kind)
             frames = candidate(y[test], action[test]).with_global()
             score = float(_log_mixture(u[test], frames).mean())
-            if score > best + is_further * margin:
+            if score > best + least:
                 best, self.baseline = score, candidate
 
     @property

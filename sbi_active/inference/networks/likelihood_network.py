@@ -122,11 +122,8 @@ class LikelihoodNetwork(ConditionalDensityEstimator):
         self.response: Response | None = None
         self.x_scaling: ActionScaling | None = None
         few = not can_regress(valid, y.shape[1])
-        if details.baseline != "none" and not few:
-            kind = details.baseline
-            self.response = (
-                Response.best(*rows) if kind == "best" else Response(*rows, kind=kind)
-            )
+        if details.baseline == "best" and not few:
+            self.response = Response.best(*rows)
         elif details.scaling == "action" and not few:
             self.x_scaling = ActionScaling(y, action[valid])
         z, _ = self._standardize(known, condition[valid])

@@ -37,9 +37,8 @@ class MixtureDetails:
         scaling: Scaling of x: "action" standardizes it given the action, "global" over
             all rows; with a baseline, that does the former.
         whiten: Whether theta is whitened by its full covariance, or number by number.
-        baseline: Gaussian posterior that the network corrects: "linear" or "curved" in
-            theta, "none", or "best" of these on held-out rows, see
-            :class:`.Conditioning`.
+        baseline: Gaussian posterior that the network corrects: "none", or the "best" on
+            held-out rows of one linear or curved in theta, see :class:`.Conditioning`.
     """
 
     batch_size: int = 200
@@ -48,14 +47,14 @@ class MixtureDetails:
     anneal: bool = True
     scaling: Literal["action", "global"] = "action"
     whiten: bool = True
-    baseline: Literal["best", "none", "linear", "curved"] = "best"
+    baseline: Literal["best", "none"] = "best"
 
     def __post_init__(self) -> None:
         require_least(self, "raise it", batch_size=1)
         rate = self.learning_rate
         require(rate > 0, "learning_rate > 0", rate, "use 1e-3")
         require_one_of(self, activation=ACTIVATIONS, scaling=("action", "global"))
-        require_one_of(self, baseline=("best", "none", "linear", "curved"))
+        require_one_of(self, baseline=("best", "none"))
 
 
 #: Settings whose fields were the network's own in the last version.

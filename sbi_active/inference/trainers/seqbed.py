@@ -193,11 +193,9 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         require_whole(torch.stack([trial.x for trial in trials]))
         if told.simulator is None:
             return self._weighted(self.build_posterior(), trials[-1], {})
-        if not told.afresh:
-            return self._simulated(told, self.belief, trials[-1], seed)
-        beliefs: list[Any] = [self._prior]
-        for k, trial in enumerate(trials):
-            own = derive_seed(seed, "trial", k)
+        beliefs: list[Any] = [self._prior if told.afresh else self.belief]
+        for k, trial in enumerate(trials if told.afresh else trials[-1:]):
+            own = derive_seed(seed, "trial", k) if told.afresh else seed
             beliefs.append(self._simulated(told, beliefs[-1], trial, own))
         known = [belief.diagnostics for belief in beliefs[1:]]
         beliefs[-1].diagnostics = known[-1].extended(
@@ -207,7 +205,7 @@ class SeqBED_LFIRE(ActiveInference):  # noqa: N801 - as NRE_B
         return beliefs[-1]
 
     def _simulated(
-        self, told: Told, belief: Any, trial: Observation, seed: int
+        self, told: Told, belief: Distribution, trial: Observation, seed: int
     ) -> Belief:
         """Weigh new particles of a belief, simulated at the executed action."""
         n = told.settings.num_histories
