@@ -16,7 +16,9 @@ from typing_extensions import override
 
 from sbi_active.arrays import Array
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
+from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.engine.learned import LearnedBelief, learned_fit
+from sbi_active.inference.refinement.stages import StageSettings
 from sbi_active.inference.rounds.condition import action_rows, outcome_rows, pack
 from sbi_active.inference.rounds.rows import Observation
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
@@ -216,18 +218,6 @@ class Product:
     region: TrainedRegion | None = None
     previous: Distribution | None = None
 
-    def log_factors(self, theta: Tensor) -> Tensor:
-        r"""Return :math:`\sum_k \log q(x_k | \theta, \xi_k)`, (n, d) -> (n,), float64.
-
-        Gradients flow to theta.
-        """
-        total = torch.zeros(len(theta), dtype=torch.float64)
-        for trial in self.trials:
-            rows = trial.x.expand(len(theta), *trial.x.shape)
-            action = trial.action.expand(len(theta), -1)
-            total = total + self.model.log_factor(theta, rows, action).double()
-        return total
-
     def log_likelihood(self, z: Array, *, batch_size: int = 20_000) -> Array:
         """Return the log likelihood, (n, d) -> (n,), so many rows in memory at once."""
         total = np.full(len(z), -np.inf)
@@ -238,12 +228,23 @@ class Product:
             return total
         theta = self.coordinates.to_theta(z[inside])
         with torch.no_grad(), single_thread():
-            parts = [self._evaluate(part) for part in theta.split(batch_size)]
+            parts = [self.log_factors(part) for part in theta.split(batch_size)]
         total[inside] = torch.cat(parts).numpy()
         return total
 
-    def _evaluate(self, theta: Tensor) -> Tensor:
-        total = self.log_factors(theta)
+    def log_factors(self, theta: Tensor) -> Tensor:
+        r"""Return the log likelihood of parameters, (n, d) -> (n,), float64.
+
+        .. math::
+            \sum_k \log q(x_k | \theta, \xi_k),
+
+        and the log ratio of the belief that takes the prior's place to the prior.
+        """
+        total = torch.zeros(len(theta), dtype=torch.float64)
+        for trial in self.trials:
+            rows = trial.x.expand(len(theta), *trial.x.shape)
+            action = trial.action.expand(len(theta), -1)
+            total = total + self.model.log_factor(theta, rows, action).double()
         if self.previous is None:
             return total
         ratio = self.previous.log_prob(theta) - self.coordinates.prior.log_prob(theta)
@@ -251,13 +252,11 @@ class Product:
 
 
 def sample_product(
-    prior: Distribution,
     product: Product,
     hint: Tensor | None,
     rng: np.random.Generator,
+    settings: RefinementOptions,
     *,
-    num_effective: float,
-    defensive: float,
     enough: float = 100.0,
 ) -> LearnedBelief:
     r"""Return the belief of a product, sampled by :func:`.infer`.
@@ -267,19 +266,19 @@ def sample_product(
         + \epsilon\, p(\theta)
 
     Args:
-        prior: The original prior.
         product: The learned likelihood of all trials.
         hint: Draws around the posterior, shape (n, theta_dim), such as those of the
             belief before; None begins at the prior.
         rng: Source of randomness.
-        num_effective: Number of effective draws.
-        defensive: Share of the prior in the belief.
+        settings: Settings of the belief.
         enough: Effective draws below which the normalizer is off by more than a tenth
             of a nat.
     """
+    prior, num = product.coordinates.prior, settings.num_effective
     near = None if hint is None else product.coordinates.to_z(hint)
-    fit = learned_fit(product, rng, near=near, num_effective=num_effective)
-    belief = LearnedBelief(prior, fit, defensive=defensive)
+    num *= StageSettings().oversampling
+    fit = learned_fit(product, rng, near=near, num_effective=num)
+    belief = LearnedBelief(prior, fit, defensive=settings.defensive)
     belief.label = "product over trials"
     effective = fit.effective_sample_size
     belief.diagnostics = Diagnostics().extended(

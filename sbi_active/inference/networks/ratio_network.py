@@ -10,11 +10,7 @@ from torch import Tensor, nn
 
 from sbi_active.expected import require, require_least
 from sbi_active.inference.networks.action_scaling import ActionScaling
-from sbi_active.inference.networks.conditioning import (
-    Whitening,
-    can_regress,
-    scale_of,
-)
+from sbi_active.inference.networks.conditioning import Whitening, can_regress, scale_of
 from sbi_active.inference.networks.response import Response
 
 

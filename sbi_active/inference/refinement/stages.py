@@ -309,8 +309,5 @@ class Stages(ABC):
             effective_sample_size=float(last.fit.effective_sample_size),
             error_nats=last.error,
             error_nats_if_explained=last.error,
-            figures={
-                "num_stages": num,
-                "prior_edge_mass": edge_mass,
-            },
+            figures={"num_stages": num, "prior_edge_mass": edge_mass},
         )

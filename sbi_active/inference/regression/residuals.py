@@ -230,8 +230,7 @@ class NoiseShape:
         score = (score - shift) / deviation
         covariance = ResidualCovariance.of(score, deviation, freedom, trial)
         return NoiseShape(
-            *(power, floor, scale, mixture, covariance, shift),
-            *(coefficient, observed),
+            *(power, floor, scale, mixture, covariance, shift), *(coefficient, observed)
         )
 
     def log_likelihood(self, features: Array, widening: Array) -> Array:

@@ -81,10 +81,7 @@ class ALHI(ProductRounds, MixtureRounds, NLE_A):
 
     @extends(NLE_A.__init__)
     def __init__(
-        self,
-        *args: Any,
-        posterior: str = "importance",
-        **kwargs: Any,
+        self, *args: Any, posterior: str = "importance", **kwargs: Any
     ) -> None:
         super().__init__(*args, posterior=posterior, **kwargs)
 
@@ -174,10 +171,7 @@ class SeqBED(ProductRounds, NRE_C):
 
     @extends(NRE_C.__init__)
     def __init__(
-        self,
-        *args: Any,
-        posterior: str = "importance",
-        **kwargs: Any,
+        self, *args: Any, posterior: str = "importance", **kwargs: Any
     ) -> None:
         super().__init__(*args, posterior=posterior, **kwargs)
 

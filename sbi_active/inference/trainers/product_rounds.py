@@ -22,7 +22,6 @@ from sbi_active.inference.models.factors import (
     sample_product,
     widened,
 )
-from sbi_active.inference.refinement.stages import StageSettings
 from sbi_active.inference.rounds.rows import Observation, require_whole, rows_of
 from sbi_active.inference.sampling.coordinates import PriorCoordinates
 from sbi_active.inference.trainers.action_rounds import ActionRounds
@@ -216,14 +215,7 @@ class ProductRounds(ActionRounds):
         counted = [t for t in used if _says_something(learned, t, prior)]
         before = previous if chained and previous is not prior else None
         product = Product(coordinates, learned, counted, region, before)
-        belief = sample_product(
-            prior,
-            product,
-            hint,
-            rng,
-            num_effective=StageSettings().oversampling * told.settings.num_effective,
-            defensive=told.settings.defensive,
-        )
+        belief = sample_product(product, hint, rng, told.settings)
         sampled: Belief = belief
         if chained:
             with forked_generators(seed, "kernels"):

@@ -17,11 +17,7 @@ from sbi_active.inference.beliefs.belief import Belief
 from sbi_active.inference.beliefs.priors import require_support
 from sbi_active.inference.beliefs.weighted import KernelBelief
 from sbi_active.inference.models.lfire import LFIRE, LFIREModel, fit_log_ratios
-from sbi_active.inference.rounds.rows import (
-    Observation,
-    require_whole,
-    rows_of,
-)
+from sbi_active.inference.rounds.rows import Observation, require_whole, rows_of
 from sbi_active.inference.trainers.base import ActiveInference, Told
 from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
