@@ -129,34 +129,3 @@ class Coordinates:
             self.num_continuous, scramble=True, seed=seed % 2**31
         )
         return engine.draw(num, dtype=torch.float64)
-
-
-def cells(
-    point: Tensor, num: int, *, num_continuous: int, fewest: int = 8
-) -> list[Tensor]:
-    """Halve groups of points across their widest side until they are small enough.
-
-    About ``num`` cells of points (n, dim), whose first entries are in a unit cube and
-    are halved by; points of a cell agree in the others, and are ``fewest`` or more.
-
-    Example:
-        >>> point = torch.tensor([[0.0], [1.0], [0.25], [0.75]] * 8)
-        >>> [point[c, 0].unique().tolist() for c in cells(point, 2, num_continuous=1)]
-        [[0.0, 0.25], [0.75, 1.0]]
-    """
-    largest = max(-(-len(point) // num), 2 * fewest - 1)
-    constant = torch.zeros(len(point), 1, dtype=point.dtype)
-    category = torch.cat([constant, point[:, num_continuous:]], 1)
-    _, label = category.unique(dim=0, return_inverse=True)
-    groups = [torch.nonzero(label == k)[:, 0] for k in range(int(label.max()) + 1)]
-    done: list[Tensor] = []
-    while groups:
-        group = groups.pop()
-        inside = point[group, :num_continuous]
-        if len(group) <= largest or not inside.numel():
-            done.append(group.sort().values)
-            continue
-        side = int((inside.amax(0) - inside.amin(0)).argmax())
-        order = inside[:, side].argsort(stable=True)
-        groups += [group[half] for half in order.tensor_split(2)][::-1]
-    return [group for group in done if len(group) > 1]
