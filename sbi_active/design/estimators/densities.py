@@ -24,33 +24,23 @@ def cross_fit(
     """Return scores of every row (n,) by members fitted and chosen without it.
 
     Args:
-        score: ``score(train, test)``, see :func:`held_out`.
+        score: ``score(train, test)``, both of rows, gives the scores of the test rows
+            by each member fitted to the training rows, shape (members, test).
         block: Number of the block that a row belongs to, shape (n,): rows of a block
             share a fold, which the member scores that is the best on the others.
         weight: Weight of each row in the choice, shape (n,).
-    """
-    fold, scores = block % NUM_FOLDS, held_out(score, block)
-    result = torch.empty(len(block), dtype=torch.float64)
-    for k in range(NUM_FOLDS):
-        others = (scores * weight)[:, fold != k].sum(1)
-        result[fold == k] = scores[int(others.argmax()), fold == k]
-    return result
-
-
-def held_out(score: Callable[[Tensor, Tensor], Tensor], block: Tensor) -> Tensor:
-    """Return scores of every row by members fitted to other folds, (members, n).
-
-    Args:
-        score: ``score(train, test)``, both of rows, gives the scores of the test rows
-            by each member fitted to the training rows, shape (members, test).
-        block: Number of the block that a row belongs to, shape (n,).
     """
     fold, parts, rows = block % NUM_FOLDS, [], []
     for k in fold.unique().tolist():
         train, test = (torch.nonzero(part)[:, 0] for part in (fold != k, fold == k))
         parts.append(score(train, test))
         rows.append(test)
-    return torch.cat(parts, 1).double()[:, torch.cat(rows).argsort()]
+    scores = torch.cat(parts, 1).double()[:, torch.cat(rows).argsort()]
+    result = torch.empty(len(block), dtype=torch.float64)
+    for k in range(NUM_FOLDS):
+        others = (scores * weight)[:, fold != k].sum(1)
+        result[fold == k] = scores[int(others.argmax()), fold == k]
+    return result
 
 
 def by_pattern(
