@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import math
-from itertools import product
-
 import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, BoxActions
 from sbi_active.inference.sampling.gaussian_process import IN_CUBE, GaussianProcess
-from sbi_active.seeding import derive_seed
 
 
 class Coordinates:
@@ -100,32 +96,11 @@ class Coordinates:
         )
 
     def spread(self, num: int, seed: int) -> Tensor:
-        """Return points that fill the space, shape (num, dim).
-
-        Every combination of categories has about as many, scrambled Sobol points of its
-        own; where there are more combinations than points they are drawn at random.
-        """
-        generator = torch.Generator().manual_seed(derive_seed(seed, "categories"))
-        total = math.prod(self.sizes)
-        if total > num:
-            columns = [
-                torch.randint(k, (num, 1), generator=generator) for k in self.sizes
-            ]
-            return torch.cat([self._sobol(num, derive_seed(seed, 0)), *columns], 1)
-        each = -(-num // total)
-        order = torch.randperm(total, generator=generator).tolist()
-        every = [*product(*map(range, self.sizes))]
-        points = []
-        for k in order:
-            category = torch.tensor(every[k]).double().expand(each, -1)
-            inside = self._sobol(each, derive_seed(seed, k))
-            points.append(torch.cat([inside, category], 1))
-        return torch.stack(points, 1).flatten(0, 1)[:num]
-
-    def _sobol(self, num: int, seed: int) -> Tensor:
-        if not self.num_continuous:
-            return torch.empty(num, 0).double()
+        """Return points that fill the space, shape (num, dim): scrambled Sobol."""
         engine = torch.quasirandom.SobolEngine(
-            self.num_continuous, scramble=True, seed=seed % 2**31
+            self.dim, scramble=True, seed=seed % 2**31
         )
-        return engine.draw(num, dtype=torch.float64)
+        point = engine.draw(num, dtype=torch.float64)
+        sizes = torch.tensor(self.sizes)
+        point[:, self.num_continuous :].mul_(sizes).floor_()
+        return point

@@ -65,10 +65,10 @@ def conditional_gain(
 ) -> Tensor:
     """Return contributions to what candidates tell beyond the others, (a, n).
 
-    The simulations come from :func:`join_outcomes`; the model is for single outcomes.
+    The simulations come from :func:`join_outcomes`; the model is a
+    :class:`JointLikelihood`, or None.
     """
     action_dim = simulations.action.shape[1] // (1 + num_others)
-    joint = None if model is None else JointLikelihood(model, action_dim)
     others = replace(
         simulations,
         action=simulations.action[:1, action_dim:],
@@ -78,8 +78,8 @@ def conditional_gain(
             if (part := getattr(simulations, name)) is not None
         },
     )
-    known = estimator(joint, others, belief)
-    return estimator(joint, simulations, belief) - known
+    known = estimator(model, others, belief)
+    return estimator(model, simulations, belief) - known
 
 
 class JointLikelihood:

@@ -97,16 +97,13 @@ class RivalSampler:
         self.seed, self.num_drawn, self._num_waves = seed, 0, 0
         self._is_noisy = all(hasattr(r, "predict_mean") for r in self.rivals)
 
-    def draw(
-        self, num_samples: int, action: Tensor, *, replicates: bool
-    ) -> CandidateSimulations:
+    def draw(self, num_samples: int, action: Tensor) -> CandidateSimulations:
         """Draw outcomes.
 
         Args:
             num_samples: Number of outcomes of a candidate; rounded to an even number of
                 each model.
             action: Candidates, shape (a, action_dim).
-            replicates: Flag of the sampler it stands in for; it has no effect here.
 
         Raises:
             ValueError: If a rival returns another number of rows or another shape.

@@ -18,14 +18,12 @@ from sbi_active.design.estimators.emulator import MeanEmulator, declare, fill
 from sbi_active.design.estimators.entropy import (
     EntropyGain,
     conditional_entropy,
-    with_control,
-)
-from sbi_active.design.estimators.evidence import Evidence, log_belief
-from sbi_active.design.estimators.presence import (
     presence_information,
     presence_notes,
     presence_problems,
+    with_control,
 )
+from sbi_active.design.estimators.evidence import Evidence, log_belief
 from sbi_active.simulation import NoiseModel
 
 
