@@ -92,9 +92,8 @@ class Search(Shown, ABC):
             TypeError: If the search does not apply to the space.
         """
 
-    @abstractmethod
     def num_evaluations(self, budget: int, num_samples: int) -> int:
-        """Return the number of actions to evaluate on the way.
+        """Return the number of actions to evaluate on the way, 0 by default.
 
         Args:
             budget: Simulations of the design.
@@ -103,6 +102,7 @@ class Search(Shown, ABC):
         Raises:
             ValueError: If the budget does not suffice.
         """
+        return 0
 
     @abstractmethod
     def finalists(self, objective: Objective) -> Tensor:
@@ -115,10 +115,6 @@ class ExhaustiveSearch(Search):
     @override
     def size(self, actions: ActionSpace) -> int:
         return len(self._listed(actions))
-
-    @override
-    def num_evaluations(self, budget: int, num_samples: int) -> int:
-        return 0
 
     @override
     def finalists(self, objective: Objective) -> Tensor:
