@@ -78,7 +78,7 @@ class RivalSampler:
             positive or do not add up to one.
     """
 
-    others = notes = ()
+    others, notes = torch.empty(0, 0), ()
     summaries = None
     num_missing = 0
 

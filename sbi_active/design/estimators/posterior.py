@@ -128,7 +128,11 @@ class ParameterGain(InformationGainEstimator):
             with forked_generators(0, "marginal"):
                 draws = belief.sample(torch.Size([self.num_marginal]))
             draws = self.target(draws).double().numpy()
-            scores = QuantileTransformer(output_distribution="normal", subsample=None)
+            scores = QuantileTransformer(
+                n_quantiles=min(1_000, len(draws)),
+                output_distribution="normal",
+                subsample=len(draws),
+            )
             u = torch.from_numpy(scores.fit_transform(draws))
             self._marginal = belief, scores, _dependence(u)
         _, scores, dependence = self._marginal
