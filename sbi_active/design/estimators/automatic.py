@@ -16,7 +16,7 @@ from sbi_active.design.estimators.base import (
     standard_error,
 )
 from sbi_active.design.estimators.contrast import InfoNCEGain, LikelihoodGain, RatioGain
-from sbi_active.design.estimators.entropy import EntropyGain, has_random_presence
+from sbi_active.design.estimators.entropy import EntropyGain, random_presence
 from sbi_active.design.estimators.linear import LinearGain
 from sbi_active.design.estimators.nested import NestedGain
 from sbi_active.design.estimators.posterior import ParameterGain, PosteriorGain
@@ -135,7 +135,7 @@ def choose_estimator(
             return bound, notes
         return RatioGain(), [*notes, *(f"not used: {text}" for text in cautions)]
     assert by_noise is not None
-    if has_random_presence(simulations):
+    if bool(random_presence(simulations).any()):
         return ParameterGain(range(simulations.theta.shape[1])), notes
     return by_noise, [*notes, "used all the same: there is no model"]
 

@@ -265,8 +265,8 @@ def presence_information(simulations: CandidateSimulations) -> Tensor:
     patterns, counted = _patterns(simulations), simulations.counted
     gain = torch.zeros(counted.shape, dtype=torch.float64)
     incomplete = (counted & (simulations.completeness < 1)).any(1)
-    random = _random_presence(simulations)
-    for a in torch.nonzero(incomplete & ~random)[:, 0].tolist():
+    certain = ~random_presence(simulations)
+    for a in torch.nonzero(incomplete & certain)[:, 0].tolist():
         _, label, count = torch.unique(
             patterns[a, 0, counted[a]], return_inverse=True, return_counts=True
         )
@@ -274,18 +274,22 @@ def presence_information(simulations: CandidateSimulations) -> Tensor:
     return gain
 
 
-def has_random_presence(simulations: CandidateSimulations) -> bool:
-    """Return whether outcomes at the same parameters differ in what is present."""
-    return bool(_random_presence(simulations).any())
+def random_presence(simulations: CandidateSimulations) -> Tensor:
+    """Return a mask of candidates whose outcomes differ in what is present, (a,)."""
+    first, second = _patterns(simulations).unbind(1)
+    return ((first != second) & simulations.counted).any(1)
 
 
 def presence_problems(
     simulations: CandidateSimulations, *, max_partly: float = 0.1
 ) -> list[str]:
-    """Say what of incomplete outcomes would not count."""
+    """Say what of incomplete outcomes would not count, which leaves a lower bound."""
     problems = []
-    if has_random_presence(simulations):
-        problems.append("whether there is a measurement is random given the parameters")
+    if bool(random_presence(simulations).any()):
+        problems.append(
+            "whether there is a measurement is random given the parameters, which does "
+            "not count"
+        )
     share = float(simulations.partly_observed.double().mean())
     if share > max_partly:
         problems.append(
@@ -295,26 +299,14 @@ def presence_problems(
 
 
 def presence_notes(simulations: CandidateSimulations) -> list[str]:
-    """Return notes where incomplete outcomes make the estimate a bound."""
-    notes = []
-    if has_random_presence(simulations):
-        notes.append(
-            "whether there is a measurement is random given the parameters: what it "
-            "tells is not counted, a lower bound"
-        )
+    """Return a note where some outcomes are partly observed; empty if none is."""
     partly = simulations.partly_observed
-    if bool(partly.any()):
-        notes.append(
-            f"up to {float(partly.double().mean(1).max()):.0%} of an action's outcomes "
-            "are partly observed: their numbers are not used, only which are present"
-        )
-    return notes
-
-
-def _random_presence(simulations: CandidateSimulations) -> Tensor:
-    """Return a mask of candidates whose outcomes differ in what is present, (a,)."""
-    first, second = _patterns(simulations).unbind(1)
-    return ((first != second) & simulations.counted).any(1)
+    if not bool(partly.any()):
+        return []
+    return [
+        f"up to {float(partly.double().mean(1).max()):.0%} of an action's outcomes "
+        "are partly observed: their numbers are not used, only which are present"
+    ]
 
 
 def _patterns(simulations: CandidateSimulations) -> Tensor:
