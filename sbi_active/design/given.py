@@ -115,7 +115,7 @@ class GivenGains:
                 "candidate; got fewer of every one; pass rows at the actions of the "
                 "list"
             )
-        halves = [[self._gain(own[k::2]) for own in rows] for k in range(2)]
+        halves = [[self._gain(own, k) for own in rows] for k in range(2)]
         share = torch.stack([self._share_valid(own) for own in rows])
         eligible, cost = known & limits.reached_by(share), limits.cost(action)
         index = torch.nonzero(eligible)[:, 0]
@@ -143,8 +143,8 @@ class GivenGains:
         limits = self.limits
 
         def evaluate(action: Tensor) -> Evaluations:
-            rows = [self._rows_at(own)[::2] for own in action]
-            gains, cost = [self._gain(own) for own in rows], limits.cost(action)
+            rows = [self._rows_at(own) for own in action]
+            gains, cost = [self._gain(own, 0) for own in rows], limits.cost(action)
             return Evaluations(
                 action,
                 torch.stack([gain.nanmean() for gain in gains]) / cost,
@@ -188,9 +188,10 @@ class GivenGains:
             each=action,
         )
 
-    def _gain(self, rows: Tensor) -> Tensor:
-        """Return contributions of rows, shape (n,); NaN where these are too few."""
-        if 2 * len(rows) < self.fewest - 1:
+    def _gain(self, rows: Tensor, half: int) -> Tensor:
+        """Return contributions of half of the rows, (n,); NaN where these are few."""
+        if len(rows) < self.fewest:
             return torch.full((2,), torch.nan)
+        given = self._simulations(rows[half::2])
         with single_thread():
-            return self.estimator(self.model, self._simulations(rows), self.belief)[0]
+            return self.estimator(self.model, given, self.belief)[0]

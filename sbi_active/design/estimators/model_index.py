@@ -166,10 +166,11 @@ class ModelIndexGain(InformationGainEstimator):
 
     with v the numbers of x that are present, P_k(v) their share among the model's
     draws, and f_k a density of them: Gaussian or by kernels, of a few discriminating
-    numbers where x is long; :math:`\beta \le 1` tempers it. Where the rivals know their noise and x is short, kernels at the
-    outcomes without noise are as narrow as the noise. All are fitted to three quarters
-    of the draws and score the rest, in turn (a posterior draw that is used twice stands
-    in one of them); the kind and :math:`\beta` of a quarter are chosen on the others.
+    numbers where x is long; :math:`\beta \le 1` tempers it. Where the
+    rivals know their noise and x is short, kernels at the outcomes without noise are as
+    narrow as the noise. All are fitted to three quarters of the draws and score the
+    rest, in turn (a posterior draw that is used twice stands in one of them);
+    the kind and :math:`\beta` of a quarter are chosen on the others.
     It is a lower bound for any q, and the information is at most the entropy of p.
 
     Args:
