@@ -142,9 +142,6 @@ class RandomSearch(Search):
     def size(self, actions):
         return self.num
 
-    def num_evaluations(self, budget, num_samples):
-        return 0
-
     def finalists(self, objective):
         drawn = objective.actions.sample((self.num,), seed=objective.seed)
         return drawn[objective.permitted(drawn)]

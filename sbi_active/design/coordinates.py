@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import math
-from itertools import product
-
 import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, BoxActions
 from sbi_active.inference.sampling.gaussian_process import IN_CUBE, GaussianProcess
-from sbi_active.seeding import derive_seed
 
 
 class Coordinates:
@@ -100,63 +96,11 @@ class Coordinates:
         )
 
     def spread(self, num: int, seed: int) -> Tensor:
-        """Return points that fill the space, shape (num, dim).
-
-        Every combination of categories has about as many, scrambled Sobol points of its
-        own; where there are more combinations than points they are drawn at random.
-        """
-        generator = torch.Generator().manual_seed(derive_seed(seed, "categories"))
-        total = math.prod(self.sizes)
-        if total > num:
-            columns = [
-                torch.randint(k, (num, 1), generator=generator) for k in self.sizes
-            ]
-            return torch.cat([self._sobol(num, derive_seed(seed, 0)), *columns], 1)
-        each = -(-num // total)
-        order = torch.randperm(total, generator=generator).tolist()
-        every = [*product(*map(range, self.sizes))]
-        points = []
-        for k in order:
-            category = torch.tensor(every[k]).double().expand(each, -1)
-            inside = self._sobol(each, derive_seed(seed, k))
-            points.append(torch.cat([inside, category], 1))
-        return torch.stack(points, 1).flatten(0, 1)[:num]
-
-    def _sobol(self, num: int, seed: int) -> Tensor:
-        if not self.num_continuous:
-            return torch.empty(num, 0).double()
+        """Return points that fill the space, shape (num, dim): scrambled Sobol."""
         engine = torch.quasirandom.SobolEngine(
-            self.num_continuous, scramble=True, seed=seed % 2**31
+            self.dim, scramble=True, seed=seed % 2**31
         )
-        return engine.draw(num, dtype=torch.float64)
-
-
-def cells(
-    point: Tensor, num: int, *, num_continuous: int, fewest: int = 8
-) -> list[Tensor]:
-    """Halve groups of points across their widest side until they are small enough.
-
-    About ``num`` cells of points (n, dim), whose first entries are in a unit cube and
-    are halved by; points of a cell agree in the others, and are ``fewest`` or more.
-
-    Example:
-        >>> point = torch.tensor([[0.0], [1.0], [0.25], [0.75]] * 8)
-        >>> [point[c, 0].unique().tolist() for c in cells(point, 2, num_continuous=1)]
-        [[0.0, 0.25], [0.75, 1.0]]
-    """
-    largest = max(-(-len(point) // num), 2 * fewest - 1)
-    constant = torch.zeros(len(point), 1, dtype=point.dtype)
-    category = torch.cat([constant, point[:, num_continuous:]], 1)
-    _, label = category.unique(dim=0, return_inverse=True)
-    groups = [torch.nonzero(label == k)[:, 0] for k in range(int(label.max()) + 1)]
-    done: list[Tensor] = []
-    while groups:
-        group = groups.pop()
-        inside = point[group, :num_continuous]
-        if len(group) <= largest or not inside.numel():
-            done.append(group.sort().values)
-            continue
-        side = int((inside.amax(0) - inside.amin(0)).argmax())
-        order = inside[:, side].argsort(stable=True)
-        groups += [group[half] for half in order.tensor_split(2)][::-1]
-    return [group for group in done if len(group) > 1]
+        point = engine.draw(num, dtype=torch.float64)
+        sizes = torch.tensor(self.sizes)
+        point[:, self.num_continuous :].mul_(sizes).floor_()
+        return point

@@ -12,8 +12,9 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.actions.discrete import Actions, action_space
+from sbi_active.callers import stack_level
 from sbi_active.design.design import Design
-from sbi_active.design.elimination import as_batch, eliminate
+from sbi_active.design.elimination import GainEvaluator, as_batch, eliminate
 from sbi_active.design.estimators.automatic import by_name, find_estimator
 from sbi_active.design.estimators.base import (
     InformationGainEstimator,
@@ -21,9 +22,8 @@ from sbi_active.design.estimators.base import (
     standard_error,
 )
 from sbi_active.design.estimators.model_index import ModelIndexGain, RivalSampler
-from sbi_active.design.evaluator import GainEvaluator
 from sbi_active.design.given import GivenGains
-from sbi_active.design.limits import DesignLimits, rows_of, warn_missing
+from sbi_active.design.limits import DesignLimits, rows_of
 from sbi_active.design.sampler import CandidateSampler
 from sbi_active.design.search import (
     Evaluations,
@@ -34,8 +34,9 @@ from sbi_active.design.search import (
 )
 from sbi_active.design.target import Target, target_estimator
 from sbi_active.expected import Shown, suggests
+from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed
-from sbi_active.simulation import Simulations
+from sbi_active.simulation import MissingRowsWarning, Simulations
 from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 #: Name of a search: its class.
@@ -189,7 +190,7 @@ class InformationGainDesigner(Shown):
         at_least(num_actions, 1, "num_actions", 1)
         others = rows_of(self.actions, pending, "pending")
         allowed = constraint, exclude, cost, min_probability_valid
-        limits = DesignLimits.of(self.actions, *allowed)
+        limits = DesignLimits(self.actions, *allowed)
         belief = getattr(model, "belief", None) if belief is None else belief
         seed = int(torch.randint(2**62, ())) if seed is None else seed
         num_others = len(others) + num_actions - 1
@@ -208,9 +209,17 @@ class InformationGainDesigner(Shown):
             assert belief is not None
             # A model was learned from whole outcomes.
             learns = estimator is not None and estimator.needs_model
-            most_numbers = math.inf if learns else self.most_numbers
-            about = simulator, belief, probed, seed, self.workers, others, most_numbers
-            return GainEvaluator(CandidateSampler(*about), estimator, model, belief)
+            sampler = CandidateSampler(
+                simulator,
+                belief,
+                probed,
+                seed,
+                self.workers,
+                others,
+                most_numbers=math.inf if learns else self.most_numbers,
+                replicates=estimator is None or estimator.needs_noise,
+            )
+            return GainEvaluator(sampler, estimator, model, belief)
 
         listed, notes = limits.listed()
         budget = self._budget(budget, listed)
@@ -224,7 +233,14 @@ class InformationGainDesigner(Shown):
             steps.append(self._selected(gains, limits, budget, own, notes))
             others = torch.cat([others, steps[-1].action[None]])
         design = as_batch(steps)
-        warn_missing(design.num_missing, design.num_simulations)
+        if design.num_missing:
+            warn(
+                f"SA301 {design.num_missing} of {design.num_simulations} simulations "
+                "of the design are missing, by faults of the simulator; they were left "
+                "out",
+                MissingRowsWarning,
+                stacklevel=stack_level(),
+            )
         return design
 
     def _budget(self, budget: int | None, listed: Tensor | None) -> int:

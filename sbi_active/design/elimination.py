@@ -1,4 +1,4 @@
-"""Successive elimination of candidates on common random numbers, and the choice."""
+"""Successive elimination of candidates, by estimates of what they tell."""
 
 from __future__ import annotations
 
@@ -8,12 +8,22 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.distributions import Distribution
 
 from sbi_active.design.design import Design, action_labels
-from sbi_active.design.estimators.base import CandidateSimulations, standard_error
-from sbi_active.design.evaluator import GainEvaluator
+from sbi_active.design.estimators.automatic import choose_estimator, disagreements
+from sbi_active.design.estimators.base import (
+    Bound,
+    CandidateSimulations,
+    InformationGainEstimator,
+    standard_error,
+)
+from sbi_active.design.estimators.model_index import RivalSampler
 from sbi_active.design.limits import DesignLimits
+from sbi_active.design.outcomes import JointLikelihood, conditional_gain
+from sbi_active.design.sampler import CandidateSampler
 from sbi_active.seeding import derive_seed
+from sbi_active.threads import single_thread
 
 
 @dataclass(frozen=True)
@@ -99,6 +109,97 @@ def paired_errors(contributions: Sequence[Tensor], chosen: int) -> Tensor:
     )
 
 
+class GainEvaluator:
+    """Draws outcomes of candidates and estimates what these tell.
+
+    Args:
+        sampler: Sampler of the outcomes.
+        estimator: Estimator of the information; None is chosen by the first
+            simulations.
+        model: Model that the estimator needs.
+        belief: Distribution of the parameters; None for rivals.
+
+    Attributes:
+        notes: Notes on failed checks of the estimator, or why others were not taken.
+    """
+
+    def __init__(
+        self,
+        sampler: CandidateSampler | RivalSampler,
+        estimator: InformationGainEstimator | None,
+        model: Any,
+        belief: Distribution | None = None,
+    ) -> None:
+        self.sampler, self.belief = sampler, belief
+        self.num_others = len(sampler.others)
+        if self.num_others and model is not None:
+            model = JointLikelihood(model, sampler.others.shape[1])
+        self.model: Any = model
+        self._chosen, self._is_settled = estimator, False
+        self.notes: list[str] = []
+
+    @property
+    def estimator(self) -> InformationGainEstimator:
+        """The estimator given, or the one chosen by the first simulations."""
+        assert self._chosen is not None
+        return self._chosen
+
+    @property
+    def bound(self) -> Bound:
+        """Side of the information that the estimates lie on.
+
+        A difference of two bounds is none.
+        """
+        return "none" if self.num_others else self.estimator.bound_on(self.model)
+
+    def draw(
+        self, num_samples: int, action: Tensor, *, halves: bool = False
+    ) -> CandidateSimulations:
+        """Simulate candidates (a, action_dim); the first call settles the estimator.
+
+        Args:
+            num_samples: Simulations of a candidate.
+            action: Candidates.
+            halves: Whether an estimate will rest on half of them.
+        """
+        sampler = self.sampler
+        drawn = sampler.draw(num_samples, action)
+        if self._is_settled:
+            return drawn
+        self._is_settled = True
+        if self._chosen is not None:
+            self.notes = self._chosen.problems(drawn)
+            return drawn
+        num_rows = num_samples // 2 if halves else num_samples
+        self._chosen, self.notes = choose_estimator(
+            self.model, drawn, num_rows=num_rows
+        )
+        # A model was learned from whole outcomes.
+        if sampler.summaries is not None and self._chosen.needs_model:
+            sampler.summaries = None
+            sampler.rewind()
+            return sampler.draw(num_samples, action)
+        return drawn
+
+    def __call__(self, simulations: CandidateSimulations) -> Tensor:
+        """Return contributions, shape (a, n), nats."""
+        given = self.model, simulations, self.belief
+        with single_thread():
+            if self.num_others:
+                return conditional_gain(self.estimator, *given, self.num_others)
+            return self.estimator(*given)
+
+    def disagreements(
+        self, simulations: CandidateSimulations, gain: Tensor
+    ) -> list[str]:
+        """Return the disagreements of other estimators, see :func:`.disagreements`."""
+        if self.num_others:
+            return self.estimator.cautions(gain)
+        model = self.model if self.sampler.summaries is None else None
+        with single_thread():
+            return disagreements(self.estimator, model, simulations, self.belief, gain)
+
+
 def eliminate(
     evaluator: GainEvaluator,
     limits: DesignLimits,
@@ -150,7 +251,7 @@ def eliminate(
     if len(excluded):  # estimated once, never chosen
         estimate(excluded, [half.candidates(excluded) for half in halves])
         halves = [half.candidates(active) for half in halves]
-    runs = 2 if evaluator.replicates else 1
+    runs = len(first.outcomes())
     while True:
         estimate(active, halves)
         race = Race.run([weight[a] * gains[0][a] for a in active], seed)

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from sbi_active.design.coordinates import Coordinates, cells
+from sbi_active.design.coordinates import Coordinates
 from sbi_active.design.design import Design
 from sbi_active.design.elimination import Race, choose
 from sbi_active.design.estimators.automatic import choose_estimator
 from sbi_active.design.estimators.base import (
     CandidateSimulations,
     InformationGainEstimator,
+    standard_error,
 )
 from sbi_active.design.limits import DesignLimits
-from sbi_active.design.search import Evaluations, Objective, Search, presence
-from sbi_active.inference.sampling.gaussian_process import GaussianProcess
+from sbi_active.design.search import Evaluations, Objective, Search
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import Outcome, Simulations
 from sbi_active.threads import single_thread
@@ -34,10 +32,9 @@ IN_SAMPLE = (
 class GivenGains:
     """Estimates without further simulations: half of the rows choose, half report.
 
-    Actions of a list are estimated on their own rows. In a continuous space no two rows
-    share an action: contributions of single rows are averaged over cells and a
-    regression of the averages gives the estimates, which takes an estimator that scores
-    rows one by one.
+    An action of a list is estimated on its own rows, and one of a space without end,
+    where no two rows share an action, on the rows nearest to it. This takes an
+    estimator that scores rows one by one.
 
     Args:
         rows: Simulations at hand.
@@ -47,12 +44,14 @@ class GivenGains:
         limits: Limits and costs of the actions.
         seed: Seed of all draws.
         fewest: Number of rows that a candidate needs.
-        num_cells: Number of cells into which the rows of a continuous space are
-            averaged.
+        num_near: Number of the nearest rows of a half; of a quarter the standard error
+            is twice as large, of four times as many a peak is as much flatter.
+        num_evaluations: Number of actions that a search evaluates.
 
     Raises:
         TypeError: If the rows are no simulations, or of other actions.
-        ValueError: If there is no model.
+        ValueError: If there is no model, or the estimator does not score rows one by
+            one in a space without end.
     """
 
     def __init__(
@@ -65,7 +64,8 @@ class GivenGains:
         seed: int,
         *,
         fewest: int = 16,
-        num_cells: int = 128,
+        num_near: int = 64,
+        num_evaluations: int = 64,
     ) -> None:
         dim = limits.actions.action_dim
         if not isinstance(rows, Simulations) or rows.action.shape[1] != dim:
@@ -74,8 +74,8 @@ class GivenGains:
                 f"simulations=; got {rows!r:.80}; wrap rows of this space in it"
             )
         self.rows, self.model, self.belief = rows, model, belief
-        self.limits, self.seed = limits, seed
-        self.fewest, self.num_cells = fewest, num_cells
+        self.limits, self.seed, self.fewest = limits, seed, fewest
+        self.num_near, self.num_evaluations = num_near, num_evaluations
         if estimator is None:
             if model is None:
                 raise ValueError(
@@ -85,136 +85,43 @@ class GivenGains:
             some = self._simulations(torch.arange(len(rows))[:256])
             estimator = choose_estimator(model, some)[0]
         self.estimator = estimator
+        is_listed = limits.actions.listed() is not None
+        self._space = None if is_listed else Coordinates(limits.actions)
+        if not is_listed and not estimator.rowwise:
+            raise ValueError(
+                "expected an estimator that scores rows one by one with simulations= "
+                f"and continuous actions; got {type(estimator).__name__}; use "
+                "estimator='posterior', or leave out simulations="
+            )
 
     def design(self, search: Search) -> Design:
         """Return the design by these rows; nothing is simulated.
 
         Args:
             search: Search of a space without end.
-        """
-        listed, notes = self.limits.listed()
-        if listed is None:
-            return self._of_space(search)
-        return self._of_list(listed, notes)
-
-    def _of_list(self, action: Tensor, notes: Sequence[str]) -> Design:
-        """Return the design of candidates by their own rows.
 
         Raises:
             ValueError: If no candidate has rows enough.
         """
-        halves: list[list[Tensor]] = [[], []]
-        share = torch.full((len(action),), torch.nan, dtype=torch.float64)
-        for a, own in enumerate(action):
-            near = torch.isclose(self.rows.action, own, rtol=1e-5, atol=1e-7)
-            rows = torch.nonzero(near.all(1))[:, 0]
-            enough = len(rows) >= self.fewest
-            if enough:
-                status = self.rows.status[rows]
-                known = (status != Outcome.MISSING).sum()
-                share[a] = (status == Outcome.OK).sum() / known
-            for gains, half in zip(halves, self._split(rows), strict=True):
-                gains.append(
-                    self._gain(half) if enough else torch.full((2,), torch.nan)
-                )
-        if bool(share.isnan().all()):
+        limits = self.limits
+        action, notes = limits.listed()
+        if action is None:
+            action = search.finalists(self._objective())
+        rows = [self._rows_at(own) for own in action]
+        known = torch.tensor([len(own) >= self.fewest for own in rows])
+        if not bool(known.any()):
             raise ValueError(
                 f"expected simulations with at least {self.fewest} rows of a "
                 "candidate; got fewer of every one; pass rows at the actions of the "
                 "list"
             )
-        return self._chosen(action, halves, share, notes)
-
-    def _of_space(self, search: Search) -> Design:
-        """Return the design of the finalists of a search.
-
-        Raises:
-            ValueError: If the estimator does not score rows one by one.
-        """
-        if not self.estimator.rowwise:
-            raise ValueError(
-                "expected an estimator that scores rows one by one with simulations= "
-                f"and continuous actions; got {type(self.estimator).__name__}; use "
-                "estimator='posterior', or leave out simulations="
-            )
-        limits = self.limits
-        space = Coordinates(limits.actions)
-        everything = torch.arange(len(self.rows))
-        averages = [self._averages(space, half) for half in self._split(everything)]
-        first, _ = averages[0]
-        price = limits.cost(first.action)
-        utility, error = first.utility / price, first.standard_error / price
-        known = replace(first, utility=utility, standard_error=error)
-        objective = Objective(
-            actions=limits.actions,
-            permitted=limits,
-            evaluate=lambda action: known,
-            num_evaluations=0,
-            seed=derive_seed(self.seed, "search"),
-            min_probability_valid=limits.least,
-            known=known,
-        )
-        action = search.finalists(objective)
-        point = space.points(action)
-        halves, shares = [], []
-        for part, num in averages:
-            knots = space.points(part.action)
-            gain = space.regression(knots, part.utility, part.standard_error)
-            halves.append([*_as_contributions(gain, point)])
-            valid = presence(space, part, num)
-            share = torch.ones(len(point)) if valid is None else valid(point)[0][:, 0]
-            shares.append(share.double().clamp(0, 1))
-        return self._chosen(action, halves, torch.stack(shares).mean(0))
-
-    def _split(self, rows: Tensor) -> list[Tensor]:
-        generator = torch.Generator().manual_seed(derive_seed(self.seed, "split"))
-        shuffled = rows[torch.randperm(len(rows), generator=generator)]
-        return [*shuffled.tensor_split(2)]
-
-    def _simulations(self, rows: Tensor) -> CandidateSimulations:
-        given, action = self.rows, self.rows.action[rows]
-        lost = given.status[rows] == Outcome.MISSING
-        return CandidateSimulations(
-            *(given.theta[rows], action[:1], given.x[rows][None]),
-            missing=lost[None],
-            each=action,
-        )
-
-    def _gain(self, rows: Tensor) -> Tensor:
-        """Return contributions of rows, shape (n,)."""
-        with single_thread():
-            return self.estimator(self.model, self._simulations(rows), self.belief)[0]
-
-    def _averages(self, space: Coordinates, rows: Tensor) -> tuple[Evaluations, Tensor]:
-        """Return averages of rows over cells, and the number of rows in each."""
-        rows = rows[self.rows.status[rows] != Outcome.MISSING]
-        gain = self._gain(rows)
-        valid = (self.rows.status[rows] == Outcome.OK).double()
-        point = space.points(self.rows.action[rows])
-        groups = cells(point, self.num_cells, num_continuous=space.num_continuous)
-        averages = Evaluations(
-            space.actions(torch.stack([point[g].mean(0) for g in groups])),
-            torch.stack([gain[g].mean() for g in groups]),
-            torch.stack([gain[g].std() / len(g) ** 0.5 for g in groups]),
-            torch.stack([valid[g].mean() for g in groups]),
-        )
-        return averages, torch.tensor([len(g) for g in groups])
-
-    def _chosen(
-        self,
-        action: Tensor,
-        halves: list[list[Tensor]],
-        share: Tensor,
-        notes: Sequence[str] = (),
-    ) -> Design:
-        limits = self.limits
-        known = torch.tensor([bool(g.isfinite().any()) for g in halves[0]])
+        halves = [[self._gain(own, k) for own in rows] for k in range(2)]
+        share = torch.stack([self._share_valid(own) for own in rows])
         eligible, cost = known & limits.reached_by(share), limits.cost(action)
         index = torch.nonzero(eligible)[:, 0]
         race = Race.run([halves[0][a] / cost[a] for a in index], self.seed)
-        few = int((~known).sum())
         said = [IN_SAMPLE, *limits.excluded_note(eligible | ~known)]
-        if few:
+        if few := int((~known).sum()):
             said.append(f"{few} candidates with fewer than {self.fewest} rows excluded")
         return choose(
             limits,
@@ -231,18 +138,60 @@ class GivenGains:
             notes=(*said, *notes),
         )
 
+    def _objective(self) -> Objective:
+        """Return the utility at actions of a space without end, by half of the rows."""
+        limits = self.limits
 
-def _as_contributions(process: GaussianProcess, point: Tensor) -> Tensor:
-    r"""Return numbers whose mean is the regression's, shape (m, cells).
+        def evaluate(action: Tensor) -> Evaluations:
+            rows = [self._rows_at(own) for own in action]
+            gains, cost = [self._gain(own, 0) for own in rows], limits.cost(action)
+            return Evaluations(
+                action,
+                torch.stack([gain.nanmean() for gain in gains]) / cost,
+                torch.stack([standard_error(gain) for gain in gains]) / cost,
+                torch.stack([self._share_valid(own) for own in rows]),
+            )
 
-    Their standard error is the root of the sum of squares of what the residual of each
-    cell does to the regression (Huber-White), paired between points; or the standard
-    deviation of the regression where that is larger, as beyond the outermost cells.
-    """
-    with torch.no_grad():
-        mean, variance = process(point)
-        influence = process.influence(point)
-        influence = influence - influence.mean(1, keepdim=True)
-        size = influence.square().sum(1).sqrt().clamp_min(1e-30)
-        ratio = (variance[:, 0].sqrt() / size).clamp_min(1.0)
-        return mean + influence.shape[1] * ratio[:, None] * influence
+        return Objective(
+            actions=limits.actions,
+            permitted=limits,
+            evaluate=evaluate,
+            num_evaluations=self.num_evaluations,
+            seed=derive_seed(self.seed, "search"),
+            min_probability_valid=limits.least,
+        )
+
+    def _rows_at(self, action: Tensor) -> Tensor:
+        """Return the rows at an action of a list, or those nearest to one, (k,)."""
+        if self._space is None:
+            near = torch.isclose(self.rows.action, action, rtol=1e-5, atol=1e-7)
+            return torch.nonzero(near.all(1))[:, 0]
+        point = self._space.points(torch.cat([action[None], self.rows.action]))
+        apart = self._space.distance(point[1:], point[0])
+        order = apart.argsort(stable=True)[: 2 * self.num_near]
+        return order[apart[order].isfinite()]
+
+    def _share_valid(self, rows: Tensor) -> Tensor:
+        """Return the share of rows with a measurement, NaN where too few are known."""
+        status = self.rows.status[rows]
+        known = status[status != Outcome.MISSING]
+        if len(rows) < self.fewest:
+            return torch.tensor(torch.nan, dtype=torch.float64)
+        return (known == Outcome.OK).double().mean()
+
+    def _simulations(self, rows: Tensor) -> CandidateSimulations:
+        given, action = self.rows, self.rows.action[rows]
+        lost = given.status[rows] == Outcome.MISSING
+        return CandidateSimulations(
+            *(given.theta[rows], action[:1], given.x[rows][None]),
+            missing=lost[None],
+            each=action,
+        )
+
+    def _gain(self, rows: Tensor, half: int) -> Tensor:
+        """Return contributions of half of the rows, (n,); NaN where these are few."""
+        if len(rows) < self.fewest:
+            return torch.full((2,), torch.nan)
+        given = self._simulations(rows[half::2])
+        with single_thread():
+            return self.estimator(self.model, given, self.belief)[0]

@@ -3,48 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from sbi_active.actions import ActionSpace, BoxActions
-from sbi_active.messages import warn
-from sbi_active.simulation import MissingRowsWarning
 
 
-@dataclass(frozen=True)
 class DesignLimits:
     """Limits and costs of the actions that may be chosen.
 
-    Attributes:
+    Args:
         actions: The space.
         constraint: Function of actions (n, action_dim) that says which are permitted,
             shape (n,), bool; None permits all.
         exclude: Actions that are not to be repeated, shape (t, action_dim); in a box
             nor others within a hundredth of its width in every entry.
-        price: Cost of actions (n, action_dim), shape (n,); None for none.
+        price: Cost of actions (n, action_dim), shape (n,), or one number for each
+            action of a list, shape (a,); None for none.
         least: Share of measurements that a choice needs.
+
+    Raises:
+        ValueError: If excluded actions or a list of costs have another shape.
     """
 
-    actions: ActionSpace
-    constraint: Callable[[Tensor], Tensor] | None
-    exclude: Tensor
-    price: Callable[[Tensor], Tensor] | None = None
-    least: float = 0.0
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         actions: ActionSpace,
         constraint: Callable[[Tensor], Tensor] | None = None,
         exclude: Tensor | None = None,
-        cost: Callable[[Tensor], Tensor] | Tensor | None = None,
+        price: Callable[[Tensor], Tensor] | Tensor | None = None,
         least: float = 0.0,
-    ) -> DesignLimits:
-        """Return limits as users declare them, see :func:`pricing`."""
-        rows = rows_of(actions, exclude, "exclude")
-        return cls(actions, constraint, rows, pricing(cost, actions), least)
+    ) -> None:
+        self.actions, self.constraint, self.least = actions, constraint, least
+        self.exclude = rows_of(actions, exclude, "exclude")
+        if price is not None and not callable(price):
+            price = _listed_cost(torch.as_tensor(price), actions)
+        self.price = price
 
     def __call__(self, action: Tensor) -> Tensor:
         """Return a mask of permitted actions (n, action_dim), shape (n,), bool."""
@@ -98,10 +93,21 @@ class DesignLimits:
         return drawn
 
     def cost(self, action: Tensor) -> Tensor:
-        """Return the cost of actions (n, action_dim), shape (n,); 1 for none."""
+        """Return the cost of actions (n, action_dim), shape (n,); 1 for none.
+
+        Raises:
+            ValueError: If the shape is another, or a cost is not positive.
+        """
         if self.price is None:
             return torch.ones(len(action)).double()
-        return self.price(action)
+        given = torch.as_tensor(self.price(action)).double()
+        if given.shape != (len(action),) or not bool((given > 0).all()):
+            raise ValueError(
+                f"expected positive costs of shape ({len(action)},); got shape "
+                f"{tuple(given.shape)}, {given.flatten()[:4].tolist()}, ...; return "
+                "one positive number an action"
+            )
+        return given
 
     def reached_by(self, valid: Tensor) -> Tensor:
         """Return a mask of sufficient shares of measurements, shape (a,).
@@ -141,33 +147,6 @@ class DesignLimits:
         return torch.cat(parts)
 
 
-def pricing(
-    cost: Callable[[Tensor], Tensor] | Tensor | None, actions: ActionSpace
-) -> Callable[[Tensor], Tensor] | None:
-    """Return the cost as a function of actions (n, action_dim) -> (n,), float64.
-
-    The cost may be given as one number for each action of a list, shape (a,).
-
-    Raises:
-        ValueError: If the shape is another, or when called if a cost is not positive.
-    """
-    if cost is None:
-        return None
-    of = cost if callable(cost) else _listed_cost(torch.as_tensor(cost), actions)
-
-    def price(action: Tensor) -> Tensor:
-        given = torch.as_tensor(of(action)).double()
-        if given.shape != (len(action),) or not bool((given > 0).all()):
-            raise ValueError(
-                f"expected positive costs of shape ({len(action)},); got shape "
-                f"{tuple(given.shape)}, {given.flatten()[:4].tolist()}, ...; return "
-                "one positive number an action"
-            )
-        return given
-
-    return price
-
-
 def _listed_cost(table: Tensor, actions: ActionSpace) -> Callable[[Tensor], Tensor]:
     values = actions.listed()
     if values is None or table.shape != (len(values),):
@@ -192,14 +171,3 @@ def rows_of(actions: ActionSpace, given: Tensor | None, name: str) -> Tensor:
             "one row an action"
         )
     return rows
-
-
-def warn_missing(num_missing: int, num_simulations: int) -> None:
-    """Warn once a design of simulations lost to faults."""
-    if num_missing:
-        warn(
-            f"SA301 {num_missing} of {num_simulations} simulations of the design are "
-            "missing, by faults of the simulator; they were left out",
-            MissingRowsWarning,
-            stacklevel=3,
-        )

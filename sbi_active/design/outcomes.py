@@ -65,10 +65,10 @@ def conditional_gain(
 ) -> Tensor:
     """Return contributions to what candidates tell beyond the others, (a, n).
 
-    The simulations come from :func:`join_outcomes`; the model is for single outcomes.
+    The simulations come from :func:`join_outcomes`; the model is a
+    :class:`JointLikelihood`, or None.
     """
     action_dim = simulations.action.shape[1] // (1 + num_others)
-    joint = None if model is None else JointLikelihood(model, action_dim)
     others = replace(
         simulations,
         action=simulations.action[:1, action_dim:],
@@ -78,8 +78,8 @@ def conditional_gain(
             if (part := getattr(simulations, name)) is not None
         },
     )
-    known = estimator(joint, others, belief)
-    return estimator(joint, simulations, belief) - known
+    known = estimator(model, others, belief)
+    return estimator(model, simulations, belief) - known
 
 
 class JointLikelihood:
@@ -193,9 +193,7 @@ class LinearSummaries:
             if key not in self._known:
                 some = white[whole][: self._num_rows]
                 center = some.mean(0)
-                every = torch.linalg.svd(some - center, full_matrices=False)[2]
-                # Without a copy all that are not kept would stay in memory.
-                self._known[key] = center, every[: self._num_kept].clone()
+                self._known[key] = center, leading(some - center, self._num_kept)
             center, directions = self._known[key]
             off = white[whole] - center
             short = off @ directions.T
@@ -213,3 +211,12 @@ class LinearSummaries:
             f"{self._num_kept} linear summaries stand for the {num_numbers} numbers of "
             f"an outcome, and leave out about {self.left_out:.2g} nats"
         )
+
+
+def leading(rows: Tensor, num: int) -> Tensor:
+    """Return orthonormal leading directions (num, N) at most, of rows (n, N), n << N.
+
+    By the inner products of the rows: a tenth of the time of their singular values.
+    """
+    vectors = torch.linalg.eigh(rows @ rows.T).eigenvectors.flip(1)[:, :num]
+    return torch.linalg.qr(rows.T @ vectors).Q.T.contiguous()

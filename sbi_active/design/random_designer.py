@@ -57,7 +57,7 @@ class RandomDesigner(Shown):
         Raises:
             ValueError: If no action is permitted.
         """
-        limits = DesignLimits.of(self.actions, constraint, exclude)
+        limits = DesignLimits(self.actions, constraint, exclude)
         candidates, notes = limits.listed()
         if candidates is None:
             own = None if seed is None else derive_seed(seed, "candidates")

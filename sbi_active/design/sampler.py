@@ -39,6 +39,8 @@ class CandidateSampler:
         most_numbers: Number of an outcome's numbers beyond which
             :class:`.LinearSummaries` stand for them, where noise is declared that
             allows for it; infinite keeps all.
+        replicates: Whether half of the simulations repeat the parameters of the others,
+            unless the noise is declared.
 
     Attributes:
         declared: Whether the simulator declares its noise around an output that does
@@ -57,9 +59,11 @@ class CandidateSampler:
         workers: Workers,
         others: Tensor,
         most_numbers: float,
+        replicates: bool,
     ) -> None:
         self.simulator, self.belief = simulator, belief
         self.seed, self.workers, self.others = seed, workers, others
+        self.replicates = replicates
         self.num_drawn = self.num_missing = self._num_waves = 0
         self.declared = self._probe(probed)
         self.summaries: LinearSummaries | None = None
@@ -68,16 +72,10 @@ class CandidateSampler:
         if many and noise is not None and noise.is_known_gaussian:
             self.summaries = LinearSummaries(noise)
 
-    def draw(
-        self, num_samples: int, action: Tensor, *, replicates: bool
-    ) -> CandidateSimulations:
-        """Simulate candidates (a, action_dim) at fresh parameters, the same for all.
-
-        With replicates half of the simulations repeat the parameters of the others,
-        unless the noise is declared.
-        """
+    def draw(self, num_samples: int, action: Tensor) -> CandidateSimulations:
+        """Simulate candidates (a, action_dim) at fresh parameters, the same for all."""
         self._num_waves += 1
-        paired = replicates and not self.declared
+        paired = self.replicates and not self.declared
         num = num_samples // 2 if paired else num_samples
         with forked_generators(self.seed, "theta", self._num_waves):
             theta = self.belief.sample((num,))
@@ -87,7 +85,7 @@ class CandidateSampler:
             drawn = None if beside is None else join_outcomes(drawn, beside)
         if drawn is None:  # what is declared as noise-free is not
             self.declared = False
-            return self.draw(num_samples, action, replicates=replicates)
+            return self.draw(num_samples, action)
         return drawn
 
     @property

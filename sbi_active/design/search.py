@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
+from scipy.optimize import minimize
 from torch import Tensor
 from typing_extensions import override
 
 from sbi_active.actions import ActionSpace
+from sbi_active.arrays import Array
 from sbi_active.design.coordinates import Coordinates
 from sbi_active.expected import Shown, require_least
-from sbi_active.inference.sampling.adam import Adam
 from sbi_active.inference.sampling.gaussian_process import GaussianProcess
 from sbi_active.seeding import derive_seed
 
@@ -61,7 +62,6 @@ class Objective:
         num_evaluations: Actions that may be evaluated.
         seed: Seed of the search's draws.
         min_probability_valid: Share of measurements that a choice needs.
-        known: Evaluations to begin with; None for none.
     """
 
     actions: ActionSpace
@@ -70,7 +70,6 @@ class Objective:
     num_evaluations: int
     seed: int
     min_probability_valid: float = 0.0
-    known: Evaluations | None = None
 
     @cached_property
     def space(self) -> Coordinates:
@@ -93,9 +92,8 @@ class Search(Shown, ABC):
             TypeError: If the search does not apply to the space.
         """
 
-    @abstractmethod
     def num_evaluations(self, budget: int, num_samples: int) -> int:
-        """Return the number of actions to evaluate on the way.
+        """Return the number of actions to evaluate on the way, 0 by default.
 
         Args:
             budget: Simulations of the design.
@@ -104,6 +102,7 @@ class Search(Shown, ABC):
         Raises:
             ValueError: If the budget does not suffice.
         """
+        return 0
 
     @abstractmethod
     def finalists(self, objective: Objective) -> Tensor:
@@ -116,10 +115,6 @@ class ExhaustiveSearch(Search):
     @override
     def size(self, actions: ActionSpace) -> int:
         return len(self._listed(actions))
-
-    @override
-    def num_evaluations(self, budget: int, num_samples: int) -> int:
-        return 0
 
     @override
     def finalists(self, objective: Objective) -> Tensor:
@@ -154,16 +149,9 @@ class GradientSearch(Search):
     by one, such as the paper's, they are all that is needed. Otherwise half of a
     design's simulations are the search's, and the others compare its finalists. Half of
     its evaluations fill the space, at common parameters and with common noise; the
-    others follow in rounds where
-
-    .. math::
-        \mu(\xi_b) + 2 s(\xi_b) - \lambda \sum_{b' \ne b}
-        \exp\left(- |\xi_b - \xi_{b'}|^2 / 2 r^2\right)
-
-    is largest; :math:`\lambda`, which keeps the starts apart, falls to zero on the way.
-    The actions of a round are chosen from the ends one after the other, each as if
-    those before had been evaluated. A point that leaves what is permitted stays where
-    it was.
+    others follow in rounds where :math:`\mu(\xi) + 2 s(\xi)` is largest. The actions
+    of a round are chosen from the ends one after the other, each as if those before had
+    been evaluated. A point that leaves what is permitted goes back to its edge.
 
     Args:
         num_rounds: Rounds after the first.
@@ -171,6 +159,8 @@ class GradientSearch(Search):
         num_starts: Number of starts of an ascent.
         optimism: Standard deviations of the regression that a proposal may hope for.
         apart: Least distance of actions chosen together, in the unit cube.
+        penalty: Deviations of the utility that an action loses for a measurement that
+            is too improbable, a unit of probability.
         fewest: Number of evaluations that a search needs.
         each: Candidates' worth of simulations for each degree of freedom (an entry of a
             box, a category after the first), and for none.
@@ -188,6 +178,7 @@ class GradientSearch(Search):
     num_starts: int = 64
     optimism: float = 2.0
     apart: float = 0.02
+    penalty: float = 10.0
     fewest: int = 8
     each: int = 4
 
@@ -220,12 +211,10 @@ class GradientSearch(Search):
     @override
     def finalists(self, objective: Objective) -> Tensor:
         space = objective.space
-        found, left = objective.known, objective.num_evaluations
-        if found is None:
-            first = self._spread(objective, -(-left // 2), "first")
-            found = objective.evaluate(space.actions(first))
-            left -= len(first)
-        for r in range(self.num_rounds if left > 0 else 0):
+        first = self._spread(objective, -(-objective.num_evaluations // 2), "first")
+        found = objective.evaluate(space.actions(first))
+        left = objective.num_evaluations - len(first)
+        for r in range(self.num_rounds):
             num = left // (self.num_rounds - r)
             if num == 0:
                 continue
@@ -265,13 +254,20 @@ class GradientSearch(Search):
 
         Beside them are their scores (s,), and the regression of the utility.
         """
-        score, utility = _score(objective, found, optimism)
-        known = objective.space.points(found.action)
+        space, least = objective.space, objective.min_probability_valid
+        lacking = (least - found.probability_valid).clamp_min(0.0)
+        value = found.utility - self.penalty * found.utility.std() * lacking
+        known = space.points(found.action)
+        utility = space.regression(known, value, found.standard_error)
+
+        def score(z: Tensor) -> Tensor:
+            mean, variance = utility(z)
+            return (mean + optimism * variance.sqrt())[:, 0]
+
         known = known[objective.permitted(found.action)]
         start = torch.cat([self._spread(objective, self.num_starts, key), known])
-        with torch.enable_grad():
-            end = ascend(score, start, objective, 0.3 * float(found.utility.std()))
-        point = torch.cat([end, start])  # an ascent may end lower than it started
+        # An ascent may end lower than it started.
+        point = torch.cat([ascended(score, start, objective), start])
         with torch.no_grad():
             return point, score(point), utility
 
@@ -308,85 +304,44 @@ class GradientSearch(Search):
         return torch.tensor(chosen).long()
 
 
-def ascend(
-    score: Score,
-    start: Tensor,
-    objective: Objective,
-    repulsion: float,
-    *,
-    num_steps: int = 50,
-    step: float = 0.03,
-    reach: float = 0.1,
+def ascended(
+    score: Score, start: Tensor, objective: Objective, *, num_steps: int = 20
 ) -> Tensor:
     """Return points that rose from permitted starts (s, dim), shape (s, dim).
+
+    A point that left what is permitted goes back to its edge, on the line to its start.
 
     Args:
         score: Score of points (s, dim), differentiable in the first entries, shape
             (s,).
-        start: Starts, shape (s, dim).
+        start: Starts.
         objective: Objective that says which points are permitted.
-        repulsion: The penalty on two points that coincide, in units of the score.
         num_steps: Number of steps.
-        step: Length of the first steps.
-        reach: Distance at which the penalty has fallen to .6.
     """
     c = objective.space.num_continuous
     fixed = start[:, c:]
-    other = (fixed[:, None] != fixed[None]).any(-1) | torch.eye(len(start)).bool()
-    u = start[:, :c].clone().requires_grad_(True)
-    optimizer = Adam([u], rate=step)
-    for k in range(num_steps):
-        optimizer.forget_gradients()
-        left = 1 - (k + 1) / num_steps
-        square = (u[:, None] - u[None]).square().sum(-1) / (2 * reach**2)
-        close = (-square).exp().masked_fill(other, 0.0).sum()
-        total = score(torch.cat([u, fixed], 1)).sum() - 0.5 * repulsion * left * close
-        (-total).backward()
-        before = u.detach().clone()
-        optimizer.step()
-        with torch.no_grad():
-            u.clamp_(0, 1)
-            inside = objective.allows(torch.cat([u, fixed], 1))
-            u.copy_(torch.where(inside[:, None], u, before))
-        optimizer.rate = step * (0.1 + 0.9 * left)
-    return torch.cat([u.detach(), fixed], 1)
 
+    def fall(flat: Array) -> tuple[float, Array]:
+        u = torch.tensor(flat.reshape(-1, c), requires_grad=True)
+        total = -score(torch.cat([u, fixed], 1)).sum()
+        return float(total.detach()), torch.autograd.grad(total, u)[0].flatten().numpy()
 
-def presence(
-    space: Coordinates, found: Evaluations, num: Tensor | float
-) -> GaussianProcess | None:
-    """Return a regression of the probability of a measurement; None where it is 1.
-
-    Args:
-        space: Space of the actions.
-        found: Evaluations with shares of measurements.
-        num: Number of simulations behind each share.
-    """
-    share = found.probability_valid.double()
-    if bool((share == 1).all()):
-        return None
-    error = (share * (1 - share) / num + 1e-4).sqrt()
-    return space.regression(space.points(found.action), share, error)
-
-
-def _score(
-    objective: Objective, found: Evaluations, optimism: float, *, penalty: float = 10.0
-) -> tuple[Score, GaussianProcess]:
-    """Return the score to ascend, and the regression of the utility in it.
-
-    The penalty is on a measurement that is too improbable, a unit of probability.
-    """
-    space, least = objective.space, objective.min_probability_valid
-    point = space.points(found.action)
-    utility = space.regression(point, found.utility, found.standard_error)
-    valid = presence(space, found, 100) if least > 0 else None
-
-    def score(z: Tensor) -> Tensor:
-        mean, variance = utility(z)
-        height = (mean + optimism * variance.sqrt())[:, 0]
-        if valid is None:
-            return height
-        lacking = (least - valid(z)[0][:, 0]).clamp_min(0.0)
-        return height - penalty * utility.scale[0] * lacking
-
-    return score, utility
+    first = start[:, :c].flatten().numpy()
+    with torch.enable_grad():
+        found = minimize(
+            *(fall, first),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=[(0.0, 1.0)] * len(first),
+            options={"maxiter": num_steps},
+        )
+    end = torch.cat([torch.from_numpy(found.x).reshape(-1, c), fixed], 1)
+    inside = torch.where(objective.allows(end)[:, None], end, start)
+    for _ in range(10):  # a thousandth of the way
+        middle = 0.5 * (inside + end)
+        allowed = objective.allows(middle)[:, None]
+        inside, end = (
+            torch.where(allowed, middle, inside),
+            torch.where(allowed, end, middle),
+        )
+    return inside

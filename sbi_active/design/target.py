@@ -221,13 +221,9 @@ class Quantity:
 def _takes_effects(function: Callable[..., Any]) -> bool:
     """Whether a function needs a second argument."""
     try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):  # some of C have no signature
+        inspect.signature(function).bind("theta")
+    except TypeError:
+        return True
+    except ValueError:  # some of C have no signature
         return False
-    by_place = [
-        p
-        for p in parameters
-        if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
-        and p.default is p.empty
-    ]
-    return len(by_place) > 1
+    return False

@@ -35,7 +35,7 @@ class Counted:
         )
 
 
-def objective(evaluate, *, permitted=None, num=40, seed=0, least=0.0, known=None):
+def objective(evaluate, *, permitted=None, num=40, seed=0, least=0.0):
     return Objective(
         actions=SPACE,
         permitted=permitted or (lambda action: torch.ones(len(action)).bool()),
@@ -43,5 +43,4 @@ def objective(evaluate, *, permitted=None, num=40, seed=0, least=0.0, known=None
         num_evaluations=num,
         seed=seed,
         min_probability_valid=least,
-        known=known,
     )

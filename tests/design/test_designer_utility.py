@@ -101,7 +101,8 @@ def test_given_simulations_need_no_others(estimator):
     exact = information(VALUES[:, None])
     distance = (design.expected_information_gain - exact).abs()
     assert (distance < 4 * design.standard_error + 1e-6).all()
-    again = designer.select(ExactModel(), simulations=given, seed=0, cost=dear)
+    dearer = lambda action: 1 + action[:, 0] ** 3  # noqa: E731, .35 against .18
+    again = designer.select(ExactModel(), simulations=given, seed=0, cost=dearer)
     assert again.action.tolist() == [1.0]
 
 

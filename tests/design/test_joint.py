@@ -8,7 +8,11 @@ from torch.distributions import MultivariateNormal, Normal
 
 from sbi_active.design import LikelihoodGain
 from sbi_active.design.estimators.base import CandidateSimulations
-from sbi_active.design.outcomes import conditional_gain, join_outcomes
+from sbi_active.design.outcomes import (
+    JointLikelihood,
+    conditional_gain,
+    join_outcomes,
+)
 
 PRIOR = MultivariateNormal(torch.zeros(1), torch.eye(1))
 
@@ -35,7 +39,7 @@ def test_what_an_action_tells_beyond_others_has_a_closed_form():
     action, others = torch.tensor([[0.5], [2.0]]), torch.tensor([[1.0], [1.5]])
     joint = join_outcomes(simulated(action, theta, 1), simulated(others, theta, 2))
     estimator = LikelihoodGain(num_contrastive=1_000)
-    gain = conditional_gain(estimator, Slope(), joint, PRIOR, 2)
+    gain = conditional_gain(estimator, JointLikelihood(Slope(), 1), joint, PRIOR, 2)
     known = 1 + float(others.square().sum())
     exact = [0.5 * math.log1p(a**2 / known) for a in (0.5, 2.0)]
     assert gain.mean(1).tolist() == pytest.approx(exact, abs=0.04)

@@ -16,10 +16,10 @@ from sbi_active.design.estimators.base import (
     standard_error,
 )
 from sbi_active.design.estimators.contrast import InfoNCEGain, LikelihoodGain, RatioGain
-from sbi_active.design.estimators.entropy import EntropyGain
+from sbi_active.design.estimators.entropy import EntropyGain, random_presence
 from sbi_active.design.estimators.linear import LinearGain
 from sbi_active.design.estimators.nested import NestedGain
-from sbi_active.design.estimators.posterior import PosteriorGain
+from sbi_active.design.estimators.posterior import ParameterGain, PosteriorGain
 from sbi_active.messages import warn
 
 #: Name of an estimator: its class.
@@ -99,7 +99,8 @@ def choose_estimator(
     the smoothed outcomes. If checks fail, it depends on the model: the bound of a
     posterior, nested Monte Carlo on a likelihood, or InfoNCE on a ratio, which no
     normalization of it can fool, but the mean log ratio where that is near its largest
-    value. Beside it, why others were not taken.
+    value. Without a model outcomes that may have no measurement by luck have densities
+    fitted to each candidate. Beside it, why others were not taken.
 
     Args:
         model: Model that was learned, or None.
@@ -134,6 +135,8 @@ def choose_estimator(
             return bound, notes
         return RatioGain(), [*notes, *(f"not used: {text}" for text in cautions)]
     assert by_noise is not None
+    if bool(random_presence(simulations).any()):
+        return ParameterGain(range(simulations.theta.shape[1])), notes
     return by_noise, [*notes, "used all the same: there is no model"]
 
 

@@ -179,8 +179,9 @@ class InformationGainEstimator(Shown, ABC):
         lost = int((gain.isnan() & simulations.counted).sum())
         if self.needs_model and lost:  # a mean of the others would hide it
             raise ValueError(
-                f"expected densities of the learned model; got NaN at {lost} of "
-                f"{gain.numel()} outcomes; train it again, or leave out what overflows"
+                f"expected densities of {type(model).__name__}; got NaN at {lost} of "
+                f"{gain.numel()} outcomes; give a model that says how probable an "
+                "outcome without a measurement is, x = NaN, or train it again"
             )
         return gain.masked_fill(~simulations.counted, torch.nan)
 

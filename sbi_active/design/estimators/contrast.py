@@ -41,7 +41,7 @@ class _Critic(InformationGainEstimator):
         parts = [p.split(self.batch_size) for p in _ordered(name, x, theta, action)]
         batches = zip(*parts, strict=True)
         values = [getattr(model, name)(*batch).double() for batch in batches]
-        return self._known(model, torch.cat(values))
+        return torch.cat(values)
 
     def _table(self, model: Any, x: Tensor, theta: Tensor, action: Tensor) -> Tensor:
         """Return f of every x (n, ...) with every theta (m, d) at one action, (n, m).
@@ -52,8 +52,7 @@ class _Critic(InformationGainEstimator):
         name = self._function(model)
         all_pairs = getattr(model, f"{name}_table", None)
         if all_pairs is not None:
-            values = all_pairs(*_ordered(name, x, theta, action))
-            return self._known(model, values.double())
+            return all_pairs(*_ordered(name, x, theta, action)).double()
         n, m = len(x), len(theta)
         every = x.repeat_interleave(m, 0), theta.repeat(n, 1), action.expand(n * m, -1)
         return self._rows(model, *every).reshape(n, m)
@@ -67,17 +66,6 @@ class _Critic(InformationGainEstimator):
             f"got {type(model).__name__}; pass one that has it, or choose "
             "estimator='auto'"
         )
-
-    def _known(self, model: Any, values: Tensor) -> Tensor:
-        lost = int(values.isnan().sum())
-        if lost:
-            raise ValueError(
-                f"expected numbers from {type(model).__name__}."
-                f"{self._function(model)} for {type(self).__name__}; got NaN in {lost} "
-                f"of {values.numel()} rows; give a model that says how probable an "
-                "outcome without a measurement is, x = NaN"
-            )
-        return values
 
 
 def _ordered(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -13,7 +13,6 @@ from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise
 
 NUGGET = 1e-6  # of the variance: rounding leaves kernels of near rows singular
-NUM_CHOOSING = 300  # rows that choose a metric
 
 
 @dataclass(frozen=True)
@@ -21,21 +20,22 @@ class MeanEmulator:
     r"""Kriging with the Matern kernel of smoothness 5/2, one metric for all outcomes.
 
     .. math::
-        \hat f(\theta) = B^\top (1, z) + k(z)^\top K^{-1} (F - Z B), \qquad
+        \hat f(\theta) = B^\top (1, z) + k(z)^\top (K + \rho)^{-1} (F - Z B), \qquad
         z = W^\top (\theta - \mu), \quad
         k = (1 + s + s^2 / 3)\, e^{-s}, \; s = \sqrt 5\, |z - z_j|.
 
-    All candidates share their parameters, hence one factor of K serves them all. W is
+    All candidates share their parameters, hence one inverse serves them all. W is
     chosen by leave-one-out errors, first isotropic in whitened theta, then along the
-    average slopes of the outcomes.
+    average slopes of the outcomes. The ridge of noisy outcomes, one for each of them,
+    is chosen by these errors as well.
 
     Attributes:
         center: :math:`\mu`, shape (d,).
         transform: W, shape (d, d).
         knots: z of the simulations, shape (n, d).
         trend: B, shape (1 + d, q).
-        weight: :math:`K^{-1} (F - Z B)`, shape (n, q).
-        error: Leave-one-out errors of the rows that chose the metric, shape (m, q).
+        weight: :math:`(K + \rho)^{-1} (F - Z B)`, shape (n, q).
+        error: Leave-one-out errors, shape (n, q).
 
     References:
         Rasmussen & Williams, Gaussian Processes for Machine Learning, 2006, section
@@ -54,35 +54,70 @@ class MeanEmulator:
         theta: Tensor,
         f: Tensor,
         *,
-        lengths: tuple[float, ...] = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 6.0),
+        ridges: Sequence[float] = (NUGGET,),
+        lengths: Sequence[float] = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 6.0),
+        bent: Sequence[float] = (0.7, 1.0, 1.4),
+        num_choosing: int = 300,
     ) -> MeanEmulator:
-        """Interpolate outcomes (n, q) over parameters (n, d), in negligible units.
+        """Smooth outcomes (n, q) over parameters (n, d), in units of their noise.
 
-        The lengths are those tried, in standard deviations of the parameters.
+        Args:
+            theta: Parameters.
+            f: Outcomes.
+            ridges: Ridges, of which each outcome has the best; one that is small
+                interpolates.
+            lengths: Lengths to try, in standard deviations of the parameters.
+            bent: Lengths to try along the slopes, in the best of these.
+            num_choosing: Number of rows that choose the metric.
         """
+        center, white = whitening(theta)
+        unit = f.std(0) + 1
 
-        def judge(z: Tensor, f: Tensor) -> tuple[float, Tensor, Tensor]:
-            error = _leave_one_out(z, f)
-            # metrics tie where errors are negligible, lest rounding choose among them
-            score = max(float(error.square().log1p().mean()), 1e-8)
-            return score, error, f
+        def best(transform: Tensor, lengths: Sequence[float]) -> MeanEmulator:
+            rows = theta[:num_choosing], f[:num_choosing], center
+            fits = [MeanEmulator._solve(*rows, transform / s, ridges) for s in lengths]
+            return min(fits, key=lambda fit: fit.score)
 
-        center, transform, error = choose_metric(theta, f, judge, lengths)
-        return MeanEmulator._solve(theta, f, center, transform, error)
+        first = best(white, lengths)
+        slope = first.slope(first.knots) / unit[:, None]
+        metric = torch.einsum("nqi,nqj->ij", slope, slope)
+        metric = metric / metric.diagonal().mean().clamp_min(1e-30)
+        along = torch.linalg.cholesky(metric + 0.01 * torch.eye(len(metric)))
+        chosen = min(
+            first, best(first.transform @ along, bent), key=lambda fit: fit.score
+        )
+        return MeanEmulator._solve(theta, f, center, chosen.transform, ridges)
 
     @staticmethod
     def _solve(
-        theta: Tensor, f: Tensor, center: Tensor, transform: Tensor, error: Tensor
+        theta: Tensor,
+        f: Tensor,
+        center: Tensor,
+        transform: Tensor,
+        ridges: Sequence[float],
     ) -> MeanEmulator:
         z = (theta - center) @ transform
         trend = torch.linalg.lstsq(linear(z), f).solution
-        factor = torch.linalg.cholesky(kernel(z, z) + NUGGET * torch.eye(len(z)))
-        weight = torch.cholesky_solve(f - linear(z) @ trend, factor)
+        rest, correlation = f - linear(z) @ trend, kernel(z, z)
+        weight = error = torch.full_like(rest, torch.inf)
+        for ridge in ridges:
+            inverse = torch.linalg.inv(correlation + ridge * torch.eye(len(z)))
+            own = inverse @ rest
+            missed = own / inverse.diagonal()[:, None]
+            better = missed.square().mean(0) < error.square().mean(0)
+            weight, error = (
+                torch.where(better, own, weight),
+                torch.where(better, missed, error),
+            )
         return MeanEmulator(center, transform, z, trend, weight, error)
 
-    def coordinates(self, theta: Tensor) -> Tensor:
-        """Return z of parameters, shape (n, d)."""
-        return (theta - self.center) @ self.transform
+    @property
+    def score(self) -> float:
+        """Score of the metric, the lower the better.
+
+        Metrics tie where errors are negligible, lest rounding choose among them.
+        """
+        return max(float(self.error.square().log1p().mean()), 1e-8)
 
     def parameters(self, z: Tensor) -> Tensor:
         """Return parameters of z, shape (n, d)."""
@@ -133,71 +168,25 @@ def kernel(z: Tensor, knots: Tensor) -> Tensor:
     return s.div(3).add_(1).mul_(s).add_(1).mul_(s.neg_().exp_())
 
 
-def choose_metric(
-    theta: Tensor,
-    y: Tensor,
-    judge: Callable[[Tensor, Tensor], tuple[float, Tensor, Tensor]],
-    lengths: tuple[float, ...],
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the center of parameters (n, d), what makes z of them, and its errors.
-
-    Some lengths are tried in whitened parameters, then some in the metric of the
-    average slopes of the outcomes (n, q).
-
-    Args:
-        theta: Parameters.
-        y: Outcomes.
-        judge: Function of coordinates and outcomes that returns a score, the lower the
-            better, errors of the outcomes, and what the slopes are those of.
-        lengths: Lengths to try first.
-    """
-    center, white = whitening(theta)
-    unit = y.std(0) + 1
-    theta, y = theta[:NUM_CHOOSING], y[:NUM_CHOOSING]
-
-    def choose(w: Tensor, lengths: tuple[float, ...]) -> tuple[float, Tensor, Tensor]:
-        judged = [judge((theta - center) @ w / s, y)[:2] for s in lengths]
-        best = min(range(len(lengths)), key=lambda i: judged[i][0])
-        return *judged[best], w / lengths[best]
-
-    score, error, transform = choose(white, lengths)
-    smooth = judge((theta - center) @ transform, y)[2]
-    emulator = MeanEmulator._solve(theta, smooth, center, transform, error)
-    slope = emulator.slope(emulator.knots) / unit[:, None]
-    metric = torch.einsum("nqi,nqj->ij", slope, slope)
-    metric = metric / metric.diagonal().mean().clamp_min(1e-30)
-    bent = transform @ torch.linalg.cholesky(metric + 0.01 * torch.eye(len(metric)))
-    bent_score, bent_error, bent = choose(bent, (0.7, 1.0, 1.4))
-    if bent_score < score:
-        return center, bent, bent_error
-    return center, transform, error
-
-
-def _leave_one_out(z: Tensor, f: Tensor) -> Tensor:
-    inverse = torch.linalg.inv(kernel(z, z) + NUGGET * torch.eye(len(z)))
-    trend = linear(z) @ torch.linalg.lstsq(linear(z), f).solution
-    return inverse @ (f - trend) / inverse.diagonal()[:, None]
+#: Ridges of outcomes that are learned from pairs.
+RIDGES = tuple(10.0**k for k in range(-5, 2))
 
 
 @dataclass(frozen=True)
 class Learned:
-    """Simulations of a learned model, and what it was learned from.
+    """Simulations of a learned model, and what it was learned by.
 
     Attributes:
         simulations: Simulations in whitened coordinates with mean and noise, x of shape
             (a, n, q).
+        emulator: Emulator of the means, a * q outcomes.
         score: Leave-one-out mean squares over their expectation under the noise, near 1
             where smoothing misses nothing, shape (a, q).
-        difference: Difference of each pair, of unit mean square; zero for incomplete
-            ones, (a, n, q).
-        residual: Residual of each pair's average to the smoothed mean; zero if there
-            is none, shape (a, n, q).
     """
 
     simulations: CandidateSimulations
+    emulator: MeanEmulator
     score: Tensor
-    difference: Tensor
-    residual: Tensor
 
 
 def declare(simulations: CandidateSimulations) -> Learned:
@@ -208,14 +197,7 @@ def declare(simulations: CandidateSimulations) -> Learned:
     .. math::
         S = \frac{1}{2n} \sum_i (x_i - x_i') (x_i - x_i')^\top = L L^\top.
 
-    Averages of pairs, whitened by L, are smoothed over theta by kernel ridge
-    regression,
-
-    .. math::
-        \hat f = Q \Lambda (\Lambda + \rho)^{-1} Q^\top y, \qquad
-        K = Q \Lambda Q^\top,
-
-    with a ridge for each number of x and a metric for all, by leave-one-out errors.
+    Averages of pairs, whitened by L, are smoothed over theta (:class:`MeanEmulator`).
     Outcomes are drawn anew, :math:`\hat f(\theta_i) + \epsilon_i`, so that none had a
     part in its own mean.
     """
@@ -232,25 +214,22 @@ def declare(simulations: CandidateSimulations) -> Learned:
     num_actions, n, q = x.shape
     difference = torch.where(complete[..., None], (x - again) / 2**0.5, 0.0)
     share = complete.sum(1).clamp_min(1)[:, None, None]
-    floor = (
-        torch.finfo(torch.float32).eps * x.abs().nan_to_num().amax(1)
-    ).square() + 1e-300
-    covariance = difference.mT @ difference / share + torch.diag_embed(floor)
-    factor = torch.linalg.cholesky(covariance)
+    rounding = torch.finfo(torch.float32).eps * x.abs().nan_to_num().amax(1)
+    floor = torch.diag_embed(rounding.square() + 1e-300)
+    factor = torch.linalg.cholesky(difference.mT @ difference / share + floor)
     average = fill(theta, torch.stack([x, again]).nanmean(0)).mT
     white = torch.linalg.solve_triangular(factor, average, upper=False).mT
-    difference = torch.linalg.solve_triangular(factor, difference.mT, upper=False).mT
-    f, square = _smooth(theta, white.transpose(0, 1).flatten(1))
-    mean = f.reshape(n, num_actions, q).transpose(0, 1)
+    emulator = MeanEmulator.fit(theta, white.transpose(0, 1).flatten(1), ridges=RIDGES)
+    mean = emulator(emulator.knots).reshape(n, num_actions, q).transpose(0, 1)
     known = (simulations.completeness > 0)[..., None]
-    residual = torch.where(known, white - mean, 0.0)
     mean = torch.where(known, mean, torch.nan)
     with forked_generators(0, "smoothing"):
         x = mean + torch.randn(n, q, dtype=torch.float64)
     declared = replace(
         simulations, x=x, mean=mean, noise=GaussianNoise(1.0), replicate=None
     )
-    return Learned(declared, 2 * square.reshape(num_actions, q), difference, residual)
+    square = emulator.error.square().mean(0)
+    return Learned(declared, emulator, 2 * square.reshape(num_actions, q))
 
 
 def fill(theta: Tensor, x: Tensor) -> Tensor:
@@ -268,40 +247,3 @@ def fill(theta: Tensor, x: Tensor) -> Tensor:
         nearest = torch.cdist(z[missing[a]], z[complete]).argmin(1)
         x[a, missing[a]] = x[a, complete[nearest]]
     return x
-
-
-def _smooth(
-    theta: Tensor,
-    y: Tensor,
-    lengths: tuple[float, ...] = (0.7, 1.0, 1.4, 2.0, 4.0),
-) -> tuple[Tensor, Tensor]:
-    """Return smoothed columns of y and their leave-one-out mean squares."""
-
-    def judge(z: Tensor, y: Tensor) -> tuple[float, Tensor, Tensor]:
-        f, square = _ridge(z, y)
-        return float(square.log().mean()), square, f
-
-    center, transform, _ = choose_metric(theta, y, judge, lengths)
-    return _ridge((theta - center) @ transform, y)
-
-
-def _ridge(
-    z: Tensor, y: Tensor, powers: tuple[int, ...] = (-5, -4, -3, -2, -1, 0, 1)
-) -> tuple[Tensor, Tensor]:
-    """Return the smoothed y at the best ridge of each column and its score.
-
-    The left-out rows choose one of some powers of ten.
-    """
-    ridges = 10.0 ** torch.tensor(powers, dtype=torch.float64)
-    value, vector = torch.linalg.eigh(kernel(z, z))
-    trend = linear(z) @ torch.linalg.lstsq(linear(z), y).solution
-    rotated = vector.T @ (y - trend)
-    scores = []
-    for ridge in ridges:
-        shrink = value / (value + ridge)
-        leverage = vector.square() @ shrink
-        error = (y - trend - vector @ (shrink[:, None] * rotated)).T / (1 - leverage)
-        scores.append(error.square().mean(1))
-    score, best = torch.stack(scores).min(0)
-    shrink = value[:, None] / (value[:, None] + ridges[best])
-    return trend + vector @ (shrink * rotated), score

@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.design.estimators.emulator import MeanEmulator
-from sbi_active.design.estimators.presence import Completeness
 from sbi_active.seeding import forked_generators
 from sbi_active.simulation import GaussianNoise, NoiseModel
 from sbi_active.support import within_support
@@ -25,7 +24,8 @@ class Evidence:
         columns: Columns of the candidate in it.
         mean: Noise-free outcomes of the simulations.
         scale: Scale of the noise of each number.
-        complete: Probability of a complete outcome.
+        share: Share of each simulation's outcomes that are complete, shape (n,).
+        counted: Simulations that are not missing, shape (n,), bool.
         noise: Noise around the mean.
         belief: Belief over the parameters.
         log_belief: Log density of the belief at the simulations.
@@ -42,7 +42,8 @@ class Evidence:
     columns: slice
     mean: Tensor
     scale: Tensor
-    complete: Completeness
+    share: Tensor
+    counted: Tensor
     noise: NoiseModel
     belief: Distribution
     log_belief: Tensor
@@ -64,7 +65,7 @@ class Evidence:
         That is the share of each simulation in them, summed over the outcomes, shape
         (n,); local draws have the rest.
         """
-        m, num_local = int(self.complete.counted.sum()) - 1, self.num_local
+        m, num_local = int(self.counted.sum()) - 1, self.num_local
         parts = []
         influence = torch.zeros(len(self.knots), dtype=torch.float64)
         with forked_generators(0):  # the same base draws for all candidates
@@ -79,16 +80,15 @@ class Evidence:
                     log_p[poor], variance[poor] = _log_mean(terms, m, m + num_local)
                     weight[poor] = terms.softmax(1)[:, :-num_local]
                 parts.append(log_p + 0.5 * variance)
-                influence += self.complete.share[some] @ weight.nan_to_num()
+                influence += self.share[some] @ weight.nan_to_num()
         return torch.cat(parts), influence
 
     def _shared(self, x: Tensor, rows: Tensor) -> Tensor:
         """Log density p(x_i | theta_j), -inf for j = i, shape (rows, n)."""
-        share = self.complete.share
-        known = (share > 0).reshape(-1, *[1] * (x.ndim - 1))
+        known = (self.share > 0).reshape(-1, *[1] * (x.ndim - 1))
         mean = torch.where(known, self.mean, 0)
         log_term = _pairwise(self.noise, x[rows], mean)
-        log_term += share.log()
+        log_term += self.share.log()
         log_term[torch.arange(len(rows)), rows] = -torch.inf
         return log_term
 
@@ -111,13 +111,21 @@ class Evidence:
         local = torch.full((n * num_local,), -torch.inf).double()
         local[inside] = self.noise.log_prob(outcome, mean.reshape(outcome.shape))
         log_t = self._log_proposal(z, location, i, factor)
-        local[inside] += self.complete(flat[inside], self.emulator)
+        local[inside] += self._log_complete(flat[inside])
         local = local.reshape(n, num_local) - torch.nn.functional.softplus(
             ratio + torch.where(log_b.isfinite(), log_t - log_b, 0.0)
         )
         log_t = self._log_proposal(self.knots, location, i, factor)
         shared = shared - torch.nn.functional.softplus(ratio + log_t - self.log_belief)
         return torch.cat([shared, local], 1)
+
+    def _log_complete(self, z: Tensor) -> Tensor:
+        """Log probability of a complete outcome, that of the nearest simulation."""
+        share = self.share[self.counted]
+        if bool((share == 1).all()):
+            return torch.zeros(len(z), dtype=z.dtype)
+        nearest = torch.cdist(z, self.knots[self.counted]).argmin(1)
+        return share[nearest].log()
 
     def _log_proposal(
         self, z: Tensor, location: Tensor, i: Tensor, factor: Tensor

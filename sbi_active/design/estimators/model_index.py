@@ -78,7 +78,7 @@ class RivalSampler:
             positive or do not add up to one.
     """
 
-    others = notes = ()
+    others, notes = torch.empty(0, 0), ()
     summaries = None
     num_missing = 0
 
@@ -97,16 +97,13 @@ class RivalSampler:
         self.seed, self.num_drawn, self._num_waves = seed, 0, 0
         self._is_noisy = all(hasattr(r, "predict_mean") for r in self.rivals)
 
-    def draw(
-        self, num_samples: int, action: Tensor, *, replicates: bool
-    ) -> CandidateSimulations:
+    def draw(self, num_samples: int, action: Tensor) -> CandidateSimulations:
         """Draw outcomes.
 
         Args:
             num_samples: Number of outcomes of a candidate; rounded to an even number of
                 each model.
             action: Candidates, shape (a, action_dim).
-            replicates: Flag of the sampler it stands in for; it has no effect here.
 
         Raises:
             ValueError: If a rival returns another number of rows or another shape.
@@ -168,12 +165,12 @@ class ModelIndexGain(InformationGainEstimator):
         q(k | x, \xi) \propto p_k\, P_k(v)\, f_k(x | v)^{\beta}
 
     with v the numbers of x that are present, P_k(v) their share among the model's
-    draws, and f_k a density of them: Gaussian (with one covariance or one a model) or
-    by kernels, of a few discriminating numbers where x is long; :math:`\beta \le 1`
-    tempers it. Where the rivals know their noise and x is short, kernels at the
-    outcomes without noise are as narrow as the noise. All are fitted to three quarters
-    of the draws and score the rest, in turn (a posterior draw that is used twice stands
-    in one of them); the kind and :math:`\beta` of a quarter are chosen on the others.
+    draws, and f_k a density of them: Gaussian or by kernels, of a few discriminating
+    numbers where x is long; :math:`\beta \le 1` tempers it. Where the
+    rivals know their noise and x is short, kernels at the outcomes without noise are as
+    narrow as the noise. All are fitted to three quarters of the draws and score the
+    rest, in turn (a posterior draw that is used twice stands in one of them);
+    the kind and :math:`\beta` of a quarter are chosen on the others.
     It is a lower bound for any q, and the information is at most the entropy of p.
 
     Args:

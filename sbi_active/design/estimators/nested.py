@@ -18,15 +18,12 @@ from sbi_active.design.estimators.emulator import MeanEmulator, declare, fill
 from sbi_active.design.estimators.entropy import (
     EntropyGain,
     conditional_entropy,
-    with_control,
-)
-from sbi_active.design.estimators.evidence import Evidence, log_belief
-from sbi_active.design.estimators.presence import (
-    completeness,
     presence_information,
     presence_notes,
     presence_problems,
+    with_control,
 )
+from sbi_active.design.estimators.evidence import Evidence, log_belief
 from sbi_active.simulation import NoiseModel
 
 
@@ -56,13 +53,12 @@ class NestedGain(InformationGainEstimator):
     Where noise is not declared, mean and noise are first learned from pairs of outcomes
     at the same parameters (:func:`.declare`):
     Gaussian noise of one covariance a candidate, and an outcome smooth in theta. The
-    estimate is then the information of the learned model, and its contributions include
-    the error of learning.
+    estimate is then the information of the learned model; its standard errors are
+    without the error of learning.
 
     Where outcomes lack numbers, those that are complete are compared under the belief
     given completeness. The noise-free outcomes decide which parameters give complete
-    ones, and elsewhere the nearest simulation does; where completeness is random given
-    the parameters, its probability is a logistic function fitted to all simulations.
+    ones, and elsewhere the nearest simulation does.
 
     Args:
         num_local: l.
@@ -82,31 +78,31 @@ class NestedGain(InformationGainEstimator):
         self, model: Any, simulations: CandidateSimulations, belief: Distribution
     ) -> Tensor:
         gain = presence_information(simulations)
+        shares, counted = simulations.completeness, simulations.counted
         enough = _enough(simulations).tolist()
-        chances = completeness(simulations)
         learned = declare(simulations) if simulations.noise is None else None
         if learned is not None:
             simulations = learned.simulations
         mean, noise = _declared(simulations)
         entropy, surprise = conditional_entropy(simulations)
-        theta = simulations.theta.double()
-        scale = noise_scale(simulations)
-        filled = fill(theta, mean.flatten(2).double())
-        emulator = MeanEmulator.fit(
-            theta, (filled / scale[:, None]).transpose(0, 1).flatten(1)
-        )
+        q = mean[0, 0].numel()
+        if learned is None:
+            scale = noise_scale(simulations)
+            emulator = _emulator(simulations, scale)
+        else:
+            scale, emulator = torch.ones(len(mean), q).double(), learned.emulator
         slopes = emulator.slope(emulator.knots)
-        q = filled.shape[-1]
-        for a, complete in enumerate(chances):
-            rows, counted = complete.share > 0, complete.counted
+        for a, share in enumerate(shares):
             if not enough[a]:
                 continue  # too few measurements: what is present still counts
+            rows = share > 0
             evidence = Evidence(
                 emulator=emulator,
                 columns=slice(a * q, (a + 1) * q),
                 mean=mean[a].double(),
                 scale=scale[a],
-                complete=complete,
+                share=share,
+                counted=counted[a],
                 noise=noise,
                 belief=belief,
                 log_belief=log_belief(belief, emulator, emulator.knots),
@@ -117,20 +113,14 @@ class NestedGain(InformationGainEstimator):
                 slopes[:, evidence.columns],
                 torch.nonzero(rows)[:, 0],
             )
-            log_p -= complete.log_probability
-            gain[a, rows] += complete.share[rows] * with_control(
+            log_p -= share[counted[a]].mean().log()
+            gain[a, rows] += share[rows] * with_control(
                 -log_p - entropy[a, rows], surprise[a, rows] - entropy[a, rows]
             )
-            chance = complete(emulator.knots, emulator).exp()
-            gain[a] += _of_sharing(influence, complete.share, chance, counted)
-            if learned is not None:
-                gain[a, counted] += learning_error(
-                    slopes[counted, evidence.columns],
-                    emulator.knots[counted],
-                    learned.difference[a, counted],
-                    learned.residual[a, counted],
-                    complete.share[counted],
-                )
+            # What a simulation does to the evidence of others has mean zero: it adds to
+            # errors and leaves the estimate.
+            effect = torch.where(counted[a], share - influence, 0.0)
+            gain[a] += effect - counted[a] * effect[counted[a]].mean()
         return gain
 
     @override
@@ -176,11 +166,8 @@ class NestedGain(InformationGainEstimator):
             if share > 0.5:
                 problems.append(f"smoothing misses {share:.0%} of the numbers of x")
             return problems
-        mean, _ = _declared(simulations)
-        theta = simulations.theta.double()[:num_rows]
-        filled = fill(theta, mean[:, :num_rows].flatten(2).double())
-        f = filled / noise_scale(simulations)[:, None]
-        error = MeanEmulator.fit(theta, f.transpose(0, 1).flatten(1)).error
+        some = simulations.samples(slice(num_rows))
+        error = _emulator(some, noise_scale(simulations)).error
         share = float((error.abs() > 1).double().mean())
         problems = presence_problems(simulations)
         if share <= 0.25:
@@ -189,6 +176,13 @@ class NestedGain(InformationGainEstimator):
             *problems,
             f"the emulator misses {share:.0%} of outcomes by more than the noise",
         ]
+
+
+def _emulator(simulations: CandidateSimulations, scale: Tensor) -> MeanEmulator:
+    """Return the emulator of declared outcomes in units of their noise (a, q)."""
+    theta, (mean, _) = simulations.theta.double(), _declared(simulations)
+    filled = fill(theta, mean.flatten(2).double()) / scale[:, None]
+    return MeanEmulator.fit(theta, filled.transpose(0, 1).flatten(1))
 
 
 def noise_scale(simulations: CandidateSimulations) -> Tensor:
@@ -208,84 +202,7 @@ def _enough(simulations: CandidateSimulations, fewest: int = 8) -> Tensor:
     return simulations.complete.sum(1) >= needed
 
 
-def _of_sharing(
-    influence: Tensor, share: Tensor, chance: Tensor, counted: Tensor
-) -> Tensor:
-    r"""Return the error that simulations add by being in others' evidence, (n,).
-
-    Simulation j, of completeness :math:`v_j`, changes :math:`- \sum_i \log \hat p(x_i)`
-    by minus its share in the evidences. Without local draws that is :math:`v_j` but for
-    noise, and the contributions of its own outcome and of validity are all. Local draws
-    take a share :math:`\lambda` and know the belief, so that only the chance
-    :math:`\pi(\theta_j)` of a complete outcome is learned from simulations:
-
-    .. math::
-        (1 - \lambda) v_j + \lambda \pi(\theta_j) - \sum_i v_i w_{ij}
-
-    with the last sum the influence. It is of mean zero over the rows that count: it
-    adds to errors and leaves the estimate.
-    """
-    local = 1 - influence.sum() / share.sum()
-    effect = (1 - local) * share + local * chance - influence
-    return torch.where(counted, effect - effect[counted].mean(), 0.0)
-
-
 def _declared(simulations: CandidateSimulations) -> tuple[Tensor, NoiseModel]:
     assert simulations.mean is not None
     assert simulations.noise is not None
     return simulations.mean, simulations.noise
-
-
-def learning_error(
-    slope: Tensor, z: Tensor, difference: Tensor, residual: Tensor, share: Tensor
-) -> Tensor:
-    r"""Return the effect of each pair's noise on the information, to first order.
-
-    With :math:`x = f(\theta) + \epsilon`, standard normal noise, and errors
-    :math:`\delta f` of the mean and :math:`\delta S` of the covariance,
-
-    .. math::
-        \delta I = E[(x - E[f | x])^\top \delta f(\theta)]
-        - \tfrac12 \mathrm{tr}\, E[\mathrm{Cov}(f | x)]\, \delta S.
-
-    Both expectations are those of a linear f around each :math:`\theta_i` and a
-    Gaussian belief of precision P, with J the slope,
-
-    .. math::
-        E[f - E[f | x]] = G_i P (z_i - \bar z), \qquad
-        \mathrm{Cov}(f | x) = G_i J_i^\top, \qquad
-        G_i = J_i (J_i^\top J_i + P)^{-1}.
-
-    :math:`\delta f` is the smoothed residual, :math:`\delta S` the mean of
-    :math:`d d^\top - 1` over the pairs' differences d.
-
-    Args:
-        slope: J, shape (n, q, d).
-        z: Coordinates of the parameters, shape (n, d).
-        difference: d, shape (n, q); zero for incomplete pairs.
-        residual: Residual of the pairs' averages, shape (n, q); zero if there is
-            none.
-        share: Share of a pair that is complete, shape (n,).
-
-    Returns:
-        Shape (n,), nats, of mean zero; it adds to errors and leaves the estimate.
-
-    References:
-        Palomar & Verdu, IEEE Transactions on Information Theory 2006 (the gradient of
-        mutual information).
-    """
-    d = z.shape[1]
-    spread = torch.cov(z.T).reshape(d, d) + 1e-9 * torch.eye(d)
-    precision = torch.linalg.inv(spread)
-    gain = torch.linalg.solve(slope.mT @ slope + precision, slope.mT).mT  # (n, q, d)
-    pull = (gain @ ((z - z.mean(0)) @ precision)[..., None])[..., 0]
-    by_mean = share * (pull * residual).sum(1)
-    weight = (share / share.sum())[:, None, None]
-    moment = ((gain * weight).transpose(0, 1).flatten(1)) @ (
-        slope.transpose(0, 1).flatten(1).T
-    )
-    pairs = (share == 1).double()
-    square = ((difference @ moment) * difference).sum(1) - moment.trace() * pairs
-    by_noise = -0.5 * square * share.mean() / pairs.mean().clamp_min(1 / len(pairs))
-    effect = by_mean + by_noise
-    return effect - effect.mean()

@@ -212,16 +212,6 @@ class GaussianProcess:
         own = self._kernel(u, u)
         return self.scale[0].square() * (own - cross @ self.precision @ cross.mT)
 
-    def influence(self, u: Tensor) -> Tensor:
-        r"""Return what each value adds to the mean of the first output, shape (m, n).
-
-        :math:`k(u, U) K^{-1}` times the residual of the value. Their root of the sum of
-        squares is a standard error that does not assume the values' errors.
-        """
-        # The fit misses a value by its noise times its weight.
-        residual = self.noise * (self.precision @ self.values)[:, 0]
-        return self.scale[0] * (self._cross(u) @ self.precision) * residual
-
     @property
     def _kernel(self) -> _Kernel:
         return _Kernel(self.free, self.num_categories, self.settings)

@@ -77,7 +77,7 @@ def test_the_gain_is_that_of_two_known_densities():
     candidates = BOTH.values[[0, 3]]
     rivals = [PredictedRival(c.rivals, ModelKey.of(n), 0.5, candidates) for n in names]
     sampler = RivalSampler(rivals, 0)
-    simulations = sampler.draw(1_000, candidates, replicates=False)
+    simulations = sampler.draw(1_000, candidates)
     gain = ModelIndexGain(sampler.probability)(None, simulations, None)
     for a, rows in enumerate(gain):
         draws = [r.predict(candidates[a], 10_000, 9)[:, 0].double() for r in rivals]

@@ -59,7 +59,7 @@ def information(rivals):
 
 def estimate(rivals, num_samples, seed=0):
     sampler = RivalSampler(rivals, seed)
-    rows = sampler.draw(num_samples, ACTIONS, replicates=False)
+    rows = sampler.draw(num_samples, ACTIONS)
     gain = ModelIndexGain(sampler.probability)(None, rows, None)
     return gain.mean(1), gain.std(1) / gain.shape[1] ** 0.5
 
@@ -96,7 +96,7 @@ def test_a_difference_hidden_in_a_long_trajectory():
     """The wave is small beside the spread, in a direction that has little of it."""
     rivals = [Trajectory(0.5, 0.0), Trajectory(0.5, 0.4)]
     sampler = RivalSampler(rivals, 0)
-    rows = sampler.draw(900, ACTIONS[:3], replicates=False)
+    rows = sampler.draw(900, ACTIONS[:3])
     assert rows.x.shape == (3, 900, 200, 1)
     gain = ModelIndexGain(sampler.probability)(None, rows, None)
     error = gain.std(1) / gain.shape[1] ** 0.5

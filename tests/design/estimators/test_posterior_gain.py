@@ -38,5 +38,5 @@ def test_outcomes_without_a_density_are_not_left_out_of_the_mean():
         def log_posterior(self, theta, x, action):
             return torch.where(theta[:, 0] > 0, torch.nan, theta[:, 0])
 
-    with pytest.raises(ValueError, match=r"densities of the learned model; got NaN at"):
+    with pytest.raises(ValueError, match=r"densities of Overflows; got NaN at"):
         PosteriorGain()(Overflows(), simulations(n=64), PRIOR)
