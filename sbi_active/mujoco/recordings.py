@@ -18,7 +18,7 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.data.units import TIME, split, to_si
 from sbi_active.expected import did_you_mean, require
 from sbi_active.messages import warn
-from sbi_active.mujoco.models.names import held_places, names_of, start_places
+from sbi_active.mujoco.models.names import names_of, places_of
 from sbi_active.mujoco.simulator import Channel
 
 START = "start "
@@ -150,7 +150,7 @@ def _cells(
     frame = pd.DataFrame(given)
     frame.columns = [str(c).strip() for c in frame.columns]
     names, own = [channel.name for channel in channels], [split(c)[0] for c in frame]
-    starts = [START + name for name in (*start_places(model), *held_places(model))]
+    starts = [START + name for name in places_of(model)]
     for name in own:
         require(
             not name.startswith(START) or name in starts,

@@ -17,14 +17,14 @@ from sbi_active.expected import require, suggests
 from sbi_active.mujoco.models.machine import Machine
 from sbi_active.mujoco.models.names import (
     element_id,
-    held_places,
     meaning,
     names_of,
+    places_of,
     require_name,
     scalar_joints,
-    start_places,
 )
 from sbi_active.mujoco.models.parameters import Bounded, bounded
+from sbi_active.mujoco.models.running import initial
 from sbi_active.mujoco.models.spec import Source
 from sbi_active.mujoco.recordings import require_in_range, require_seconds, trials_of
 from sbi_active.mujoco.sensors import added_sensors, channels_of
@@ -220,7 +220,7 @@ def from_spec(spec_or_path: Any) -> SimulatorModel:
     """Return the simulator of a model without parameters, by all its joints."""
     source = Source(spec_or_path)
     model = source.compile()
-    sensors = names_of(model, "sensor") or scalar_joints(model)
+    sensors = names_of(model, "sensor") or [*scalar_joints(model)]
     source = added_sensors(source, model, sensors)
     machine = Machine(source, ())
     channels = channels_of(machine.model, sensors)
@@ -250,8 +250,8 @@ def _actions(
         return space, ()
     played = [] if space is None else [*space.inputs(space.sample((1,), seed=0))]
     controls = [n for n in names_of(model, "actuator") if n not in played]
-    places = [*start_places(model), *held_places(model)]
-    known = [*places, *controls, *(f"{n} position" for n in names_of(model, "joint"))]
+    joints = (f"{n} position" for n in names_of(model, "joint"))
+    known = [*places_of(model), *controls, *joints]
     for k, name in enumerate(actions.names):
         require_name(
             *(name, [*known, MODEL]),
@@ -277,17 +277,12 @@ def _start(
 ) -> dict[str, float] | None:
     if start is None:
         return None
+    places = places_of(model)
     if isinstance(start, str):
-        i = element_id(model, "key", start)
-        state = [*model.key_qpos[i], *model.key_qvel[i], *model.key_act[i]]
-        held = [*model.key_ctrl[i], *model.key_mpos[i], *model.key_mquat[i]]
-        return {
-            **{name: float(state[at]) for name, at in start_places(model).items()},
-            **{name: float(held[at]) for name, at in held_places(model).items()},
-        }
-    known = [*start_places(model), *held_places(model)]
+        state = initial(model, element_id(model, "key", start))
+        return {name: float(state[place]) for name, place in places.items()}
     for name in start:
-        require_name(name, known, "joint, or one with ' velocity',")
+        require_name(name, places, "joint, or one with ' velocity',")
     return {name: float(value) for name, value in start.items()}
 
 

@@ -112,7 +112,7 @@ def from_sysid(
         times=grid,
         threads=threads,
         readout=readout,
-        recorded=[(s.model, s.start) for s in sequences],
+        recorded={k: v.double().numpy() for k, v in (trials.start or {}).items()},
     )
     noise = _noise(trials) if noise is None else noise
     inputs = space if isinstance(space, SignalActions) else None
@@ -281,7 +281,7 @@ class _Sequence:
         return cls(
             str(group.sequence_name[i]),
             k,
-            {n: float(state[1 + place]) for n, place in start_places(model).items()},
+            {n: float(state[place]) for n, place in start_places(model).items()},
             times[inside] - begin,
             np.asarray(series.data, dtype=float)[inside][:, columns],
             {name: data[:, j] for j, name in enumerate(names)},

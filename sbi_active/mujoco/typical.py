@@ -11,7 +11,7 @@ from torch import Tensor
 from sbi_active.actions import ActionSpace
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.messages import warn
-from sbi_active.mujoco.models.names import start_places
+from sbi_active.mujoco.models.names import scalar_joints
 from sbi_active.mujoco.simulator import MujocoFunction
 from sbi_active.simulation import SimulatorModel
 
@@ -68,13 +68,10 @@ def typical_call(
 def _released(model: Any) -> dict[str, Any]:
     """Return start states around that of the model."""
     rng = np.random.default_rng(0)
-    start = {
-        name: torch.from_numpy(
-            model.qpos0[place] + SPREAD * rng.uniform(-1, 1, NUM_ROWS)
-        )
-        for name, place in start_places(model).items()
-        if place < model.nq and "[" not in name
-    }
+    start = {}
+    for name, joint in scalar_joints(model).items():
+        rest = model.qpos0[model.jnt_qposadr[joint]]
+        start[name] = torch.from_numpy(rest + SPREAD * rng.uniform(-1, 1, NUM_ROWS))
     return {"action": torch.zeros(NUM_ROWS, 1, dtype=torch.float64), "start": start}
 
 

@@ -156,14 +156,13 @@ def _body(names: tuple[str, ...], model: Any) -> Element:
 
 
 def _joints(model: Any) -> tuple[list[str], list[Any]]:
-    names, features = scalar_joints(model), []
-    for name in names:
-        i = element_id(model, "joint", name)
+    joints, features = scalar_joints(model), []
+    for i in joints.values():
         dof, body = int(model.jnt_dofadr[i]), int(model.jnt_bodyid[i])
         numbers = [model.dof_M0[dof], model.body_mass[body]]
         numbers += [np.ptp(model.jnt_range[i]), *np.abs(model.jnt_axis[i])]
         features.append(((model.jnt_type[i], _depth(model, body)), numbers))
-    return names, features
+    return [*joints], features
 
 
 def _actuators(model: Any) -> tuple[list[str], list[Any]]:

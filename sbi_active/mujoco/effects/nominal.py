@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,9 +9,8 @@ import numpy as np
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
-from sbi_active.mujoco.models.machine import Rows
-from sbi_active.mujoco.models.names import element_id, start_places
-from sbi_active.mujoco.models.running import begin, start_states
+from sbi_active.mujoco.models.names import scalar_joints
+from sbi_active.mujoco.models.running import Run
 from sbi_active.mujoco.models.spec import mujoco_of
 from sbi_active.mujoco.simulator import MujocoFunction
 from sbi_active.mujoco.typical import SPREAD, typical_call
@@ -77,9 +75,13 @@ def nominal(
     assert isinstance(function, MujocoFunction)
     call = typical_call(simulator, trials, actions)
     seen: list[dict[str, Array]] = []
-    x = function(**call, watch=lambda *given: seen.append(_watched(*given)))
+    x = function(**call, watch=lambda run: seen.append(_watched(run)))
     together = {k: np.concatenate([s[k] for s in seen]) for k in seen[0]}
     model = function.machines[0].model
+    # Positions are counted from the model's own, as a hinge or slide reads there.
+    zeros = np.zeros(model.nv)
+    joints = [*scalar_joints(model).values()]
+    zeros[model.jnt_dofadr[joints]] = model.qpos0[model.jnt_qposadr[joints]]
     low, high = np.percentile(together["q"], [5, 95], axis=0)
     parts = [_rms(together[k]) ** 2 for k in ("bias", "actuator", "passive")]
     readings = x.double().reshape(len(x), x.shape[1], -1).numpy()
@@ -90,8 +92,8 @@ def nominal(
         Nominal(
             model,
             position=_positive(0.5 * (high - low), SPREAD),
-            lowest=together["q"].min(0) + _zeros(model),
-            highest=together["q"].max(0) + _zeros(model),
+            lowest=together["q"].min(0) + zeros,
+            highest=together["q"].max(0) + zeros,
             velocity=_positive(_rms(together["v"]), 1.0),
             force=_positive(np.sqrt(sum(parts)), 1.0),
             inertia=together["inertia"].mean(0),
@@ -105,19 +107,17 @@ def nominal(
     )
 
 
-def _watched(model: Any, models: Sequence[Any], rows: Rows) -> dict[str, Array]:
+def _watched(run: Run) -> dict[str, Array]:
     """Return states and forces along rows."""
     mujoco = mujoco_of()
     found: dict[str, list[Array]] = {}
-    steps = rows.controls.shape[1]
-    every = max(1, steps // NUM_STATES)
-    starts = start_states(model, rows)
-    for own, start, controls in zip(models, starts, rows.controls, strict=True):
+    every = max(1, run.controls.shape[1] // NUM_STATES)
+    for i, own in enumerate(run.models):
         data = mujoco.MjData(own)
-        begin(own, data, start, controls[0])
+        run.begin(i, data)
         inertia = np.array(own.dof_M0)
-        for k in range(steps):
-            data.ctrl[:] = controls[k, : own.nu]
+        for k, control in enumerate(run.controls[i]):
+            data.ctrl[:] = control[: own.nu]
             mujoco.mj_step(own, data)
             if k % every or data.warning.number.any():
                 continue
@@ -142,16 +142,6 @@ def _scalars(model: Any, data: Any) -> Array:
     away = np.zeros(model.nv)
     mujoco_of().mj_differentiatePos(model, away, 1.0, model.qpos0, data.qpos)
     return away
-
-
-def _zeros(model: Any) -> Array:
-    """Return the joints' readings where :func:`_scalars` counts from, (nv,)."""
-    zeros = np.zeros(model.nv)
-    for name, place in start_places(model).items():
-        if place < model.nq and "[" not in name:
-            joint = element_id(model, "joint", name)
-            zeros[model.jnt_dofadr[joint]] = model.qpos0[place]
-    return zeros
 
 
 def _rms(value: Array) -> Array:

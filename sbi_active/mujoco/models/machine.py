@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import compress, product
 from typing import Any
@@ -23,21 +23,23 @@ POOL = 32
 
 @dataclass
 class Rows:
-    """Rows that one model simulates at once.
+    """Rows to simulate.
 
     Attributes:
         theta: Parameters, shape (n, d).
         changes: Parameters by change, shape (n, k).
         forces: Parameters by force, shape (n, k).
-        start: Positions and velocities at the start, by name, (n,).
-        controls: Controls, shape (n, steps, nu), held over each step.
+        start: What is set at the start, by name, shape (n,).
+        inputs: Controls over time by actuator, shape (n, m).
+        times: Times of the readings, shape (n, k).
     """
 
     theta: Array
     changes: dict[Any, Array]
     forces: dict[Any, Array]
     start: dict[str, Array]
-    controls: Array
+    inputs: dict[str, Array]
+    times: Array
 
     def __len__(self) -> int:
         return len(self.theta)
@@ -51,13 +53,9 @@ class Rows:
 
     def at(self, rows: Any) -> Rows:
         """Return some rows."""
-        return Rows(
-            self.theta[rows],
-            {change: phi[rows] for change, phi in self.changes.items()},
-            {force: phi[rows] for force, phi in self.forces.items()},
-            {name: value[rows] for name, value in self.start.items()},
-            self.controls[rows],
-        )
+        named = self.changes, self.forces, self.start, self.inputs
+        some = ({key: value[rows] for key, value in part.items()} for part in named)
+        return Rows(self.theta[rows], *some, self.times[rows])
 
 
 @dataclass
@@ -164,34 +162,26 @@ class Machine:
                 "lower bounds of masses above 0, or give the joint an armature"
             )
 
-    def models(
-        self, rows: Rows, run: Callable[[Model, list[Any], Rows], Array], size: int
-    ) -> Array:
-        """Run rows, whatever models they need.
+    def batches(
+        self, rows: Rows, size: int
+    ) -> Iterator[tuple[Model, list[Any], Array, Array]]:
+        """Yield rows, whatever models they need, a few at a time.
 
         Args:
-            rows: Rows, all of them.
-            run: ``run(model, models, rows)`` simulates some rows, each by its model,
-                and returns one result a row.
+            rows: Rows, all of them. One that is a mixture comes several times.
             size: Most rows at a time.
 
-        Returns:
-            Results of ``run``, in the order of the rows.
+        Yields:
+            The model, and for each row its copy, its place among all rows, and the
+            share of its readings in what is read.
         """
-        found: Array | None = None
         for inserted, places, weights in self._groups(rows):
             model = self._model(inserted)
             share = np.zeros(len(rows))
             share[places] = weights
             for part in _parts(places, rows, size):
-                some = rows.at(part)
-                with quiet():
-                    x = run(model, self._each(model, some, inserted), some)
-                if found is None:
-                    found = np.zeros((len(rows), *x.shape[1:]))
-                found[part] += share[part].reshape(-1, *[1] * (x.ndim - 1)) * x
-        assert found is not None
-        return found
+                models = self._each(model, rows.at(part), inserted)
+                yield model, models, part, share[part]
 
     def _each(
         self, model: Model, rows: Rows, inserted: tuple[Insertion, ...]
@@ -250,9 +240,10 @@ class Machine:
     def _order(self, base: Any) -> tuple[Array, Array]:
         """Return the places of the machine's positions and velocities in a model."""
         own, other = start_places(self.model), start_places(base)
-        places = np.array([other[name] for name in sorted(own, key=own.__getitem__)])
+        order = sorted(own, key=own.__getitem__)
+        places = np.array([other[name] - 1 for name in order], dtype=int)
         nq, nv = self.model.nq, self.model.nv
-        return places[:nq].astype(int), places[nq : nq + nv].astype(int) - base.nq
+        return places[:nq], places[nq : nq + nv] - base.nq
 
 
 def _parts(places: Array, rows: Rows, size: int) -> list[Array]:

@@ -9,6 +9,7 @@ A sensor's reading belongs to the state before a step: reading k is at time k h.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,120 +17,138 @@ import numpy as np
 from sbi_active.arrays import Array
 from sbi_active.mujoco.models.changes import StateChange
 from sbi_active.mujoco.models.machine import Model, Rows
-from sbi_active.mujoco.models.names import element_id, start_places
+from sbi_active.mujoco.models.names import element_id, physics_size, places_of
 from sbi_active.mujoco.models.quantities import field_of
 from sbi_active.mujoco.models.spec import mujoco_of
 
 
-def readings(model: Model, models: list[Any], rows: Rows, *, threads: int = 1) -> Array:
-    """Return the sensors' readings, NaN throughout for a row that diverged.
+@dataclass
+class Run:
+    """Rows that one model simulates at once.
 
-    Args:
+    Attributes:
         model: Model of all rows.
-        models: Models, one a row.
-        rows: Rows whose controls have shape (n, steps, nu + 7 nmocap).
-        threads: Threads of MuJoCo's rollout.
-
-    Returns:
-        Shape (n, steps, sensordata).
+        models: Copies of it, one a row.
+        rows: Rows.
+        state: Physics states at the start, shape (n, nstate).
+        controls: Controls and poses of mocap bodies, shape
+            (n, steps, nu + 7 nmocap), held over each step.
     """
-    start = start_states(model, rows)
-    _settle(model, models, rows, start)
-    run = _stepped if rows.is_stepped else _rolled_out
-    x, finished = run(model, models, start, rows, threads)
-    x[~finished] = np.nan
-    return x
+
+    model: Model
+    models: list[Any]
+    rows: Rows
+    state: Array
+    controls: Array
+
+    @classmethod
+    def of(
+        cls, model: Model, models: list[Any], rows: Rows, grid: Array | None, steps: int
+    ) -> Run:
+        """Return rows at their start.
+
+        Args:
+            model: Model of all rows.
+            models: Copies of it, one a row.
+            rows: Rows.
+            grid: Times of the inputs, shape (m,).
+            steps: Number of readings.
+        """
+        base, size = model.base, physics_size(model.base)
+        every, places = np.repeat(initial(base)[None], len(rows), 0), places_of(base)
+        for name, value in rows.start.items():
+            every[:, places[name]] = value
+        controls = np.repeat(every[:, None, size:], steps, 1)
+        for name, series in rows.inputs.items():
+            place = element_id(base, "actuator", name)
+            assert grid is not None
+            controls[:, :, place] = held(series, grid, steps, base.opt.timestep)
+        return cls(model, models, rows, every[:, :size], controls)
+
+    def begin(self, i: int, data: Any) -> None:
+        """Set data to the start of a row."""
+        mujoco = mujoco_of()
+        mujoco.mj_resetData(self.models[i], data)
+        for state, kind in zip(
+            (self.state[i], self.controls[i, 0]), kinds(), strict=True
+        ):
+            mujoco.mj_setState(self.models[i], data, state, kind)
+
+    def readings(self, *, threads: int = 1) -> Array:
+        """Return the sensors' readings, NaN throughout for a row that diverged.
+
+        Args:
+            threads: Threads of MuJoCo's rollout.
+
+        Returns:
+            Shape (n, steps, sensordata).
+        """
+        if self.model.inserted:
+            self._settle()
+        x, finished = _stepped(self) if self.rows.is_stepped else _rolled(self, threads)
+        x[~finished] = np.nan
+        return x
+
+    def _settle(self) -> None:
+        """Move inserted elements to where they rest."""
+        mujoco, data = mujoco_of(), self.model.data
+        for i, own in enumerate(self.models):
+            self.begin(i, data)
+            mujoco.mj_forward(own, data)
+            for change in self.model.inserted:
+                change.settle(own, data, self.rows.changes[change][i])
+            mujoco.mj_getState(own, data, self.state[i], kinds()[0])
 
 
-def start_states(model: Model, rows: Rows) -> Array:
-    """Return the physics states that rows start from, shape (n, nstate)."""
-    mujoco = mujoco_of()
-    kind = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
-    base, data = model.base, model.data
-    mujoco.mj_resetData(base, data)
-    state = np.empty(mujoco.mj_stateSize(base, kind))
-    mujoco.mj_getState(base, data, state, kind)
-    states = np.repeat(state[None], len(rows), 0)
-    places = start_places(base)
-    for name, value in rows.start.items():
-        if name in places:  # and not held, as a control is
-            states[:, 1 + places[name]] = value  # the time comes first
-    return states
-
-
-def begin(model: Any, data: Any, state: Array, held: Array) -> None:
-    """Set the start of a row.
-
-    Args:
-        model: Model of the row.
-        data: Data of the model, to set.
-        state: Physics state, shape (nstate,).
-        held: Controls and poses of mocap bodies, shape (nu + 7 nmocap,).
-    """
-    mujoco = mujoco_of()
-    mujoco.mj_resetData(model, data)
-    mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
-    mujoco.mj_setState(model, data, held, held_kind())
-
-
-def held_kind() -> int:
-    """Return the kind of MuJoCo's state that a row's controls are."""
+def kinds() -> tuple[int, int]:
+    """Return MuJoCo's kinds of state of a row's physics, and of what is held."""
     state = mujoco_of().mjtState
-    kinds = state.mjSTATE_CTRL, state.mjSTATE_MOCAP_POS, state.mjSTATE_MOCAP_QUAT
-    return sum(kind.value for kind in kinds)
+    held = state.mjSTATE_CTRL, state.mjSTATE_MOCAP_POS, state.mjSTATE_MOCAP_QUAT
+    return state.mjSTATE_FULLPHYSICS.value, sum(kind.value for kind in held)
 
 
-def held_states(model: Model) -> Array:
-    """Return the states held where nothing says otherwise, shape (nu + 7 nmocap,)."""
+def initial(model: Any, key: int | None = None) -> Array:
+    """Return physics state and what is held of a model, or of one of its keyframes."""
     mujoco = mujoco_of()
-    mujoco.mj_resetData(model.base, model.data)
-    held = np.empty(mujoco.mj_stateSize(model.base, held_kind()))
-    mujoco.mj_getState(model.base, model.data, held, held_kind())
-    return held
+    data = mujoco.MjData(model)
+    if key is not None:
+        mujoco.mj_resetDataKeyframe(model, data, key)
+    parts = []
+    for kind in kinds():
+        parts.append(np.empty(mujoco.mj_stateSize(model, kind)))
+        mujoco.mj_getState(model, data, parts[-1], kind)
+    return np.concatenate(parts)
 
 
-def _settle(model: Model, models: list[Any], rows: Rows, start: Array) -> None:
-    """Move inserted elements to where they rest, in place."""
-    if not model.inserted:
-        return
+def _rolled(run: Run, threads: int) -> tuple[Array, Array]:
+    """Return readings by MuJoCo's rollout, and which rows came to their end."""
     mujoco = mujoco_of()
-    kind = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
-    for i, own in enumerate(models):
-        begin(own, model.data, start[i], rows.controls[i, 0])
-        mujoco.mj_forward(own, model.data)
-        for change in model.inserted:
-            change.settle(own, model.data, rows.changes[change][i])
-        mujoco.mj_getState(own, model.data, start[i], kind)
-
-
-def _rolled_out(
-    model: Model, models: list[Any], start: Array, rows: Rows, threads: int
-) -> tuple[Array, Array]:
-    mujoco = mujoco_of()
-    steps = rows.controls.shape[1]
-    data = [mujoco.MjData(model.base) for _ in range(threads)]
+    steps = run.controls.shape[1]
     state, sensors = mujoco.rollout.rollout(
-        *(models, data, start, rows.controls),
-        control_spec=held_kind(),
+        run.models,
+        [mujoco.MjData(run.model.base) for _ in range(threads)],
+        run.state,
+        run.controls,
+        control_spec=kinds()[1],
         nstep=steps,
         persistent_pool=threads > 1,
     )
     # A rollout ends where MuJoCo warns, and repeats its last state from there on.
-    span = steps * np.array([m.opt.timestep for m in models])
-    ran = np.abs(state[:, -1, 0] - start[:, 0] - span) < 0.5 * span / steps
+    span = steps * np.array([m.opt.timestep for m in run.models])
+    ran = np.abs(state[:, -1, 0] - run.state[:, 0] - span) < 0.5 * span / steps
     return sensors, ran & np.isfinite(sensors).all((1, 2))
 
 
-def _stepped(
-    model: Model, models: list[Any], start: Array, rows: Rows, threads: int
-) -> tuple[Array, Array]:
+def _stepped(run: Run) -> tuple[Array, Array]:
+    """Return readings step by step, and which rows came to their end."""
     mujoco = mujoco_of()
-    steps, step = rows.controls.shape[1], model.base.opt.timestep
+    model, models, rows = run.model, run.models, run.rows
+    steps, step = run.controls.shape[1], model.base.opt.timestep
     while len(model.datas) < len(models):
         model.datas.append(mujoco.MjData(model.base))
     datas = model.datas[: len(models)]
-    for i, (own, data) in enumerate(zip(models, datas, strict=True)):
-        begin(own, data, start[i], rows.controls[i, 0])
+    for i, data in enumerate(datas):
+        run.begin(i, data)
     x = np.empty((len(rows), steps, model.base.nsensordata))
     # Views: what MuJoCo writes is there at the next look.
     q, v = [d.qpos for d in datas], [d.qvel for d in datas]
@@ -138,7 +157,7 @@ def _stepped(
     going = np.ones(len(rows), dtype=bool)
     pairs = [*zip(models, datas, strict=True)]
     following = _Following(model, models, datas, rows)
-    given = [*rows.controls[..., : model.base.nu]]
+    given = [*run.controls[..., : model.base.nu]]
     with np.errstate(all="ignore"):  # of rows that diverge
         for k in range(steps):
             if rows.forces:
@@ -212,3 +231,61 @@ class _Following:
         for fields, dofs, before, _ in self.parts:
             for field, values in zip(fields, before, strict=True):
                 field[dofs] = values
+
+
+#: Share of a step by which a time may be off and count as that of a step.
+ON_TIME = 1e-3
+
+
+def num_steps(times: Array, start: float, step: float) -> int:
+    """Return the number of readings, one a step from the start, up to the last time."""
+    last = float(times.max()) - start
+    return max(int(np.ceil(last / step - ON_TIME)), 0) + 1
+
+
+def held(series: Array, own: Array, num: int, step: float) -> Array:
+    """Return a series (n, m), held between the points of its grid, at every step.
+
+    Args:
+        series: Series, shape (n, m).
+        own: Grid of the series, shape (m,).
+        num: Number of steps from the grid's first point.
+        step: Time step of the simulation.
+    """
+    times = own[0] + step * np.arange(num)
+    slack = ON_TIME * min(step, own[1] - own[0])
+    place = np.searchsorted(own, times + slack, side="right") - 1
+    return series[:, np.clip(place, 0, len(own) - 1)]
+
+
+def sampled(
+    readings: Array,
+    times: Array,
+    start: float,
+    step: float,
+    late: Array | None = None,
+) -> Array:
+    """Return readings at times, a line between those of two steps.
+
+    Args:
+        readings: Readings, shape (n, steps, c), from the start on.
+        times: Times, shape (n, k).
+        start: Time of the first reading.
+        step: Time between readings.
+        late: Delay of each channel, (n, c); None is 0.
+
+    Returns:
+        Shape (n, k, c).
+    """
+    last, wanted = readings.shape[1] - 1, times[..., None]
+    if late is not None:
+        wanted = wanted - late[:, None]
+    place = np.clip((wanted - start) / step, 0, last)
+    nearest = np.round(place)
+    place = np.where(np.abs(place - nearest) < ON_TIME, nearest, place)
+    low = np.floor(place).astype(int)
+    found, weight = np.take_along_axis(readings, low, 1), place - low
+    if not weight.any():
+        return found
+    after = np.take_along_axis(readings, np.minimum(low + 1, last), 1)
+    return np.where(weight > 0, (1 - weight) * found + weight * after, found)
