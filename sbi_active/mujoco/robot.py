@@ -134,14 +134,15 @@ def from_mjcf(
         torch.Size([1, 2])
     """
     every = spec_or_path if isinstance(spec_or_path, list | tuple) else [spec_or_path]
-    sources = [_read(given, sensors) for given in every]
+    sources = [added_sensors(Source(given), sensors) for given in every]
     declared = bounded(sources[0].compile(), parameters)
     machines = [Machine(source, declared) for source in sources]
     require_usable(machines)
     machine = machines[0]
     channels = channels_of(machine.model, sensors)
     space, driven = _inputs(machine.model, inputs)
-    actions, roles = _actions(machine.model, actions, space)
+    played = driven if space is not None else []
+    actions, roles = _actions(machine.model, actions, space, played)
     trials = None
     if recordings is not None:
         trials = trials_of(machine.model, recordings, channels, inputs=driven)
@@ -186,9 +187,7 @@ def robot_of(
         function,
         noise=noise,
         parameter_names=[p.name for p in parameters],
-        channel_names=[
-            f"{c.name} [{c.unit}]" if c.unit else c.name for c in function.channels
-        ],
+        channel_names=[channel.label for channel in function.channels],
         sample_times=None if times is None else torch.from_numpy(times),
         inputs=inputs,
     )
@@ -197,21 +196,16 @@ def robot_of(
     return Robot(simulator, prior, actions, trials)
 
 
-def _read(given: Any, sensors: Sequence[str] | None) -> Source:
-    source = Source(given)
-    return added_sensors(source, source.compile(), sensors)
-
-
 def require_usable(machines: Sequence[Machine]) -> None:
     """Raise if models differ in what trials say of them by name, or lack inertia."""
     for kind in ("joint", "actuator", "sensor"):
-        names = [names_of(machine.model, kind) for machine in machines]
-        for k, own in enumerate(names):
-            if own != names[0]:
-                raise ValueError(
-                    f"expected models with the same {kind}s; got {', '.join(own)} in "
-                    f"model {k} beside {', '.join(names[0])}; name them alike"
-                )
+        first = names_of(machines[0].model, kind)
+        for k, machine in enumerate(machines):
+            own = names_of(machine.model, kind)
+            got = f"{', '.join(own)} in model {k} beside {', '.join(first)}"
+            require(
+                own == first, f"models with the same {kind}s", got, "name them alike"
+            )
     for machine in machines:
         machine.require_inertia()
 
@@ -221,8 +215,7 @@ def from_spec(spec_or_path: Any) -> SimulatorModel:
     source = Source(spec_or_path)
     model = source.compile()
     sensors = names_of(model, "sensor") or [*scalar_joints(model)]
-    source = added_sensors(source, model, sensors)
-    machine = Machine(source, ())
+    machine = Machine(added_sensors(source, sensors), ())
     channels = channels_of(machine.model, sensors)
     return SimulatorModel(MujocoFunction([machine], channels))
 
@@ -243,28 +236,28 @@ def _inputs(model: Any, inputs: Any) -> tuple[SignalActions | None, list[str]]:
 
 
 def _actions(
-    model: Any, actions: ActionSpace | None, space: SignalActions | None
+    model: Any,
+    actions: ActionSpace | None,
+    space: SignalActions | None,
+    played: Sequence[str],
 ) -> tuple[ActionSpace | None, tuple[str, ...]]:
     """Return the actions, and what each entry sets in the model; "" for a signal's."""
     if actions is None:
         return space, ()
-    played = [] if space is None else [*space.inputs(space.sample((1,), seed=0))]
-    controls = [n for n in names_of(model, "actuator") if n not in played]
+    controls = {f"{name} control": name for name in names_of(model, "actuator")}
     joints = (f"{n} position" for n in names_of(model, "joint"))
-    known = [*places_of(model), *controls, *joints]
+    free = [name for name in controls.values() if name not in played]
+    known = [*places_of(model), *free, *joints, MODEL]
     for k, name in enumerate(actions.names):
-        require_name(
-            *(name, [*known, MODEL]),
-            "joint, a joint with ' velocity', or an actuator",
+        require_name(name, known, "joint, a joint with ' velocity', or an actuator")
+        control = controls.get(meaning(name, model))
+        require(
+            control not in played,
+            f"{name!r} to be set once",
+            "an action and a signal of this actuator",
+            f"call the start of a joint '{name} position'",
         )
-        sets = meaning(name, model)
-        control = sets.removesuffix(" control") if sets.endswith(" control") else ""
-        if control in played:
-            raise ValueError(
-                f"expected {name!r} to be set once; got an action and a signal of this "
-                f"actuator; call the start of a joint '{name} position'"
-            )
-        if control in controls:
+        if control is not None:
             drawn = actions.sample((64,), seed=0)[:, k]
             require_in_range(model, control, drawn.numpy(), "an action")
     if space is None:
@@ -297,8 +290,8 @@ def _noise(model: Any, channels: Sequence[Any], noise: Any) -> Any:
         return sds[0] if len(sds) == 1 else torch.tensor(sds)
     if noise is not None:
         return noise
-    owner = np.repeat(np.arange(model.nsensor), model.sensor_dim)
-    sds = [float(model.sensor_noise[owner[c.place]]) for c in channels]
+    each = np.repeat(model.sensor_noise, model.sensor_dim)
+    sds = [float(each[channel.place]) for channel in channels]
     if min(sds) <= 0:
         return None
     return sds[0] if len(sds) == 1 else torch.tensor(sds)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sbi_active.arrays import Array
+from sbi_active.expected import require
 from sbi_active.mujoco.models.changes import require_changes
 from sbi_active.mujoco.models.machine import Machine, Rows
 from sbi_active.mujoco.models.names import meaning, names_of, places_of, require_name
@@ -44,6 +45,11 @@ class Channel:
     name: str
     place: int
     unit: str = ""
+
+    @property
+    def label(self) -> str:
+        """Name and unit, as in "hinge [rad]"."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
 
 
 class MujocoFunction:
@@ -91,10 +97,9 @@ class MujocoFunction:
         self.machines, self.channels = tuple(machines), tuple(channels)
         self.roles, self.threads = tuple(roles), threads
         self.times, self.start = times, dict(start or {})
-        if not isinstance(threads, int) or threads < 1:
-            raise ValueError(
-                f"expected at least one thread; got threads={threads!r}; pass 1 or more"
-            )
+        is_number = isinstance(threads, int) and threads >= 1
+        got = f"threads={threads!r}"
+        require(is_number, "at least one thread", got, "pass 1 or more")
 
     @property
     def model(self) -> Any:
@@ -105,11 +110,8 @@ class MujocoFunction:
     def joints(self) -> tuple[list[str], list[str]]:
         """Names of the joints, and of those that slide; ``force_effects`` asks."""
         names = names_of(self.model, "joint")
-        slide = int(mujoco_of().mjtJoint.mjJNT_SLIDE)
-        slides = [
-            n for n, k in zip(names, self.model.jnt_type, strict=True) if k == slide
-        ]
-        return names, slides
+        slides = np.flatnonzero(self.model.jnt_type == mujoco_of().mjtJoint.mjJNT_SLIDE)
+        return names, [names[i] for i in slides]
 
     def __call__(
         self,
@@ -145,11 +147,11 @@ class MujocoFunction:
         num = len(theta)
         starts = self._starts(start, _array(action), num)
         which = np.rint(starts.pop(MODEL, np.zeros(num))).astype(int)
-        if num and (which.min() < 0 or which.max() >= len(self.machines)):
-            raise ValueError(
-                f"expected models 0 to {len(self.machines) - 1}; got {which.min()} to "
-                f"{which.max()}; correct the action"
-            )
+        last = len(self.machines) - 1
+        if num:
+            got = f"{which.min()} to {which.max()}"
+            is_known = bool((which >= 0).all() and (which <= last).all())
+            require(is_known, f"models 0 to {last}", got, "correct the action")
         rows = Rows(
             _array(theta),
             require_changes("model", model),
@@ -218,11 +220,9 @@ class MujocoFunction:
                 found[name] = value
         if start is None:
             return found
-        if not isinstance(start, Mapping):
-            raise ValueError(
-                "expected start states by the names of joints; got an array; pass "
-                "Trials(start={'hinge': angles})"
-            )
+        expected = "start states by the names of joints"
+        advice = "pass Trials(start={'hinge': angles})"
+        require(isinstance(start, Mapping), expected, "an array", advice)
         for name, value in start.items():
             require_name(name, known, "joint, or one with ' velocity',")
             found[name] = _array(value)

@@ -14,7 +14,6 @@ from sbi_active.mujoco.effects.changes import (
     ContactChange,
     FrictionChange,
     GravityTilt,
-    Polynomial,
     QuantityChange,
     ZeroOffset,
 )
@@ -72,12 +71,9 @@ def _change(changes: str, element: Element) -> Any:
             return ContactChange(what)  # pyright: ignore
         case ["density" | "viscosity" as what]:
             return QuantityChange("option", names, what)
-        case [power] if "^" in power:
-            what, _, exponent = power.partition("^")
-            if hasattr(given["model"], "dof_dampingpoly"):  # from MuJoCo 3.7 on
-                return Polynomial(names, what, int(exponent))  # pyright: ignore
         case [what]:
-            if given.get("is_movable", True) or what == "mass":
+            is_there = "^" not in what or hasattr(given["model"], "dof_dampingpoly")
+            if is_there and (what == "mass" or given.get("is_movable", True)):
                 return QuantityChange(element.kind, names, what)
     return None
 

@@ -14,7 +14,7 @@ from sbi_active.arrays import Array
 from sbi_active.mujoco.models.changes import Insertion, ModelChange, StateChange
 from sbi_active.mujoco.models.names import names_of, start_places
 from sbi_active.mujoco.models.parameters import Bounded, Writer, renew, writer_of
-from sbi_active.mujoco.models.quantities import copied, restore
+from sbi_active.mujoco.models.quantities import field_of, set_field
 from sbi_active.mujoco.models.spec import Source, mujoco_of, quiet
 
 #: Models at a time: more gain nothing, and each has memory of its own.
@@ -98,11 +98,13 @@ class Model:
             model = self.writer.compiled(theta)
         else:
             names = {*self.writer.parts}.union(*(c.fields() for c in changes))
-            self.originals |= copied(self.base, names - {*self.originals})
+            for name in names - {*self.originals}:
+                self.originals[name] = np.array(field_of(self.base, name))
             while len(self.pool) <= number:
                 self.pool.append(copy.copy(self.base))
             model = self.pool[number]
-            restore(model, self.originals)
+            for name, value in self.originals.items():
+                set_field(model, name, value)
             self.writer.write(model, theta)
         for change, phi in changes.items():
             change.write(model, phi)

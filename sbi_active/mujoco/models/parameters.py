@@ -24,12 +24,11 @@ import numpy as np
 from sbi_active.arrays import Array
 from sbi_active.mujoco.models.quantities import (
     FRAMES,
-    Entry,
     Quantity,
     field_of,
     find_quantity,
     is_movable,
-    set_to,
+    set_field,
 )
 from sbi_active.mujoco.models.spec import mujoco_of
 
@@ -94,11 +93,9 @@ class Writer:
         """Write parameters (d,) into a model whose fields are as compiled."""
         for name, (places, constant, slope) in self.parts.items():
             values = constant + slope @ theta
-            now = field_of(model, name)
-            if isinstance(now, np.ndarray):
-                now.reshape(-1)[places] = values
-            else:
-                set_to(model, Entry(name, ()), float(values[0]))
+            now = np.array(field_of(model, name))
+            now.reshape(-1)[places] = values
+            set_field(model, name, now)
 
 
 def bounded(model: Any, parameters: Mapping[str, Any]) -> tuple[Bounded, ...]:
@@ -212,7 +209,7 @@ def _of_quantities(parameters: Sequence[Bounded], model: Any) -> Writer:
     slopes: dict[str, dict[int, Array]] = {}
     quantities = [p.quantity for p in parameters]
     for j, quantity in enumerate(quantities):
-        for entry in [] if quantity is None else quantity.entries(model):
+        for entry in quantity.entries(model) if quantity else []:
             shape = np.shape(field_of(model, entry.field))
             place = int(np.ravel_multi_index(entry.index, shape)) if shape else 0
             slopes.setdefault(entry.field, {})[place] = entry.factor * np.eye(num)[j]
