@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from sbi_active.mujoco.models.names import names_of, require_name, scalar_joints
 from sbi_active.mujoco.models.quantities import units_of
-from sbi_active.mujoco.models.spec import Source, mujoco_of
+from sbi_active.mujoco.models.spec import Source, mujoco
 from sbi_active.mujoco.simulator import Channel
 
 VELOCITY = " velocity"
@@ -44,11 +44,10 @@ class AddedSensor:
 
     name: str
     owner: str
-    what: Literal["position", "velocity", "force"]
+    what: str
 
     def __call__(self, spec: Any) -> None:
         """Add it to a spec."""
-        mujoco = mujoco_of()
         kind, owner = READ[self.what]
         spec.add_sensor(
             name=self.name,
@@ -106,7 +105,7 @@ def channels_of(model: Any, sensors: Sequence[str] | None) -> tuple[Channel, ...
 
 
 def _unit(model: Any, i: int) -> str:
-    kind = mujoco_of().mjtSensor(int(model.sensor_type[i])).name
+    kind = mujoco.mjtSensor(int(model.sensor_type[i])).name
     unit = UNITS.get(kind.removeprefix("mjSENS_"), "")
     if "{" not in unit:
         return unit

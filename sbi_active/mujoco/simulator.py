@@ -17,12 +17,10 @@ from sbi_active.mujoco.models.changes import require_changes
 from sbi_active.mujoco.models.machine import Machine, Rows
 from sbi_active.mujoco.models.names import meaning, names_of, places_of, require_name
 from sbi_active.mujoco.models.running import Run, num_steps, sampled
-from sbi_active.mujoco.models.spec import mujoco_of, quiet
+from sbi_active.mujoco.models.spec import mujoco, quiet
 
 #: Numbers of readings, controls and states in memory at once.
 NUMBERS = 4_000_000
-#: Rows that are stepped together, each with data of its own.
-TOGETHER = 64
 #: Rows of one length from which they run apart from longer ones, on average: of
 #: MuJoCo's rollout, and of those that are stepped together, where few cost as many.
 FEWEST = (1, 16)
@@ -110,7 +108,7 @@ class MujocoFunction:
     def joints(self) -> tuple[list[str], list[str]]:
         """Names of the joints, and of those that slide; ``force_effects`` asks."""
         names = names_of(self.model, "joint")
-        slides = np.flatnonzero(self.model.jnt_type == mujoco_of().mjtJoint.mjJNT_SLIDE)
+        slides = np.flatnonzero(self.model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE)
         return names, [names[i] for i in slides]
 
     def __call__(
@@ -183,8 +181,6 @@ class MujocoFunction:
         steps = num_steps(rows.times, start, step)
         width = base.nu + 7 * base.nmocap + base.nsensordata + base.nq + base.nv + 1
         size = max(1, NUMBERS // (steps * width))
-        if rows.is_stepped:
-            size = min(size, TOGETHER)
         channels = [c.place for c in self.channels]
         for model, models, places, share in machine.batches(rows, size):
             some = rows.at(places)

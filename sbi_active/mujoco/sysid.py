@@ -37,9 +37,8 @@ from sbi_active.simulation.noise.base import NoiseModel
 #: Unknown errors, from this share of a signal's deviation up to all of it, lasting from
 #: this share of a sample's distance up to this share of a trial.
 SHARE, SHORT, LONG = 1e-4, 0.1, 0.5
-#: Endings of signals that are states, by kind.
-STATES = {"MjStateQPos": "_qpos", "MjStateQVel": "_qvel"}
-SPEED = "MjStateQVel"
+#: Endings of signals that are states, and what they read, by kind.
+STATES = {"MjStateQPos": ("_qpos", "position"), "MjStateQVel": ("_qvel", "velocity")}
 
 
 @suggests
@@ -151,19 +150,16 @@ def _groups(given: Any) -> list[Any]:
 def _signals(groups: Sequence[Any]) -> list[Signal]:
     """Return the signals that all sequences have."""
     found: list[Signal] = []
-    for group in groups:
-        for series in group.sensordata:
-            own = [
-                Signal(name, kind.name, len(np.atleast_1d(places)))
-                for name, (kind, places) in _mapping(series, group).items()
-            ]
-            if found and own != found:
-                raise ValueError(
-                    f"expected the same signals in all sequences; got "
-                    f"{[s.name for s in own]} in {group.name!r} beside "
-                    f"{[s.name for s in found]}; slice them by name"
-                )
-            found = own
+    for group, series in ((g, series) for g in groups for series in g.sensordata):
+        own = [
+            Signal(name, kind.name, len(np.atleast_1d(places)))
+            for name, (kind, places) in _mapping(series, group).items()
+        ]
+        found = found or own
+        got = f"{[s.name for s in own]} in {group.name!r} beside "
+        got += f"{[s.name for s in found]}"
+        expected = "the same signals in all sequences"
+        require(own == found, expected, got, "slice them by name")
     return found
 
 
@@ -179,31 +175,23 @@ def _readable(
 ) -> tuple[Source, tuple[Channel, ...]]:
     """Return a source with a sensor of every signal, and the channels."""
     joints = scalar_joints(source.compile())
-    edits, reads = [], []
+    edits, reads, names = [], [], []
     for signal in signals:
-        if signal.kind in STATES:
-            joint = signal.name.removesuffix(STATES[signal.kind])
-            if joint not in joints:
-                raise ValueError(
-                    f"expected the state of a hinge or slide; got {signal.name!r}; "
-                    "pass sensors of other joints"
-                )
-            reads.append(f"state {signal.name}")
-            what = "velocity" if signal.kind == SPEED else "position"
+        kind, name = signal.kind, signal.name
+        expected, got = "sensors, positions or velocities", f"{name!r} of type {kind}"
+        advice = "pass a residual_fn, which knows what it is"
+        require(kind in ("MjSensor", *STATES), expected, got, advice)
+        reads.append(name)
+        if kind in STATES:
+            ending, what = STATES[kind]
+            joint = name.removesuffix(ending)
+            expected, advice = "the state of a hinge or slide", "pass sensors of others"
+            require(joint in joints, expected, repr(name), advice)
+            reads[-1] = f"state {name}"
             edits.append(AddedSensor(reads[-1], joint, what))
-        elif signal.kind == "MjSensor":
-            reads.append(signal.name)
-        else:
-            raise ValueError(
-                f"expected sensors, positions or velocities; got {signal.name!r} of "
-                f"type {signal.kind}; pass a residual_fn, which knows what it is"
-            )
+        wide = [f"{name}[{k}]" for k in range(signal.width)]
+        names += [name] if signal.width == 1 else wide
     source = source.edited(*edits)
-    names = (
-        s.name if s.width == 1 else f"{s.name}[{k}]"
-        for s in signals
-        for k in range(s.width)
-    )
     pairs = zip(names, channels_of(source.compile(), reads), strict=True)
     return source, tuple(Channel(name, c.place) for name, c in pairs)
 
@@ -304,11 +292,10 @@ def _recorded(trials: Trials) -> ActionSpace:
 
 def _noise(trials: Trials) -> AutocorrelatedNoise:
     """Return errors of unknown size and duration, one size a signal."""
-    x = trials.x.double()
-    x = x.reshape(*x.shape[:2], -1)
     times = trials.sample_times
     assert times is not None
-    gap = float(times.diff(dim=-1)[times.diff(dim=-1).isfinite()].median())
+    gap = float(times.diff(dim=-1).nanmedian())
+    x = trials.x.double().reshape(*trials.x.shape[:2], -1)
     spread = np.nanstd(x.numpy(), (0, 1))
     spread = np.where(spread > 0, spread, 1.0)
     pairs = [(SHARE * float(sd), float(sd)) for sd in spread]

@@ -35,7 +35,7 @@ class SignalReadout:
 
     stamp: Array
     delays: dict[int, int] = field(default_factory=dict)
-    changes: list[tuple[int, np.ufunc, int]] = field(default_factory=list)
+    changes: Sequence[tuple[int, np.ufunc, int]] = field(default_factory=list)
     fixed: Array = field(default_factory=lambda: np.zeros(0))
     window: tuple[float, float] = (0.0, 0.0)
 

@@ -12,7 +12,10 @@ from sbi_active.arrays import Array
 from sbi_active.mujoco.models.changes import ModelChange, StateChange
 from sbi_active.mujoco.models.names import element_id
 from sbi_active.mujoco.models.quantities import ATTRIBUTES, Quantity, add_to, field_of
-from sbi_active.mujoco.models.spec import mujoco_of
+from sbi_active.mujoco.models.spec import mujoco
+
+ActuatorLaw = Literal["gain", "bias", "back-EMF", "saturation"]
+ContactLaw = Literal["friction", "softness", "restitution"]
 
 
 @dataclass(frozen=True)
@@ -125,7 +128,7 @@ class ActuatorChange(ModelChange):
     """
 
     names: tuple[str, ...]
-    what: Literal["gain", "bias", "back-EMF", "saturation"]
+    what: ActuatorLaw
 
     @override
     def fields(self) -> tuple[str, ...]:
@@ -138,7 +141,7 @@ class ActuatorChange(ModelChange):
     @override
     def write(self, model: Any, phi: Array) -> None:
         value = float(phi[0])
-        affine = int(mujoco_of().mjtBias.mjBIAS_AFFINE)
+        affine = int(mujoco.mjtBias.mjBIAS_AFFINE)
         for name in self.names:
             i = element_id(model, "actuator", name)
             if self.what == "gain":
@@ -193,7 +196,7 @@ class ContactChange(ModelChange):
         what: Quantity that is multiplied.
     """
 
-    what: Literal["friction", "softness", "restitution"]
+    what: ContactLaw
 
     @override
     def fields(self) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import compress, product
 from typing import Any
@@ -15,9 +15,9 @@ from sbi_active.mujoco.models.changes import Insertion, ModelChange, StateChange
 from sbi_active.mujoco.models.names import names_of, start_places
 from sbi_active.mujoco.models.parameters import Bounded, Writer, renew, writer_of
 from sbi_active.mujoco.models.quantities import field_of, set_field
-from sbi_active.mujoco.models.spec import Source, mujoco_of, quiet
+from sbi_active.mujoco.models.spec import Source, mujoco, quiet
 
-#: Models at a time: more gain nothing, and each has memory of its own.
+#: Rows and models at a time: more gain nothing, and each has memory of its own.
 POOL = 32
 
 
@@ -53,9 +53,11 @@ class Rows:
 
     def at(self, rows: Any) -> Rows:
         """Return some rows."""
-        named = self.changes, self.forces, self.start, self.inputs
-        some = ({key: value[rows] for key, value in part.items()} for part in named)
-        return Rows(self.theta[rows], *some, self.times[rows])
+        each = self.changes, self.forces, self.start, self.inputs
+        changes, forces, start, inputs = (
+            {key: value[rows] for key, value in part.items()} for part in each
+        )
+        return Rows(self.theta[rows], changes, forces, start, inputs, self.times[rows])
 
 
 @dataclass
@@ -84,8 +86,25 @@ class Model:
     datas: list[Any] = field(default_factory=list)
     originals: dict[str, Any] = field(default_factory=dict)
 
+    def each(self, rows: Rows) -> list[Any]:
+        """Return a model for every row; rows of the same numbers share one."""
+        changes = [
+            change
+            for change in rows.changes
+            if not isinstance(change, Insertion) or change in self.inserted
+        ]
+        table = np.concatenate([rows.theta, *(rows.changes[c] for c in changes)], 1)
+        _, first, number = np.unique(
+            table, axis=0, return_index=True, return_inverse=True
+        )
+        models = [
+            self.written(k, rows.theta[i], {c: rows.changes[c][i] for c in changes})
+            for k, i in enumerate(first)
+        ]
+        return [models[k] for k in number.reshape(-1)]
+
     def written(
-        self, number: int, theta: Array, changes: dict[ModelChange, Array]
+        self, number: int, theta: Array, changes: Mapping[ModelChange, Array]
     ) -> Any:
         """Return a model with its parameters and changes.
 
@@ -133,7 +152,6 @@ class Machine:
     ) -> None:
         self.source, self.parameters, self.edit = source, tuple(parameters), edit
         self.model = source.compile()
-        mujoco = mujoco_of()
         # A state that diverges stays what it is, instead of starting again.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         # Found here, with all digits of the spec, and used in every process.
@@ -154,7 +172,7 @@ class Machine:
         low = np.array([p.low for p in self.parameters])
         with quiet():
             inertia = self._model(()).written(0, low, {}).dof_M0
-        lost = np.flatnonzero(~(inertia > mujoco_of().mjMINVAL))
+        lost = np.flatnonzero(~(inertia > mujoco.mjMINVAL))
         if len(lost):
             joint = int(self.model.dof_jntid[lost[0]])
             bounds = ", ".join(f"{p.name} = {p.low:g}" for p in self.parameters)
@@ -179,26 +197,10 @@ class Machine:
         """
         for inserted, places, weights in self._groups(rows):
             model = self._model(inserted)
-            share = np.zeros(len(rows))
-            share[places] = weights
-            for part in _parts(places, rows, size):
-                models = self._each(model, rows.at(part), inserted)
-                yield model, models, part, share[part]
-
-    def _each(
-        self, model: Model, rows: Rows, inserted: tuple[Insertion, ...]
-    ) -> list[Any]:
-        """Return a model for every row; rows of the same numbers share one."""
-        active = [
-            c for c in rows.changes if not isinstance(c, Insertion) or c in inserted
-        ]
-        keys = _keys(rows.theta, [rows.changes[c] for c in active])
-        known: dict[bytes, Any] = {}
-        for i, key in enumerate(keys):
-            if key not in known:
-                phi: dict[ModelChange, Array] = {c: rows.changes[c][i] for c in active}
-                known[key] = model.written(len(known), rows.theta[i], phi)
-        return [known[key] for key in keys]
+            for first in range(0, len(places), min(size, POOL)):
+                part = slice(first, first + min(size, POOL))
+                models = model.each(rows.at(places[part]))
+                yield model, models, places[part], weights[part]
 
     def _groups(self, rows: Rows) -> list[tuple[tuple[Insertion, ...], Array, Array]]:
         """Return the insertions, their rows, and their weights in the readings."""
@@ -223,7 +225,6 @@ class Machine:
 
     def _model(self, inserted: tuple[Insertion, ...]) -> Model:
         if inserted not in self._models:
-            mujoco = mujoco_of()
             edits = tuple(change.edit for change in inserted)
             spec = self.source.edited(*edits).spec
             base, writer = self.model, self._writer
@@ -246,23 +247,3 @@ class Machine:
         places = np.array([other[name] - 1 for name in order], dtype=int)
         nq, nv = self.model.nq, self.model.nv
         return places[:nq], places[nq : nq + nv] - base.nq
-
-
-def _parts(places: Array, rows: Rows, size: int) -> list[Array]:
-    """Return places in parts of a few rows, and of no more models than the pool has."""
-    keys = _keys(rows.theta[places], [phi[places] for phi in rows.changes.values()])
-    parts: list[list[int]] = [[]]
-    seen: set[bytes] = set()
-    for place, key in zip(places.tolist(), keys, strict=True):
-        full = len(parts[-1]) == size or (key not in seen and len(seen) == POOL)
-        if full:
-            parts.append([])
-            seen = set()
-        parts[-1].append(place)
-        seen.add(key)
-    return [np.array(part) for part in parts]
-
-
-def _keys(theta: Array, phi: Sequence[Array]) -> list[bytes]:
-    table = np.ascontiguousarray(np.concatenate([theta, *phi], 1) + 0.0)
-    return [row.tobytes() for row in table]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from sbi_active.expected import did_you_mean
-from sbi_active.mujoco.models.spec import mujoco_of
+from sbi_active.mujoco.models.spec import mujoco
 
 #: Kinds of elements, each with a field of ``mjModel`` that has a row an element.
 KINDS = {
@@ -27,7 +27,6 @@ def names_of(model: Any, kind: str) -> list[str]:
 
     An element without a name is called by its kind and number, as in "joint 0".
     """
-    mujoco = mujoco_of()
     mark = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
     number = len(getattr(model, KINDS[kind]))
     each = (mujoco.mj_id2name(model, mark, i) for i in range(number))
@@ -47,7 +46,7 @@ def element_id(model: Any, kind: str, name: str) -> int:
 
 def scalar_joints(model: Any) -> dict[str, int]:
     """Return the numbers of hinges and slides by name."""
-    types = mujoco_of().mjtJoint
+    types = mujoco.mjtJoint
     is_scalar = np.isin(model.jnt_type, [types.mjJNT_HINGE, types.mjJNT_SLIDE])
     names = names_of(model, "joint")
     return {names[i]: int(i) for i in np.flatnonzero(is_scalar)}
@@ -112,7 +111,6 @@ def places_of(model: Any) -> dict[str, int]:
 
 def physics_size(model: Any) -> int:
     """Return the number of entries of MuJoCo's full physics state."""
-    mujoco = mujoco_of()
     return mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
 
 

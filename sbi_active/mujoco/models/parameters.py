@@ -30,7 +30,7 @@ from sbi_active.mujoco.models.quantities import (
     is_movable,
     set_field,
 )
-from sbi_active.mujoco.models.spec import mujoco_of
+from sbi_active.mujoco.models.spec import mujoco
 
 #: What ``mj_setConst`` makes of the other fields.
 DERIVED = (
@@ -176,7 +176,7 @@ def writer_of(
                 parameter.edit(edited, float(value))
         changed = edited.compile()
         _of_quantities(parameters, changed).write(changed, theta)
-        renew(changed, mujoco_of().MjData(changed))
+        renew(changed, mujoco.MjData(changed))
         return changed
 
     low = np.array([p.low for p in parameters])
@@ -198,7 +198,7 @@ def renew(model: Any, data: Any) -> None:
     """
     mean = float(model.dof_M0.mean()) if model.nv else 0.0
     is_own = abs(model.stat.meaninertia - mean) <= 1e-9 * mean
-    mujoco_of().mj_setConst(model, data)
+    mujoco.mj_setConst(model, data)
     if model.nv and is_own:  # and not given in the MJCF
         model.stat.meaninertia = float(model.dof_M0.mean())
 
@@ -293,7 +293,6 @@ def _agrees(
         tolerance: Relative error of numbers that are alike; compiling keeps about 12
             digits.
     """
-    mujoco = mujoco_of()
     model = compiled(0.5 * (low + high))
     rng = np.random.default_rng(0)
     for _ in range(places):

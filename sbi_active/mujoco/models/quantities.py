@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from operator import attrgetter
 from typing import Any
 
@@ -22,7 +23,7 @@ from sbi_active.mujoco.models.names import (
     require_name,
     scalar_joints,
 )
-from sbi_active.mujoco.models.spec import mujoco_of
+from sbi_active.mujoco.models.spec import mujoco
 
 
 @dataclass(frozen=True)
@@ -130,28 +131,23 @@ KP = Attribute(
     "actuator_gainprm", (0,), "{N}/{L}", further=_servo, others=("actuator_biasprm",)
 )
 DOF, QPOS = "jnt_dofadr", "jnt_qposadr"
-POSITIVE = {"is_signed": False}
+Positive = partial(Attribute, is_signed=False)
 #: Attributes of each kind of element, by their MJCF names.
 ATTRIBUTES: dict[str, dict[str, Attribute]] = {
     "joint": {
         "damping": Attribute("dof_damping", (), "{N} s/{L}", DOF),
         "damping^2": Attribute("dof_dampingpoly", (0,), "{N} (s/{L})^2", DOF),
         "damping^3": Attribute("dof_dampingpoly", (1,), "{N} (s/{L})^3", DOF),
-        "armature": Attribute("dof_armature", (), "{I}", DOF, **POSITIVE),
-        "frictionloss": Attribute("dof_frictionloss", (), "{N}", DOF, **POSITIVE),
+        "armature": Positive("dof_armature", (), "{I}", DOF),
+        "frictionloss": Positive("dof_frictionloss", (), "{N}", DOF),
         "stiffness": Attribute("jnt_stiffness", (), "{N}/{L}"),
         "stiffness^2": Attribute("jnt_stiffnesspoly", (0,), "{N}/{L}^2"),
         "stiffness^3": Attribute("jnt_stiffnesspoly", (1,), "{N}/{L}^3"),
         "springref": Attribute("qpos_spring", (), "{L}", QPOS),
     },
     "body": {
-        "mass": Attribute(
-            "body_mass",
-            (),
-            "kg",
-            further=_inertia,
-            others=("body_inertia",),
-            **POSITIVE,
+        "mass": Positive(
+            "body_mass", (), "kg", further=_inertia, others=("body_inertia",)
         ),
         "com_x": Attribute("body_ipos", (0,), "m", others=FRAMES),
         "com_y": Attribute("body_ipos", (1,), "m", others=FRAMES),
@@ -165,16 +161,16 @@ ATTRIBUTES: dict[str, dict[str, Attribute]] = {
         "timeconst": Attribute("actuator_dynprm", (0,), "s"),
     },
     "geom": {
-        "friction": Attribute("geom_friction", (0,), **POSITIVE),
-        "torsional_friction": Attribute("geom_friction", (1,), "m", **POSITIVE),
-        "rolling_friction": Attribute("geom_friction", (2,), "m", **POSITIVE),
+        "friction": Positive("geom_friction", (0,)),
+        "torsional_friction": Positive("geom_friction", (1,), "m"),
+        "rolling_friction": Positive("geom_friction", (2,), "m"),
         "timeconst": Attribute("geom_solref", (0,), "s"),
         "dampratio": Attribute("geom_solref", (1,)),
     },
     "tendon": {
         "stiffness": Attribute("tendon_stiffness"),
         "damping": Attribute("tendon_damping"),
-        "frictionloss": Attribute("tendon_frictionloss", **POSITIVE),
+        "frictionloss": Positive("tendon_frictionloss"),
     },
     "option": {
         "gravity": Attribute(GRAVITY, unit="m/s^2", further=_gravity),
@@ -230,7 +226,7 @@ class Quantity:
         if not self.attribute.startswith("com_"):
             return False
         i = element_id(model, "body", self.name)
-        same = mujoco_of().mjtSameFrame
+        same = mujoco.mjtSameFrame
         own = model.geom_bodyid == i
         inertial = int(same.mjSAMEFRAME_INERTIA), int(same.mjSAMEFRAME_INERTIAROT)
         model.geom_sameframe[own & np.isin(model.geom_sameframe, inertial)] = 0
@@ -278,14 +274,13 @@ def find_quantity(model: Any, text: str) -> Quantity:
 def units_of(model: Any, joint: str) -> dict[str, str]:
     """Return the units of force, length and inertia of a joint: N, L and I."""
     kind = int(model.jnt_type[element_id(model, "joint", joint)])
-    if kind == int(mujoco_of().mjtJoint.mjJNT_SLIDE):
+    if kind == int(mujoco.mjtJoint.mjJNT_SLIDE):
         return {"N": "N", "L": "m", "I": "kg"}
     return {"N": "N m", "L": "rad", "I": "kg m^2"}
 
 
 def joint_of_actuator(model: Any, actuator: str) -> str | None:
     """Return the joint that an actuator drives, None if it is something else."""
-    mujoco = mujoco_of()
     i = element_id(model, "actuator", actuator)
     joints = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT
     if int(model.actuator_trntype[i]) not in map(int, joints):

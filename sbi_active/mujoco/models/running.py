@@ -19,7 +19,7 @@ from sbi_active.mujoco.models.changes import StateChange
 from sbi_active.mujoco.models.machine import Model, Rows
 from sbi_active.mujoco.models.names import element_id, physics_size, places_of
 from sbi_active.mujoco.models.quantities import field_of
-from sbi_active.mujoco.models.spec import mujoco_of
+from sbi_active.mujoco.models.spec import mujoco
 
 
 @dataclass
@@ -67,7 +67,6 @@ class Run:
 
     def begin(self, i: int, data: Any) -> None:
         """Set data to the start of a row."""
-        mujoco = mujoco_of()
         mujoco.mj_resetData(self.models[i], data)
         for state, kind in zip(
             (self.state[i], self.controls[i, 0]), kinds(), strict=True
@@ -91,7 +90,7 @@ class Run:
 
     def _settle(self) -> None:
         """Move inserted elements to where they rest."""
-        mujoco, data = mujoco_of(), self.model.data
+        data = self.model.data
         for i, own in enumerate(self.models):
             self.begin(i, data)
             mujoco.mj_forward(own, data)
@@ -102,14 +101,13 @@ class Run:
 
 def kinds() -> tuple[int, int]:
     """Return MuJoCo's kinds of state of a row's physics, and of what is held."""
-    state = mujoco_of().mjtState
+    state = mujoco.mjtState
     held = state.mjSTATE_CTRL, state.mjSTATE_MOCAP_POS, state.mjSTATE_MOCAP_QUAT
     return state.mjSTATE_FULLPHYSICS.value, sum(kind.value for kind in held)
 
 
 def initial(model: Any, key: int | None = None) -> Array:
     """Return physics state and what is held of a model, or of one of its keyframes."""
-    mujoco = mujoco_of()
     data = mujoco.MjData(model)
     if key is not None:
         mujoco.mj_resetDataKeyframe(model, data, key)
@@ -122,7 +120,6 @@ def initial(model: Any, key: int | None = None) -> Array:
 
 def _rolled(run: Run, threads: int) -> tuple[Array, Array]:
     """Return readings by MuJoCo's rollout, and which rows came to their end."""
-    mujoco = mujoco_of()
     steps = run.controls.shape[1]
     state, sensors = mujoco.rollout.rollout(
         run.models,
@@ -141,7 +138,6 @@ def _rolled(run: Run, threads: int) -> tuple[Array, Array]:
 
 def _stepped(run: Run) -> tuple[Array, Array]:
     """Return readings step by step, and which rows came to their end."""
-    mujoco = mujoco_of()
     model, models, rows = run.model, run.models, run.rows
     steps, step = run.controls.shape[1], model.base.opt.timestep
     while len(model.datas) < len(models):
