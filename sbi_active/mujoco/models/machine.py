@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sbi_active.arrays import Array
+from sbi_active.expected import require
 from sbi_active.mujoco.models.changes import Insertion, ModelChange, StateChange
 from sbi_active.mujoco.models.names import names_of, start_places
 from sbi_active.mujoco.models.parameters import Bounded, Writer, renew, writer_of
@@ -72,7 +73,6 @@ class Model:
         velocities: Places of the machine's ``qvel`` in that of this model.
         inserted: Insertions that the machine's model does not have.
         pool: Copies of the base that are written into.
-        datas: Data to step rows together.
         originals: Fields as compiled, of those that are ever written.
     """
 
@@ -83,7 +83,6 @@ class Model:
     velocities: Array
     inserted: tuple[Insertion, ...] = ()
     pool: list[Any] = field(default_factory=list)
-    datas: list[Any] = field(default_factory=list)
     originals: dict[str, Any] = field(default_factory=dict)
 
     def each(self, rows: Rows) -> list[Any]:
@@ -151,9 +150,7 @@ class Machine:
         edit: Callable[[Any, Array], Any] | None = None,
     ) -> None:
         self.source, self.parameters, self.edit = source, tuple(parameters), edit
-        self.model = source.compile()
-        # A state that diverges stays what it is, instead of starting again.
-        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self.model = _lasting(source.compile())
         # Found here, with all digits of the spec, and used in every process.
         writer = writer_of(
             source.exact, self.model, self.parameters, edit=edit, text=source.spec
@@ -172,15 +169,15 @@ class Machine:
         low = np.array([p.low for p in self.parameters])
         with quiet():
             inertia = self._model(()).written(0, low, {}).dof_M0
-        lost = np.flatnonzero(~(inertia > mujoco.mjMINVAL))
-        if len(lost):
-            joint = int(self.model.dof_jntid[lost[0]])
-            bounds = ", ".join(f"{p.name} = {p.low:g}" for p in self.parameters)
-            raise ValueError(
-                "expected joints that have inertia; got none of "
-                f"{names_of(self.model, 'joint')[joint]!r} at {bounds}; raise the "
-                "lower bounds of masses above 0, or give the joint an armature"
-            )
+        lost = self.model.dof_jntid[~(inertia > mujoco.mjMINVAL)]
+        joints = [names_of(self.model, "joint")[joint] for joint in lost[:1]]
+        bounds = ", ".join(f"{p.name} = {p.low:g}" for p in self.parameters)
+        require(
+            not joints,
+            "joints that have inertia",
+            f"none of {', '.join(map(repr, joints))} at {bounds}",
+            "raise the lower bounds of masses above 0, or give the joint an armature",
+        )
 
     def batches(
         self, rows: Rows, size: int
@@ -205,17 +202,11 @@ class Machine:
     def _groups(self, rows: Rows) -> list[tuple[tuple[Insertion, ...], Array, Array]]:
         """Return the insertions, their rows, and their weights in the readings."""
         insertions = [c for c in rows.changes if isinstance(c, Insertion)]
-        if not insertions:
-            return [((), np.arange(len(rows)), np.ones(len(rows)))]
-        shares = np.array(
-            [
-                [change.share(phi) for phi in rows.changes[change]]
-                for change in insertions
-            ]
-        )
+        each = [list(map(c.share, rows.changes[c])) for c in insertions]
+        shares = np.array(each).reshape(len(insertions), len(rows))
         groups = []
         for pattern in product((False, True), repeat=len(insertions)):
-            on = np.array(pattern)[:, None]
+            on = np.array(pattern, dtype=bool)[:, None]
             weights = np.where(on, shares, 1 - shares).prod(0)
             places = np.flatnonzero(weights)
             if len(places):
@@ -225,12 +216,10 @@ class Machine:
 
     def _model(self, inserted: tuple[Insertion, ...]) -> Model:
         if inserted not in self._models:
-            edits = tuple(change.edit for change in inserted)
-            spec = self.source.edited(*edits).spec
+            spec = self.source.edited(*(change.edit for change in inserted)).spec
             base, writer = self.model, self._writer
             if inserted:
-                base, writer = spec().compile(), None
-                base.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+                base, writer = _lasting(spec().compile()), None
             self._models[inserted] = Model(
                 base,
                 writer or writer_of(spec, base, self.parameters, edit=self.edit),
@@ -247,3 +236,9 @@ class Machine:
         places = np.array([other[name] - 1 for name in order], dtype=int)
         nq, nv = self.model.nq, self.model.nv
         return places[:nq], places[nq : nq + nv] - base.nq
+
+
+def _lasting(model: Any) -> Any:
+    """Return a model in which a state that diverges stays, and starts not again."""
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    return model

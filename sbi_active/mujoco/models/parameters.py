@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from sbi_active.arrays import Array
+from sbi_active.expected import require
 from sbi_active.mujoco.models.quantities import (
     FRAMES,
     Quantity,
@@ -68,11 +69,12 @@ class Bounded:
     edit: Callable[[Any, float], Any] | None = None
 
     def __post_init__(self) -> None:
-        if not (np.isfinite([self.low, self.high]).all() and self.low < self.high):
-            raise ValueError(
-                f"expected finite bounds low < high of parameter {self.name!r}; got "
-                f"{self.low:g} and {self.high:g}; pass them in this order"
-            )
+        expected = f"finite bounds low < high of parameter {self.name!r}"
+        in_order = (
+            bool(np.isfinite([self.low, self.high]).all()) and self.low < self.high
+        )
+        got = f"{self.low:g} and {self.high:g}"
+        require(in_order, expected, got, "pass them in this order")
 
 
 @dataclass(frozen=True)
@@ -110,11 +112,8 @@ def bounded(model: Any, parameters: Mapping[str, Any]) -> tuple[Bounded, ...]:
     Raises:
         ValueError: If there is none, bounds are not in order, or a name is unknown.
     """
-    if not parameters:
-        raise ValueError(
-            "expected at least one parameter; got none; pass parameters={'joint."
-            "damping': (low, high)}"
-        )
+    advice = "pass parameters={'joint.damping': (low, high)}"
+    require(bool(parameters), "at least one parameter", "none", advice)
     found = []
     for name, given in parameters.items():
         try:
@@ -129,19 +128,18 @@ def bounded(model: Any, parameters: Mapping[str, Any]) -> tuple[Bounded, ...]:
             found.append(Bounded(name, low, high, edit=what))
             continue
         quantity = find_quantity(model, what)
-        if low < 0 and not quantity.known.is_signed:
-            raise ValueError(
-                f"expected bounds of {str(quantity)!r} from 0 on; got {low:g} to "
-                f"{high:g}; raise the lower one"
-            )
-        if quantity.attribute.startswith("com_") and not is_movable(
-            model, quantity.name
-        ):
-            raise ValueError(
-                f"expected a body whose center of mass can be written; got "
-                f"{quantity.name!r}, which MuJoCo compiles as simple; give it "
-                "simple='false' in the MJCF"
-            )
+        require(
+            low >= 0 or quantity.known.is_signed,
+            f"bounds of {str(quantity)!r} from 0 on",
+            f"{low:g} to {high:g}",
+            "raise the lower one",
+        )
+        require(
+            not quantity.is_center or is_movable(model, quantity.name),
+            "a body whose center of mass can be written",
+            f"{quantity.name!r}, which MuJoCo compiles as simple",
+            "give it simple='false' in the MJCF",
+        )
         found.append(Bounded(name, low, high, quantity.unit(model), quantity))
     return tuple(found)
 
@@ -218,13 +216,13 @@ def _of_quantities(parameters: Sequence[Bounded], model: Any) -> Writer:
         for name, own in slopes.items()
     }
     loose = copy.copy(model)
-    for quantity in quantities:
-        if quantity is not None and quantity.loosen(loose):
-            for name in FRAMES:
-                frames = field_of(loose, name)
-                places = np.flatnonzero(frames != field_of(model, name))
-                zeros = np.zeros((len(places), num))
-                parts[name] = places, frames[places].astype(float), zeros
+    for quantity in filter(None, quantities):
+        quantity.loosen(loose)
+    for name in FRAMES:
+        frames = field_of(loose, name)
+        places = np.flatnonzero(frames != field_of(model, name))
+        if len(places):
+            parts[name] = places, frames[places] + 0.0, np.zeros((len(places), num))
     return Writer(parts)
 
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from sbi_active.arrays import Array
+from sbi_active.expected import require
 from sbi_active.mujoco.models.names import (
     element_id,
     names_of,
@@ -203,6 +204,11 @@ class Quantity:
         """What is known of the attribute."""
         return ATTRIBUTES[self.kind][self.attribute]
 
+    @property
+    def is_center(self) -> bool:
+        """Whether it is a center of mass."""
+        return self.attribute.startswith("com_")
+
     def entries(self, model: Any) -> list[Entry]:
         """Return the numbers of a model that follow it."""
         i = 0 if self.kind == "option" else element_id(model, self.kind, self.name)
@@ -217,21 +223,16 @@ class Quantity:
             joint = joint_of_actuator(model, self.name)
         return "" if joint is None else unit.format(**units_of(model, joint))
 
-    def loosen(self, model: Any) -> bool:
-        """Tell MuJoCo, in place, that a center of mass that is written is elsewhere.
-
-        Returns:
-            Whether it is a center of mass.
-        """
-        if not self.attribute.startswith("com_"):
-            return False
+    def loosen(self, model: Any) -> None:
+        """Tell MuJoCo, in place, that a center of mass that is written is elsewhere."""
+        if not self.is_center:
+            return
         i = element_id(model, "body", self.name)
         same = mujoco.mjtSameFrame
         own = model.geom_bodyid == i
         inertial = int(same.mjSAMEFRAME_INERTIA), int(same.mjSAMEFRAME_INERTIAROT)
         model.geom_sameframe[own & np.isin(model.geom_sameframe, inertial)] = 0
         model.body_sameframe[i] = 0
-        return True
 
 
 def find_quantity(model: Any, text: str) -> Quantity:
@@ -263,11 +264,9 @@ def find_quantity(model: Any, text: str) -> Quantity:
     ]
     if not dot or not found:
         require_name(rest, map(str, every), "quantity, 'element.attribute',")
-    if len(found) > 1:
-        kinds = ", ".join(f"{q.kind}:{q}" for q in found)
-        raise ValueError(
-            f"expected one quantity {text!r}; got {len(found)}; pass one of {kinds}"
-        )
+    kinds = ", ".join(f"{q.kind}:{q}" for q in found)
+    expected, advice = f"one quantity {text!r}", f"pass one of {kinds}"
+    require(len(found) == 1, expected, len(found), advice)
     return found[0]
 
 

@@ -140,9 +140,7 @@ def _stepped(run: Run) -> tuple[Array, Array]:
     """Return readings step by step, and which rows came to their end."""
     model, models, rows = run.model, run.models, run.rows
     steps, step = run.controls.shape[1], model.base.opt.timestep
-    while len(model.datas) < len(models):
-        model.datas.append(mujoco.MjData(model.base))
-    datas = model.datas[: len(models)]
+    datas = [mujoco.MjData(model.base) for _ in models]
     for i, data in enumerate(datas):
         run.begin(i, data)
     x = np.empty((len(rows), steps, model.base.nsensordata))
@@ -152,7 +150,7 @@ def _stepped(run: Run) -> tuple[Array, Array]:
     controls = [d.ctrl for d in datas]
     going = np.ones(len(rows), dtype=bool)
     pairs = [*zip(models, datas, strict=True)]
-    following = _Following(model, models, datas, rows)
+    following = _Following(run, datas)
     given = [*run.controls[..., : model.base.nu]]
     with np.errstate(all="ignore"):  # of rows that diverge
         for k in range(steps):
@@ -167,9 +165,8 @@ def _stepped(run: Run) -> tuple[Array, Array]:
             tables = following.tables(q, v)
             for i in np.flatnonzero(going).tolist():
                 controls[i][:] = given[i][k]
-                for fields, dofs, table in tables:
-                    for dof, number in zip(dofs, table[i], strict=True):
-                        fields[i][dof] = number
+                for fields, table in tables:
+                    fields[i][:] = table[i]
                 mujoco.mj_step(*pairs[i])
                 x[i, k] = sensors[i]
             if k % 64 == 0 or k == steps - 1:
@@ -180,53 +177,45 @@ def _stepped(run: Run) -> tuple[Array, Array]:
 
 
 class _Following:
-    """Entries of each row's model that follow the state of its joints."""
+    """Fields of each row's model that follow the state of its joints."""
 
-    def __init__(
-        self, model: Model, models: list[Any], datas: list[Any], rows: Rows
-    ) -> None:
-        self.loads = [d.qfrc_actuator for d in datas]
-        own, base = [], model.base
-        for change, phi in rows.changes.items():
+    def __init__(self, run: Run, datas: list[Any]) -> None:
+        self.loads = [data.qfrc_actuator for data in datas]
+        self.changes, base = [], run.model.base
+        for change, phi in run.rows.changes.items():
             if isinstance(change, StateChange):
                 joints = [element_id(base, "joint", name) for name in change.joints()]
                 places = base.jnt_qposadr[joints], base.jnt_dofadr[joints]
-                own.append((change, phi, *places))
-        # Changes of one field add up. Rows of the same numbers share a model: what it
-        # has is looked up before any of them runs.
-        self.parts = []
-        for name in dict.fromkeys(one[0].fields()[0] for one in own):
-            some = [one for one in own if one[0].fields()[0] == name]
-            dofs = np.unique(np.concatenate([one[3] for one in some]))
-            some = [(*one, np.searchsorted(dofs, one[3])) for one in some]
-            fields = [field_of(each, name) for each in models]
-            before = np.array([field[dofs] for field in fields])
-            self.parts.append((fields, dofs.tolist(), before, some))
+                self.changes.append((change.fields()[0], change, phi, *places))
+        # Rows of the same numbers share a model: what it has is looked up before any of
+        # them runs.
+        names = dict.fromkeys(name for name, *_ in self.changes)
+        self.fields = {n: [field_of(own, n) for own in run.models] for n in names}
+        self.before = {name: np.array(fields) for name, fields in self.fields.items()}
 
-    def tables(self, q: list[Array], v: list[Array]) -> list[tuple[Any, Any, Any]]:
-        """Return fields by row, entries, and the numbers that each row has there.
+    def tables(self, q: list[Array], v: list[Array]) -> list[tuple[list[Any], Array]]:
+        """Return fields by row, and the numbers that each row has there.
 
         Args:
             q: Positions of each row.
             v: Velocities.
         """
-        if not self.parts:
+        if not self.changes:
             return []
         at, speed, load = np.stack(q), np.stack(v), np.stack(self.loads)
-        found = []
-        for fields, dofs, before, changes in self.parts:
-            total = before.copy()
-            for change, phi, places, own, among in changes:
-                state = at[:, places], speed[:, own], load[:, own]
-                total[:, among] += change.values(*state, phi)
-            found.append((fields, dofs, total.tolist()))
-        return found
+        total = {name: before.copy() for name, before in self.before.items()}
+        for name, change, phi, places, dofs in self.changes:  # they add up
+            state = at[:, places], speed[:, dofs], load[:, dofs]
+            total[name][:, dofs] += change.values(
+                *state, phi
+            )  # those of a field add up
+        return [(self.fields[name], table) for name, table in total.items()]
 
     def restore(self) -> None:
         """Write back what the models had."""
-        for fields, dofs, before, _ in self.parts:
-            for field, values in zip(fields, before, strict=True):
-                field[dofs] = values
+        for name, fields in self.fields.items():
+            for own, values in zip(fields, self.before[name], strict=True):
+                own[:] = values
 
 
 #: Share of a step by which a time may be off and count as that of a step.
