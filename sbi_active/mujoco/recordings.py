@@ -86,8 +86,16 @@ def trials_of(
         for name, column in zip(inputs, log.columns["input"], strict=True):
             series[name].append(log.numbers(column))
             require_in_range(model, name, series[name][-1], log.source)
-        for name, column in zip(starts, log.columns["start"], strict=True):
-            starts[name].append(float(log.numbers(column, empty=True)[0]))
+        own = [column.name for column in log.columns["start"]]
+        got = f"{', '.join(own) or 'none'} in {log.source} beside "
+        got += f"{', '.join(starts) or 'none'} in {cells[0].source}"
+        expected = "the same start states in each recording"
+        require(own == [*starts], expected, got, "add them to each")
+        for column in log.columns["start"]:
+            first = float(log.numbers(column, empty=True)[0])
+            expected = f"{column.name} in the first row of {log.source}"
+            require(np.isfinite(first), expected, "an empty cell", "fill it in")
+            starts[column.name].append(first)
     same = all(np.array_equal(time, times[0]) for time in times)
     return Trials(
         None,
@@ -137,6 +145,7 @@ def _cells(
         what = f"{what} ({given})"
         given = read_csv(Path(given))
     frame = pd.DataFrame(given)
+    require(len(frame) > 0, f"samples in {what}", "no rows", "record some")
     frame.columns = [str(c).strip() for c in frame.columns]
     units = {TIME: "s", **{channel.name: channel.unit for channel in channels}}
     names, own = [channel.name for channel in channels], [split(c)[0] for c in frame]
