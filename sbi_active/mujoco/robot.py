@@ -25,7 +25,7 @@ from sbi_active.mujoco.models.names import (
 )
 from sbi_active.mujoco.models.parameters import Bounded, bounded
 from sbi_active.mujoco.models.running import initial
-from sbi_active.mujoco.models.spec import Source
+from sbi_active.mujoco.models.spec import Source, mujoco
 from sbi_active.mujoco.recordings import require_in_range, require_seconds, trials_of
 from sbi_active.mujoco.sensors import added_sensors, channels_of
 from sbi_active.mujoco.simulator import MODEL, MujocoFunction
@@ -272,7 +272,8 @@ def _start(
         return None
     places = places_of(model)
     if isinstance(start, str):
-        state = initial(model, element_id(model, "key", start))
+        key = element_id(model, "key", start)
+        state = initial(model, mujoco.MjData(model), key)
         return {name: float(state[place]) for name, place in places.items()}
     for name in start:
         require_name(name, places, "joint, or one with ' velocity',")

@@ -73,6 +73,7 @@ class Model:
         velocities: Places of the machine's ``qvel`` in that of this model.
         inserted: Insertions that the machine's model does not have.
         pool: Copies of the base that are written into.
+        datas: Data to step rows together.
         originals: Fields as compiled, of those that are ever written.
     """
 
@@ -83,6 +84,7 @@ class Model:
     velocities: Array
     inserted: tuple[Insertion, ...] = ()
     pool: list[Any] = field(default_factory=list)
+    datas: list[Any] = field(default_factory=list)
     originals: dict[str, Any] = field(default_factory=dict)
 
     def each(self, rows: Rows) -> list[Any]:

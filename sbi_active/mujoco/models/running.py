@@ -55,7 +55,8 @@ class Run:
             steps: Number of readings.
         """
         base, size = model.base, physics_size(model.base)
-        every, places = np.repeat(initial(base)[None], len(rows), 0), places_of(base)
+        first, places = initial(base, model.data), places_of(base)
+        every = np.repeat(first[None], len(rows), 0)
         for name, value in rows.start.items():
             every[:, places[name]] = value
         controls = np.repeat(every[:, None, size:], steps, 1)
@@ -106,9 +107,15 @@ def kinds() -> tuple[int, int]:
     return state.mjSTATE_FULLPHYSICS.value, sum(kind.value for kind in held)
 
 
-def initial(model: Any, key: int | None = None) -> Array:
-    """Return physics state and what is held of a model, or of one of its keyframes."""
-    data = mujoco.MjData(model)
+def initial(model: Any, data: Any, key: int | None = None) -> Array:
+    """Return physics state and what is held of a model, or of one of its keyframes.
+
+    Args:
+        model: Compiled model.
+        data: Data of the model, to work in.
+        key: Number of the keyframe.
+    """
+    mujoco.mj_resetData(model, data)
     if key is not None:
         mujoco.mj_resetDataKeyframe(model, data, key)
     parts = []
@@ -140,7 +147,9 @@ def _stepped(run: Run) -> tuple[Array, Array]:
     """Return readings step by step, and which rows came to their end."""
     model, models, rows = run.model, run.models, run.rows
     steps, step = run.controls.shape[1], model.base.opt.timestep
-    datas = [mujoco.MjData(model.base) for _ in models]
+    while len(model.datas) < len(models):
+        model.datas.append(mujoco.MjData(model.base))
+    datas = model.datas[: len(models)]
     for i, data in enumerate(datas):
         run.begin(i, data)
     x = np.empty((len(rows), steps, model.base.nsensordata))
@@ -165,8 +174,9 @@ def _stepped(run: Run) -> tuple[Array, Array]:
             tables = following.tables(q, v)
             for i in np.flatnonzero(going).tolist():
                 controls[i][:] = given[i][k]
-                for fields, table in tables:
-                    fields[i][:] = table[i]
+                for fields, dofs, table in tables:
+                    for dof in dofs:
+                        fields[i][dof] = table[i][dof]
                 mujoco.mj_step(*pairs[i])
                 x[i, k] = sensors[i]
             if k % 64 == 0 or k == steps - 1:
@@ -192,9 +202,11 @@ class _Following:
         names = dict.fromkeys(name for name, *_ in self.changes)
         self.fields = {n: [field_of(own, n) for own in run.models] for n in names}
         self.before = {name: np.array(fields) for name, fields in self.fields.items()}
+        own = {n: [part[-1] for part in self.changes if part[0] == n] for n in names}
+        self.entries = {n: np.unique(np.concatenate(own[n])).tolist() for n in names}
 
-    def tables(self, q: list[Array], v: list[Array]) -> list[tuple[list[Any], Array]]:
-        """Return fields by row, and the numbers that each row has there.
+    def tables(self, q: list[Array], v: list[Array]) -> list[tuple[Any, Any, Any]]:
+        """Return fields by row, entries that change, and each row's numbers.
 
         Args:
             q: Positions of each row.
@@ -209,7 +221,10 @@ class _Following:
             total[name][:, dofs] += change.values(
                 *state, phi
             )  # those of a field add up
-        return [(self.fields[name], table) for name, table in total.items()]
+        return [
+            (fields, self.entries[name], total[name].tolist())
+            for name, fields in self.fields.items()
+        ]
 
     def restore(self) -> None:
         """Write back what the models had."""
