@@ -19,7 +19,7 @@ from torch import Tensor
 from sbi_active.criticism import AugmentedSimulator, Effect
 from sbi_active.criticism.rivals.trial_simulator import conditions_of_trials
 from sbi_active.mujoco import from_mjcf, mjcf_effects
-from sbi_active.mujoco.models.spec import mujoco_of
+from sbi_active.mujoco.models.spec import mujoco
 from sbi_active.mujoco.robot import Robot
 from sbi_active.simulation import AutocorrelatedNoise
 
@@ -85,7 +85,7 @@ class Leg:
 
     def spec(self) -> Any:
         """Return its MJCF: the leg alone, rigid, its motors driven by the PD law."""
-        spec = mujoco_of().MjSpec.from_file(str(self.folder / "go2_in_air.xml"))
+        spec = mujoco.MjSpec.from_file(str(self.folder / "go2_in_air.xml"))
         for key in [*spec.keys]:
             spec.delete(key)
         for motor in [*spec.actuators]:

@@ -39,8 +39,7 @@ from sbi_active import GaussianNoise
 from sbi_active.criticism import close_loop
 from sbi_active.criticism.identification import identify
 from sbi_active.display.table import Table
-from sbi_active.mujoco import from_sysid, mjcf_effects
-from sbi_active.mujoco.identification import identify_robot
+from sbi_active.mujoco import from_sysid, identify_robot, mjcf_effects
 from sbi_active.mujoco.robot import Robot
 
 RESULTS = Path(__file__).parent / "results/coverage.csv"

@@ -47,7 +47,7 @@ from sbi_active import DiscreteActions, InformationGainDesigner, MixedActions
 from sbi_active.actions import SignalActions
 from sbi_active.criticism import Trials, identify
 from sbi_active.mujoco import MotionLimits, from_mjcf
-from sbi_active.mujoco.models.spec import mujoco_of
+from sbi_active.mujoco.models.spec import mujoco
 from sbi_active.mujoco.robot import Robot
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 
@@ -100,7 +100,7 @@ class Machine:
 
 MACHINES = {
     "arm": Machine(
-        lambda: mujoco_of().MjSpec.from_string(ARM),
+        lambda: mujoco.MjSpec.from_string(ARM),
         joints=("shoulder", "elbow"),
         drives=("shoulder servo", "elbow servo"),
         last="lower",

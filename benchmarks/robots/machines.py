@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from benchmarks.robots.models import MJCF
 from benchmarks.rows import toml
-from sbi_active.mujoco.models.spec import mujoco_of
+from sbi_active.mujoco.models.spec import mujoco
 
 Array = NDArray[Any]
 
@@ -125,7 +125,6 @@ def recorded(machine: Machine, condition: str, seed: int) -> Set:
         seed: Of truths, controls, starts and errors; white and correlated sets of one
             seed share the first three.
     """
-    mujoco = mujoco_of()
     from mujoco import sysid  # pyright: ignore
 
     correlation, friction = CONDITIONS[condition]
@@ -199,7 +198,7 @@ def spec_of(mjcf: str) -> Any:
         return shipped(package, path)
     if mjcf == "go2":
         return go2_leg()
-    return mujoco_of().MjSpec.from_file(str(MJCF / f"{mjcf}.xml"))
+    return mujoco.MjSpec.from_file(str(MJCF / f"{mjcf}.xml"))
 
 
 def shipped(package: str, path: str) -> Any:
@@ -212,7 +211,7 @@ def shipped(package: str, path: str) -> Any:
     found = find_spec(package)
     if found is None or found.origin is None:
         raise ImportError(f"needs {package}; run pip install {package}")
-    spec = mujoco_of().MjSpec.from_file(str(Path(found.origin).parent / path))
+    spec = mujoco.MjSpec.from_file(str(Path(found.origin).parent / path))
     for number, actuator in enumerate(spec.actuators):
         if not actuator.name:
             actuator.name = f"motor {number + 1}"
@@ -221,7 +220,6 @@ def shipped(package: str, path: str) -> Any:
 
 def go2_leg() -> Any:
     """Return the front left leg of a Go2 with its drives, Kp 20 and Kd 1.5."""
-    mujoco = mujoco_of()
     spec = mujoco.MjSpec.from_file(str(os.environ.get("GO2_IN_AIR", GO2)))
     for motor in [*spec.actuators]:
         if not motor.name.startswith("FL"):
@@ -238,8 +236,6 @@ def go2_leg() -> Any:
 
 
 def _read_joints(spec: Any) -> None:
-    mujoco = mujoco_of()
-
     for joint in spec.joints:
         spec.add_sensor(
             name=f"read {joint.name}",

@@ -28,7 +28,7 @@ from benchmarks.robots.models import ARM, CART_POLE, PENDULUM, SPRING_MASS
 from benchmarks.rows import in_turn, keep
 from sbi_active import BoxActions
 from sbi_active.mujoco import from_mjcf
-from sbi_active.mujoco.models.spec import mujoco_of
+from sbi_active.mujoco.models.spec import mujoco
 
 RESULT = Path(__file__).with_suffix(".json")
 SECONDS = 1.0
@@ -43,7 +43,6 @@ MODELS = {
 
 def ways(xml: Any, joint: str, low: float, high: float, num: int) -> dict[str, Any]:
     """Return the ways of simulating rows, and how many steps each has."""
-    mujoco = mujoco_of()
     spec = mujoco.MjSpec.from_string(xml) if isinstance(xml, str) else xml
     model = spec.compile()
     joints = [model.joint(i).name for i in range(model.njnt)]
@@ -111,7 +110,6 @@ def main(*, go2: Path | None = None) -> None:
     Args:
         go2: File of the Go2's model.
     """
-    mujoco = mujoco_of()
     models: dict[str, Any] = dict(MODELS)
     if go2 is not None:
         spec = mujoco.MjSpec.from_file(str(go2))

@@ -6,9 +6,12 @@ does not infer, and does not criticize models. It needs ``sbi-active[mujoco]``.
 """
 
 from sbi_active.criticism.forces.library import force_effects
-from sbi_active.mujoco.beliefs import belief_to_parameters, randomization
+from sbi_active.mujoco.beliefs import (
+    belief_to_parameters,
+    identify_robot,
+    randomization,
+)
 from sbi_active.mujoco.effects.library import mjcf_effects
-from sbi_active.mujoco.identification import identify_robot
 from sbi_active.mujoco.limits import MotionLimits
 from sbi_active.mujoco.robot import from_mjcf
 from sbi_active.mujoco.sysid import from_sysid

@@ -1,4 +1,4 @@
-"""A belief for the tools of MuJoCo: its parameters, and domain randomization."""
+"""Beliefs of robots: from recordings, and for the tools of MuJoCo."""
 
 from __future__ import annotations
 
@@ -10,10 +10,46 @@ import numpy as np
 import torch
 
 from sbi_active.arrays import Array
-from sbi_active.expected import require
+from sbi_active.criticism.data.trials import Trials
+from sbi_active.criticism.effects.effect import Effect
+from sbi_active.criticism.identification import IdentifiedBelief, identify
+from sbi_active.expected import require, suggests
+from sbi_active.mujoco.effects.library import likely_effects
+from sbi_active.mujoco.robot import Robot
 from sbi_active.seeding import forked_generators
 
 NUM_DRAWS = 10_000
+
+
+@suggests
+def identify_robot(
+    robot: Robot,
+    *,
+    trials: Trials | None = None,
+    beside: Sequence[Effect] | None = None,
+    seed: int = 0,
+) -> IdentifiedBelief:
+    """Return the belief of recordings over a robot's parameters, with intervals.
+
+    It is :func:`sbi_active.criticism.identification.identify` with what the MJCF may
+    lack beside the parameters.
+
+    Args:
+        robot: Robot of :func:`.from_mjcf` or :func:`.from_sysid`.
+        trials: Trials in place of the robot's recordings.
+        beside: Effects that may be there; None takes friction loss, quadratic damping
+            and stiffness of each joint, and a lag of each drive.
+        seed: Seed of all draws.
+
+    Raises:
+        ValueError: If there are no recordings.
+    """
+    trials = robot.trials if trials is None else trials
+    advice = "pass trials=, or from_mjcf(recordings=...)"
+    require(trials is not None, "a robot with recordings", "none", advice)
+    assert trials is not None
+    beside = likely_effects(robot, trials) if beside is None else beside
+    return identify(robot.simulator, robot.prior, trials, beside=beside, seed=seed)
 
 
 def belief_to_parameters(
@@ -56,30 +92,25 @@ def belief_to_parameters(
     mean = draws.mean(0)
     low, high = np.quantile(draws, [0.5 - level / 2, 0.5 + level / 2], axis=0)
     if params is None:
-        found = ParameterDict()
-        for k, name in enumerate(_names(belief, names, draws.shape[1])):
-            found.add(Parameter(name, mean[k], low[k], high[k]))
-    else:
-        if params.size != draws.shape[1]:
-            raise ValueError(
-                f"expected a belief over {params.size} free parameters; got "
-                f"{draws.shape[1]}; pass the parameters that it began with"
-            )
-        found, at = params.copy(), 0
-        for name in found.keys():  # noqa: SIM118
-            own = found[name]
-            if own.frozen:
-                continue
-            here = slice(at, at + own.size)
-            at += own.size
-            own.value, own.min_value, own.max_value = (
-                part[here].reshape(own.shape) for part in (mean, low, high)
-            )
-            own.nominal = own.value.copy()
+        each = zip(_names(belief, names, len(mean)), mean, low, high, strict=True)
+        params = ParameterDict({n: Parameter(n, *numbers) for n, *numbers in each})
+    advice = "pass the parameters that it began with"
+    expected = f"a belief over {params.size} free parameters"
+    require(params.size == len(mean), expected, len(mean), advice)
+    found, at = params.copy(), 0
+    for own in found.values():
+        if own.frozen:
+            continue
+        here = slice(at, at + own.size)
+        at += own.size
+        own.value, own.min_value, own.max_value = (
+            part[here].reshape(own.shape) for part in (mean, low, high)
+        )
+        own.nominal = own.value.copy()
     if path is not None:
         import yaml
 
-        states = {name: found[name].__getstate__() for name in found.keys()}  # noqa: SIM118
+        states = {name: own.__getstate__() for name, own in found.items()}
         Path(path).write_text(yaml.safe_dump(states, sort_keys=False))
     return found
 
@@ -149,8 +180,7 @@ def _draws(belief: Any, seed: int) -> Array:
 def _names(belief: Any, names: Sequence[str] | None, num: int) -> tuple[str, ...]:
     for own in ("parameter_names", "names"):
         names = getattr(belief, own, None) if names is None else names
-    if names is None or len(names) != num:
-        raise ValueError(
-            f"expected {num} names of parameters; got {names}; pass names="
-        )
-    return tuple(str(name) for name in names)
+    names = names or ()
+    got = [*names] or None
+    require(len(names) == num, f"{num} names of parameters", got, "pass names=")
+    return tuple(map(str, names))

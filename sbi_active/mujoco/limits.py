@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from sbi_active.arrays import Array
+from sbi_active.expected import require
 from sbi_active.mujoco.models.machine import Machine
 from sbi_active.mujoco.models.names import names_of, require_name, scalar_joints
 from sbi_active.mujoco.robot import Robot
@@ -71,7 +72,7 @@ class MotionLimits:
         *,
         position: Mapping[str, tuple[float, float]] | None = None,
         velocity: Mapping[str, float] | None = None,
-        torque: Mapping[str, float] | None = None,
+        torque: Mapping[str, Any] | None = None,
         belief: Distribution | None = None,
         num_draws: int = 8,
         seed: int = 0,
@@ -85,35 +86,34 @@ class MotionLimits:
         model = function.model
         if position is None:
             position = _ranges(model, "joint", model.jnt_limited, model.jnt_range)
-        forces: Mapping[str, Any] | None = torque
-        if forces is None:
+        if torque is None:
             own = model.actuator_forcelimited, model.actuator_forcerange
-            forces = _ranges(model, "actuator", *own)
+            torque = _ranges(model, "actuator", *own)
         joints, actuators = scalar_joints(model), names_of(model, "actuator")
-        #: Sensor to add, label, lowest and highest value.
-        watched = [
-            *_watched(position, joints, "", "position"),
-            *_watched(velocity or {}, joints, " velocity", "velocity"),
-            *_watched(forces, actuators, " torque", "force"),
-        ]
+        watched = {
+            **_watched(position, joints, "", "position"),
+            **_watched(velocity or {}, joints, " velocity", "velocity"),
+            **_watched(torque, actuators, " torque", "force"),
+        }
         if not watched:
             raise ValueError(
                 "expected limits of positions, velocities or torques; got none, nor "
                 "has the MJCF; pass, say, position={'hinge': (-1.0, 1.0)}"
             )
-        self._labels = [label for _, label, _, _ in watched]
-        self._low = np.array([low for *_, low, _ in watched])
-        self._high = np.array([high for *_, high in watched])
-        self._run = _with_sensors(robot.simulator, [edit for edit, *_ in watched])
+        self._labels = [*watched]
+        self._low, self._high = np.array([ends for _, ends in watched.values()]).T
+        self._run = _with_sensors(
+            robot.simulator, [edit for edit, _ in watched.values()]
+        )
         self._times = _every_step(robot.simulator, model.opt.timestep)
         with forked_generators(seed):
-            drawn = (belief or robot.prior).sample((num_draws,))
-        self._theta = drawn.double()
+            self._theta = (belief or robot.prior).sample((num_draws,)).double()
 
     def __repr__(self) -> str:
         rows = zip(self._labels, self._low, self._high, strict=True)
-        limits = ", ".join(f"{n} in [{a:g}, {b:g}]" for n, a, b in rows)
-        return f"MotionLimits({limits})"
+        return (
+            f"MotionLimits({', '.join(f'{n} in [{a:g}, {b:g}]' for n, a, b in rows)})"
+        )
 
     def __call__(self, action: Tensor) -> Tensor:
         """Return a mask of actions (n, action_dim) within all limits, bool (n,)."""
@@ -166,26 +166,26 @@ def _ranges(
 
 
 def _watched(
-    limits: Mapping[str, Any], known: list[str], ending: str, what: Any
-) -> list[tuple[AddedSensor, str, float, float]]:
-    """Return the sensor, the label and the limits of each."""
-    found = []
+    limits: Mapping[str, Any], known: Iterable[str], ending: str, what: Any
+) -> dict[str, tuple[AddedSensor, tuple[float, float]]]:
+    """Return the sensor and the limits of each, by its label."""
+    found = {}
     for name, limit in limits.items():
         require_name(name, known, "actuator" if what == "force" else "joint")
         label = name + ending
-        low, high = limit if np.ndim(limit) else (-limit, limit)
-        if not low < high or math.isinf(low) and math.isinf(high):
-            raise ValueError(
-                f"expected limits of {label} that leave room; got {limit}; pass "
-                "(low, high), or one positive number for both sides"
-            )
+        low, high = map(float, limit if np.ndim(limit) else (-limit, limit))
+        require(
+            low < high and not (math.isinf(low) and math.isinf(high)),
+            f"limits of {label} that leave room",
+            limit,
+            "pass (low, high), or one positive number for both sides",
+        )
         # beside one that the MJCF may have
-        sensor = AddedSensor(f"limit of {label}", name, what)
-        found.append((sensor, label, float(low), float(high)))
+        found[label] = AddedSensor(f"limit of {label}", name, what), (low, high)
     return found
 
 
-def _with_sensors(simulator: SimulatorModel, edits: list[Any]) -> SimulatorModel:
+def _with_sensors(simulator: SimulatorModel, edits: Sequence[Any]) -> SimulatorModel:
     """Return a simulator that reads what is limited, and nothing else."""
     function: MujocoFunction = simulator.fn  # pyright: ignore[reportAssignmentType]
     machines = [
@@ -200,11 +200,9 @@ def _with_sensors(simulator: SimulatorModel, edits: list[Any]) -> SimulatorModel
 
 def _every_step(simulator: SimulatorModel, step: float) -> Array:
     """Return the times of all steps of a trial, s, shape (k,)."""
-    grids = [simulator.sample_times]
+    grids, first = [simulator.sample_times], 0.0
     if simulator.inputs is not None:
         grids.append(simulator.inputs.input_times)
-    known = torch.cat([grid.flatten() for grid in grids if grid is not None])
-    first = 0.0
-    if simulator.inputs is not None:
         first = float(simulator.inputs.input_times[0])
-    return first + step * np.arange(int((float(known.max()) - first) / step + 1.5))
+    last = max(float(grid.max()) for grid in grids if grid is not None)
+    return first + step * np.arange(int((last - first) / step + 1.5))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.data.units import TIME, split, to_si
 from sbi_active.expected import did_you_mean, require
 from sbi_active.messages import warn
-from sbi_active.mujoco.models.names import held_places, names_of, start_places
+from sbi_active.mujoco.models.names import names_of, places_of, scalar_joints
 from sbi_active.mujoco.simulator import Channel
 
 START = "start "
@@ -71,44 +72,40 @@ def trials_of(
         _cells(model, f"recording {k}", log, channels, inputs)
         for k, log in enumerate(logs)
     ]
-    times = [log.time for log in cells]
-    x = [
-        np.stack([log.numbers(column, empty=True) for column in log.columns["x"]], 1)
-        for log in cells
-    ]
-    series = {
-        name: [log.numbers(log.columns["input"][i]) for log in cells]
-        for i, name in enumerate(inputs)
-    }
+    times, x, series = [], [], {name: [] for name in inputs}
+    starts = {column.name: [] for column in cells[0].columns["start"]}
     step = float(model.opt.timestep)
-    for k, (log, time, values) in enumerate(zip(cells, times, x, strict=True)):
-        require_seconds(time, step, log.source)
-        _note_spacing(time, step, log.source)
-        for name, own in series.items():
-            require_in_range(model, name, own[k], log.source)
-        for channel, column in zip(channels, values.T, strict=True):
+    for log in cells:
+        require_seconds(log.time, step, log.source)
+        _note_spacing(log.time, step, log.source)
+        times.append(log.time)
+        values = [log.numbers(column, empty=True) for column in log.columns["x"]]
+        for channel, column in zip(channels, values, strict=True):
             _note_angles(model, channel, column, log.source)
-    if len(channels) == 1:
-        x = [part[:, 0] for part in x]
-    same = all(t.shape == times[0].shape and (t == times[0]).all() for t in times)
+        x.append(values[0] if len(channels) == 1 else np.stack(values, 1))
+        for name, column in zip(inputs, log.columns["input"], strict=True):
+            series[name].append(log.numbers(column))
+            require_in_range(model, name, series[name][-1], log.source)
+        own = [column.name for column in log.columns["start"]]
+        got = f"{', '.join(own) or 'none'} in {log.source} beside "
+        got += f"{', '.join(starts) or 'none'} in {cells[0].source}"
+        expected = "the same start states in each recording"
+        require(own == [*starts], expected, got, "add them to each")
+        for column in log.columns["start"]:
+            first = float(log.numbers(column, empty=True)[0])
+            expected = f"{column.name} in the first row of {log.source}"
+            require(np.isfinite(first), expected, "an empty cell", "fill it in")
+            starts[column.name].append(first)
+    same = all(np.array_equal(time, times[0]) for time in times)
     return Trials(
         None,
         x,
         sample_times=times[0] if same else times,
         inputs=series or None,
         input_times=times if inputs else None,
-        start={
-            column.name.removeprefix(START): [_first(log, i) for log in cells]
-            for i, column in enumerate(cells[0].columns["start"])
-        }
-        or None,
-        channel_labels=[f"{c.name} [{c.unit}]" if c.unit else c.name for c in channels],
+        start={name.removeprefix(START): own for name, own in starts.items()} or None,
+        channel_labels=[channel.label for channel in channels],
     )
-
-
-def _first(log: Cells, i: int) -> float:
-    """Return the start state in the first row of a log."""
-    return float(log.numbers(log.columns["start"][i], empty=True)[0])
 
 
 def require_in_range(model: Any, name: str, values: Array, what: str) -> None:
@@ -128,12 +125,12 @@ def require_in_range(model: Any, name: str, values: Array, what: str) -> None:
     low, high = (float(v) for v in model.actuator_ctrlrange[i])
     slack = SLACK * (high - low)
     lowest, highest = float(np.nanmin(values)), float(np.nanmax(values))
-    if lowest < low - slack or highest > high + slack:
-        raise ValueError(
-            f"expected controls of {name!r} within its ctrlrange, {low:g} to {high:g}; "
-            f"got {lowest:g} to {highest:g} in {what}; correct the unit, or the range "
-            "in the MJCF"
-        )
+    require(
+        low - slack <= lowest and highest <= high + slack,
+        f"controls of {name!r} within its ctrlrange, {low:g} to {high:g}",
+        f"{lowest:g} to {highest:g} in {what}",
+        "correct the unit, or the range in the MJCF",
+    )
 
 
 def _cells(
@@ -148,9 +145,11 @@ def _cells(
         what = f"{what} ({given})"
         given = read_csv(Path(given))
     frame = pd.DataFrame(given)
+    require(len(frame) > 0, f"samples in {what}", "no rows", "record some")
     frame.columns = [str(c).strip() for c in frame.columns]
+    units = {TIME: "s", **{channel.name: channel.unit for channel in channels}}
     names, own = [channel.name for channel in channels], [split(c)[0] for c in frame]
-    starts = [START + name for name in (*start_places(model), *held_places(model))]
+    starts = [START + name for name in places_of(model)]
     for name in own:
         require(
             not name.startswith(START) or name in starts,
@@ -159,18 +158,16 @@ def _cells(
             did_you_mean(name, starts, f"did you mean {starts[0]!r}?"),
         )
     # A column that an input shares with a sensor is the sensor's.
+    controls = {name: f"{name} control" for name in inputs}
+    is_other = {name: name in names or controls[name] in own for name in inputs}
     columns = {
         TIME: TIME,
         "x": names,
-        "input": [
-            control if name in names or control in own else name
-            for name, control in ((name, f"{name} control") for name in inputs)
-        ],
+        "input": [controls[name] if is_other[name] else name for name in inputs],
         "start": [name for name in starts if name in own],
     }
     found = find_columns([*frame.columns], columns=columns, source=what)
-    units = {TIME: "s", **{channel.name: channel.unit for channel in channels}}
-    for column in (column for group in found.values() for column in group):
+    for column in chain(*found.values()):
         name, told = split(column.header)
         expected = units.get(name, "")
         is_known = not told or (to_si(told) and expected in ("", column.unit))
@@ -191,13 +188,13 @@ def require_seconds(time: Array, step: float, what: str) -> None:
         step: Time step of the model, s.
         what: Name of the times in messages.
     """
-    increase = time.ndim == 1 and len(time) > 0 and (np.diff(time) > 0).all()
-    if not increase or not 0 <= time[0] <= MOST_STEPS * step:
-        raise ValueError(
-            f"expected times in {what} that increase from the start of the trial, s; "
-            f"got {np.array2string(time, threshold=6)}; subtract the time at which the "
-            "trial starts"
-        )
+    increase = time.ndim == 1 and len(time) > 0 and bool((np.diff(time) > 0).all())
+    require(
+        increase and 0 <= time[0] <= MOST_STEPS * step,
+        f"times in {what} that increase from the start of the trial, s",
+        np.array2string(time, threshold=6),
+        "subtract the time at which the trial starts",
+    )
 
 
 def _note_spacing(time: Array, step: float, what: str) -> None:
@@ -234,9 +231,8 @@ def _note_angles(model: Any, channel: Channel, x: Array, what: str) -> None:
                 "numpy.unwrap of it",
                 stacklevel=stack_level(),
             )
-    names = names_of(model, "joint")
-    if channel.name in names:
-        joint = names.index(channel.name)
+    joint = scalar_joints(model).get(channel.name)
+    if joint is not None:
         limit = float(np.abs(model.jnt_range[joint]).max())
         if model.jnt_limited[joint] and np.abs(seen).max() > DEGREES * limit:
             warn(

@@ -11,6 +11,7 @@ from torch import Tensor
 from sbi_active.actions import DiscreteActions
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
+from sbi_active.expected import require
 from sbi_active.mujoco.models.parameters import Bounded
 from sbi_active.mujoco.robot import Robot, named_box
 from sbi_active.simulation import SimulatorModel
@@ -23,10 +24,8 @@ def free_parameters(params: Any) -> tuple[Bounded, ...]:
         ValueError: If there is none, or bounds are not finite and in order.
     """
     names = params.get_non_frozen_parameter_names()
-    if not names:
-        raise ValueError(
-            "expected a parameter that is not frozen; got none; free the unknown ones"
-        )
+    advice = "free the unknown ones"
+    require(bool(names), "a parameter that is not frozen", "none", advice)
     each = zip(names, *params.get_bounds(), strict=True)
     return tuple(Bounded(name, float(low), float(high)) for name, low, high in each)
 
@@ -44,34 +43,33 @@ def from_residuals(residual_fn: Any, params: Any, *, noise: Any) -> Robot:
     Raises:
         ValueError: If there is no noise.
     """
-    if noise is None:
-        raise ValueError(
-            "expected the noise of residuals; got none; pass noise=, in their units"
-        )
+    advice = "pass noise=, in their units"
+    require(noise is not None, "the noise of residuals", "none", advice)
     declared = free_parameters(params)
-    function = _Residuals(residual_fn, params.copy())
-    middle = np.array([0.5 * (p.low + p.high) for p in declared])
-    lengths = [len(r) for r in function.each(middle)]
-    function.length = max(lengths)
-    number = torch.arange(len(lengths), dtype=torch.float32)[:, None]
-    x = [np.zeros(k) for k in lengths]
-    simulator = SimulatorModel(
-        function, noise=noise, parameter_names=[p.name for p in declared]
-    )
+    function = _Residuals(residual_fn, params)
+    names = [p.name for p in declared]
+    simulator = SimulatorModel(function, noise=noise, parameter_names=names)
+    number = torch.arange(len(function.lengths), dtype=torch.float32)[:, None]
     actions = DiscreteActions(number, names=["recording"])
+    x = [np.zeros(length) for length in function.lengths]
     trials = Trials(number, x, action_labels=["recording"])
     return Robot(simulator, named_box(declared), actions, trials)
 
 
 class _Residuals:
-    """Minus the residuals of one sequence a row."""
+    """Minus the residuals of one sequence a row.
 
-    length = 0
+    Args:
+        residual_fn: ``residual_fn(x, params)``.
+        params: A ``ParameterDict``.
+    """
 
     def __init__(self, residual_fn: Any, params: Any) -> None:
-        self.residual_fn, self.params = residual_fn, params
+        self.residual_fn, self.params = residual_fn, params.copy()
+        middle = np.mean(params.get_bounds(), axis=0)
+        self.lengths = [len(each) for each in self.of(middle)]
 
-    def each(self, theta: Array) -> list[Array]:
+    def of(self, theta: Array) -> list[Array]:
         """Return the residuals of all sequences, one array each."""
         found, *_ = self.residual_fn(theta, self.params)
         return [np.asarray(r, dtype=float).reshape(-1) for r in found]
@@ -83,14 +81,12 @@ class _Residuals:
             theta: Parameters, shape (n, d).
             action: Numbers of sequences, shape (n, 1).
         """
-        rows = theta.detach().cpu().double().numpy()
+        rows, place = np.unique(
+            theta.detach().cpu().double(), axis=0, return_inverse=True
+        )
+        known = [self.of(row) for row in rows]
         number = action[:, 0].round().long().tolist()
-        x = np.full((len(rows), self.length), np.nan)
-        known: dict[bytes, list[Array]] = {}
-        for i, row in enumerate(rows):
-            key = row.tobytes()
-            if key not in known:
-                known[key] = self.each(row.copy())
-            own = known[key][number[i]]
-            x[i, : len(own)] = -own
+        x = np.full((len(theta), max(self.lengths)), np.nan)
+        for i, (k, which) in enumerate(zip(place.reshape(-1), number, strict=True)):
+            x[i, : self.lengths[which]] = -known[k][which]
         return torch.from_numpy(x).to(theta.dtype)

@@ -17,15 +17,15 @@ from sbi_active.expected import require, suggests
 from sbi_active.mujoco.models.machine import Machine
 from sbi_active.mujoco.models.names import (
     element_id,
-    held_places,
     meaning,
     names_of,
+    places_of,
     require_name,
     scalar_joints,
-    start_places,
 )
 from sbi_active.mujoco.models.parameters import Bounded, bounded
-from sbi_active.mujoco.models.spec import Source
+from sbi_active.mujoco.models.running import initial
+from sbi_active.mujoco.models.spec import Source, mujoco
 from sbi_active.mujoco.recordings import require_in_range, require_seconds, trials_of
 from sbi_active.mujoco.sensors import added_sensors, channels_of
 from sbi_active.mujoco.simulator import MODEL, MujocoFunction
@@ -134,14 +134,15 @@ def from_mjcf(
         torch.Size([1, 2])
     """
     every = spec_or_path if isinstance(spec_or_path, list | tuple) else [spec_or_path]
-    sources = [_read(given, sensors) for given in every]
+    sources = [added_sensors(Source(given), sensors) for given in every]
     declared = bounded(sources[0].compile(), parameters)
     machines = [Machine(source, declared) for source in sources]
     require_usable(machines)
     machine = machines[0]
     channels = channels_of(machine.model, sensors)
     space, driven = _inputs(machine.model, inputs)
-    actions, roles = _actions(machine.model, actions, space)
+    played = driven if space is not None else []
+    actions, roles = _actions(machine.model, actions, space, played)
     trials = None
     if recordings is not None:
         trials = trials_of(machine.model, recordings, channels, inputs=driven)
@@ -186,9 +187,7 @@ def robot_of(
         function,
         noise=noise,
         parameter_names=[p.name for p in parameters],
-        channel_names=[
-            f"{c.name} [{c.unit}]" if c.unit else c.name for c in function.channels
-        ],
+        channel_names=[channel.label for channel in function.channels],
         sample_times=None if times is None else torch.from_numpy(times),
         inputs=inputs,
     )
@@ -197,21 +196,16 @@ def robot_of(
     return Robot(simulator, prior, actions, trials)
 
 
-def _read(given: Any, sensors: Sequence[str] | None) -> Source:
-    source = Source(given)
-    return added_sensors(source, source.compile(), sensors)
-
-
 def require_usable(machines: Sequence[Machine]) -> None:
     """Raise if models differ in what trials say of them by name, or lack inertia."""
     for kind in ("joint", "actuator", "sensor"):
-        names = [names_of(machine.model, kind) for machine in machines]
-        for k, own in enumerate(names):
-            if own != names[0]:
-                raise ValueError(
-                    f"expected models with the same {kind}s; got {', '.join(own)} in "
-                    f"model {k} beside {', '.join(names[0])}; name them alike"
-                )
+        first = names_of(machines[0].model, kind)
+        for k, machine in enumerate(machines):
+            own = names_of(machine.model, kind)
+            got = f"{', '.join(own)} in model {k} beside {', '.join(first)}"
+            require(
+                own == first, f"models with the same {kind}s", got, "name them alike"
+            )
     for machine in machines:
         machine.require_inertia()
 
@@ -220,9 +214,8 @@ def from_spec(spec_or_path: Any) -> SimulatorModel:
     """Return the simulator of a model without parameters, by all its joints."""
     source = Source(spec_or_path)
     model = source.compile()
-    sensors = names_of(model, "sensor") or scalar_joints(model)
-    source = added_sensors(source, model, sensors)
-    machine = Machine(source, ())
+    sensors = names_of(model, "sensor") or [*scalar_joints(model)]
+    machine = Machine(added_sensors(source, sensors), ())
     channels = channels_of(machine.model, sensors)
     return SimulatorModel(MujocoFunction([machine], channels))
 
@@ -243,28 +236,28 @@ def _inputs(model: Any, inputs: Any) -> tuple[SignalActions | None, list[str]]:
 
 
 def _actions(
-    model: Any, actions: ActionSpace | None, space: SignalActions | None
+    model: Any,
+    actions: ActionSpace | None,
+    space: SignalActions | None,
+    played: Sequence[str],
 ) -> tuple[ActionSpace | None, tuple[str, ...]]:
     """Return the actions, and what each entry sets in the model; "" for a signal's."""
     if actions is None:
         return space, ()
-    played = [] if space is None else [*space.inputs(space.sample((1,), seed=0))]
-    controls = [n for n in names_of(model, "actuator") if n not in played]
-    places = [*start_places(model), *held_places(model)]
-    known = [*places, *controls, *(f"{n} position" for n in names_of(model, "joint"))]
+    controls = {f"{name} control": name for name in names_of(model, "actuator")}
+    joints = (f"{n} position" for n in names_of(model, "joint"))
+    free = [name for name in controls.values() if name not in played]
+    known = [*places_of(model), *free, *joints, MODEL]
     for k, name in enumerate(actions.names):
-        require_name(
-            *(name, [*known, MODEL]),
-            "joint, a joint with ' velocity', or an actuator",
+        require_name(name, known, "joint, a joint with ' velocity', or an actuator")
+        control = controls.get(meaning(name, model))
+        require(
+            control not in played,
+            f"{name!r} to be set once",
+            "an action and a signal of this actuator",
+            f"call the start of a joint '{name} position'",
         )
-        sets = meaning(name, model)
-        control = sets.removesuffix(" control") if sets.endswith(" control") else ""
-        if control in played:
-            raise ValueError(
-                f"expected {name!r} to be set once; got an action and a signal of this "
-                f"actuator; call the start of a joint '{name} position'"
-            )
-        if control in controls:
+        if control is not None:
             drawn = actions.sample((64,), seed=0)[:, k]
             require_in_range(model, control, drawn.numpy(), "an action")
     if space is None:
@@ -277,17 +270,13 @@ def _start(
 ) -> dict[str, float] | None:
     if start is None:
         return None
+    places = places_of(model)
     if isinstance(start, str):
-        i = element_id(model, "key", start)
-        state = [*model.key_qpos[i], *model.key_qvel[i], *model.key_act[i]]
-        held = [*model.key_ctrl[i], *model.key_mpos[i], *model.key_mquat[i]]
-        return {
-            **{name: float(state[at]) for name, at in start_places(model).items()},
-            **{name: float(held[at]) for name, at in held_places(model).items()},
-        }
-    known = [*start_places(model), *held_places(model)]
+        key = element_id(model, "key", start)
+        state = initial(model, mujoco.MjData(model), key)
+        return {name: float(state[place]) for name, place in places.items()}
     for name in start:
-        require_name(name, known, "joint, or one with ' velocity',")
+        require_name(name, places, "joint, or one with ' velocity',")
     return {name: float(value) for name, value in start.items()}
 
 
@@ -302,8 +291,8 @@ def _noise(model: Any, channels: Sequence[Any], noise: Any) -> Any:
         return sds[0] if len(sds) == 1 else torch.tensor(sds)
     if noise is not None:
         return noise
-    owner = np.repeat(np.arange(model.nsensor), model.sensor_dim)
-    sds = [float(model.sensor_noise[owner[c.place]]) for c in channels]
+    each = np.repeat(model.sensor_noise, model.sensor_dim)
+    sds = [float(each[channel.place]) for channel in channels]
     if min(sds) <= 0:
         return None
     return sds[0] if len(sds) == 1 else torch.tensor(sds)

@@ -4,14 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from sbi_active.mujoco.models.names import names_of, require_name, scalar_joints
 from sbi_active.mujoco.models.quantities import units_of
-from sbi_active.mujoco.models.spec import Source, mujoco_of
+from sbi_active.mujoco.models.spec import Source, mujoco
 from sbi_active.mujoco.simulator import Channel
 
 VELOCITY = " velocity"
+#: MuJoCo's sensor of each quantity, and what it is attached to.
+READ = {
+    "position": ("JOINTPOS", "JOINT"),
+    "velocity": ("JOINTVEL", "JOINT"),
+    "force": ("ACTUATORFRC", "ACTUATOR"),
+}
+#: Units of MuJoCo's sensors; L in braces is that of the joint.
+UNITS = {
+    "JOINTPOS": "{L}",
+    "JOINTVEL": "{L}/s",
+    "ACCELEROMETER": "m/s^2",
+    "GYRO": "rad/s",
+    "FRAMEPOS": "m",
+    "FORCE": "N",
+    "TORQUE": "N m",
+    "TOUCH": "N",
+    "VELOCIMETER": "m/s",
+}
 
 
 @dataclass(frozen=True)
@@ -26,32 +44,31 @@ class AddedSensor:
 
     name: str
     owner: str
-    what: Literal["position", "velocity", "force"]
+    what: str
 
     def __call__(self, spec: Any) -> None:
         """Add it to a spec."""
-        kinds, objects = mujoco_of().mjtSensor, mujoco_of().mjtObj
-        kind, owner = {
-            "position": (kinds.mjSENS_JOINTPOS, objects.mjOBJ_JOINT),
-            "velocity": (kinds.mjSENS_JOINTVEL, objects.mjOBJ_JOINT),
-            "force": (kinds.mjSENS_ACTUATORFRC, objects.mjOBJ_ACTUATOR),
-        }[self.what]
-        spec.add_sensor(name=self.name, type=kind, objtype=owner, objname=self.owner)
+        kind, owner = READ[self.what]
+        spec.add_sensor(
+            name=self.name,
+            type=getattr(mujoco.mjtSensor, f"mjSENS_{kind}"),
+            objtype=getattr(mujoco.mjtObj, f"mjOBJ_{owner}"),
+            objname=self.owner,
+        )
 
 
-def added_sensors(source: Source, model: Any, sensors: Sequence[str] | None) -> Source:
+def added_sensors(source: Source, sensors: Sequence[str] | None) -> Source:
     """Return a source with sensors of those joints that are named in their place.
 
     Args:
         source: Source of the model.
-        model: Compiled model.
         sensors: Names; None for those that the model has.
 
     Raises:
         ValueError: If there is neither a sensor nor a joint of a name, or none at all.
     """
-    own = names_of(model, "sensor")
-    joints = scalar_joints(model)
+    model = source.compile()
+    own, joints = names_of(model, "sensor"), scalar_joints(model)
     if sensors is None and own:
         return source
     if not sensors or isinstance(sensors, str):
@@ -88,19 +105,9 @@ def channels_of(model: Any, sensors: Sequence[str] | None) -> tuple[Channel, ...
 
 
 def _unit(model: Any, i: int) -> str:
-    kinds = mujoco_of().mjtSensor
-    kind, position = int(model.sensor_type[i]), int(kinds.mjSENS_JOINTPOS)
-    if kind in (position, int(kinds.mjSENS_JOINTVEL)):
-        joint = names_of(model, "joint")[int(model.sensor_objid[i])]
-        unit = units_of(model, joint)["L"]
-        return unit if kind == position else f"{unit}/s"
-    fixed = {
-        kinds.mjSENS_ACCELEROMETER: "m/s^2",
-        kinds.mjSENS_GYRO: "rad/s",
-        kinds.mjSENS_FRAMEPOS: "m",
-        kinds.mjSENS_FORCE: "N",
-        kinds.mjSENS_TORQUE: "N m",
-        kinds.mjSENS_TOUCH: "N",
-        kinds.mjSENS_VELOCIMETER: "m/s",
-    }
-    return {int(key): unit for key, unit in fixed.items()}.get(kind, "")
+    kind = mujoco.mjtSensor(int(model.sensor_type[i])).name
+    unit = UNITS.get(kind.removeprefix("mjSENS_"), "")
+    if "{" not in unit:
+        return unit
+    joint = names_of(model, "joint")[int(model.sensor_objid[i])]
+    return unit.format(**units_of(model, joint))

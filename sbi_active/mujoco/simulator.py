@@ -12,24 +12,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sbi_active.arrays import Array
+from sbi_active.expected import require
 from sbi_active.mujoco.models.changes import require_changes
-from sbi_active.mujoco.models.machine import Machine, Model, Rows
-from sbi_active.mujoco.models.names import (
-    held_places,
-    meaning,
-    names_of,
-    require_name,
-    start_places,
-)
-from sbi_active.mujoco.models.running import held_states, readings
-from sbi_active.mujoco.models.spec import mujoco_of
-
-Watch = Callable[[Model, list[Any], Rows], Any]
+from sbi_active.mujoco.models.machine import Machine, Rows
+from sbi_active.mujoco.models.names import meaning, names_of, places_of, require_name
+from sbi_active.mujoco.models.running import Run, num_steps, sampled
+from sbi_active.mujoco.models.spec import mujoco, quiet
 
 #: Numbers of readings, controls and states in memory at once.
 NUMBERS = 4_000_000
-#: Rows that are stepped together, each with data of its own.
-TOGETHER = 64
 #: Rows of one length from which they run apart from longer ones, on average: of
 #: MuJoCo's rollout, and of those that are stepped together, where few cost as many.
 FEWEST = (1, 16)
@@ -53,6 +44,11 @@ class Channel:
     place: int
     unit: str = ""
 
+    @property
+    def label(self) -> str:
+        """Name and unit, as in "hinge [rad]"."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
 
 class MujocoFunction:
     r"""The function ``fn(theta, action, ...)`` of a simulator that runs MuJoCo.
@@ -75,8 +71,8 @@ class MujocoFunction:
         readout: Readout between the model's sensors and what is returned, with
             ``readout.late(theta)``, by how much each channel reads what was there
             before, s, and ``readout.read(x, theta)``, shapes (n, c) and (n, k, c).
-        recorded: Model and start states of each recording, where the entry "recording"
-            of an action is its number.
+        recorded: Model and start states by name, one a recording, where the entry
+            "recording" of an action is its number.
 
     Attributes:
         machines: Models of one set of parameters.
@@ -93,16 +89,15 @@ class MujocoFunction:
         start: Mapping[str, float] | None = None,
         threads: int = 1,
         readout: Any = None,
-        recorded: Sequence[tuple[int, Mapping[str, float]]] = (),
+        recorded: Mapping[str, Array] | None = None,
     ) -> None:
-        self.readout, self.recorded = readout, tuple(recorded)
+        self.readout, self.recorded = readout, dict(recorded or {})
         self.machines, self.channels = tuple(machines), tuple(channels)
         self.roles, self.threads = tuple(roles), threads
         self.times, self.start = times, dict(start or {})
-        if not isinstance(threads, int) or threads < 1:
-            raise ValueError(
-                f"expected at least one thread; got threads={threads!r}; pass 1 or more"
-            )
+        is_number = isinstance(threads, int) and threads >= 1
+        got = f"threads={threads!r}"
+        require(is_number, "at least one thread", got, "pass 1 or more")
 
     @property
     def model(self) -> Any:
@@ -113,11 +108,8 @@ class MujocoFunction:
     def joints(self) -> tuple[list[str], list[str]]:
         """Names of the joints, and of those that slide; ``force_effects`` asks."""
         names = names_of(self.model, "joint")
-        slide = int(mujoco_of().mjtJoint.mjJNT_SLIDE)
-        slides = [
-            n for n, k in zip(names, self.model.jnt_type, strict=True) if k == slide
-        ]
-        return names, slides
+        slides = np.flatnonzero(self.model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE)
+        return names, [names[i] for i in slides]
 
     def __call__(
         self,
@@ -130,7 +122,7 @@ class MujocoFunction:
         start: Any = None,
         model: Any = None,
         force: Any = None,
-        watch: Watch | None = None,
+        watch: Callable[[Run], Any] | None = None,
     ) -> Tensor:
         """Return the sensors' readings.
 
@@ -151,88 +143,56 @@ class MujocoFunction:
             diverged.
         """
         num = len(theta)
-        actions = action.detach().cpu().double().numpy()
-        wanted = self._times(times, num)
-        series = {k: _array(u) for k, u in (inputs or {}).items()}
-        grid = None if input_times is None else _array(input_times)
-        starts = self._starts(start, actions, num)
+        starts = self._starts(start, _array(action), num)
         which = np.rint(starts.pop(MODEL, np.zeros(num))).astype(int)
-        if num and (which.min() < 0 or which.max() >= len(self.machines)):
-            raise ValueError(
-                f"expected models 0 to {len(self.machines) - 1}; got {which.min()} to "
-                f"{which.max()}; correct the action"
-            )
-        found = np.empty((num, wanted.shape[1], len(self.channels)))
-        changes = require_changes("model", model)
-        forces = require_changes("force", force)
-        begin = 0.0 if grid is None else float(grid[0])
-        rows = Rows(_array(theta), changes, forces, starts, np.empty((num, 0)))
-        for k, own in _alike(which, wanted - begin, FEWEST[rows.is_stepped]):
-            played = {name: u[own] for name, u in series.items()}
-            about = rows.at(own), played, grid, wanted[own], watch
-            found[own] = self._run(self.machines[k], *about)
-        x = torch.from_numpy(found[..., 0] if len(self.channels) == 1 else found)
-        return x.to(theta.dtype)
+        last = len(self.machines) - 1
+        if num:
+            got = f"{which.min()} to {which.max()}"
+            is_known = bool((which >= 0).all() and (which <= last).all())
+            require(is_known, f"models 0 to {last}", got, "correct the action")
+        rows = Rows(
+            _array(theta),
+            require_changes("model", model),
+            require_changes("force", force),
+            starts,
+            {name: _array(series) for name, series in (inputs or {}).items()},
+            self._times(times, num),
+        )
+        grid = None if input_times is None else _array(input_times)
+        x = np.zeros((*rows.times.shape, len(self.channels)))
+        with quiet():
+            for k, own in _alike(which, rows.times, FEWEST[rows.is_stepped]):
+                self._run(self.machines[k], rows.at(own), grid, watch, x, own)
+        found = torch.from_numpy(x[..., 0] if len(self.channels) == 1 else x)
+        return found.to(theta.dtype)
 
     def _run(
         self,
         machine: Machine,
         rows: Rows,
-        series: dict[str, Array],
         grid: Array | None,
-        times: Array,
-        watch: Watch | None,
-    ) -> Array:
+        watch: Callable[[Run], Any] | None,
+        x: Array,
+        own: NDArray[np.intp],
+    ) -> None:
+        """Add the readings of rows to x, at places of their own."""
         base = machine.model
-        step = base.opt.timestep
-        begin = 0.0 if grid is None else float(grid[0])
-        num = num_steps(times, begin, step)
+        step, start = base.opt.timestep, 0.0 if grid is None else float(grid[0])
+        steps = num_steps(rows.times, start, step)
         width = base.nu + 7 * base.nmocap + base.nsensordata + base.nq + base.nv + 1
-        size = max(1, NUMBERS // (num * width))
-        if rows.is_stepped:
-            size = min(size, TOGETHER)
-        numbers = np.arange(len(rows), dtype=float)[:, None]
-        places = [c.place for c in self.channels]
-        # Controls of all rows may be large: they are made for those that run.
-        rows.controls = numbers
-
-        def run(model: Model, models: list[Any], some: Rows) -> Array:
-            at = some.controls[:, 0].astype(int)
-            default = held_states(model)
-            some.controls = self._controls(
-                base, default, some.start, series, grid, at, num, step
-            )
+        size = max(1, NUMBERS // (steps * width))
+        channels = [c.place for c in self.channels]
+        for model, models, places, share in machine.batches(rows, size):
+            some = rows.at(places)
+            run = Run.of(model, models, some, grid, steps)
             if watch is not None:
-                watch(model, models, some)
-            x = readings(model, models, some, threads=self.threads)
+                watch(run)
             late = None if self.readout is None else self.readout.late(some.theta)
-            x = sampled(x[..., places], times[at], begin, step, late)
-            return x if self.readout is None else self.readout.read(x, some.theta)
-
-        return machine.models(rows, run, size)
-
-    def _controls(
-        self,
-        model: Any,
-        default: Array,
-        start: dict[str, Array],
-        series: dict[str, Array],
-        grid: Array | None,
-        at: Array,
-        num: int,
-        step: float,
-    ) -> Array:
-        """Return controls and poses of mocap bodies, (n, num, nu + 7 nmocap)."""
-        controls = np.tile(default, (len(at), num, 1))
-        for name, place in held_places(model).items():
-            if name in start:
-                controls[:, :, place] = start[name][:, None]
-        names = names_of(model, "actuator")
-        for name, u in series.items():
-            require_name(name, names, "actuator")
-            assert grid is not None
-            controls[:, :, names.index(name)] = held(u[at], grid, num, step)
-        return controls
+            read = run.readings(threads=self.threads)[..., channels]
+            read = sampled(read, some.times, start, step, late)
+            if self.readout is not None:
+                read = self.readout.read(read, some.theta)
+            x[own[places]] += share[:, None, None] * read
 
     def _times(self, times: Tensor | None, num: int) -> Array:
         if times is not None:
@@ -245,24 +205,20 @@ class MujocoFunction:
         return np.broadcast_to(self.times, (num, len(self.times)))
 
     def _starts(self, start: Any, actions: Array, num: int) -> dict[str, Array]:
-        known = {*start_places(self.model), *held_places(self.model), MODEL}
+        known = [*places_of(self.model), MODEL]
         found = {name: np.full(num, value) for name, value in self.start.items()}
         if RECORDING in self.roles and start is None:
             number = np.rint(actions[:, self.roles.index(RECORDING)]).astype(int)
-            each = [{MODEL: k, **values} for k, values in self.recorded]
-            for name in each[0]:
-                found[name] = np.array([own[name] for own in each])[number]
+            found |= {name: value[number] for name, value in self.recorded.items()}
         for role, value in zip(self.roles, actions.T, strict=False):
             name = meaning(role, self.model)
             if name in known:
                 found[name] = value
         if start is None:
             return found
-        if not isinstance(start, Mapping):
-            raise ValueError(
-                "expected start states by the names of joints; got an array; pass "
-                "Trials(start={'hinge': angles})"
-            )
+        expected = "start states by the names of joints"
+        advice = "pass Trials(start={'hinge': angles})"
+        require(isinstance(start, Mapping), expected, "an array", advice)
         for name, value in start.items():
             require_name(name, known, "joint, or one with ' velocity',")
             found[name] = _array(value)
@@ -276,86 +232,18 @@ def _alike(
 
     Args:
         which: Model of each row, (n,).
-        times: Times of its readings since the start, (n, k).
+        times: Times of its readings, (n, k).
         fewest: Rows of one length, on average, from which lengths run apart.
     """
-    last = np.nanmax(times, 1, initial=0.0)
+    last = times.max(1, initial=0.0)
     for k in np.unique(which):
         mine = np.flatnonzero(which == k)
         lasting = np.unique(last[mine])
         # Recordings differ in length; where every row does, parts would be too small.
-        if len(lasting) * fewest > len(mine):
-            yield int(k), mine
-            continue
-        for length in lasting:
-            yield int(k), mine[last[mine] == length]
+        is_few = len(lasting) * fewest > len(mine)
+        for length in [None] if is_few else lasting:
+            yield int(k), mine if length is None else mine[last[mine] == length]
 
 
 def _array(value: Tensor) -> Array:
     return value.detach().cpu().double().numpy()
-
-
-#: Share of a step by which a time may be off and count as that of a step.
-ON_TIME = 1e-3
-
-
-def num_steps(times: Array, start: float, step: float) -> int:
-    """Return the number of readings, one a step from the start, up to the last time."""
-    last = float(np.nanmax(times)) - start
-    return max(int(np.ceil(last / step - ON_TIME)), 0) + 1
-
-
-def held(series: Array, own: Array, num: int, step: float) -> Array:
-    """Return a series (n, m), held between the points of its grid, at every step.
-
-    Args:
-        series: Series, shape (n, m).
-        own: Grid of the series, shape (m,).
-        num: Number of steps from the grid's first point.
-        step: Time step of the simulation.
-    """
-    times = own[0] + step * np.arange(num)
-    slack = ON_TIME * min(step, own[1] - own[0])
-    place = np.searchsorted(own, times + slack, side="right") - 1
-    return series[:, np.clip(place, 0, len(own) - 1)]
-
-
-def sampled(
-    readings: Array,
-    times: Array,
-    start: float,
-    step: float,
-    late: Array | None = None,
-) -> Array:
-    """Return readings at times, a line between those of two steps.
-
-    Args:
-        readings: Readings, shape (n, steps, c), from the start on.
-        times: Times, shape (n, k).
-        start: Time of the first reading.
-        step: Time between readings.
-        late: Delay of each channel, (n, c); None is 0.
-
-    Returns:
-        Shape (n, k, c).
-    """
-    if late is not None:
-        each = [
-            sampled(readings[..., [c]], times - late[:, [c]], start, step)
-            for c in range(readings.shape[2])
-        ]
-        return np.concatenate(each, 2)
-    last = readings.shape[1] - 1
-    place = np.clip((times - start) / step, 0, last)
-    nearest = np.round(place)
-    place = np.where(np.abs(place - nearest) < ON_TIME, nearest, place)
-    low = np.floor(place).astype(int)
-    weight = (place - low)[..., None]
-    high = np.minimum(low + 1, last)
-    row = np.arange(len(readings))[:, None]
-    found = readings[row, low]
-    between = weight[..., 0] > 0
-    if between.any():
-        line = (1 - weight) * found + weight * readings[row, high]
-        found = np.where(between[..., None], line, found)
-    return found

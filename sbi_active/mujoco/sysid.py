@@ -11,7 +11,6 @@ outcomes are in the units in which they were measured.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -38,9 +37,8 @@ from sbi_active.simulation.noise.base import NoiseModel
 #: Unknown errors, from this share of a signal's deviation up to all of it, lasting from
 #: this share of a sample's distance up to this share of a trial.
 SHARE, SHORT, LONG = 1e-4, 0.1, 0.5
-#: Endings of signals that are states, by kind.
-STATES = {"MjStateQPos": "_qpos", "MjStateQVel": "_qvel"}
-SPEED = "MjStateQVel"
+#: Endings of signals that are states, and what they read, by kind.
+STATES = {"MjStateQPos": ("_qpos", "position"), "MjStateQVel": ("_qvel", "velocity")}
 
 
 @suggests
@@ -81,76 +79,61 @@ def from_sysid(
     if callable(model_sequences):
         return from_residuals(model_sequences, params, noise=noise)
     groups = _groups(model_sequences)
-    edit = _Edit.of(params)
-    declared = free_parameters(params)
-    signals = _signals(groups)
+    edit, declared, signals = _Edit(params), free_parameters(params), _signals(groups)
     machines, channels = [], ()
     for group in groups:
         source, channels = _readable(Source(group.spec), signals)
         machines.append(Machine(source, declared, edit=edit))
     require_usable(machines)
-    step = float(machines[0].model.opt.timestep)
     read = [s for s in signals for _ in range(s.width)]
     enabled = None if transform is None else transform._enabled_sensors
     kept = [k for k, s in enumerate(read) if enabled is None or s.name in enabled]
     channels, read = [channels[k] for k in kept], [read[k] for k in kept]
+    step = float(machines[0].model.opt.timestep)
     stamp = step * np.array([s.kind == "MjSensor" for s in read])
     readout = SignalReadout.of(transform, params, [s.name for s in read], stamp)
-    sequences = [
-        _Sequence.of(k, group, i, signals, step, readout, kept, machines[k].model)
-        for k, group in enumerate(groups)
-        for i in range(len(group.control))
-    ]
-    trials = _trials(sequences, channels)
+    trials = _trials(groups, machines, signals, kept, readout.window, channels)
     space = _recorded(trials) if actions is None else actions
-    times = trials.sample_times
-    grid = times.numpy() if times is not None and times.ndim == 1 else None
+    times, start = trials.sample_times, trials.start
+    assert times is not None
+    assert isinstance(start, dict)
     function = MujocoFunction(
         machines,
         channels,
         roles=(RECORDING,) if actions is None else tuple(actions.names),
-        times=grid,
+        times=times.numpy() if times.ndim == 1 else None,
         threads=threads,
         readout=readout,
-        recorded=[(s.model, s.start) for s in sequences],
+        recorded={name: value.numpy() for name, value in start.items()},
     )
     noise = _noise(trials) if noise is None else noise
     inputs = space if isinstance(space, SignalActions) else None
     return robot_of(function, noise, inputs, space, trials)
 
 
-@dataclass
 class _Edit:
     """Puts parameters into a spec by their modifiers.
 
     A ``Parameter`` that is pickled loses its modifier: what it has is kept apart.
+
+    Args:
+        params: A ``ParameterDict``.
     """
 
-    each: list[dict[str, Any]]
-
-    @classmethod
-    def of(cls, params: Any) -> _Edit:
-        """Return the edit of a ``ParameterDict``."""
-        return cls([dict(vars(params[name])) for name in params.keys()])  # noqa: SIM118
+    def __init__(self, params: Any) -> None:
+        self.free = [dict(vars(p)) for p in params.values() if not p.frozen]
 
     def __call__(self, spec: Any, theta: Array) -> None:
-        params = self.params()
-        params.update_from_vector(np.asarray(theta))
-        for name in params.keys():  # noqa: SIM118
-            if not params[name].frozen:
-                params[name].apply_modifier(spec)
+        from mujoco.sysid import Parameter  # pyright: ignore
 
-    def params(self) -> Any:
-        """Return a ``ParameterDict`` of its own."""
-        from mujoco.sysid import Parameter, ParameterDict  # pyright: ignore
-
-        found = ParameterDict()
-        for each in self.each:
+        first = 0
+        for each in self.free:
             parameter = Parameter.__new__(Parameter)
-            parameter.__dict__.update(each)
-            parameter.value = np.array(each["value"], dtype=float)
-            found.add(parameter)
-        return found
+            vars(parameter).update(each)
+            last = first + parameter.size
+            parameter.update_from_vector(np.asarray(theta)[first:last])
+            parameter.apply_modifier(spec)
+            first = last
 
 
 def _groups(given: Any) -> list[Any]:
@@ -167,19 +150,16 @@ def _groups(given: Any) -> list[Any]:
 def _signals(groups: Sequence[Any]) -> list[Signal]:
     """Return the signals that all sequences have."""
     found: list[Signal] = []
-    for group in groups:
-        for series in group.sensordata:
-            own = [
-                Signal(name, kind.name, len(np.atleast_1d(places)))
-                for name, (kind, places) in _mapping(series, group).items()
-            ]
-            if found and own != found:
-                raise ValueError(
-                    f"expected the same signals in all sequences; got "
-                    f"{[s.name for s in own]} in {group.name!r} beside "
-                    f"{[s.name for s in found]}; slice them by name"
-                )
-            found = own
+    for group, series in ((g, series) for g in groups for series in g.sensordata):
+        own = [
+            Signal(name, kind.name, len(np.atleast_1d(places)))
+            for name, (kind, places) in _mapping(series, group).items()
+        ]
+        found = found or own
+        got = f"{[s.name for s in own]} in {group.name!r} beside "
+        got += f"{[s.name for s in found]}"
+        expected = "the same signals in all sequences"
+        require(own == found, expected, got, "slice them by name")
     return found
 
 
@@ -195,124 +175,110 @@ def _readable(
 ) -> tuple[Source, tuple[Channel, ...]]:
     """Return a source with a sensor of every signal, and the channels."""
     joints = scalar_joints(source.compile())
-    edits, reads = [], []
+    edits, reads, names = [], [], []
     for signal in signals:
-        if signal.kind in STATES:
-            joint = signal.name.removesuffix(STATES[signal.kind])
-            if joint not in joints:
-                raise ValueError(
-                    f"expected the state of a hinge or slide; got {signal.name!r}; "
-                    "pass sensors of other joints"
-                )
-            reads.append(f"state {signal.name}")
-            what = "velocity" if signal.kind == SPEED else "position"
+        kind, name = signal.kind, signal.name
+        expected, got = "sensors, positions or velocities", f"{name!r} of type {kind}"
+        advice = "pass a residual_fn, which knows what it is"
+        require(kind in ("MjSensor", *STATES), expected, got, advice)
+        reads.append(name)
+        if kind in STATES:
+            ending, what = STATES[kind]
+            joint = name.removesuffix(ending)
+            expected, advice = "the state of a hinge or slide", "pass sensors of others"
+            require(joint in joints, expected, repr(name), advice)
+            reads[-1] = f"state {name}"
             edits.append(AddedSensor(reads[-1], joint, what))
-        elif signal.kind == "MjSensor":
-            reads.append(signal.name)
-        else:
-            raise ValueError(
-                f"expected sensors, positions or velocities; got {signal.name!r} of "
-                f"type {signal.kind}; pass a residual_fn, which knows what it is"
-            )
+        wide = [f"{name}[{k}]" for k in range(signal.width)]
+        names += [name] if signal.width == 1 else wide
     source = source.edited(*edits)
-    names = (
-        s.name if s.width == 1 else f"{s.name}[{k}]"
-        for s in signals
-        for k in range(s.width)
-    )
     pairs = zip(names, channels_of(source.compile(), reads), strict=True)
     return source, tuple(Channel(name, c.place) for name, c in pairs)
 
 
-@dataclass
-class _Sequence:
-    """A recorded sequence, its times from the begin of its control."""
+def _trials(
+    groups: Sequence[Any],
+    machines: Sequence[Machine],
+    signals: Sequence[Signal],
+    kept: Sequence[int],
+    window: tuple[float, float],
+    channels: Sequence[Channel],
+) -> Trials:
+    """Return recorded sequences as trials, of which the action is the number.
 
-    name: str
-    model: int
-    start: dict[str, float]
-    times: Array
-    x: Array
-    controls: dict[str, Array]
-    grid: Array
-
-    @classmethod
-    def of(
-        cls,
-        k: int,
-        group: Any,
-        i: int,
-        signals: Sequence[Signal],
-        step: float,
-        readout: SignalReadout,
-        kept: Sequence[int],
-        model: Any,
-    ) -> _Sequence:
-        """Return a sequence of a group."""
-        what = f"sequence {group.sequence_name[i]!r} of {group.name!r}"
-        control = group.control[i].resample(target_dt=step)
-        begin = float(control.times[0])
-        end = begin + (len(control.times) - 1) * step
-        series = group.sensordata[i]
-        require(
-            bool(np.isfinite(np.asarray(group.control[i].data, dtype=float)).all()),
-            f"finite controls in {what}",
-            "NaN or inf",
-            "fill in what was commanded, or cut the log there",
-        )
-        mapping = _mapping(series, group)
-        columns = np.concatenate(
-            [np.atleast_1d(mapping[s.name][1]).astype(int) for s in signals]
-        )[list(kept)]
-        times = np.asarray(series.times, dtype=float)
-        low, high = readout.window
-        slack = 1e-9 * max(abs(end), step)
-        inside = (times >= begin + step - low - slack) & (times <= end - high + slack)
-        if not inside.any():
-            raise ValueError(
-                f"expected signals measured while the controls of {what} act, "
-                f"{begin:g} to {end:g}; got none; give both in one unit"
-            )
-        names = names_of(model, "actuator")
-        data = np.asarray(control.data, dtype=float)
-        for j, name in enumerate(names):
-            require_in_range(model, name, data[:, j], what)
-        state = np.asarray(group.initial_state[i], dtype=float)
-        return cls(
-            str(group.sequence_name[i]),
-            k,
-            {n: float(state[1 + place]) for n, place in start_places(model).items()},
-            times[inside] - begin,
-            np.asarray(series.data, dtype=float)[inside][:, columns],
-            {name: data[:, j] for j, name in enumerate(names)},
-            step * np.arange(len(data)),
-        )
-
-
-def _trials(sequences: Sequence[_Sequence], channels: Sequence[Channel]) -> Trials:
-    """Return sequences as trials, of which the action is the number."""
-    single = len(channels) == 1
-    times = [s.times for s in sequences]
-    same = all(len(t) == len(times[0]) and (t == times[0]).all() for t in times)
-    controls = {
-        name: [s.controls[name] for s in sequences] for name in sequences[0].controls
-    }
+    Args:
+        groups: ``ModelSequences``.
+        machines: Models of these.
+        signals: Signals that all sequences have.
+        kept: Numbers of the columns that are read.
+        window: Lowest and highest delay.
+        channels: Channels of x.
+    """
+    names, x, times, grids = [], [], [], []
+    starts: list[dict[str, float]] = []
+    controls: list[dict[str, Array]] = []
+    for k, (group, machine) in enumerate(zip(groups, machines, strict=True)):
+        model = machine.model
+        step, places = float(model.opt.timestep), start_places(model)
+        for i, name in enumerate(group.sequence_name):
+            what = f"sequence {name!r} of {group.name!r}"
+            series, control = group.sensordata[i], group.control[i]
+            is_finite = bool(np.isfinite(np.asarray(control.data, dtype=float)).all())
+            advice = "fill in what was commanded, or cut the log there"
+            require(is_finite, f"finite controls in {what}", "NaN or inf", advice)
+            control = control.resample(target_dt=step)
+            begin, steps = float(control.times[0]), len(control.times)
+            own = np.asarray(series.times, dtype=float)
+            inside = _inside(own, begin, (steps - 1) * step, step, window, what)
+            mapping = _mapping(series, group)
+            each = [np.atleast_1d(mapping[s.name][1]).astype(int) for s in signals]
+            columns = np.concatenate(each)[list(kept)]
+            values = np.asarray(series.data, dtype=float)[inside][:, columns]
+            data = np.asarray(control.data, dtype=float)
+            actuators = dict(zip(names_of(model, "actuator"), data.T, strict=False))
+            for actuator, played in actuators.items():
+                require_in_range(model, actuator, played, what)
+            state = np.asarray(group.initial_state[i], dtype=float)
+            start = {n: float(state[place]) for n, place in places.items()}
+            names.append(str(name))
+            x.append(values[:, 0] if len(channels) == 1 else values)
+            times.append(own[inside] - begin)
+            grids.append(step * np.arange(steps))
+            starts.append({MODEL: float(k), **start})
+            controls.append(actuators)
+    same = all(np.array_equal(each, times[0]) for each in times)
     return Trials(
-        np.arange(len(sequences), dtype=float)[:, None],
-        [s.x[:, 0] if single else s.x for s in sequences],
+        np.arange(len(x), dtype=float)[:, None],
+        x,
         sample_times=times[0] if same else times,
-        names=[s.name for s in sequences]
-        if len({s.name for s in sequences}) == len(sequences)
-        else None,
+        names=names if len({*names}) == len(names) else None,
         action_labels=["recording"],
         channel_labels=[c.name for c in channels],
-        inputs=controls or None,
-        input_times=[s.grid for s in sequences] if controls else None,
-        start={
-            MODEL: [float(s.model) for s in sequences],
-            **{name: [s.start[name] for s in sequences] for name in sequences[0].start},
-        },
+        inputs={n: [own[n] for own in controls] for n in controls[0]} or None,
+        input_times=grids if controls[0] else None,
+        start={n: [own[n] for own in starts] for n in starts[0]},
     )
+
+
+def _inside(
+    times: Array,
+    begin: float,
+    length: float,
+    step: float,
+    window: tuple[float, float],
+    what: str,
+) -> Array:
+    """Return the measured times that any delay leaves within the controls."""
+    low, high = window
+    end = begin + length
+    slack = 1e-9 * max(abs(end), step)
+    inside = (times >= begin + step - low - slack) & (times <= end - high + slack)
+    if not inside.any():
+        raise ValueError(
+            f"expected signals measured while the controls of {what} act, {begin:g} to "
+            f"{end:g}; got none; give both in one unit"
+        )
+    return inside
 
 
 def _recorded(trials: Trials) -> ActionSpace:
@@ -326,11 +292,10 @@ def _recorded(trials: Trials) -> ActionSpace:
 
 def _noise(trials: Trials) -> AutocorrelatedNoise:
     """Return errors of unknown size and duration, one size a signal."""
-    x = trials.x.double()
-    x = x.reshape(*x.shape[:2], -1)
     times = trials.sample_times
     assert times is not None
-    gap = float(times.diff(dim=-1)[times.diff(dim=-1).isfinite()].median())
+    gap = float(times.diff(dim=-1).nanmedian())
+    x = trials.x.double().reshape(*trials.x.shape[:2], -1)
     spread = np.nanstd(x.numpy(), (0, 1))
     spread = np.where(spread > 0, spread, 1.0)
     pairs = [(SHARE * float(sd), float(sd)) for sd in spread]

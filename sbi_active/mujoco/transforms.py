@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fnmatch import fnmatch
 from typing import Any
 
@@ -27,18 +27,16 @@ class SignalReadout:
 
     Attributes:
         stamp: Time by which a reading is stamped late, (c,), s.
-        delays: Place in (theta, fixed values) of each channel's delay, -1 for none.
-        scales: Pairs of a place and whether it divides, a list a channel.
-        shifts: Pairs of a place and whether it is subtracted, a list a channel.
+        delays: Place in (theta, fixed values) of a channel's delay.
+        changes: Channel, operation of NumPy, and place of what it takes, in order.
         fixed: Values of frozen parameters.
         window: Lowest and highest delay.
     """
 
     stamp: Array
-    delays: list[int]
-    scales: list[list[tuple[int, bool]]]
-    shifts: list[list[tuple[int, bool]]]
-    fixed: Array
+    delays: dict[int, int] = field(default_factory=dict)
+    changes: Sequence[tuple[int, np.ufunc, int]] = field(default_factory=list)
+    fixed: Array = field(default_factory=lambda: np.zeros(0))
     window: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
@@ -47,52 +45,53 @@ class SignalReadout:
     ) -> SignalReadout:
         """Return the readout of a ``SignalTransform``, or of none.
 
+        What is done to the measured signals is undone in the predicted ones; what is
+        done to both changes no comparison.
+
         Args:
             transform: The transform, or None.
             params: A ``ParameterDict``.
             names: Name of each channel's signal.
             stamp: Time by which a reading is stamped late, (c,), s.
         """
-        delays = [-1 for _ in names]
-        scales, shifts = ([[] for _ in names] for _ in range(2))
         if transform is None:
-            return cls(stamp, delays, scales, shifts, np.zeros(0))
+            return cls(stamp)
         places, fixed = _places(params)
-        for c, name in enumerate(names):
-            for pattern, parameter, _ in transform._delays:
-                if fnmatch(name, pattern):
-                    delays[c] = places[parameter]
-            given = (transform._gains, scales[c]), (transform._biases, shifts[c])
-            for every, into in given:
-                for pattern, parameter, target in every:
-                    # What is done to both sides alike changes no comparison.
-                    if fnmatch(name, pattern) and target != "both":
-                        into.append((places[parameter], target == "measured"))
-        window = transform._compute_delay_bounds()
-        return cls(stamp, delays, scales, shifts, fixed, window)
+        delays = {
+            c: places[parameter]
+            for pattern, parameter, _ in transform._delays
+            for c, name in enumerate(names)
+            if fnmatch(name, pattern)
+        }
+        steps = (
+            (transform._gains, "predicted", np.multiply),
+            (transform._biases, "predicted", np.add),
+            (transform._biases, "measured", np.subtract),
+            (transform._gains, "measured", np.divide),
+        )
+        changes = [
+            (c, change, places[parameter])
+            for every, side, change in steps
+            for pattern, parameter, target in every
+            for c, name in enumerate(names)
+            if target == side and fnmatch(name, pattern)
+        ]
+        return cls(stamp, delays, changes, fixed, transform._compute_delay_bounds())
 
     def late(self, theta: Array) -> Array:
         """Return by how much each channel reads what was there before, (n, c), s."""
-        values = self._values(theta)
         late = np.repeat(self.stamp[None], len(theta), 0)
-        for c, place in enumerate(self.delays):
-            if place >= 0:
-                late[:, c] += values[:, place]
+        for channel, place in self.delays.items():
+            late[:, channel] += self._values(theta)[:, place]
         return late
 
     def read(self, x: Array, theta: Array) -> Array:
         """Return signals as they would have been measured, (n, k, c)."""
-        values = self._values(theta)
         x = x.copy()
-        for c in range(x.shape[2]):
-            for place, is_measured in self.scales[c]:
-                if not is_measured:
-                    x[..., c] *= values[:, [place]]
-            for place, is_measured in self.shifts[c]:
-                x[..., c] += (-1 if is_measured else 1) * values[:, [place]]
-            for place, is_measured in self.scales[c]:
-                if is_measured:
-                    x[..., c] /= values[:, [place]]
+        for channel, change, place in self.changes:
+            change(
+                x[..., channel], self._values(theta)[:, [place]], out=x[..., channel]
+            )
         return x
 
     def _values(self, theta: Array) -> Array:
@@ -101,14 +100,13 @@ class SignalReadout:
 
 def _places(params: Any) -> tuple[dict[str, int], Array]:
     """Return the first place of each parameter in theta, frozen ones behind it."""
-    places, free = {}, 0
-    fixed: list[float] = []
-    for name in params.keys():  # noqa: SIM118
-        parameter = params[name]
+    places: dict[str, int] = {}
+    free, fixed = 0, np.zeros(0)
+    for name, parameter in params.items():
         if parameter.frozen:
             places[name] = params.size + len(fixed)
-            fixed += parameter.as_vector().tolist()
+            fixed = np.append(fixed, parameter.as_vector())
         else:
             places[name] = free
             free += parameter.size
-    return places, np.array(fixed)
+    return places, fixed

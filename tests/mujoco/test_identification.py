@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from benchmarks.robots.models import PENDULUM
-from sbi_active.mujoco import from_mjcf
-from sbi_active.mujoco.identification import identify_robot
+from sbi_active.mujoco import from_mjcf, identify_robot
 
 TRUTH = 0.03
 

@@ -68,9 +68,19 @@ def backwards(frame):
     frame.loc[7, "time"] = 0.015
 
 
+def without_rows(frame):
+    frame.drop(frame.index, inplace=True)
+
+
+def started_apart(frame):
+    frame["start slide"] = 0.1
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
+        (without_rows, "samples in recording 1; got no rows"),
+        (started_apart, "start slide in recording 1 beside none in recording 0"),
         (out_of_range, "within its ctrlrange, -5 to 5"),
         (nan_input, "finite number in column push, row 8; .* recording 1"),
         (renamed, "column push for input; .* recording 1; did you mean 'pusher'"),
@@ -81,6 +91,14 @@ def test_logs_that_do_not_fit_are_said(spoil, message):
     frames = logs()
     spoil(frames[1])
     with pytest.raises(ValueError, match=message):
+        from_mjcf(SPRING_MASS, {"cart.mass": (0.5, 2)}, recordings=frames)
+
+
+def test_a_start_state_that_is_not_told_is_refused():
+    frames = logs()
+    for frame in frames:
+        frame["start slide"] = np.where(np.arange(len(frame)) == 0, np.nan, 0.1)
+    with pytest.raises(ValueError, match="start slide in the first row of recording 0"):
         from_mjcf(SPRING_MASS, {"cart.mass": (0.5, 2)}, recordings=frames)
 
 

@@ -7,7 +7,7 @@ import torch
 
 from sbi_active import BoxActions
 from sbi_active.mujoco import from_mjcf
-from tests.mujoco.machines import held_arm
+from tests.mujoco.machines import GAINS, held_arm
 
 TENDON = """
 <mujoco>
@@ -66,6 +66,36 @@ def by_hand(*, key: bool, **start: float) -> list[float]:
         if data.time == model.opt.timestep:
             first = float(data.sensordata[0])
     return [first, float(data.sensordata[0])]
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "RK4", "implicit", "implicitfast"])
+@pytest.mark.parametrize("kind", GAINS)
+def test_rows_of_a_held_arm_are_those_of_a_bare_loop(kind, integrator):
+    """Keyframe, mocap body, equality, held control; every servo and integrator."""
+    text = held_arm("drive", kind, integrator)
+    robot = from_mjcf(
+        text,
+        {"hinge.damping": (0.0, 1.0)},
+        actions=BoxActions([-1.0], [1.0], names=["drive"]),
+        times=np.linspace(0.05, 0.5, 10),
+        start="home",
+        noise=0.01,
+    )
+    theta = torch.tensor([[0.1], [0.4], [0.9]], dtype=torch.float64)
+    action = torch.tensor([[0.7], [-0.2], [0.4]], dtype=torch.float64)
+    x = robot.simulator.mean(theta, action)
+    for row in range(3):
+        model = mujoco.MjModel.from_xml_string(text)
+        model.dof_damping[0] = theta[row, 0]
+        data = mujoco.MjData(model)
+        mujoco.mj_resetDataKeyframe(model, data, 0)
+        data.ctrl[0] = action[row, 0]
+        angles = []
+        for _ in range(251):
+            mujoco.mj_step(model, data)
+            angles.append(float(data.sensordata[0]))
+        assert x[row].tolist() == pytest.approx(angles[25::25], abs=1e-12)
+    assert float((x[0] - x[1]).abs().max()) > 1e-6
 
 
 def test_a_keyframe_gives_controls_and_mocap_poses_too():

@@ -1,8 +1,8 @@
 """The problems: each a function, with what makes it hard in one line.
 
 Truths and seeds here judge engines; nothing may be tuned on them. Of the families,
-compartments served to tune the flag of learned beliefs, with other truths
-(``benchmarks/flag``); no other was tuned on.
+compartments served to tune the flag of learned beliefs, with other truths; no other was
+tuned on.
 """
 
 from __future__ import annotations

@@ -11,14 +11,11 @@ from typing_extensions import override
 from sbi_active.arrays import Array
 from sbi_active.mujoco.models.changes import ModelChange, StateChange
 from sbi_active.mujoco.models.names import element_id
-from sbi_active.mujoco.models.quantities import (
-    ATTRIBUTES,
-    Entry,
-    Quantity,
-    add_to,
-    field_of,
-)
-from sbi_active.mujoco.models.spec import mujoco_of
+from sbi_active.mujoco.models.quantities import ATTRIBUTES, Quantity, add_to, field_of
+from sbi_active.mujoco.models.spec import mujoco
+
+ActuatorLaw = Literal["gain", "bias", "back-EMF", "saturation"]
+ContactLaw = Literal["friction", "softness", "restitution"]
 
 
 @dataclass(frozen=True)
@@ -45,29 +42,6 @@ class QuantityChange(ModelChange):
                 add_to(model, entry, float(phi[0]) * entry.factor)
             if phi[0]:
                 quantity.loosen(model)
-
-
-@dataclass(frozen=True)
-class Polynomial(ModelChange):
-    """Adds a power of the position or the speed to a joint's spring or damper.
-
-    Writes ``dof_dampingpoly`` or ``jnt_stiffnesspoly``, of MuJoCo 3.7 or later.
-    """
-
-    names: tuple[str, ...]
-    what: Literal["damping", "stiffness"]
-    power: int
-
-    @override
-    def fields(self) -> tuple[str, ...]:
-        return (f"{'dof' if self.what == 'damping' else 'jnt'}_{self.what}poly",)
-
-    @override
-    def write(self, model: Any, phi: Array) -> None:
-        for name in self.names:
-            i = element_id(model, "joint", name)
-            at = int(model.jnt_dofadr[i]) if self.what == "damping" else i
-            add_to(model, Entry(self.fields()[0], (at, self.power - 2)), float(phi[0]))
 
 
 @dataclass(frozen=True)
@@ -154,7 +128,7 @@ class ActuatorChange(ModelChange):
     """
 
     names: tuple[str, ...]
-    what: Literal["gain", "bias", "back-EMF", "saturation"]
+    what: ActuatorLaw
 
     @override
     def fields(self) -> tuple[str, ...]:
@@ -167,7 +141,7 @@ class ActuatorChange(ModelChange):
     @override
     def write(self, model: Any, phi: Array) -> None:
         value = float(phi[0])
-        affine = int(mujoco_of().mjtBias.mjBIAS_AFFINE)
+        affine = int(mujoco.mjtBias.mjBIAS_AFFINE)
         for name in self.names:
             i = element_id(model, "actuator", name)
             if self.what == "gain":
@@ -222,7 +196,7 @@ class ContactChange(ModelChange):
         what: Quantity that is multiplied.
     """
 
-    what: Literal["friction", "softness", "restitution"]
+    what: ContactLaw
 
     @override
     def fields(self) -> tuple[str, ...]:

@@ -25,7 +25,7 @@ from typing_extensions import override
 from sbi_active.arrays import Array
 from sbi_active.mujoco.models.changes import Insertion
 from sbi_active.mujoco.models.names import element_id
-from sbi_active.mujoco.models.spec import mujoco_of
+from sbi_active.mujoco.models.spec import mujoco
 
 #: What an inserted joint is called after its joint.
 INSERTED = " (inserted)"
@@ -67,7 +67,6 @@ class Transmission(Insertion):
 
     @override
     def edit(self, spec: Any) -> None:
-        mujoco = mujoco_of()
         for name, inertia in zip(self.names, self.inertias, strict=True):
             joint, added = spec.joint(name), name + INSERTED
             if spec.joint(added) is None:
@@ -108,17 +107,17 @@ class Transmission(Insertion):
                 data.qpos[place] = -0.5 * np.sign(load) * width
 
 
-def least_compliance(inertia: float, armature: float, step: float) -> float:
-    """Return the compliance of the stiffest spring that steps can follow.
+def least_compliance(inertia: Array, armature: Array, step: float) -> float:
+    """Return the compliance of the stiffest spring that steps can follow everywhere.
 
     Args:
-        inertia: Inertia behind the joint.
-        armature: Armature of the joint, 0 for none.
+        inertia: Inertia behind each joint.
+        armature: Armature of each joint, 0 for none.
         step: Time step, s.
     """
-    motor = armature if armature > 0 else ROTOR * inertia
+    motor = np.where(armature > 0, armature, ROTOR * inertia)
     reduced = inertia * motor / (inertia + motor)
-    return 1 / (reduced * (STIFFEST / step) ** 2)
+    return float((1 / (reduced * (STIFFEST / step) ** 2)).max())
 
 
 def _like(inserted: Any, joint: Any) -> None:
@@ -126,7 +125,7 @@ def _like(inserted: Any, joint: Any) -> None:
     inserted.type, inserted.axis, inserted.pos = joint.type, joint.axis, joint.pos
     if joint.frame is not None:
         inserted.set_frame(joint.frame)
-    inserted.limited = mujoco_of().mjtLimited.mjLIMITED_FALSE
+    inserted.limited = mujoco.mjtLimited.mjLIMITED_FALSE
     inserted.armature = inserted.frictionloss = 0.0
     inserted.ref = inserted.springref = 0.0
     for name in ("stiffness", "damping"):  # numbers, or with a polynomial's behind

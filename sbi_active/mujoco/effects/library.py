@@ -16,10 +16,9 @@ from sbi_active.criticism.effects.patterns import picked
 from sbi_active.expected import suggests
 from sbi_active.mujoco.effects.changes import QuantityChange
 from sbi_active.mujoco.effects.elements import elements
-from sbi_active.mujoco.effects.nominal import nominal
-from sbi_active.mujoco.effects.table import effects_of
 from sbi_active.mujoco.robot import Robot, from_spec
 from sbi_active.mujoco.simulator import MujocoFunction
+from sbi_active.mujoco.typical import nominal
 from sbi_active.simulation import SimulatorModel
 
 
@@ -112,7 +111,7 @@ def _offered(
     every = [
         effect
         for element in elements(channels, sizes, driven=driven, noise=noise)
-        for effect in effects_of(element)
+        for effect in element.effects()
     ]
     return simulator, every, call
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import compress, product
 from typing import Any
@@ -11,33 +11,36 @@ from typing import Any
 import numpy as np
 
 from sbi_active.arrays import Array
+from sbi_active.expected import require
 from sbi_active.mujoco.models.changes import Insertion, ModelChange, StateChange
 from sbi_active.mujoco.models.names import names_of, start_places
 from sbi_active.mujoco.models.parameters import Bounded, Writer, renew, writer_of
-from sbi_active.mujoco.models.quantities import copied, restore
-from sbi_active.mujoco.models.spec import Source, mujoco_of, quiet
+from sbi_active.mujoco.models.quantities import field_of, set_field
+from sbi_active.mujoco.models.spec import Source, mujoco, quiet
 
-#: Models at a time: more gain nothing, and each has memory of its own.
+#: Rows and models at a time: more gain nothing, and each has memory of its own.
 POOL = 32
 
 
 @dataclass
 class Rows:
-    """Rows that one model simulates at once.
+    """Rows to simulate.
 
     Attributes:
         theta: Parameters, shape (n, d).
         changes: Parameters by change, shape (n, k).
         forces: Parameters by force, shape (n, k).
-        start: Positions and velocities at the start, by name, (n,).
-        controls: Controls, shape (n, steps, nu), held over each step.
+        start: What is set at the start, by name, shape (n,).
+        inputs: Controls over time by actuator, shape (n, m).
+        times: Times of the readings, shape (n, k).
     """
 
     theta: Array
     changes: dict[Any, Array]
     forces: dict[Any, Array]
     start: dict[str, Array]
-    controls: Array
+    inputs: dict[str, Array]
+    times: Array
 
     def __len__(self) -> int:
         return len(self.theta)
@@ -51,13 +54,11 @@ class Rows:
 
     def at(self, rows: Any) -> Rows:
         """Return some rows."""
-        return Rows(
-            self.theta[rows],
-            {change: phi[rows] for change, phi in self.changes.items()},
-            {force: phi[rows] for force, phi in self.forces.items()},
-            {name: value[rows] for name, value in self.start.items()},
-            self.controls[rows],
+        each = self.changes, self.forces, self.start, self.inputs
+        changes, forces, start, inputs = (
+            {key: value[rows] for key, value in part.items()} for part in each
         )
+        return Rows(self.theta[rows], changes, forces, start, inputs, self.times[rows])
 
 
 @dataclass
@@ -86,8 +87,25 @@ class Model:
     datas: list[Any] = field(default_factory=list)
     originals: dict[str, Any] = field(default_factory=dict)
 
+    def each(self, rows: Rows) -> list[Any]:
+        """Return a model for every row; rows of the same numbers share one."""
+        changes = [
+            change
+            for change in rows.changes
+            if not isinstance(change, Insertion) or change in self.inserted
+        ]
+        table = np.concatenate([rows.theta, *(rows.changes[c] for c in changes)], 1)
+        _, first, number = np.unique(
+            table, axis=0, return_index=True, return_inverse=True
+        )
+        models = [
+            self.written(k, rows.theta[i], {c: rows.changes[c][i] for c in changes})
+            for k, i in enumerate(first)
+        ]
+        return [models[k] for k in number.reshape(-1)]
+
     def written(
-        self, number: int, theta: Array, changes: dict[ModelChange, Array]
+        self, number: int, theta: Array, changes: Mapping[ModelChange, Array]
     ) -> Any:
         """Return a model with its parameters and changes.
 
@@ -100,11 +118,13 @@ class Model:
             model = self.writer.compiled(theta)
         else:
             names = {*self.writer.parts}.union(*(c.fields() for c in changes))
-            self.originals |= copied(self.base, names - {*self.originals})
+            for name in names - {*self.originals}:
+                self.originals[name] = np.array(field_of(self.base, name))
             while len(self.pool) <= number:
                 self.pool.append(copy.copy(self.base))
             model = self.pool[number]
-            restore(model, self.originals)
+            for name, value in self.originals.items():
+                set_field(model, name, value)
             self.writer.write(model, theta)
         for change, phi in changes.items():
             change.write(model, phi)
@@ -132,10 +152,7 @@ class Machine:
         edit: Callable[[Any, Array], Any] | None = None,
     ) -> None:
         self.source, self.parameters, self.edit = source, tuple(parameters), edit
-        self.model = source.compile()
-        mujoco = mujoco_of()
-        # A state that diverges stays what it is, instead of starting again.
-        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self.model = _lasting(source.compile())
         # Found here, with all digits of the spec, and used in every process.
         writer = writer_of(
             source.exact, self.model, self.parameters, edit=edit, text=source.spec
@@ -154,74 +171,44 @@ class Machine:
         low = np.array([p.low for p in self.parameters])
         with quiet():
             inertia = self._model(()).written(0, low, {}).dof_M0
-        lost = np.flatnonzero(~(inertia > mujoco_of().mjMINVAL))
-        if len(lost):
-            joint = int(self.model.dof_jntid[lost[0]])
-            bounds = ", ".join(f"{p.name} = {p.low:g}" for p in self.parameters)
-            raise ValueError(
-                "expected joints that have inertia; got none of "
-                f"{names_of(self.model, 'joint')[joint]!r} at {bounds}; raise the "
-                "lower bounds of masses above 0, or give the joint an armature"
-            )
+        lost = self.model.dof_jntid[~(inertia > mujoco.mjMINVAL)]
+        joints = [names_of(self.model, "joint")[joint] for joint in lost[:1]]
+        bounds = ", ".join(f"{p.name} = {p.low:g}" for p in self.parameters)
+        require(
+            not joints,
+            "joints that have inertia",
+            f"none of {', '.join(map(repr, joints))} at {bounds}",
+            "raise the lower bounds of masses above 0, or give the joint an armature",
+        )
 
-    def models(
-        self, rows: Rows, run: Callable[[Model, list[Any], Rows], Array], size: int
-    ) -> Array:
-        """Run rows, whatever models they need.
+    def batches(
+        self, rows: Rows, size: int
+    ) -> Iterator[tuple[Model, list[Any], Array, Array]]:
+        """Yield rows, whatever models they need, a few at a time.
 
         Args:
-            rows: Rows, all of them.
-            run: ``run(model, models, rows)`` simulates some rows, each by its model,
-                and returns one result a row.
+            rows: Rows, all of them. One that is a mixture comes several times.
             size: Most rows at a time.
 
-        Returns:
-            Results of ``run``, in the order of the rows.
+        Yields:
+            The model, and for each row its copy, its place among all rows, and the
+            share of its readings in what is read.
         """
-        found: Array | None = None
         for inserted, places, weights in self._groups(rows):
             model = self._model(inserted)
-            share = np.zeros(len(rows))
-            share[places] = weights
-            for part in _parts(places, rows, size):
-                some = rows.at(part)
-                with quiet():
-                    x = run(model, self._each(model, some, inserted), some)
-                if found is None:
-                    found = np.zeros((len(rows), *x.shape[1:]))
-                found[part] += share[part].reshape(-1, *[1] * (x.ndim - 1)) * x
-        assert found is not None
-        return found
-
-    def _each(
-        self, model: Model, rows: Rows, inserted: tuple[Insertion, ...]
-    ) -> list[Any]:
-        """Return a model for every row; rows of the same numbers share one."""
-        active = [
-            c for c in rows.changes if not isinstance(c, Insertion) or c in inserted
-        ]
-        keys = _keys(rows.theta, [rows.changes[c] for c in active])
-        known: dict[bytes, Any] = {}
-        for i, key in enumerate(keys):
-            if key not in known:
-                phi: dict[ModelChange, Array] = {c: rows.changes[c][i] for c in active}
-                known[key] = model.written(len(known), rows.theta[i], phi)
-        return [known[key] for key in keys]
+            for first in range(0, len(places), min(size, POOL)):
+                part = slice(first, first + min(size, POOL))
+                models = model.each(rows.at(places[part]))
+                yield model, models, places[part], weights[part]
 
     def _groups(self, rows: Rows) -> list[tuple[tuple[Insertion, ...], Array, Array]]:
         """Return the insertions, their rows, and their weights in the readings."""
         insertions = [c for c in rows.changes if isinstance(c, Insertion)]
-        if not insertions:
-            return [((), np.arange(len(rows)), np.ones(len(rows)))]
-        shares = np.array(
-            [
-                [change.share(phi) for phi in rows.changes[change]]
-                for change in insertions
-            ]
-        )
+        each = [list(map(c.share, rows.changes[c])) for c in insertions]
+        shares = np.array(each).reshape(len(insertions), len(rows))
         groups = []
         for pattern in product((False, True), repeat=len(insertions)):
-            on = np.array(pattern)[:, None]
+            on = np.array(pattern, dtype=bool)[:, None]
             weights = np.where(on, shares, 1 - shares).prod(0)
             places = np.flatnonzero(weights)
             if len(places):
@@ -231,13 +218,10 @@ class Machine:
 
     def _model(self, inserted: tuple[Insertion, ...]) -> Model:
         if inserted not in self._models:
-            mujoco = mujoco_of()
-            edits = tuple(change.edit for change in inserted)
-            spec = self.source.edited(*edits).spec
+            spec = self.source.edited(*(change.edit for change in inserted)).spec
             base, writer = self.model, self._writer
             if inserted:
-                base, writer = spec().compile(), None
-                base.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+                base, writer = _lasting(spec().compile()), None
             self._models[inserted] = Model(
                 base,
                 writer or writer_of(spec, base, self.parameters, edit=self.edit),
@@ -250,26 +234,13 @@ class Machine:
     def _order(self, base: Any) -> tuple[Array, Array]:
         """Return the places of the machine's positions and velocities in a model."""
         own, other = start_places(self.model), start_places(base)
-        places = np.array([other[name] for name in sorted(own, key=own.__getitem__)])
+        order = sorted(own, key=own.__getitem__)
+        places = np.array([other[name] - 1 for name in order], dtype=int)
         nq, nv = self.model.nq, self.model.nv
-        return places[:nq].astype(int), places[nq : nq + nv].astype(int) - base.nq
+        return places[:nq], places[nq : nq + nv] - base.nq
 
 
-def _parts(places: Array, rows: Rows, size: int) -> list[Array]:
-    """Return places in parts of a few rows, and of no more models than the pool has."""
-    keys = _keys(rows.theta[places], [phi[places] for phi in rows.changes.values()])
-    parts: list[list[int]] = [[]]
-    seen: set[bytes] = set()
-    for place, key in zip(places.tolist(), keys, strict=True):
-        full = len(parts[-1]) == size or (key not in seen and len(seen) == POOL)
-        if full:
-            parts.append([])
-            seen = set()
-        parts[-1].append(place)
-        seen.add(key)
-    return [np.array(part) for part in parts]
-
-
-def _keys(theta: Array, phi: Sequence[Array]) -> list[bytes]:
-    table = np.ascontiguousarray(np.concatenate([theta, *phi], 1) + 0.0)
-    return [row.tobytes() for row in table]
+def _lasting(model: Any) -> Any:
+    """Return a model in which a state that diverges stays, and starts not again."""
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    return model

@@ -5,18 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from sbi_active.expected import did_you_mean
-from sbi_active.mujoco.models.spec import mujoco_of
+import numpy as np
 
-#: Kinds of elements: what MuJoCo calls them, and the count in a model.
+from sbi_active.expected import did_you_mean
+from sbi_active.mujoco.models.spec import mujoco
+
+#: Kinds of elements, each with a field of ``mjModel`` that has a row an element.
 KINDS = {
-    "body": ("mjOBJ_BODY", "nbody"),
-    "joint": ("mjOBJ_JOINT", "njnt"),
-    "geom": ("mjOBJ_GEOM", "ngeom"),
-    "actuator": ("mjOBJ_ACTUATOR", "nu"),
-    "sensor": ("mjOBJ_SENSOR", "nsensor"),
-    "tendon": ("mjOBJ_TENDON", "ntendon"),
-    "key": ("mjOBJ_KEY", "nkey"),
+    "body": "body_mass",
+    "joint": "jnt_type",
+    "geom": "geom_type",
+    "actuator": "actuator_trntype",
+    "sensor": "sensor_type",
+    "tendon": "tendon_stiffness",
+    "key": "key_time",
 }
 
 
@@ -25,13 +27,9 @@ def names_of(model: Any, kind: str) -> list[str]:
 
     An element without a name is called by its kind and number, as in "joint 0".
     """
-    mujoco = mujoco_of()
-    mark, count = KINDS[kind]
-    is_actuator = kind == "actuator"
-    number = len(model.actuator_trntype) if is_actuator else getattr(model, count)
-    each = (
-        mujoco.mj_id2name(model, getattr(mujoco.mjtObj, mark), i) for i in range(number)
-    )
+    mark = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
+    number = len(getattr(model, KINDS[kind]))
+    each = (mujoco.mj_id2name(model, mark, i) for i in range(number))
     return [name or f"{kind} {i}" for i, name in enumerate(each)]
 
 
@@ -46,12 +44,12 @@ def element_id(model: Any, kind: str, name: str) -> int:
     return known.index(name)
 
 
-def scalar_joints(model: Any) -> list[str]:
-    """Return the names of hinges and slides."""
-    types = mujoco_of().mjtJoint
-    scalar = int(types.mjJNT_HINGE), int(types.mjJNT_SLIDE)
-    each = zip(names_of(model, "joint"), model.jnt_type, strict=True)
-    return [name for name, kind in each if int(kind) in scalar]
+def scalar_joints(model: Any) -> dict[str, int]:
+    """Return the numbers of hinges and slides by name."""
+    types = mujoco.mjtJoint
+    is_scalar = np.isin(model.jnt_type, [types.mjJNT_HINGE, types.mjJNT_SLIDE])
+    names = names_of(model, "joint")
+    return {names[i]: int(i) for i in np.flatnonzero(is_scalar)}
 
 
 def require_name(name: str, known: Iterable[str], what: str) -> None:
@@ -70,46 +68,57 @@ def require_name(name: str, known: Iterable[str], what: str) -> None:
 
 
 def start_places(model: Any) -> dict[str, int]:
-    """Return places of start states in (qpos, qvel, act), by name.
+    """Return places of start states in MuJoCo's full physics state, by name.
 
     Joints of more than one position are numbered, as in "base[0]"; velocities are
     "hinge velocity", and states of an actuator "motor activation".
     """
-    found = {}
-    for name in names_of(model, "joint"):
-        i = element_id(model, "joint", name)
-        q, v = int(model.jnt_qposadr[i]), int(model.jnt_dofadr[i])
+    found: dict[str, int] = {}
+    positions, velocities = 1, 1 + model.nq  # the time comes first
+    activations = velocities + model.nv
+    for i, name in enumerate(names_of(model, "joint")):
         kind = int(model.jnt_type[i])
         nq, nv = {0: (7, 6), 1: (4, 3)}.get(kind, (1, 1))  # free, ball
-        for k in range(nq):
-            found[name if nq == 1 else f"{name}[{k}]"] = q + k
-        for k in range(nv):
-            speed = f"{name} velocity"
-            found[speed if nv == 1 else f"{speed}[{k}]"] = model.nq + v + k
-    first = model.nq + model.nv
+        found |= _numbered(name, positions + int(model.jnt_qposadr[i]), nq)
+        speed = velocities + int(model.jnt_dofadr[i])
+        found |= _numbered(f"{name} velocity", speed, nv)
     for i, name in enumerate(names_of(model, "actuator")):
-        at, number = int(model.actuator_actadr[i]), int(model.actuator_actnum[i])
-        for k in range(number if at >= 0 else 0):
-            state = f"{name} activation"
-            found[state if number == 1 else f"{state}[{k}]"] = first + at + k
+        first = int(model.actuator_actadr[i])
+        number = int(model.actuator_actnum[i]) if first >= 0 else 0
+        found |= _numbered(f"{name} activation", activations + first, number)
     return found
 
 
-def held_places(model: Any) -> dict[str, int]:
-    """Return places of what a trial holds in (ctrl, mocap_pos, mocap_quat), by name.
+def places_of(model: Any) -> dict[str, int]:
+    """Return places of all that a trial may set, by name.
 
-    Controls are "motor control"; the pose of a mocap body is "target mocap[0]" to
+    Behind the physics state of :func:`start_places` stands what is held: controls,
+    "motor control", and the poses of mocap bodies, "target mocap[0]" to
     "target mocap[6]", a position and a quaternion.
     """
-    held = {f"{n} control": i for i, n in enumerate(names_of(model, "actuator"))}
-    first, turn = model.nu, model.nu + 3 * model.nmocap
+    found, first = start_places(model), physics_size(model)
+    for i, name in enumerate(names_of(model, "actuator")):
+        found[f"{name} control"] = first + i
+    position = first + model.nu
+    turn = position + 3 * model.nmocap
     for body, name in enumerate(names_of(model, "body")):
         k = int(model.body_mocapid[body])
-        if k < 0:
-            continue
-        held |= {f"{name} mocap[{j}]": first + 3 * k + j for j in range(3)}
-        held |= {f"{name} mocap[{3 + j}]": turn + 4 * k + j for j in range(4)}
-    return held
+        if k >= 0:
+            found |= {f"{name} mocap[{j}]": position + 3 * k + j for j in range(3)}
+            found |= {f"{name} mocap[{3 + j}]": turn + 4 * k + j for j in range(4)}
+    return found
+
+
+def physics_size(model: Any) -> int:
+    """Return the number of entries of MuJoCo's full physics state."""
+    return mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
+
+
+def _numbered(name: str, first: int, number: int) -> dict[str, int]:
+    """Return the places of a name, with numbers in brackets where it has several."""
+    if number == 1:
+        return {name: first}
+    return {f"{name}[{k}]": first + k for k in range(number)}
 
 
 def meaning(name: str, model: Any) -> str:
@@ -124,5 +133,4 @@ def meaning(name: str, model: Any) -> str:
     """
     if name in names_of(model, "actuator"):
         return f"{name} control"
-    joint = name.removesuffix(" position")
-    return name if name in start_places(model) else joint
+    return name if name in start_places(model) else name.removesuffix(" position")

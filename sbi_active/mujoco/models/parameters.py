@@ -22,16 +22,16 @@ from typing import Any
 import numpy as np
 
 from sbi_active.arrays import Array
+from sbi_active.expected import require
 from sbi_active.mujoco.models.quantities import (
     FRAMES,
-    Entry,
     Quantity,
     field_of,
     find_quantity,
     is_movable,
-    set_to,
+    set_field,
 )
-from sbi_active.mujoco.models.spec import mujoco_of
+from sbi_active.mujoco.models.spec import mujoco
 
 #: What ``mj_setConst`` makes of the other fields.
 DERIVED = (
@@ -69,11 +69,12 @@ class Bounded:
     edit: Callable[[Any, float], Any] | None = None
 
     def __post_init__(self) -> None:
-        if not (np.isfinite([self.low, self.high]).all() and self.low < self.high):
-            raise ValueError(
-                f"expected finite bounds low < high of parameter {self.name!r}; got "
-                f"{self.low:g} and {self.high:g}; pass them in this order"
-            )
+        expected = f"finite bounds low < high of parameter {self.name!r}"
+        in_order = (
+            bool(np.isfinite([self.low, self.high]).all()) and self.low < self.high
+        )
+        got = f"{self.low:g} and {self.high:g}"
+        require(in_order, expected, got, "pass them in this order")
 
 
 @dataclass(frozen=True)
@@ -94,11 +95,9 @@ class Writer:
         """Write parameters (d,) into a model whose fields are as compiled."""
         for name, (places, constant, slope) in self.parts.items():
             values = constant + slope @ theta
-            now = field_of(model, name)
-            if isinstance(now, np.ndarray):
-                now.reshape(-1)[places] = values
-            else:
-                set_to(model, Entry(name, ()), float(values[0]))
+            now = np.array(field_of(model, name))
+            now.reshape(-1)[places] = values
+            set_field(model, name, now)
 
 
 def bounded(model: Any, parameters: Mapping[str, Any]) -> tuple[Bounded, ...]:
@@ -113,11 +112,8 @@ def bounded(model: Any, parameters: Mapping[str, Any]) -> tuple[Bounded, ...]:
     Raises:
         ValueError: If there is none, bounds are not in order, or a name is unknown.
     """
-    if not parameters:
-        raise ValueError(
-            "expected at least one parameter; got none; pass parameters={'joint."
-            "damping': (low, high)}"
-        )
+    advice = "pass parameters={'joint.damping': (low, high)}"
+    require(bool(parameters), "at least one parameter", "none", advice)
     found = []
     for name, given in parameters.items():
         try:
@@ -132,19 +128,18 @@ def bounded(model: Any, parameters: Mapping[str, Any]) -> tuple[Bounded, ...]:
             found.append(Bounded(name, low, high, edit=what))
             continue
         quantity = find_quantity(model, what)
-        if low < 0 and not quantity.known.is_signed:
-            raise ValueError(
-                f"expected bounds of {str(quantity)!r} from 0 on; got {low:g} to "
-                f"{high:g}; raise the lower one"
-            )
-        if quantity.attribute.startswith("com_") and not is_movable(
-            model, quantity.name
-        ):
-            raise ValueError(
-                f"expected a body whose center of mass can be written; got "
-                f"{quantity.name!r}, which MuJoCo compiles as simple; give it "
-                "simple='false' in the MJCF"
-            )
+        require(
+            low >= 0 or quantity.known.is_signed,
+            f"bounds of {str(quantity)!r} from 0 on",
+            f"{low:g} to {high:g}",
+            "raise the lower one",
+        )
+        require(
+            not quantity.is_center or is_movable(model, quantity.name),
+            "a body whose center of mass can be written",
+            f"{quantity.name!r}, which MuJoCo compiles as simple",
+            "give it simple='false' in the MJCF",
+        )
         found.append(Bounded(name, low, high, quantity.unit(model), quantity))
     return tuple(found)
 
@@ -179,7 +174,7 @@ def writer_of(
                 parameter.edit(edited, float(value))
         changed = edited.compile()
         _of_quantities(parameters, changed).write(changed, theta)
-        renew(changed, mujoco_of().MjData(changed))
+        renew(changed, mujoco.MjData(changed))
         return changed
 
     low = np.array([p.low for p in parameters])
@@ -201,7 +196,7 @@ def renew(model: Any, data: Any) -> None:
     """
     mean = float(model.dof_M0.mean()) if model.nv else 0.0
     is_own = abs(model.stat.meaninertia - mean) <= 1e-9 * mean
-    mujoco_of().mj_setConst(model, data)
+    mujoco.mj_setConst(model, data)
     if model.nv and is_own:  # and not given in the MJCF
         model.stat.meaninertia = float(model.dof_M0.mean())
 
@@ -212,7 +207,7 @@ def _of_quantities(parameters: Sequence[Bounded], model: Any) -> Writer:
     slopes: dict[str, dict[int, Array]] = {}
     quantities = [p.quantity for p in parameters]
     for j, quantity in enumerate(quantities):
-        for entry in [] if quantity is None else quantity.entries(model):
+        for entry in quantity.entries(model) if quantity else []:
             shape = np.shape(field_of(model, entry.field))
             place = int(np.ravel_multi_index(entry.index, shape)) if shape else 0
             slopes.setdefault(entry.field, {})[place] = entry.factor * np.eye(num)[j]
@@ -221,13 +216,13 @@ def _of_quantities(parameters: Sequence[Bounded], model: Any) -> Writer:
         for name, own in slopes.items()
     }
     loose = copy.copy(model)
-    for quantity in quantities:
-        if quantity is not None and quantity.loosen(loose):
-            for name in FRAMES:
-                frames = field_of(loose, name)
-                places = np.flatnonzero(frames != field_of(model, name))
-                zeros = np.zeros((len(places), num))
-                parts[name] = places, frames[places].astype(float), zeros
+    for quantity in filter(None, quantities):
+        quantity.loosen(loose)
+    for name in FRAMES:
+        frames = field_of(loose, name)
+        places = np.flatnonzero(frames != field_of(model, name))
+        if len(places):
+            parts[name] = places, frames[places] + 0.0, np.zeros((len(places), num))
     return Writer(parts)
 
 
@@ -296,7 +291,6 @@ def _agrees(
         tolerance: Relative error of numbers that are alike; compiling keeps about 12
             digits.
     """
-    mujoco = mujoco_of()
     model = compiled(0.5 * (low + high))
     rng = np.random.default_rng(0)
     for _ in range(places):

@@ -8,19 +8,23 @@ are multiples, so that it is written without another compilation; MuJoCo's
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
+from sbi_active.arrays import Array
+from sbi_active.expected import require
 from sbi_active.mujoco.models.names import (
     element_id,
     names_of,
     require_name,
     scalar_joints,
 )
-from sbi_active.mujoco.models.spec import mujoco_of
+from sbi_active.mujoco.models.spec import mujoco
 
 
 @dataclass(frozen=True)
@@ -40,169 +44,139 @@ class Entry:
 
 def field_of(model: Any, name: str) -> Any:
     """Return a field: a view of the model's memory, or a number."""
-    for part in name.split("."):
-        model = getattr(model, part)
-    return model
+    return attrgetter(name)(model)
 
 
-def set_to(model: Any, entry: Entry, value: float) -> None:
-    """Write a number."""
-    *owner, name = entry.field.split(".")
-    own = field_of(model, ".".join(owner)) if owner else model
-    if entry.index:
-        getattr(own, name)[entry.index] = value
-    else:
-        setattr(own, name, value)
+def set_field(model: Any, name: str, value: Array) -> None:
+    """Write a field, an array or a number."""
+    owner, _, last = name.rpartition(".")
+    own = field_of(model, owner) if owner else model
+    setattr(own, last, value if value.ndim else value.item())
 
 
 def add_to(model: Any, entry: Entry, value: float) -> None:
     """Add to a number."""
-    now = field_of(model, entry.field)
-    set_to(model, entry, float(now[entry.index] if entry.index else now) + value)
-
-
-def copied(model: Any, names: Iterable[str]) -> dict[str, Any]:
-    """Return copies of fields, by name."""
-    return {name: np.array(field_of(model, name)) for name in sorted({*names})}
-
-
-def restore(model: Any, fields: dict[str, Any]) -> None:
-    """Write fields back as they were copied."""
-    for name, value in fields.items():
-        if value.ndim:
-            field_of(model, name)[...] = value
-        else:
-            set_to(model, Entry(name, ()), value.item())
-
-
-Entries = Callable[[Any, int], list[Entry]]
+    now = np.array(field_of(model, entry.field))
+    now[entry.index] += value
+    set_field(model, entry.field, now)
 
 
 @dataclass(frozen=True)
 class Attribute:
-    """An attribute of a kind of element.
+    """An attribute of a kind of element: a number of a field, and what follows it.
 
     Attributes:
-        fields: Fields of ``mjModel`` that are written.
-        entries: Function of a model and the element's number that returns the numbers
-            that follow the attribute.
+        field: Field of ``mjModel``.
+        place: Indices behind the element's.
         unit: Unit in SI; N, L and I in braces are those of the joint.
-        is_signed: Whether MuJoCo's equations have a meaning for it below zero.
-    """
-
-    fields: tuple[str, ...]
-    entries: Entries
-    unit: str = ""
-    is_signed: bool = True
-
-
-def _at(
-    field: str,
-    *place: int,
-    unit: str = "",
-    by: str = "",
-    factor: float = 1.0,
-    is_signed: bool = True,
-) -> Attribute:
-    """Return an attribute that is one number of a field.
-
-    Args:
-        field: Name of the field.
-        *place: Further indices behind the element's.
-        unit: Unit in SI.
         by: Field that says where the element's numbers are; "" for its number.
         factor: Factor by which the attribute is multiplied.
-        is_signed: Whether it may be below zero.
+        is_signed: Whether MuJoCo's equations have a meaning for it below zero.
+        further: Function of a model and the element's number that returns the entries
+            of other fields.
+        others: These fields, and others that are written.
     """
 
-    def entries(model: Any, i: int) -> list[Entry]:
-        first = int(getattr(model, by)[i]) if by else i
-        return [Entry(field, (first, *place), factor)]
+    field: str
+    place: tuple[int, ...] = ()
+    unit: str = ""
+    by: str = ""
+    factor: float = 1.0
+    is_signed: bool = True
+    further: Callable[[Any, int], list[Entry]] | None = None
+    others: tuple[str, ...] = ()
 
-    return Attribute((field,), entries, unit, is_signed)
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Fields that are written."""
+        return self.field, *self.others
+
+    def entries(self, model: Any, i: int) -> list[Entry]:
+        """Return the numbers of a model that follow that of an element."""
+        index = (int(field_of(model, self.by)[i]) if self.by else i, *self.place)
+        if self.field.startswith("opt."):
+            index = self.place
+        own = [] if self.field == GRAVITY else [Entry(self.field, index, self.factor)]
+        return own + (self.further(model, i) if self.further else [])
 
 
-def _option(name: str, unit: str) -> Attribute:
-    return Attribute(
-        (f"opt.{name}",), lambda model, i: [Entry(f"opt.{name}", ())], unit
-    )
-
-
-def _mass(model: Any, i: int) -> list[Entry]:
+def _inertia(model: Any, i: int) -> list[Entry]:
+    """Return the inertia of a body, in proportion to its mass."""
     mass = float(model.body_mass[i])
     inertia = model.body_inertia[i] / mass if mass > 0 else np.zeros(3)
-    parts = [Entry("body_inertia", (i, k), float(inertia[k])) for k in range(3)]
-    return [Entry("body_mass", (i,)), *parts]
+    return [Entry("body_inertia", (i, k), float(inertia[k])) for k in range(3)]
 
 
-def _gain(model: Any, i: int) -> list[Entry]:
+def _servo(model: Any, i: int) -> list[Entry]:
+    """Return the bias of a position servo, whose force is gain (ctrl - q)."""
     gain, bias = float(model.actuator_gainprm[i, 0]), model.actuator_biasprm[i]
-    entries = [Entry("actuator_gainprm", (i, 0))]
-    if gain and bias[1] == -gain:  # a position servo: gain (ctrl - q)
-        entries.append(Entry("actuator_biasprm", (i, 1), -1.0))
-    return entries
+    is_servo = gain and bias[1] == -gain
+    return [Entry("actuator_biasprm", (i, 1), -1.0)] if is_servo else []
 
 
 def _gravity(model: Any, i: int) -> list[Entry]:
+    """Return the components of gravity, the largest first."""
     g = model.opt.gravity
     size = float(np.linalg.norm(g)) or 1.0
     return [
-        Entry("opt.gravity", (k,), float(g[k]) / size)
+        Entry(GRAVITY, (k,), float(g[k]) / size)
         for k in sorted(range(3), key=lambda k: -abs(g[k]))
         if g[k] or not g.any()
     ]
 
 
+GRAVITY = "opt.gravity"
 #: Fields that say that a frame is another's, and no longer hold for a center of mass.
 FRAMES = ("body_sameframe", "geom_sameframe")
-
-
-def _center(k: int) -> Attribute:
-    return Attribute(("body_ipos", *FRAMES), _at("body_ipos", k).entries, "m")
-
-
-GAIN = "actuator_gainprm", "actuator_biasprm"
+KP = Attribute(
+    "actuator_gainprm", (0,), "{N}/{L}", further=_servo, others=("actuator_biasprm",)
+)
+DOF, QPOS = "jnt_dofadr", "jnt_qposadr"
+Positive = partial(Attribute, is_signed=False)
 #: Attributes of each kind of element, by their MJCF names.
 ATTRIBUTES: dict[str, dict[str, Attribute]] = {
     "joint": {
-        "damping": _at("dof_damping", by="jnt_dofadr", unit="{N} s/{L}"),
-        "armature": _at("dof_armature", by="jnt_dofadr", unit="{I}", is_signed=False),
-        "frictionloss": _at(
-            "dof_frictionloss", by="jnt_dofadr", unit="{N}", is_signed=False
-        ),
-        "stiffness": _at("jnt_stiffness", unit="{N}/{L}"),
-        "springref": _at("qpos_spring", by="jnt_qposadr", unit="{L}"),
+        "damping": Attribute("dof_damping", (), "{N} s/{L}", DOF),
+        "damping^2": Attribute("dof_dampingpoly", (0,), "{N} (s/{L})^2", DOF),
+        "damping^3": Attribute("dof_dampingpoly", (1,), "{N} (s/{L})^3", DOF),
+        "armature": Positive("dof_armature", (), "{I}", DOF),
+        "frictionloss": Positive("dof_frictionloss", (), "{N}", DOF),
+        "stiffness": Attribute("jnt_stiffness", (), "{N}/{L}"),
+        "stiffness^2": Attribute("jnt_stiffnesspoly", (0,), "{N}/{L}^2"),
+        "stiffness^3": Attribute("jnt_stiffnesspoly", (1,), "{N}/{L}^3"),
+        "springref": Attribute("qpos_spring", (), "{L}", QPOS),
     },
     "body": {
-        # The inertia in proportion.
-        "mass": Attribute(("body_mass", "body_inertia"), _mass, "kg", is_signed=False),
-        "com_x": _center(0),
-        "com_y": _center(1),
-        "com_z": _center(2),
+        "mass": Positive(
+            "body_mass", (), "kg", further=_inertia, others=("body_inertia",)
+        ),
+        "com_x": Attribute("body_ipos", (0,), "m", others=FRAMES),
+        "com_y": Attribute("body_ipos", (1,), "m", others=FRAMES),
+        "com_z": Attribute("body_ipos", (2,), "m", others=FRAMES),
     },
     "actuator": {
-        "gear": _at("actuator_gear", 0),
-        "gain": Attribute(GAIN, _gain),  # of a servo kp, and its bias with it
-        "kp": Attribute(GAIN, _gain, "{N}/{L}"),
-        "kv": _at("actuator_biasprm", 2, factor=-1.0, unit="{N} s/{L}"),
-        "timeconst": _at("actuator_dynprm", 0, unit="s"),
+        "gear": Attribute("actuator_gear", (0,)),
+        "gain": replace(KP, unit=""),
+        "kp": KP,
+        "kv": Attribute("actuator_biasprm", (2,), "{N} s/{L}", factor=-1.0),
+        "timeconst": Attribute("actuator_dynprm", (0,), "s"),
     },
     "geom": {
-        "friction": _at("geom_friction", 0, is_signed=False),
-        "torsional_friction": _at("geom_friction", 1, unit="m", is_signed=False),
-        "rolling_friction": _at("geom_friction", 2, unit="m", is_signed=False),
-        "timeconst": _at("geom_solref", 0, unit="s"),
-        "dampratio": _at("geom_solref", 1),
+        "friction": Positive("geom_friction", (0,)),
+        "torsional_friction": Positive("geom_friction", (1,), "m"),
+        "rolling_friction": Positive("geom_friction", (2,), "m"),
+        "timeconst": Attribute("geom_solref", (0,), "s"),
+        "dampratio": Attribute("geom_solref", (1,)),
     },
     "tendon": {
-        "stiffness": _at("tendon_stiffness"),
-        "damping": _at("tendon_damping"),
-        "frictionloss": _at("tendon_frictionloss", is_signed=False),
+        "stiffness": Attribute("tendon_stiffness"),
+        "damping": Attribute("tendon_damping"),
+        "frictionloss": Positive("tendon_frictionloss"),
     },
     "option": {
-        "gravity": Attribute(("opt.gravity",), _gravity, "m/s^2"),
-        "density": _option("density", "kg/m^3"),
-        "viscosity": _option("viscosity", "Pa s"),
+        "gravity": Attribute(GRAVITY, unit="m/s^2", further=_gravity),
+        "density": Attribute("opt.density", unit="kg/m^3"),
+        "viscosity": Attribute("opt.viscosity", unit="Pa s"),
     },
 }
 
@@ -230,6 +204,11 @@ class Quantity:
         """What is known of the attribute."""
         return ATTRIBUTES[self.kind][self.attribute]
 
+    @property
+    def is_center(self) -> bool:
+        """Whether it is a center of mass."""
+        return self.attribute.startswith("com_")
+
     def entries(self, model: Any) -> list[Entry]:
         """Return the numbers of a model that follow it."""
         i = 0 if self.kind == "option" else element_id(model, self.kind, self.name)
@@ -244,21 +223,16 @@ class Quantity:
             joint = joint_of_actuator(model, self.name)
         return "" if joint is None else unit.format(**units_of(model, joint))
 
-    def loosen(self, model: Any) -> bool:
-        """Tell MuJoCo, in place, that a center of mass that is written is elsewhere.
-
-        Returns:
-            Whether it is a center of mass.
-        """
-        if not self.attribute.startswith("com_"):
-            return False
+    def loosen(self, model: Any) -> None:
+        """Tell MuJoCo, in place, that a center of mass that is written is elsewhere."""
+        if not self.is_center:
+            return
         i = element_id(model, "body", self.name)
-        same = mujoco_of().mjtSameFrame
+        same = mujoco.mjtSameFrame
         own = model.geom_bodyid == i
         inertial = int(same.mjSAMEFRAME_INERTIA), int(same.mjSAMEFRAME_INERTIAROT)
         model.geom_sameframe[own & np.isin(model.geom_sameframe, inertial)] = 0
         model.body_sameframe[i] = 0
-        return True
 
 
 def find_quantity(model: Any, text: str) -> Quantity:
@@ -280,7 +254,8 @@ def find_quantity(model: Any, text: str) -> Quantity:
         Quantity(kind, own, each)
         for kind, attributes in ATTRIBUTES.items()
         for own in names[kind]
-        for each in attributes
+        for each, known in attributes.items()
+        if kind == "option" or hasattr(model, known.field)  # from a version on
     ]
     found = [
         q
@@ -289,25 +264,22 @@ def find_quantity(model: Any, text: str) -> Quantity:
     ]
     if not dot or not found:
         require_name(rest, map(str, every), "quantity, 'element.attribute',")
-    if len(found) > 1:
-        kinds = ", ".join(f"{q.kind}:{q}" for q in found)
-        raise ValueError(
-            f"expected one quantity {text!r}; got {len(found)}; pass one of {kinds}"
-        )
+    kinds = ", ".join(f"{q.kind}:{q}" for q in found)
+    expected, advice = f"one quantity {text!r}", f"pass one of {kinds}"
+    require(len(found) == 1, expected, len(found), advice)
     return found[0]
 
 
 def units_of(model: Any, joint: str) -> dict[str, str]:
     """Return the units of force, length and inertia of a joint: N, L and I."""
     kind = int(model.jnt_type[element_id(model, "joint", joint)])
-    if kind == int(mujoco_of().mjtJoint.mjJNT_SLIDE):
+    if kind == int(mujoco.mjtJoint.mjJNT_SLIDE):
         return {"N": "N", "L": "m", "I": "kg"}
     return {"N": "N m", "L": "rad", "I": "kg m^2"}
 
 
 def joint_of_actuator(model: Any, actuator: str) -> str | None:
     """Return the joint that an actuator drives, None if it is something else."""
-    mujoco = mujoco_of()
     i = element_id(model, "actuator", actuator)
     joints = mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT
     if int(model.actuator_trntype[i]) not in map(int, joints):

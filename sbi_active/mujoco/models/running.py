@@ -9,6 +9,7 @@ A sensor's reading belongs to the state before a step: reading k is at time k h.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,120 +17,141 @@ import numpy as np
 from sbi_active.arrays import Array
 from sbi_active.mujoco.models.changes import StateChange
 from sbi_active.mujoco.models.machine import Model, Rows
-from sbi_active.mujoco.models.names import element_id, start_places
+from sbi_active.mujoco.models.names import element_id, physics_size, places_of
 from sbi_active.mujoco.models.quantities import field_of
-from sbi_active.mujoco.models.spec import mujoco_of
+from sbi_active.mujoco.models.spec import mujoco
 
 
-def readings(model: Model, models: list[Any], rows: Rows, *, threads: int = 1) -> Array:
-    """Return the sensors' readings, NaN throughout for a row that diverged.
+@dataclass
+class Run:
+    """Rows that one model simulates at once.
 
-    Args:
+    Attributes:
         model: Model of all rows.
-        models: Models, one a row.
-        rows: Rows whose controls have shape (n, steps, nu + 7 nmocap).
-        threads: Threads of MuJoCo's rollout.
-
-    Returns:
-        Shape (n, steps, sensordata).
+        models: Copies of it, one a row.
+        rows: Rows.
+        state: Physics states at the start, shape (n, nstate).
+        controls: Controls and poses of mocap bodies, shape
+            (n, steps, nu + 7 nmocap), held over each step.
     """
-    start = start_states(model, rows)
-    _settle(model, models, rows, start)
-    run = _stepped if rows.is_stepped else _rolled_out
-    x, finished = run(model, models, start, rows, threads)
-    x[~finished] = np.nan
-    return x
+
+    model: Model
+    models: list[Any]
+    rows: Rows
+    state: Array
+    controls: Array
+
+    @classmethod
+    def of(
+        cls, model: Model, models: list[Any], rows: Rows, grid: Array | None, steps: int
+    ) -> Run:
+        """Return rows at their start.
+
+        Args:
+            model: Model of all rows.
+            models: Copies of it, one a row.
+            rows: Rows.
+            grid: Times of the inputs, shape (m,).
+            steps: Number of readings.
+        """
+        base, size = model.base, physics_size(model.base)
+        first, places = initial(base, model.data), places_of(base)
+        every = np.repeat(first[None], len(rows), 0)
+        for name, value in rows.start.items():
+            every[:, places[name]] = value
+        controls = np.repeat(every[:, None, size:], steps, 1)
+        for name, series in rows.inputs.items():
+            place = element_id(base, "actuator", name)
+            assert grid is not None
+            controls[:, :, place] = held(series, grid, steps, base.opt.timestep)
+        return cls(model, models, rows, every[:, :size], controls)
+
+    def begin(self, i: int, data: Any) -> None:
+        """Set data to the start of a row."""
+        mujoco.mj_resetData(self.models[i], data)
+        for state, kind in zip(
+            (self.state[i], self.controls[i, 0]), kinds(), strict=True
+        ):
+            mujoco.mj_setState(self.models[i], data, state, kind)
+
+    def readings(self, *, threads: int = 1) -> Array:
+        """Return the sensors' readings, NaN throughout for a row that diverged.
+
+        Args:
+            threads: Threads of MuJoCo's rollout.
+
+        Returns:
+            Shape (n, steps, sensordata).
+        """
+        if self.model.inserted:
+            self._settle()
+        x, finished = _stepped(self) if self.rows.is_stepped else _rolled(self, threads)
+        x[~finished] = np.nan
+        return x
+
+    def _settle(self) -> None:
+        """Move inserted elements to where they rest."""
+        data = self.model.data
+        for i, own in enumerate(self.models):
+            self.begin(i, data)
+            mujoco.mj_forward(own, data)
+            for change in self.model.inserted:
+                change.settle(own, data, self.rows.changes[change][i])
+            mujoco.mj_getState(own, data, self.state[i], kinds()[0])
 
 
-def start_states(model: Model, rows: Rows) -> Array:
-    """Return the physics states that rows start from, shape (n, nstate)."""
-    mujoco = mujoco_of()
-    kind = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
-    base, data = model.base, model.data
-    mujoco.mj_resetData(base, data)
-    state = np.empty(mujoco.mj_stateSize(base, kind))
-    mujoco.mj_getState(base, data, state, kind)
-    states = np.repeat(state[None], len(rows), 0)
-    places = start_places(base)
-    for name, value in rows.start.items():
-        if name in places:  # and not held, as a control is
-            states[:, 1 + places[name]] = value  # the time comes first
-    return states
+def kinds() -> tuple[int, int]:
+    """Return MuJoCo's kinds of state of a row's physics, and of what is held."""
+    state = mujoco.mjtState
+    held = state.mjSTATE_CTRL, state.mjSTATE_MOCAP_POS, state.mjSTATE_MOCAP_QUAT
+    return state.mjSTATE_FULLPHYSICS.value, sum(kind.value for kind in held)
 
 
-def begin(model: Any, data: Any, state: Array, held: Array) -> None:
-    """Set the start of a row.
+def initial(model: Any, data: Any, key: int | None = None) -> Array:
+    """Return physics state and what is held of a model, or of one of its keyframes.
 
     Args:
-        model: Model of the row.
-        data: Data of the model, to set.
-        state: Physics state, shape (nstate,).
-        held: Controls and poses of mocap bodies, shape (nu + 7 nmocap,).
+        model: Compiled model.
+        data: Data of the model, to work in.
+        key: Number of the keyframe.
     """
-    mujoco = mujoco_of()
     mujoco.mj_resetData(model, data)
-    mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS.value)
-    mujoco.mj_setState(model, data, held, held_kind())
+    if key is not None:
+        mujoco.mj_resetDataKeyframe(model, data, key)
+    parts = []
+    for kind in kinds():
+        parts.append(np.empty(mujoco.mj_stateSize(model, kind)))
+        mujoco.mj_getState(model, data, parts[-1], kind)
+    return np.concatenate(parts)
 
 
-def held_kind() -> int:
-    """Return the kind of MuJoCo's state that a row's controls are."""
-    state = mujoco_of().mjtState
-    kinds = state.mjSTATE_CTRL, state.mjSTATE_MOCAP_POS, state.mjSTATE_MOCAP_QUAT
-    return sum(kind.value for kind in kinds)
-
-
-def held_states(model: Model) -> Array:
-    """Return the states held where nothing says otherwise, shape (nu + 7 nmocap,)."""
-    mujoco = mujoco_of()
-    mujoco.mj_resetData(model.base, model.data)
-    held = np.empty(mujoco.mj_stateSize(model.base, held_kind()))
-    mujoco.mj_getState(model.base, model.data, held, held_kind())
-    return held
-
-
-def _settle(model: Model, models: list[Any], rows: Rows, start: Array) -> None:
-    """Move inserted elements to where they rest, in place."""
-    if not model.inserted:
-        return
-    mujoco = mujoco_of()
-    kind = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
-    for i, own in enumerate(models):
-        begin(own, model.data, start[i], rows.controls[i, 0])
-        mujoco.mj_forward(own, model.data)
-        for change in model.inserted:
-            change.settle(own, model.data, rows.changes[change][i])
-        mujoco.mj_getState(own, model.data, start[i], kind)
-
-
-def _rolled_out(
-    model: Model, models: list[Any], start: Array, rows: Rows, threads: int
-) -> tuple[Array, Array]:
-    mujoco = mujoco_of()
-    steps = rows.controls.shape[1]
-    data = [mujoco.MjData(model.base) for _ in range(threads)]
+def _rolled(run: Run, threads: int) -> tuple[Array, Array]:
+    """Return readings by MuJoCo's rollout, and which rows came to their end."""
+    steps = run.controls.shape[1]
     state, sensors = mujoco.rollout.rollout(
-        *(models, data, start, rows.controls),
-        control_spec=held_kind(),
+        run.models,
+        [mujoco.MjData(run.model.base) for _ in range(threads)],
+        run.state,
+        run.controls,
+        control_spec=kinds()[1],
         nstep=steps,
         persistent_pool=threads > 1,
     )
     # A rollout ends where MuJoCo warns, and repeats its last state from there on.
-    span = steps * np.array([m.opt.timestep for m in models])
-    ran = np.abs(state[:, -1, 0] - start[:, 0] - span) < 0.5 * span / steps
+    span = steps * np.array([m.opt.timestep for m in run.models])
+    ran = np.abs(state[:, -1, 0] - run.state[:, 0] - span) < 0.5 * span / steps
     return sensors, ran & np.isfinite(sensors).all((1, 2))
 
 
-def _stepped(
-    model: Model, models: list[Any], start: Array, rows: Rows, threads: int
-) -> tuple[Array, Array]:
-    mujoco = mujoco_of()
-    steps, step = rows.controls.shape[1], model.base.opt.timestep
+def _stepped(run: Run) -> tuple[Array, Array]:
+    """Return readings step by step, and which rows came to their end."""
+    model, models, rows = run.model, run.models, run.rows
+    steps, step = run.controls.shape[1], model.base.opt.timestep
     while len(model.datas) < len(models):
         model.datas.append(mujoco.MjData(model.base))
     datas = model.datas[: len(models)]
-    for i, (own, data) in enumerate(zip(models, datas, strict=True)):
-        begin(own, data, start[i], rows.controls[i, 0])
+    for i, data in enumerate(datas):
+        run.begin(i, data)
     x = np.empty((len(rows), steps, model.base.nsensordata))
     # Views: what MuJoCo writes is there at the next look.
     q, v = [d.qpos for d in datas], [d.qvel for d in datas]
@@ -137,8 +159,8 @@ def _stepped(
     controls = [d.ctrl for d in datas]
     going = np.ones(len(rows), dtype=bool)
     pairs = [*zip(models, datas, strict=True)]
-    following = _Following(model, models, datas, rows)
-    given = [*rows.controls[..., : model.base.nu]]
+    following = _Following(run, datas)
+    given = [*run.controls[..., : model.base.nu]]
     with np.errstate(all="ignore"):  # of rows that diverge
         for k in range(steps):
             if rows.forces:
@@ -153,8 +175,8 @@ def _stepped(
             for i in np.flatnonzero(going).tolist():
                 controls[i][:] = given[i][k]
                 for fields, dofs, table in tables:
-                    for dof, number in zip(dofs, table[i], strict=True):
-                        fields[i][dof] = number
+                    for dof in dofs:
+                        fields[i][dof] = table[i][dof]
                 mujoco.mj_step(*pairs[i])
                 x[i, k] = sensors[i]
             if k % 64 == 0 or k == steps - 1:
@@ -165,50 +187,105 @@ def _stepped(
 
 
 class _Following:
-    """Entries of each row's model that follow the state of its joints."""
+    """Fields of each row's model that follow the state of its joints."""
 
-    def __init__(
-        self, model: Model, models: list[Any], datas: list[Any], rows: Rows
-    ) -> None:
-        self.loads = [d.qfrc_actuator for d in datas]
-        own, base = [], model.base
-        for change, phi in rows.changes.items():
+    def __init__(self, run: Run, datas: list[Any]) -> None:
+        self.loads = [data.qfrc_actuator for data in datas]
+        self.changes, base = [], run.model.base
+        for change, phi in run.rows.changes.items():
             if isinstance(change, StateChange):
                 joints = [element_id(base, "joint", name) for name in change.joints()]
                 places = base.jnt_qposadr[joints], base.jnt_dofadr[joints]
-                own.append((change, phi, *places))
-        # Changes of one field add up. Rows of the same numbers share a model: what it
-        # has is looked up before any of them runs.
-        self.parts = []
-        for name in dict.fromkeys(one[0].fields()[0] for one in own):
-            some = [one for one in own if one[0].fields()[0] == name]
-            dofs = np.unique(np.concatenate([one[3] for one in some]))
-            some = [(*one, np.searchsorted(dofs, one[3])) for one in some]
-            fields = [field_of(each, name) for each in models]
-            before = np.array([field[dofs] for field in fields])
-            self.parts.append((fields, dofs.tolist(), before, some))
+                self.changes.append((change.fields()[0], change, phi, *places))
+        # Rows of the same numbers share a model: what it has is looked up before any of
+        # them runs.
+        names = dict.fromkeys(name for name, *_ in self.changes)
+        self.fields = {n: [field_of(own, n) for own in run.models] for n in names}
+        self.before = {name: np.array(fields) for name, fields in self.fields.items()}
+        own = {n: [part[-1] for part in self.changes if part[0] == n] for n in names}
+        self.entries = {n: np.unique(np.concatenate(own[n])).tolist() for n in names}
 
     def tables(self, q: list[Array], v: list[Array]) -> list[tuple[Any, Any, Any]]:
-        """Return fields by row, entries, and the numbers that each row has there.
+        """Return fields by row, entries that change, and each row's numbers.
 
         Args:
             q: Positions of each row.
             v: Velocities.
         """
-        if not self.parts:
+        if not self.changes:
             return []
         at, speed, load = np.stack(q), np.stack(v), np.stack(self.loads)
-        found = []
-        for fields, dofs, before, changes in self.parts:
-            total = before.copy()
-            for change, phi, places, own, among in changes:
-                state = at[:, places], speed[:, own], load[:, own]
-                total[:, among] += change.values(*state, phi)
-            found.append((fields, dofs, total.tolist()))
-        return found
+        total = {name: before.copy() for name, before in self.before.items()}
+        for name, change, phi, places, dofs in self.changes:  # they add up
+            state = at[:, places], speed[:, dofs], load[:, dofs]
+            total[name][:, dofs] += change.values(
+                *state, phi
+            )  # those of a field add up
+        return [
+            (fields, self.entries[name], total[name].tolist())
+            for name, fields in self.fields.items()
+        ]
 
     def restore(self) -> None:
         """Write back what the models had."""
-        for fields, dofs, before, _ in self.parts:
-            for field, values in zip(fields, before, strict=True):
-                field[dofs] = values
+        for name, fields in self.fields.items():
+            for own, values in zip(fields, self.before[name], strict=True):
+                own[:] = values
+
+
+#: Share of a step by which a time may be off and count as that of a step.
+ON_TIME = 1e-3
+
+
+def num_steps(times: Array, start: float, step: float) -> int:
+    """Return the number of readings, one a step from the start, up to the last time."""
+    last = float(times.max()) - start
+    return max(int(np.ceil(last / step - ON_TIME)), 0) + 1
+
+
+def held(series: Array, own: Array, num: int, step: float) -> Array:
+    """Return a series (n, m), held between the points of its grid, at every step.
+
+    Args:
+        series: Series, shape (n, m).
+        own: Grid of the series, shape (m,).
+        num: Number of steps from the grid's first point.
+        step: Time step of the simulation.
+    """
+    times = own[0] + step * np.arange(num)
+    slack = ON_TIME * min(step, own[1] - own[0])
+    place = np.searchsorted(own, times + slack, side="right") - 1
+    return series[:, np.clip(place, 0, len(own) - 1)]
+
+
+def sampled(
+    readings: Array,
+    times: Array,
+    start: float,
+    step: float,
+    late: Array | None = None,
+) -> Array:
+    """Return readings at times, a line between those of two steps.
+
+    Args:
+        readings: Readings, shape (n, steps, c), from the start on.
+        times: Times, shape (n, k).
+        start: Time of the first reading.
+        step: Time between readings.
+        late: Delay of each channel, (n, c); None is 0.
+
+    Returns:
+        Shape (n, k, c).
+    """
+    last, wanted = readings.shape[1] - 1, times[..., None]
+    if late is not None:
+        wanted = wanted - late[:, None]
+    place = np.clip((wanted - start) / step, 0, last)
+    nearest = np.round(place)
+    place = np.where(np.abs(place - nearest) < ON_TIME, nearest, place)
+    low = np.floor(place).astype(int)
+    found, weight = np.take_along_axis(readings, low, 1), place - low
+    if not weight.any():
+        return found
+    after = np.take_along_axis(readings, np.minimum(low + 1, last), 1)
+    return np.where(weight > 0, (1 - weight) * found + weight * after, found)

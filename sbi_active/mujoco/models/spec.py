@@ -7,22 +7,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-#: What to install where MuJoCo is missing.
-INSTALL = "pip install 'sbi-active[mujoco]'"
+try:
+    import mujoco as mujoco_module
+    import mujoco.rollout
+except ImportError as error:
+    raise ImportError(
+        "expected MuJoCo 3.5 or later; got none; run pip install 'sbi-active[mujoco]'"
+    ) from error
 
+#: The module, whose types say less than its documentation.
+mujoco: Any = mujoco_module
 Edit = Callable[[Any], None]
-
-
-def mujoco_of() -> Any:
-    """Return the module ``mujoco``, or raise with the line that installs it."""
-    try:
-        import mujoco
-        import mujoco.rollout
-    except ImportError as error:
-        raise ImportError(
-            f"expected MuJoCo 3.5 or later; got none; run {INSTALL}"
-        ) from error
-    return mujoco
 
 
 @contextmanager
@@ -31,7 +26,6 @@ def quiet() -> Iterator[None]:
 
     Such rows are counted as invalid outcomes.
     """
-    mujoco = mujoco_of()
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(_nothing)
     try:
@@ -63,7 +57,6 @@ class Source:
     """
 
     def __init__(self, given: Any, edits: tuple[Edit, ...] = ()) -> None:
-        mujoco = mujoco_of()
         self.edits = edits
         self._text, self._path, self._assets, self._folder = None, None, {}, ""
         self._spec = None
@@ -96,7 +89,6 @@ class Source:
 
     def spec(self) -> Any:
         """Return the spec, edited; the same in every process."""
-        mujoco = mujoco_of()
         if self._path is not None:
             spec = mujoco.MjSpec.from_file(str(self._path))
         else:

@@ -1,1 +1,0 @@
-"""Does a belief's flag follow its error?"""
