@@ -134,30 +134,3 @@ def takes_loose(**groups: Any) -> Callable[[Taking], Taking]:
         return taking
 
     return decorate
-
-
-def set_later(*names: str) -> Callable[[Taking], Taking]:
-    """Let a constructor take attributes that are set afterwards, for one version.
-
-    Args:
-        *names: Names of the attributes.
-    """
-
-    def decorate(make: Any) -> Any:
-        suggesting = suggests(make)
-
-        @functools.wraps(make)
-        def call(self: Any, *args: Any, **kwargs: Any) -> Any:
-            later = {name: kwargs.pop(name) for name in names if name in kwargs}
-            made = suggesting(self, *args, **kwargs)
-            for name, value in later.items():
-                text = (
-                    f"SA701 the keyword {name}= goes in the next version: set .{name}"
-                )
-                warn(text, stacklevel=stack_level())
-                setattr(self if made is None else made, name, value)
-            return made
-
-        return call
-
-    return decorate

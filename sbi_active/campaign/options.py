@@ -12,7 +12,14 @@ import torch
 from torch.distributions import Distribution
 
 from sbi_active.design.design import Design
-from sbi_active.expected import require, require_least, require_one_of, suggests
+from sbi_active.design.estimators.automatic import find_estimator
+from sbi_active.expected import (
+    require,
+    require_kinds,
+    require_least,
+    require_one_of,
+    suggests,
+)
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.renamed import grouped, takes_loose
@@ -241,6 +248,9 @@ class CampaignOptions:
         if self.bank is not None:
             object.__setattr__(self, "bank", os.fspath(self.bank))
         object.__setattr__(self, "workers", Workers.of(self.workers))
+        settings = {"refinement": RefinementOptions, "details": CampaignDetails}
+        require_kinds(self, refine=bool, stop=StopRules, **settings)
+        find_estimator(self.estimator)  # an unknown name is an error here
         require(
             self.refinement.workers in (IN_PROCESS, self.workers),
             "the refinement's simulations to run as all others of a campaign, "
@@ -250,6 +260,7 @@ class CampaignOptions:
         )
         require_one_of(self, network=("each round", "on demand"))
         require_least(self, "use about 5000 a round", num_simulations=100)
+        require_least(self, "use about 1500 an action", num_samples=8)
         require_least(self, "use some hundred a trial", max_simulations=100)
         advice = "pass the number of trials that you can run"
         require_least(self, advice, planned_trials=1)

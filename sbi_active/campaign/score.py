@@ -7,26 +7,20 @@ not measured.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.distributions import Distribution
 
 from sbi_active.inference.sampling.weights import silverman
-from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation import Simulations, simulate
-from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 #: Shares of the diagonal among which the leave-one-out likelihood chooses.
 SHARES = torch.logspace(-10, 0, 21, dtype=torch.float64)
 FLOOR = 1e-10  # of the largest variance, for numbers that never vary
 
 
-def score_outcome(x: Tensor, rows: Simulations) -> tuple[float, float]:
+def score_outcome(x: Tensor, simulated: Tensor) -> tuple[float, float]:
     r"""Return tail probability and log score of an outcome among simulations.
 
     .. math::
@@ -52,7 +46,8 @@ def score_outcome(x: Tensor, rows: Simulations) -> tuple[float, float]:
 
     Args:
         x: The outcome, shape x_shape; NaN where nothing was measured.
-        rows: Simulations of its action from the belief before it.
+        simulated: Outcomes of its action under the belief before it, shape
+            (n, *x_shape).
 
     Returns:
         p in (0, 1], and the log score in nats.
@@ -61,50 +56,9 @@ def score_outcome(x: Tensor, rows: Simulations) -> tuple[float, float]:
         Dawid, J. R. Stat. Soc. A 1984 (prequential assessment); Vovk, Gammerman &
         Shafer, Algorithmic Learning in a Random World, 2005 (conformal p-values).
     """
-    drawn = rows.without_missing().x.double().flatten(1)
+    observed, drawn = x.double().flatten(), simulated.double().flatten(1)
     drawn = torch.where(drawn.isfinite(), drawn, torch.nan)
-    return compared(drawn, x.double().flatten())
-
-
-def simulate_from(
-    belief: Distribution,
-    simulator: Callable[..., Any],
-    action: Tensor,
-    *,
-    num_samples: int,
-    seed: int,
-    workers: Workers = IN_PROCESS,
-) -> Simulations:
-    """Return simulations of one action, with parameters from a distribution.
-
-    Args:
-        belief: Distribution of the parameters.
-        simulator: ``simulator(theta, action)``.
-        action: The action, shape (action_dim,).
-        num_samples: Number of rows.
-        seed: Seed of the parameters and the simulations.
-        workers: Workers that run the simulations.
-    """
-    with forked_generators(seed, "theta"):
-        theta = belief.sample(torch.Size([num_samples]))
-    return simulate(
-        simulator,
-        theta,
-        action.expand(num_samples, -1),
-        seed=derive_seed(seed, "x"),
-        workers=workers,
-    )
-
-
-def compared(drawn: Tensor, observed: Tensor) -> tuple[float, float]:
-    """Return tail probability and log density of an outcome.
-
-    Args:
-        drawn: Predictions, shape (n, q), NaN where nothing is measured.
-        observed: The outcome, shape (q,).
-    """
-    surprise = _surprise(torch.cat([drawn, observed[None]]))
-    return surprise, _log_score(drawn, observed)
+    return _surprise(torch.cat([drawn, observed[None]])), _log_score(drawn, observed)
 
 
 def _surprise(rows: Tensor) -> float:

@@ -48,10 +48,6 @@ class CampaignTrials(Telling[Trial]):
     Attributes:
         actions: Actions that the robot may take.
         state: State of the campaign.
-        on_trial: Function that is called with each trial that was told, once it is
-            recorded; set it.
-        on_update: Function that is called with each trial, once the belief contains it;
-            set it.
     """
 
     actions: ActionSpace
@@ -60,8 +56,6 @@ class CampaignTrials(Telling[Trial]):
     _planner: Any
     _storage: Storage
     _stated: tuple[Distribution, list[str], Distribution] | None = None
-    on_trial: Callable[[Trial], None] | None = None
-    on_update: Callable[[Trial], None] | None = None
 
     def __repr__(self) -> str:
         done, pending = len(self.history), self.pending is not None
@@ -147,14 +141,12 @@ class CampaignTrials(Telling[Trial]):
         """The lines of the log on the disk so far, without one in memory alone."""
         return (*self._storage.events,)
 
-    def contains(self, trial: Trial) -> bool:
-        """Return whether the belief takes account of a trial as it is recorded now."""
-        return trial.index in self.state.processed and not self.state.is_stale
-
     @property
     def not_in_belief(self) -> Sequence[int]:
         """Indices of trials that were told and the belief takes no account of yet."""
-        return [t.index for t in self.history if not self.contains(t)]
+        state = self.state
+        known = () if state.is_stale else state.processed
+        return [t.index for t in self.history if t.index not in known]
 
     @property
     def health(self) -> Health:
@@ -285,10 +277,7 @@ class CampaignTrials(Telling[Trial]):
 
     def _record(self, event: str, facts: Facts) -> Trial:
         self._storage.write(event, facts)  # on the disk before it counts
-        trial = self.state.record(facts)
-        if self.on_trial is not None and trial.status != "withdrawn":
-            self.on_trial(trial)
-        return trial
+        return self.state.record(facts)
 
 
 def outcome_told(x: Any, x_shape: torch.Size) -> Tensor:

@@ -13,9 +13,10 @@ from torch.distributions import MultivariateNormal, Normal
 from sbi_active import StopRules
 from sbi_active.campaign import CampaignOptions, Trial, health
 from sbi_active.campaign.health import assess, log_e_value
-from sbi_active.campaign.score import score_outcome, simulate_from
+from sbi_active.campaign.score import score_outcome
 from sbi_active.campaign.state import CampaignState, ModelVersion
-from sbi_active.seeding import derive_seed
+from sbi_active.seeding import derive_seed, forked_generators
+from sbi_active.simulation import simulate
 from tests.campaign.problem import campaign
 
 PRIOR = MultivariateNormal(torch.zeros(1), torch.eye(1))
@@ -28,8 +29,11 @@ def simulator(theta, action):
 
 def score(x, simulator=simulator, action=ACTION, num_samples=2_000, seed=0):
     """Return the surprise and the log score of an outcome."""
-    rows = simulate_from(PRIOR, simulator, action, num_samples=num_samples, seed=seed)
-    return score_outcome(torch.as_tensor(x), rows)
+    with forked_generators(seed, "theta"):
+        theta = PRIOR.sample((num_samples,))
+    action = action.expand(num_samples, -1)
+    rows = simulate(simulator, theta, action, seed=derive_seed(seed, "x"))
+    return score_outcome(torch.as_tensor(x), rows.x)
 
 
 def test_surprise_and_log_score_are_those_of_the_predictive():

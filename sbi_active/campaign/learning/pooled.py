@@ -16,7 +16,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.actions.summaries import find_summaries
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.learning.methods import find_method
-from sbi_active.campaign.score import compared
+from sbi_active.campaign.score import score_outcome
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.design.design import Design
 from sbi_active.design.elimination import choose
@@ -267,7 +267,7 @@ class PooledLearner(Learner):
         z = near[rng.integers(len(near), size=size)]
         if fitted.processes:
             drawn = torch.from_numpy(fitted.draw(z, rng))
-            return compared(drawn, torch.from_numpy(fitted.observed))
+            return score_outcome(torch.from_numpy(fitted.observed), drawn)
         share = 1.0
         if fitted.outcome is not None:
             share = float(np.exp(fitted.outcome.log_prob(z)).mean())
