@@ -12,12 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
+from torch.distributions import LowRankMultivariateNormal
 
 from sbi_active.inference.sampling.weights import silverman
 
 #: Shares of the diagonal among which the leave-one-out likelihood chooses.
 SHARES = torch.logspace(-10, 0, 21, dtype=torch.float64)
-FLOOR = 1e-10  # of the largest variance, for numbers that never vary
+FLOOR = 1e-10  # of a variance: the least that counts beside it, and beside a size
 
 
 def score_outcome(x: Tensor, simulated: Tensor) -> tuple[float, float]:
@@ -135,7 +136,7 @@ def _log_density(drawn: Tensor, observed: Tensor, most_numbers: int = 8) -> floa
     """Return the log density; kernels say more of few numbers than a Gaussian does."""
     n, q = drawn.shape
     spread = Spread.of(drawn)
-    log_density = spread.log_normal(observed) - 0.5 * q * math.log(2 * math.pi)
+    log_density = spread.log_normal(observed)
     if n == 1 or q > most_numbers:
         return log_density
     root, width = spread.root(), silverman(n, q)
@@ -182,8 +183,10 @@ class Spread:
         mean = rows.nansum(0) / count
         gap = torch.where(present, rows - mean, 0.0)
         variance = gap.square().sum(0) / count
-        floor = FLOOR * variance.max().clamp_min(1e-30)
-        scale = (variance + floor).sqrt()
+        # What varies by rounding alone has no scale of its own.
+        varies = variance > FLOOR * mean.square()
+        floor = torch.where(varies, variance, variance.max()).clamp_min(1e-30)
+        scale = (variance + FLOOR * floor).sqrt()
         z = gap / scale
         share, distance = _shrunk(z)
         return Spread(mean, scale, share, z, distance)
@@ -195,25 +198,16 @@ class Spread:
         return self.scale[:, None] * torch.linalg.cholesky(covariance + diagonal)
 
     def log_normal(self, x: Tensor) -> float:
-        r"""Return the log density of N(mean, C) at x (q,), without its constant.
-
-        With more numbers than rows from their products,
-        :math:`(\lambda I + Z^\top Z)^{-1} = \lambda^{-1}
-        (I - Z^\top (\lambda I + Z Z^\top)^{-1} Z)`.
-        """
+        """Return the log density of N(mean, C) at x, shape (q,)."""
         n, q = self.z.shape
-        off, scale = x - self.mean, self.scale.log().sum()
-        if q <= n:
-            root = self.root()
-            z = torch.linalg.solve_triangular(root, off[:, None], upper=False)
-            return float(-0.5 * z.square().sum() - root.diagonal().log().sum())
-        rows, off = self.z * ((1 - self.share) / n) ** 0.5, off / self.scale
-        inner = rows @ rows.T + self._least * torch.eye(n, dtype=rows.dtype)
-        root, along = torch.linalg.cholesky(inner), rows @ off
-        part = torch.linalg.solve_triangular(root, along[:, None], upper=False)
-        square = (off.square().sum() - part.square().sum()) / self._least
-        volume = root.diagonal().log().sum() + 0.5 * (q - n) * math.log(self._least)
-        return float(-0.5 * square - volume - scale)
+        if q > n:  # from products of rows, of which there are fewer than numbers
+            factor = (((1 - self.share) / n) ** 0.5 * self.z * self.scale).T
+            rest = self._least * self.scale.square()
+            return float(LowRankMultivariateNormal(self.mean, factor, rest).log_prob(x))
+        root, off = self.root(), (x - self.mean)[:, None]
+        z = torch.linalg.solve_triangular(root, off, upper=False)
+        log_density = -0.5 * z.square().sum() - root.diagonal().log().sum()
+        return float(log_density) - 0.5 * q * math.log(2 * math.pi)
 
     @property
     def _least(self) -> float:
