@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import cloudpickle
+import numpy as np
 import torch
 from torch.distributions import Distribution
 
@@ -82,9 +83,9 @@ class StopRules:
     def __post_init__(self) -> None:
         if isinstance(self.max_sd, Sequence):
             object.__setattr__(self, "max_sd", (*map(float, self.max_sd),))
-        limits = [self.min_information_gain, *self._limits()]
+        limits = (self.min_information_gain, self.max_sd)
         require(
-            all(limit is None or limit > 0 for limit in limits),
+            all(np.all(np.array(limit) > 0) for limit in limits if limit is not None),
             "positive limits to stop at",
             self,
             "leave a rule at None that is not wanted",
@@ -120,7 +121,7 @@ class StopRules:
             return None
         with forked_generators(derive_seed(seed, "stop")):
             sd = belief.sample(torch.Size([num_draws])).double().std(0)
-        limits = torch.tensor(self._limits(), dtype=torch.float64)
+        limits = torch.tensor(self.max_sd, dtype=torch.float64).reshape(-1)
         if len(limits) not in (1, len(sd)):
             raise ValueError(
                 f"expected one max_sd or one for each of {len(sd)} parameters; got "
@@ -131,11 +132,6 @@ class StopRules:
             return None
         widths = ", ".join(f"{v:.3g}" for v in sd.tolist())
         return f"the parameters' standard deviations are {widths}, below max_sd"
-
-    def _limits(self) -> Sequence[float]:
-        if self.max_sd is None:
-            return ()
-        return self.max_sd if isinstance(self.max_sd, Sequence) else (self.max_sd,)
 
 
 #: Settings whose fields were options of a campaign in the last version.

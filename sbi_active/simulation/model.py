@@ -6,6 +6,7 @@ import os
 import threading
 import uuid
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -266,10 +267,8 @@ class SimulatorModel(Shown):
             for i in range(len(theta)):
                 row = slice(i, i + 1)
                 own = at_rows(effects, row)
-                try:
+                with suppress(Exception):
                     answers.append(self._agrees(theta[row], action[row], own))
-                except Exception:
-                    continue
             if not answers:
                 raise
             return all(answers)

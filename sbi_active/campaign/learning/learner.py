@@ -251,7 +251,7 @@ class Learner:
             belief, *spent = self._updated(trial)
             seed = derive_seed(state.seed, "gain", index)
             gained = information_gained(belief, before, seed=seed)
-        self.round.close()
+        self.round = Round(self)
         state.account(index, *spent)
         return {"information_gained": gained, "misfit": misfit(belief.diagnostics)}
 
