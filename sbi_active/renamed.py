@@ -14,7 +14,6 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sbi_active.callers import stack_level
 from sbi_active.expected import suggests
 from sbi_active.messages import warn
 
@@ -36,10 +35,7 @@ def former_names(package: str, names: Mapping[str, str]) -> Callable[[str], Any]
         if name not in names:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         home, _, new = names[name].partition(":")
-        warn(
-            f"SA701 {package}.{name} goes in the next version: use {home}.{new}",
-            stacklevel=stack_level(),
-        )
+        warn(f"SA701 {package}.{name} goes in the next version: use {home}.{new}")
         return pkgutil.resolve_name(names[name])
 
     return find
@@ -115,8 +111,7 @@ def takes_loose(**groups: Any) -> Callable[[Taking], Taking]:
 
     def warned(what: str, name: str) -> None:
         place = f"{home[name]}={groups[home[name]].__name__}({name}=)"
-        text = f"SA701 {what}({name}=) goes in the next version: use {place}"
-        warn(text, stacklevel=stack_level())
+        warn(f"SA701 {what}({name}=) goes in the next version: use {place}")
 
     def decorate(taking: Any) -> Any:
         function = suggests(taking.__init__ if isinstance(taking, type) else taking)

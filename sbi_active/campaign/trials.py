@@ -13,7 +13,6 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.arrays import measured
-from sbi_active.callers import stack_level
 from sbi_active.campaign.display.figures import plot_campaign
 from sbi_active.campaign.display.page import campaign_html, to_dataframe
 from sbi_active.campaign.health import (
@@ -267,8 +266,7 @@ class CampaignTrials(Telling[Trial]):
         if not bool(self.actions.contains(executed)):
             warn(
                 f"SA202 the executed action {executed.tolist()} is not in "
-                f"{self.actions}; it is simulated where it was executed",
-                stacklevel=stack_level(),
+                f"{self.actions}; it is simulated where it was executed"
             )
         return listed(executed)
 
@@ -307,8 +305,7 @@ def outcome_told(x: Any, x_shape: torch.Size) -> Tensor:
     if bool(infinite.any()):
         warn(
             f"SA201 {int(infinite.sum())} of {infinite.numel()} told numbers are "
-            "infinite and count as not measured; pass NaN where a sensor gave nothing",
-            stacklevel=stack_level(),
+            "infinite and count as not measured; pass NaN where a sensor gave nothing"
         )
     return torch.where(infinite, torch.nan, rows[0])
 

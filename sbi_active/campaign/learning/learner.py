@@ -161,8 +161,7 @@ class Learner:
         except SimulationBudgetError as error:
             state.unscore(trial.index)
             warn(
-                f"SA602 trial {trial.index} is recorded and not in the belief: {error}",
-                stacklevel=4,
+                f"SA602 trial {trial.index} is recorded and not in the belief: {error}"
             )
             return False
         return True
@@ -228,7 +227,7 @@ class Learner:
         self.state.change(index, outlyingness=ranges)
         trial = self.state.trials[index]
         for text in doubts([trial]):
-            warn(text, stacklevel=2)
+            warn(text)
         return trial
 
     def _learn(self, trial: Trial) -> None:
