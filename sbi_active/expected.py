@@ -52,7 +52,9 @@ def require_least(settings: Any, advice: str, **limits: float) -> None:
             value = least if value is None else value
         smallest = min(value, default=least) if isinstance(value, tuple) else value
         is_number = isinstance(smallest, Real)
-        require(is_number and smallest >= least, expected, repr(smallest), advice)
+        require(
+            is_number and float(smallest) >= least, expected, repr(smallest), advice
+        )
 
 
 def require_kinds(settings: Any, **kinds: type) -> None:
