@@ -152,6 +152,8 @@ def test_other_errors():
     for effects in (["bias"], "bias"):
         with pytest.raises(TypeError, match="expected effects of class Effect; got '"):
             campaign(given={"effects": effects})
+        with pytest.raises(TypeError, match="expected effects of class Effect; got '"):
+            campaign().criticize(effects)  # pyright: ignore
     c = campaign()
     with pytest.raises(ValueError, match="expected the index of one of 0 trials"):
         c.tell([1.0], trial=3)
