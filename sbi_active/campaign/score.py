@@ -194,7 +194,7 @@ class Spread:
     def root(self) -> Tensor:
         """Return the lower Cholesky factor of C, shape (q, q)."""
         covariance = (1 - self.share) * self.z.T @ self.z / len(self.z)
-        diagonal = torch.full_like(self.scale, self._least).diag()
+        diagonal = torch.full_like(self.scale, self.share).diag()
         return self.scale[:, None] * torch.linalg.cholesky(covariance + diagonal)
 
     def log_normal(self, x: Tensor) -> float:
@@ -202,16 +202,12 @@ class Spread:
         n, q = self.z.shape
         if q > n:  # from products of rows, of which there are fewer than numbers
             factor = (((1 - self.share) / n) ** 0.5 * self.z * self.scale).T
-            rest = self._least * self.scale.square()
+            rest = self.share * self.scale.square()
             return float(LowRankMultivariateNormal(self.mean, factor, rest).log_prob(x))
         root, off = self.root(), (x - self.mean)[:, None]
         z = torch.linalg.solve_triangular(root, off, upper=False)
         log_density = -0.5 * z.square().sum() - root.diagonal().log().sum()
         return float(log_density) - 0.5 * q * math.log(2 * math.pi)
-
-    @property
-    def _least(self) -> float:
-        return max(self.share, FLOOR)
 
 
 def _shrunk(z: Tensor) -> tuple[float, Tensor]:

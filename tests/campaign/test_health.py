@@ -193,6 +193,8 @@ def test_outcomes_without_a_measurement_are_counted():
     surprise, log_score = score_outcome(torch.tensor([1e6]), drawn)
     assert surprise == 101 / 1_001  # those without a measurement are as rare
     assert log_score < -1e3
+    drawn[:500] = torch.nan
+    assert score_outcome(none, drawn[1:])[0] == 1.0  # and here as common
     drawn[:600] = torch.nan
     assert score_outcome(middle, drawn)[0] <= 401 / 1_001  # and here the more common
     drawn[:] = torch.nan
@@ -249,19 +251,18 @@ def test_a_channel_in_small_units_counts(num_numbers):
     assert score_outcome(x, drawn)[0] == 1 / 101
 
 
-def test_the_share_of_the_diagonal_is_the_best_without_each_row():
+@pytest.mark.parametrize(("num", "num_numbers"), [(30, 5), (4, 3), (12, 20)])
+def test_the_share_of_the_diagonal_is_the_best_without_each_row(num, num_numbers):
     gen = torch.Generator().manual_seed(2)
-    z = (
-        torch.randn(30, 5, generator=gen).double()
-        @ torch.randn(5, 5, generator=gen).double()
-    )
+    mix = torch.randn(num_numbers, num_numbers, generator=gen).double()
+    z = torch.randn(num, num_numbers, generator=gen).double() @ mix
     z = (z - z.mean(0)) / z.std(0, correction=0)
-    losses = []
+    losses, unit = [], torch.eye(num_numbers).double()
     for share in SHARES:
         loss = 0.0
-        for i in range(len(z)):
-            rest = z[torch.arange(len(z)) != i]
-            c = (1 - share) * rest.T @ rest / len(rest) + share * torch.eye(5).double()
+        for i in range(num):
+            rest = z[torch.arange(num) != i]
+            c = (1 - share) * rest.T @ rest / (num - 1) + share * unit
             loss += float(c.logdet() + z[i] @ torch.linalg.solve(c, z[i]))
         losses.append(loss)
     best = SHARES[int(np.argmin(losses))]
