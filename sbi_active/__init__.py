@@ -13,7 +13,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from sbi_active.renamed import former_names
+from sbi_active.renamed import lazy_names
 
 if TYPE_CHECKING:
     from sbi_active.actions import BoxActions, DiscreteActions, MixedActions
@@ -66,22 +66,13 @@ __all__ = [
     "to_inference_data",
 ]
 
-#: Where the names above are defined or re-exported.
-_HOMES = {
-    "actions": "BoxActions DiscreteActions MixedActions",
-    "campaign": "Campaign CampaignOptions StopRules",
-    "criticism": "",
-    "design": "InformationGainDesigner RandomDesigner",
-    "diagnostics": "",
-    "export": "to_datatree to_inference_data",
-    "inference": "ALHI ASBI Belief MixtureDensity RefinementOptions SeqBED",
-    "mujoco": "",
-    "simulation": "AutocorrelatedNoise Bank GaussianNoise SimulatorModel StudentTNoise "
-    "estimate_noise simulate",
-}
-_HOME = {name: home for home, names in _HOMES.items() for name in names.split()}
+#: Packages, which are imported when they are first used as well.
+_PACKAGES = (
+    *("actions", "campaign", "criticism", "design", "diagnostics", "inference"),
+    *("mujoco", "simulation"),
+)
 
-_former = former_names(
+_find = lazy_names(
     __name__,
     {
         "ActionEmbedding": "sbi_active.inference:ActionEmbedding",
@@ -98,24 +89,18 @@ _former = former_names(
         "Trial": "sbi_active.campaign:Trial",
         "unknown_noise": "sbi_active:AutocorrelatedNoise.unknown",
     },
-    stacklevel=3,
 )
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
-    elif name in _HOMES:
-        value = import_module(f"{__name__}.{name}")
-    elif name == "__version__":
+    if name in (*_PACKAGES, "export"):
+        return import_module(f"{__name__}.{name}")
+    if name == "__version__":
         from importlib.metadata import version
 
-        value = version("sbi-active")
-    else:
-        return _former(name)
-    globals()[name] = value
-    return value
+        return version("sbi-active")
+    return _find(name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__, *_HOMES, "__version__"})
+    return sorted({*globals(), *__all__, *_PACKAGES, "__version__"})

@@ -6,6 +6,7 @@ import difflib
 import functools
 import inspect
 from collections.abc import Callable, Iterable, Sequence
+from numbers import Real
 from typing import Any, TypeVar
 
 Taking = TypeVar("Taking", bound=Callable[..., Any])
@@ -50,7 +51,29 @@ def require_least(settings: Any, advice: str, **limits: float) -> None:
             expected += " or None"
             value = least if value is None else value
         smallest = min(value, default=least) if isinstance(value, tuple) else value
-        require(smallest >= least, expected, smallest, advice)
+        is_number = isinstance(smallest, Real)
+        require(
+            is_number and float(smallest) >= least, expected, repr(smallest), advice
+        )
+
+
+def require_kinds(settings: Any, **kinds: type) -> None:
+    """Raise if a field of settings is of another class.
+
+    Args:
+        settings: Dataclass.
+        **kinds: Class of each field.
+
+    Raises:
+        TypeError: If it has another one, with its name and what to pass.
+    """
+    for name, kind in kinds.items():
+        value, expected = getattr(settings, name), kind.__name__
+        if not isinstance(value, kind):
+            advice = "True or False" if kind is bool else f"{expected}(...)"
+            raise TypeError(
+                f"expected {name} of class {expected}; got {value!r}; pass {advice}"
+            )
 
 
 def require_one_of(settings: Any, **known: Iterable[Any]) -> None:

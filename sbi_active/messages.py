@@ -14,6 +14,8 @@ import warnings
 from functools import cache
 from pathlib import Path
 
+from sbi_active.callers import stack_level
+
 PAGE = "warnings.html"
 _ENTRY = re.compile(r"^### (SA\d+) (.+)\n((?:.+\n)+)", re.MULTILINE)
 _PLACE = re.compile(rf"\(see {PAGE}#(?:sa(\d+)-)?([\w-]+)\)$")
@@ -141,17 +143,19 @@ def warn(
     text: str,
     category: type[SBIActiveWarning] | None = None,
     *,
-    stacklevel: int = 1,
+    stacklevel: int | None = None,
 ) -> None:
     """Warn as :func:`warnings.warn` does, and say where the message is explained.
 
     Args:
         text: Code, what is wrong and what to do.
         category: Class of the warning; None takes that of the code.
-        stacklevel: 1 for the line that calls this, 2 for who called its function.
+        stacklevel: 1 for the line that calls this, 2 for who called its function; None
+            is the line that called the package.
     """
     said = Message(text)
-    warnings.warn(said, category or said.category, stacklevel=stacklevel + 1)
+    level = stack_level() if stacklevel is None else stacklevel + 1
+    warnings.warn(said, category or said.category, stacklevel=level)
 
 
 class Explained:

@@ -1,4 +1,4 @@
-"""Progress of slow steps: a bar, and lines of a log."""
+"""Progress of slow steps: a bar, and lines of a log, as tqdm words them."""
 
 from __future__ import annotations
 
@@ -36,11 +36,14 @@ def stage(
         yield
         return
     _inside.any = True
+    news = News(what, has_bar=show_progress, count=count)
+    how = "ended with an error after"
     try:
-        with News(what, has_bar=show_progress, count=count).told():
-            yield
+        yield
+        how = "took"
     finally:
         _inside.any = False
+        news.end(how)
 
 
 class News:
@@ -63,93 +66,40 @@ class News:
     tick: ClassVar[float] = 0.1
     sign: ClassVar[float] = 30.0
 
-    def __init__(
-        self, what: str, *, has_bar: bool = False, count: Count | None = None
-    ) -> None:
+    def __init__(self, what: str, *, has_bar: bool, count: Count | None) -> None:
         self._what, self._has_bar, self._count = what, has_bar, count
-        self._done: tuple[int, int | None] = (0, None)
-        self._expected: float | None = None  # seconds in all
-        self._bar: Any = None
-        self._said_at: float | None = None
-        self._over = threading.Event()
+        self._start, self._over = time.perf_counter(), threading.Event()
         self._thread = threading.Thread(target=self._follow, daemon=True)
-        self._start = time.perf_counter()
-
-    @contextmanager
-    def told(self) -> Iterator[None]:
-        """Report the block."""
         self._thread.start()
-        how = "ended with an error after"
-        try:
-            yield
-            how = "took"
-        finally:
-            self._over.set()
-            self._thread.join()
-            if self._bar is not None:
-                self._bar.close()
-            if self._said_at is not None:
-                LOGGER.info("%s %s %s", self._what, how, in_words(self._seconds))
+
+    def end(self, how: str) -> None:
+        """Take the bar away, and log what took long."""
+        seconds = self._seconds
+        self._over.set()
+        self._thread.join()
+        if seconds > self.long:
+            LOGGER.info("%s %s %.1f s", self._what, how, seconds)
 
     @property
     def _seconds(self) -> float:
         return time.perf_counter() - self._start
 
     def _follow(self) -> None:
-        while not self._over.wait(self.tick):
-            seconds = self._seconds
-            self._look(seconds)
-            due = self.long if self._said_at is None else self._said_at + self.sign
-            if seconds > due:
-                self._said_at = seconds
-                text = f"{in_words(seconds)} so far{self._outlook(seconds)}"
-                LOGGER.info("%s, %s", self._what, text)
-            if self._has_bar and (seconds > self.shown or self._bar is not None):
-                self._draw(seconds)
-
-    def _look(self, seconds: float) -> None:
-        """Estimate the time from the steps that were done, as each is."""
-        done = (0, None) if self._count is None else self._count()
-        if done != self._done:
-            self._done, (num, total) = done, done
-            self._expected = seconds * total / num if num and total else None
-
-    def _outlook(self, seconds: float) -> str:
-        num, total = self._done
-        if self._count is None:
-            return ""
-        steps = f"; {num} done" if total is None else f"; {num} of {total} done"
-        if self._expected is None:
-            return steps
-        return f"{steps}, about {in_words(max(self._expected - seconds, 0))} left"
-
-    def _draw(self, seconds: float) -> None:
         from tqdm.auto import tqdm
 
-        text = "{desc}: {elapsed}"
-        if self._expected is not None:
-            text = "{desc}: {percentage:3.0f}%|{bar}| {elapsed}"
-            text += f" of about {in_words(self._expected)}"
-        elif self._done[0]:
-            text += f", {self._done[0]} done"
-        if self._bar is None:
-            self._bar = tqdm(
-                total=self._expected, desc=self._what, bar_format=text, leave=False
-            )
-            self._bar.start_t -= seconds  # it began before it was drawn
-        self._bar.bar_format, self._bar.total = text, self._expected
-        limit = seconds if self._expected is None else self._expected
-        self._bar.n = min(seconds, limit)
-        self._bar.refresh()
-
-
-def in_words(seconds: float) -> str:
-    """Return a time in words.
-
-    Example:
-        >>> in_words(0.84), in_words(12.3), in_words(754.0), in_words(8000.0)
-        ('0.8 s', '12 s', '13 min', '2.2 h')
-    """
-    if seconds < 100:
-        return f"{seconds:.2g} s" if seconds >= 1 else f"{seconds:.1f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+        bar: Any = None
+        due = self.long
+        while not self._over.wait(self.tick):
+            seconds = self._seconds
+            num, total = (0, None) if self._count is None else self._count()
+            form = "{desc}: {elapsed}" if self._count is None else None
+            steps: Any = {"n": num, "total": total, "elapsed": seconds}
+            text = tqdm.format_meter(**steps, prefix=self._what, bar_format=form)
+            if seconds > due:
+                due = seconds + self.sign
+                LOGGER.info(text)
+            if self._has_bar and seconds > self.shown:
+                bar = bar or tqdm(total=1, bar_format="{desc}", leave=False)
+                bar.set_description_str(text)
+        if bar is not None:
+            bar.close()

@@ -5,30 +5,27 @@ Former names and keywords still work, and a warning gives the new ones.
 
 from __future__ import annotations
 
+import ast
 import functools
 import pkgutil
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any, TypeVar
 
-from sbi_active.callers import stack_level
 from sbi_active.expected import suggests
 from sbi_active.messages import warn
 
 Taking = TypeVar("Taking", bound=Callable[..., Any])
 
 
-def former_names(
-    package: str, names: Mapping[str, str], *, stacklevel: int = 2
-) -> Callable[[str], Any]:
+def former_names(package: str, names: Mapping[str, str]) -> Callable[[str], Any]:
     """Return a ``__getattr__`` of a package that finds its former names.
 
     Args:
         package: Name of the package.
         names: Former name: where it is now, as ``"package:Name"``.
-        stacklevel: Stack level of the warning; 2 where the function is ``__getattr__``
-            itself.
 
     Returns:
         A function of a name. It raises AttributeError for names that never were.
@@ -38,34 +35,40 @@ def former_names(
         if name not in names:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         home, _, new = names[name].partition(":")
-        warn(
-            f"SA701 {package}.{name} goes in the next version: use {home}.{new}",
-            stacklevel=stacklevel,
-        )
+        warn(f"SA701 {package}.{name} goes in the next version: use {home}.{new}")
         return pkgutil.resolve_name(names[name])
 
     return find
 
 
 def lazy_names(
-    package: str, homes: Mapping[str, str], former: Mapping[str, str] | None = None
+    package: str, former: Mapping[str, str] | None = None
 ) -> Callable[[str], Any]:
     """Return a ``__getattr__`` of a package that imports a name when it is used.
 
     A package then costs nothing where only a module of it is wanted that needs little.
+    The names, and where they come from, are the imports that the package's file has
+    under ``if TYPE_CHECKING``, which type checkers read as well.
 
     Args:
         package: Name of the package.
-        homes: Modules below it, and the names that each defines, apart by spaces.
         former: Former names, see :func:`former_names`.
     """
-    home = {name: where for where, names in homes.items() for name in names.split()}
-    find_former = former_names(package, former or {}, stacklevel=3)
+    tree = ast.parse(Path(str(sys.modules[package].__file__)).read_text("utf-8"))
+    blocks = [node for node in tree.body if isinstance(node, ast.If)]
+    home = {
+        alias.name: line.module
+        for block in blocks
+        for line in block.body
+        if isinstance(line, ast.ImportFrom)
+        for alias in line.names
+    }
+    find_former = former_names(package, former or {})
 
     def find(name: str) -> Any:
         if name not in home:
             return find_former(name)
-        value = pkgutil.resolve_name(f"{package}.{home[name]}:{name}")
+        value = pkgutil.resolve_name(f"{home[name]}:{name}")
         setattr(sys.modules[package], name, value)
         return value
 
@@ -108,8 +111,7 @@ def takes_loose(**groups: Any) -> Callable[[Taking], Taking]:
 
     def warned(what: str, name: str) -> None:
         place = f"{home[name]}={groups[home[name]].__name__}({name}=)"
-        text = f"SA701 {what}({name}=) goes in the next version: use {place}"
-        warn(text, stacklevel=stack_level())
+        warn(f"SA701 {what}({name}=) goes in the next version: use {place}")
 
     def decorate(taking: Any) -> Any:
         function = suggests(taking.__init__ if isinstance(taking, type) else taking)
@@ -132,32 +134,5 @@ def takes_loose(**groups: Any) -> Callable[[Taking], Taking]:
             return call
         taking.__init__, taking.__getattr__ = call, find
         return taking
-
-    return decorate
-
-
-def set_later(*names: str) -> Callable[[Taking], Taking]:
-    """Let a constructor take attributes that are set afterwards, for one version.
-
-    Args:
-        *names: Names of the attributes.
-    """
-
-    def decorate(make: Any) -> Any:
-        suggesting = suggests(make)
-
-        @functools.wraps(make)
-        def call(self: Any, *args: Any, **kwargs: Any) -> Any:
-            later = {name: kwargs.pop(name) for name in names if name in kwargs}
-            made = suggesting(self, *args, **kwargs)
-            for name, value in later.items():
-                text = (
-                    f"SA701 the keyword {name}= goes in the next version: set .{name}"
-                )
-                warn(text, stacklevel=stack_level())
-                setattr(self if made is None else made, name, value)
-            return made
-
-        return call
 
     return decorate

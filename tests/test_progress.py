@@ -35,16 +35,31 @@ def test_steps_tell_how_long_the_rest_will_take(caplog, capsys):
             time.sleep(2 * SOON)
             done += 1
     said = lines(caplog)
-    assert said[0].startswith("folds, ")
-    assert "0 of 10 done" in said[0]
+    assert "0/10 [" in said[0]
     assert len(said) >= 4  # a sign of life now and then
-    (late,) = [line for line in said if "3 of 10 done" in line][:1]
-    left = float(late.split("about ")[1].split(" s left")[0])
-    assert 0.4 < left < 1.2  # seven steps of .1 s
+    (late,) = [line for line in said if "3/10 [" in line][:1]
+    assert late.startswith("folds:  30%|")
+    rate = float(late.rsplit(",", 1)[1].removesuffix("it/s]"))
+    assert 3 < rate < 12  # three steps of .1 s
     assert said[-1].startswith("folds took 0.")
     shown = capsys.readouterr().err
-    assert "folds:" in shown
-    assert "of about 1" in shown  # s in all
+    assert "folds:  30%|" in shown
+
+
+def test_an_error_is_told_and_what_is_within_is_not(caplog):
+    caplog.set_level(logging.INFO, "sbi_active")
+
+    def fail():
+        with stage("inner"):
+            time.sleep(3 * SOON)
+        raise RuntimeError("stuck")
+
+    with pytest.raises(RuntimeError, match="stuck"), stage("outer"):
+        fail()
+    said = lines(caplog)
+    assert said[0] == "outer: 00:00"
+    assert said[-1].startswith("outer ended with an error after 0.")
+    assert not any("inner" in line for line in said)
 
 
 def loop(**options):
@@ -66,5 +81,4 @@ def test_the_closed_loop_tells_of_its_stages(caplog, capsys):
     for told in (shown, said):
         assert "models fitted" in told
         assert "error before and after, a verdict without each trial" in told
-    assert "of 6 done, about" in said
-    assert "of about" in shown
+        assert "/6 [" in told

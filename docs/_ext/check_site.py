@@ -80,9 +80,7 @@ def forgotten(site: Path) -> list[str]:
     for path in (site / "reference" / "api").glob("*.html"):
         anchors |= Page(path.read_text(encoding="utf-8")).anchors
     missing = []
-    for package in (*sbi_active._HOMES, "pyro", "tasks"):
-        if package == "export":
-            continue
+    for package in (*sbi_active._PACKAGES, "pyro", "tasks"):
         names = importlib.import_module(f"sbi_active.{package}").__all__
         missing += [
             f"sbi_active.{package}.{name} is not on the site"

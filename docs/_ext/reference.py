@@ -19,7 +19,7 @@ import sbi_active
 
 PAGES = Path(__file__).parents[1] / "reference" / "api"
 EXAMPLES = PAGES.parent / "examples"
-PACKAGES = [n for n in (*sbi_active._HOMES, "pyro", "tasks") if n != "export"]
+PACKAGES = [*sbi_active._PACKAGES, "pyro", "tasks"]
 #: Modules whose classes and functions users meet without importing them, by package.
 FURTHER = {
     "actions": {"sbi_active.actions.waveforms": ()},

@@ -21,11 +21,6 @@ __all__ = ["Campaign", "CampaignOptions", "StopRules", "Trial"]
 __getattr__ = lazy_names(
     __name__,
     {
-        "campaign": "Campaign",
-        "options": "CampaignOptions StopRules",
-        "state": "Trial",
-    },
-    {
         "CampaignState": "sbi_active.campaign.state:CampaignState",
         "ModelVersion": "sbi_active.campaign.state:ModelVersion",
     },

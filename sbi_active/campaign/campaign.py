@@ -18,7 +18,11 @@ from sbi_active.campaign.isolation import guarded, isolated
 from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.learning.planner import Planner
 from sbi_active.campaign.learning.pooled import make_learner
-from sbi_active.campaign.learning.revision import recompute, revise
+from sbi_active.campaign.learning.revision import (
+    recompute,
+    require_kind,
+    revise,
+)
 from sbi_active.campaign.options import CampaignOptions
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.campaign.storage.directory import (
@@ -30,7 +34,7 @@ from sbi_active.campaign.storage.directory import (
 from sbi_active.campaign.storage.loading import load
 from sbi_active.campaign.trials import CampaignTrials
 from sbi_active.design.target import Target
-from sbi_active.renamed import set_later
+from sbi_active.expected import suggests
 from sbi_active.simulation.workers.store import SimulationBudgetError, metering
 
 if TYPE_CHECKING:
@@ -93,7 +97,7 @@ class Campaign(CampaignTrials):
         >>> belief = campaign.update()
     """
 
-    @set_later("on_trial", "on_update")
+    @suggests
     @isolated
     def __init__(
         self,
@@ -140,7 +144,7 @@ class Campaign(CampaignTrials):
         storage.bank = self.state.options.bank
 
     @classmethod
-    @set_later("on_trial", "on_update")
+    @suggests
     @isolated
     def load(
         cls,
@@ -184,6 +188,7 @@ class Campaign(CampaignTrials):
             ValueError: If there is no campaign, or one of another simulator or schema.
             CorruptSegmentError: If a file does not hold what was written.
         """
+        require_kind(effects)
         given = {
             "prior": prior,
             "actions": None if actions is None else action_space(actions),
@@ -297,8 +302,6 @@ class Campaign(CampaignTrials):
             if trial.is_measured:
                 state.keep_draws(learner.belief)
             self._storage.save(state, learner)
-            if self.on_update is not None:
-                self.on_update(state.trials[trial.index])
         return self.belief
 
     def run(

@@ -54,60 +54,46 @@ def assess(state: CampaignState, *, alarm: float = 0.05, watch: float = 0.25) ->
         Vovk & Wang, Annals of Statistics 2021 (e-values from p-values); Ville, Etude
         critique de la notion de collectif, 1939.
     """
-    tests = _Tests(state.version)
-    for trial in state.measured:
-        if trial.version == state.version.number:
-            tests.add(trial)
-    return tests.health(alarm, watch)
+    version = state.version
+    trials = [t for t in state.measured if t.version == version.number]
+    return _health(version, trials, alarm, watch)
 
 
 def health_by_trial(state: CampaignState) -> dict[int, Health]:
     """Return the health when each trial had been used, without those not scored."""
-    tests = {version.number: _Tests(version) for version in state.versions}
-    given = {version.number: {*version.trials} for version in state.versions}
+    scored: dict[int, list[Trial]] = {v.number: [] for v in state.versions}
     found = {}
     for index in state.processed:
         trial = state.trials[index]
-        if trial.is_measured and trial.version in tests:
-            tests[trial.version].add(trial)
-        if not trial.is_measured or trial.version is not None:
-            then = [n for n, trials in given.items() if not n or index not in trials]
-            found[index] = tests[then[-1]].health()
+        if trial.is_measured:
+            if trial.version is None:
+                continue
+            scored[trial.version].append(trial)
+        then = [v for v in state.versions if not v.number or index not in v.trials][-1]
+        found[index] = _health(then, scored[then.number])
     return found
 
 
-class _Tests:
-    """The two tests of :func:`assess`, trial by trial.
-
-    Args:
-        version: Model that is tested.
-    """
-
-    def __init__(self, version: ModelVersion) -> None:
-        self._bet = self._largest_bet = 0.0
-        self._num_misfits, self._least = 0, math.inf
-        self._add_misfit(version.misfit)
-
-    def add(self, trial: Trial) -> None:
-        """Take a trial that the model scored."""
+def _health(
+    version: ModelVersion,
+    trials: Sequence[Trial],
+    alarm: float = 0.05,
+    watch: float = 0.25,
+) -> Health:
+    """Return the health of a model after trials that it scored, see :func:`assess`."""
+    bet = largest_bet = 0.0
+    for trial in trials:
         if trial.surprise is not None and not is_off(trial.belief_error or 0.0):
-            self._bet += log_e_value(trial.surprise)
-            self._largest_bet = max(self._largest_bet, self._bet)
-        self._add_misfit(trial.misfit)
-
-    def _add_misfit(self, misfit: float | None) -> None:
-        if misfit is not None:
-            self._num_misfits += 1
-            level = misfit * self._num_misfits * (self._num_misfits + 1)
-            self._least = min(self._least, level)
-
-    def health(self, alarm: float = 0.05, watch: float = 0.25) -> Health:
-        """Return the health after these trials, by the levels of :func:`assess`."""
-        if self._largest_bet >= math.log(2 / alarm) or self._least < alarm / 2:
-            return "alarm"
-        if self._bet >= math.log(2 / watch) or self._least < watch / 2:
-            return "watch"
-        return "ok"
+            bet += log_e_value(trial.surprise)
+            largest_bet = max(largest_bet, bet)
+    misfits = [version.misfit, *(t.misfit for t in trials)]
+    known = enumerate((m for m in misfits if m is not None), 1)
+    least = min((m * t * (t + 1) for t, m in known), default=math.inf)
+    if largest_bet >= math.log(2 / alarm) or least < alarm / 2:
+        return "alarm"
+    if bet >= math.log(2 / watch) or least < watch / 2:
+        return "watch"
+    return "ok"
 
 
 def log_e_value(p: float) -> float:

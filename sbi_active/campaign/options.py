@@ -8,11 +8,19 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import cloudpickle
+import numpy as np
 import torch
 from torch.distributions import Distribution
 
 from sbi_active.design.design import Design
-from sbi_active.expected import require, require_least, require_one_of, suggests
+from sbi_active.design.estimators.automatic import find_estimator
+from sbi_active.expected import (
+    require,
+    require_kinds,
+    require_least,
+    require_one_of,
+    suggests,
+)
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.networks.mixture_density import MixtureDensity
 from sbi_active.renamed import grouped, takes_loose
@@ -75,9 +83,9 @@ class StopRules:
     def __post_init__(self) -> None:
         if isinstance(self.max_sd, Sequence):
             object.__setattr__(self, "max_sd", (*map(float, self.max_sd),))
-        limits = [self.min_information_gain, *self._limits()]
+        limits = (self.min_information_gain, self.max_sd)
         require(
-            all(limit is None or limit > 0 for limit in limits),
+            all(np.all(np.array(limit) > 0) for limit in limits if limit is not None),
             "positive limits to stop at",
             self,
             "leave a rule at None that is not wanted",
@@ -113,7 +121,7 @@ class StopRules:
             return None
         with forked_generators(derive_seed(seed, "stop")):
             sd = belief.sample(torch.Size([num_draws])).double().std(0)
-        limits = torch.tensor(self._limits(), dtype=torch.float64)
+        limits = torch.tensor(self.max_sd, dtype=torch.float64).reshape(-1)
         if len(limits) not in (1, len(sd)):
             raise ValueError(
                 f"expected one max_sd or one for each of {len(sd)} parameters; got "
@@ -124,11 +132,6 @@ class StopRules:
             return None
         widths = ", ".join(f"{v:.3g}" for v in sd.tolist())
         return f"the parameters' standard deviations are {widths}, below max_sd"
-
-    def _limits(self) -> Sequence[float]:
-        if self.max_sd is None:
-            return ()
-        return self.max_sd if isinstance(self.max_sd, Sequence) else (self.max_sd,)
 
 
 #: Settings whose fields were options of a campaign in the last version.
@@ -241,6 +244,9 @@ class CampaignOptions:
         if self.bank is not None:
             object.__setattr__(self, "bank", os.fspath(self.bank))
         object.__setattr__(self, "workers", Workers.of(self.workers))
+        settings = {"refinement": RefinementOptions, "details": CampaignDetails}
+        require_kinds(self, refine=bool, stop=StopRules, **settings)
+        find_estimator(self.estimator)  # an unknown name is an error here
         require(
             self.refinement.workers in (IN_PROCESS, self.workers),
             "the refinement's simulations to run as all others of a campaign, "
@@ -250,6 +256,7 @@ class CampaignOptions:
         )
         require_one_of(self, network=("each round", "on demand"))
         require_least(self, "use about 5000 a round", num_simulations=100)
+        require_least(self, "use about 1500 an action", num_samples=8)
         require_least(self, "use some hundred a trial", max_simulations=100)
         advice = "pass the number of trials that you can run"
         require_least(self, advice, planned_trials=1)

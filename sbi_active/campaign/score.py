@@ -7,26 +7,21 @@ not measured.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.distributions import Distribution
+from torch.distributions import LowRankMultivariateNormal
 
 from sbi_active.inference.sampling.weights import silverman
-from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation import Simulations, simulate
-from sbi_active.simulation.workers.settings import IN_PROCESS, Workers
 
 #: Shares of the diagonal among which the leave-one-out likelihood chooses.
 SHARES = torch.logspace(-10, 0, 21, dtype=torch.float64)
-FLOOR = 1e-10  # of the largest variance, for numbers that never vary
+FLOOR = 1e-10  # of a variance: the least that counts beside it, and beside a size
 
 
-def score_outcome(x: Tensor, rows: Simulations) -> tuple[float, float]:
+def score_outcome(x: Tensor, simulated: Tensor) -> tuple[float, float]:
     r"""Return tail probability and log score of an outcome among simulations.
 
     .. math::
@@ -52,7 +47,8 @@ def score_outcome(x: Tensor, rows: Simulations) -> tuple[float, float]:
 
     Args:
         x: The outcome, shape x_shape; NaN where nothing was measured.
-        rows: Simulations of its action from the belief before it.
+        simulated: Outcomes of its action under the belief before it, shape
+            (n, *x_shape).
 
     Returns:
         p in (0, 1], and the log score in nats.
@@ -61,50 +57,9 @@ def score_outcome(x: Tensor, rows: Simulations) -> tuple[float, float]:
         Dawid, J. R. Stat. Soc. A 1984 (prequential assessment); Vovk, Gammerman &
         Shafer, Algorithmic Learning in a Random World, 2005 (conformal p-values).
     """
-    drawn = rows.without_missing().x.double().flatten(1)
+    observed, drawn = x.double().flatten(), simulated.double().flatten(1)
     drawn = torch.where(drawn.isfinite(), drawn, torch.nan)
-    return compared(drawn, x.double().flatten())
-
-
-def simulate_from(
-    belief: Distribution,
-    simulator: Callable[..., Any],
-    action: Tensor,
-    *,
-    num_samples: int,
-    seed: int,
-    workers: Workers = IN_PROCESS,
-) -> Simulations:
-    """Return simulations of one action, with parameters from a distribution.
-
-    Args:
-        belief: Distribution of the parameters.
-        simulator: ``simulator(theta, action)``.
-        action: The action, shape (action_dim,).
-        num_samples: Number of rows.
-        seed: Seed of the parameters and the simulations.
-        workers: Workers that run the simulations.
-    """
-    with forked_generators(seed, "theta"):
-        theta = belief.sample(torch.Size([num_samples]))
-    return simulate(
-        simulator,
-        theta,
-        action.expand(num_samples, -1),
-        seed=derive_seed(seed, "x"),
-        workers=workers,
-    )
-
-
-def compared(drawn: Tensor, observed: Tensor) -> tuple[float, float]:
-    """Return tail probability and log density of an outcome.
-
-    Args:
-        drawn: Predictions, shape (n, q), NaN where nothing is measured.
-        observed: The outcome, shape (q,).
-    """
-    surprise = _surprise(torch.cat([drawn, observed[None]]))
-    return surprise, _log_score(drawn, observed)
+    return _surprise(torch.cat([drawn, observed[None]])), _log_score(drawn, observed)
 
 
 def _surprise(rows: Tensor) -> float:
@@ -181,7 +136,7 @@ def _log_density(drawn: Tensor, observed: Tensor, most_numbers: int = 8) -> floa
     """Return the log density; kernels say more of few numbers than a Gaussian does."""
     n, q = drawn.shape
     spread = Spread.of(drawn)
-    log_density = spread.log_normal(observed) - 0.5 * q * math.log(2 * math.pi)
+    log_density = spread.log_normal(observed)
     if n == 1 or q > most_numbers:
         return log_density
     root, width = spread.root(), silverman(n, q)
@@ -228,8 +183,10 @@ class Spread:
         mean = rows.nansum(0) / count
         gap = torch.where(present, rows - mean, 0.0)
         variance = gap.square().sum(0) / count
-        floor = FLOOR * variance.max().clamp_min(1e-30)
-        scale = (variance + floor).sqrt()
+        # What varies by rounding alone has no scale of its own.
+        varies = variance > FLOOR * mean.square()
+        floor = torch.where(varies, variance, variance.max()).clamp_min(1e-30)
+        scale = (variance + FLOOR * floor).sqrt()
         z = gap / scale
         share, distance = _shrunk(z)
         return Spread(mean, scale, share, z, distance)
@@ -237,33 +194,20 @@ class Spread:
     def root(self) -> Tensor:
         """Return the lower Cholesky factor of C, shape (q, q)."""
         covariance = (1 - self.share) * self.z.T @ self.z / len(self.z)
-        diagonal = torch.full_like(self.scale, self._least).diag()
+        diagonal = torch.full_like(self.scale, self.share).diag()
         return self.scale[:, None] * torch.linalg.cholesky(covariance + diagonal)
 
     def log_normal(self, x: Tensor) -> float:
-        r"""Return the log density of N(mean, C) at x (q,), without its constant.
-
-        With more numbers than rows from their products,
-        :math:`(\lambda I + Z^\top Z)^{-1} = \lambda^{-1}
-        (I - Z^\top (\lambda I + Z Z^\top)^{-1} Z)`.
-        """
+        """Return the log density of N(mean, C) at x, shape (q,)."""
         n, q = self.z.shape
-        off, scale = x - self.mean, self.scale.log().sum()
-        if q <= n:
-            root = self.root()
-            z = torch.linalg.solve_triangular(root, off[:, None], upper=False)
-            return float(-0.5 * z.square().sum() - root.diagonal().log().sum())
-        rows, off = self.z * ((1 - self.share) / n) ** 0.5, off / self.scale
-        inner = rows @ rows.T + self._least * torch.eye(n, dtype=rows.dtype)
-        root, along = torch.linalg.cholesky(inner), rows @ off
-        part = torch.linalg.solve_triangular(root, along[:, None], upper=False)
-        square = (off.square().sum() - part.square().sum()) / self._least
-        volume = root.diagonal().log().sum() + 0.5 * (q - n) * math.log(self._least)
-        return float(-0.5 * square - volume - scale)
-
-    @property
-    def _least(self) -> float:
-        return max(self.share, FLOOR)
+        if q > n:  # from products of rows, of which there are fewer than numbers
+            factor = (((1 - self.share) / n) ** 0.5 * self.z * self.scale).T
+            rest = self.share * self.scale.square()
+            return float(LowRankMultivariateNormal(self.mean, factor, rest).log_prob(x))
+        root, off = self.root(), (x - self.mean)[:, None]
+        z = torch.linalg.solve_triangular(root, off, upper=False)
+        log_density = -0.5 * z.square().sum() - root.diagonal().log().sum()
+        return float(log_density) - 0.5 * q * math.log(2 * math.pi)
 
 
 def _shrunk(z: Tensor) -> tuple[float, Tensor]:

@@ -13,7 +13,6 @@ from torch.distributions import Distribution
 
 from sbi_active.actions import ActionSpace
 from sbi_active.arrays import measured
-from sbi_active.callers import stack_level
 from sbi_active.campaign.display.figures import plot_campaign
 from sbi_active.campaign.display.page import campaign_html, to_dataframe
 from sbi_active.campaign.health import (
@@ -48,10 +47,6 @@ class CampaignTrials(Telling[Trial]):
     Attributes:
         actions: Actions that the robot may take.
         state: State of the campaign.
-        on_trial: Function that is called with each trial that was told, once it is
-            recorded; set it.
-        on_update: Function that is called with each trial, once the belief contains it;
-            set it.
     """
 
     actions: ActionSpace
@@ -60,8 +55,6 @@ class CampaignTrials(Telling[Trial]):
     _planner: Any
     _storage: Storage
     _stated: tuple[Distribution, list[str], Distribution] | None = None
-    on_trial: Callable[[Trial], None] | None = None
-    on_update: Callable[[Trial], None] | None = None
 
     def __repr__(self) -> str:
         done, pending = len(self.history), self.pending is not None
@@ -147,14 +140,12 @@ class CampaignTrials(Telling[Trial]):
         """The lines of the log on the disk so far, without one in memory alone."""
         return (*self._storage.events,)
 
-    def contains(self, trial: Trial) -> bool:
-        """Return whether the belief takes account of a trial as it is recorded now."""
-        return trial.index in self.state.processed and not self.state.is_stale
-
     @property
     def not_in_belief(self) -> Sequence[int]:
         """Indices of trials that were told and the belief takes no account of yet."""
-        return [t.index for t in self.history if not self.contains(t)]
+        state = self.state
+        known = () if state.is_stale else state.processed
+        return [t.index for t in self.history if t.index not in known]
 
     @property
     def health(self) -> Health:
@@ -275,8 +266,7 @@ class CampaignTrials(Telling[Trial]):
         if not bool(self.actions.contains(executed)):
             warn(
                 f"SA202 the executed action {executed.tolist()} is not in "
-                f"{self.actions}; it is simulated where it was executed",
-                stacklevel=stack_level(),
+                f"{self.actions}; it is simulated where it was executed"
             )
         return listed(executed)
 
@@ -285,10 +275,7 @@ class CampaignTrials(Telling[Trial]):
 
     def _record(self, event: str, facts: Facts) -> Trial:
         self._storage.write(event, facts)  # on the disk before it counts
-        trial = self.state.record(facts)
-        if self.on_trial is not None and trial.status != "withdrawn":
-            self.on_trial(trial)
-        return trial
+        return self.state.record(facts)
 
 
 def outcome_told(x: Any, x_shape: torch.Size) -> Tensor:
@@ -318,8 +305,7 @@ def outcome_told(x: Any, x_shape: torch.Size) -> Tensor:
     if bool(infinite.any()):
         warn(
             f"SA201 {int(infinite.sum())} of {infinite.numel()} told numbers are "
-            "infinite and count as not measured; pass NaN where a sensor gave nothing",
-            stacklevel=stack_level(),
+            "infinite and count as not measured; pass NaN where a sensor gave nothing"
         )
     return torch.where(infinite, torch.nan, rows[0])
 

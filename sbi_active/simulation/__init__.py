@@ -52,21 +52,6 @@ __all__ = [
 __getattr__ = lazy_names(
     __name__,
     {
-        "bank.bank": "Bank",
-        "bank.reweighting": "reuse",
-        "check": "check_simulator",
-        "model": "SimulatorModel",
-        "noise.autocorrelated": "AutocorrelatedNoise",
-        "noise.base": "NoiseModel",
-        "noise.estimation": "estimate_noise",
-        "noise.gaussian": "GaussianNoise",
-        "noise.student": "StudentTNoise",
-        "outcomes": "MissingRowsWarning Outcome SimulationError SimulationInterrupted "
-        "Simulations",
-        "workers.engine": "simulate",
-        "workers.settings": "Workers",
-    },
-    {
         "ReusedRows": "sbi_active.simulation.bank:ReusedRows",
         "RowStore": "sbi_active.simulation.workers.store:RowStore",
         "Simulator": "sbi_active.simulation.simulator:Simulator",

@@ -19,7 +19,7 @@ from sbi_active.identifiability.undetermined import Undetermined, find_undetermi
 from sbi_active.renamed import takes_loose
 from sbi_active.seeding import derive_seed, forked_generators, row_seeds
 from sbi_active.simulation.model import SimulatorModel, takes_seeds
-from sbi_active.simulation.outcomes import MissingRowsWarning, Outcome, SimulationError
+from sbi_active.simulation.outcomes import MissingRowsWarning, SimulationError
 from sbi_active.simulation.report import SimulatorReport
 from sbi_active.simulation.simulator import outcome_tensor, require_noise
 from sbi_active.simulation.workers.engine import simulate
@@ -78,17 +78,10 @@ def check_simulator(
     check.found["num_simulations"] = num_simulations
     check.found["num_workers"] = Workers.of(workers).num_workers
     theta, action = check.draw(MIN_ROWS)
-    try:
-        check.look(theta, action)
-    except Exception as error:  # whatever the user's code raises is the finding
-        try:
-            check.look_by_rows(theta, action)
-        except (SimulationError, ValueError):
-            check.defects.append(_told(error))
+    seconds = check.look(theta, action)
     if not check.defects:
         num_runs = RUNS + 3 * theta.shape[1] + action.shape[1] + RUNS
-        seconds_row = check.found["seconds_batch"] / MIN_ROWS + 1e-9
-        affordable = int(max_seconds / num_runs / seconds_row)
+        affordable = int(max_seconds / num_runs / (seconds / MIN_ROWS + 1e-9))
         try:
             check.compare(max(MIN_ROWS, min(num_rows, affordable)))
         except SimulationError as error:
@@ -135,13 +128,14 @@ class _Check:
             order = torch.randperm(len(values))
         return theta, values[order[torch.arange(num) % len(values)]]
 
-    def call(self, theta: Tensor, action: Tensor, seeds: Tensor) -> Any:
-        """Call the simulator as it is, whatever it returns."""
+    def call(self, theta: Tensor, action: Tensor, seeds: Tensor) -> Tensor:
+        """Call the simulator once; raises what it raises."""
         is_model = isinstance(self.simulator, SimulatorModel)
-        takes = is_model or takes_seeds(self.simulator)
+        takes = is_model or self.found["takes_seeds"]
         given = {"seeds": seeds.clone()} if takes else {}
         with forked_generators(self.seed, "call"):
-            return self.simulator(theta.clone(), action.clone(), **given)
+            x = self.simulator(theta.clone(), action.clone(), **given)
+        return outcome_tensor(x, len(theta))
 
     def simulate(self, theta: Tensor, action: Tensor, key: str = "x") -> Any:
         """Return simulations, what raises being missing."""
@@ -150,41 +144,35 @@ class _Check:
             seed = derive_seed(self.seed, key)
             return simulate(self.simulator, theta, action, seed=seed)
 
-    def look(self, theta: Tensor, action: Tensor) -> None:
-        """Call it with several rows and with one; raises what it raises."""
-        seeds = row_seeds(self.seed, len(theta))
-        outcome_tensor(self.call(theta, action, seeds), len(theta))  # it may load
-        start = time.perf_counter()
-        raw = self.call(theta, action, seeds)
-        middle = time.perf_counter()
-        single = outcome_tensor(self.call(theta[:1], action[:1], seeds[:1]), 1)
-        end = time.perf_counter()
-        x = outcome_tensor(raw, len(theta))
+    def look(self, theta: Tensor, action: Tensor) -> float:
+        """Return seconds of several rows; one row must give x of the same shape.
+
+        Where a call raises, rows are simulated so that only those are lost that raise.
+        """
+        seeds, seconds = row_seeds(self.seed, len(theta)), math.nan
+        try:
+            self.call(theta, action, seeds)  # it may load
+            start = time.perf_counter()
+            x = self.call(theta, action, seeds)
+            seconds = time.perf_counter() - start
+            single = self.call(theta[:1], action[:1], seeds[:1])
+        except Exception as error:  # whatever the user's code raises is the finding
+            start = time.perf_counter()
+            try:
+                self.simulate(theta, action)
+            except (SimulationError, ValueError):
+                self.defects.append(_told(error))
+            return time.perf_counter() - start
         if single.shape[1:] != x.shape[1:]:
             self.defects.append(
                 f"expected x of one shape; got {tuple(x.shape[1:])} a row from "
                 f"{len(theta)} rows and {tuple(single.shape[1:])} from one; keep the "
                 "rows' axis for a single row"
             )
-            return
-        dtype = str(getattr(raw, "dtype", type(raw).__name__))
-        output = dtype if isinstance(raw, Tensor) else f"{type(raw).__module__}.{dtype}"
-        self.found |= {"num_rows": len(theta), "x_shape": (*x.shape[1:],)}
-        self.found |= {"output": output, "seconds_batch": middle - start}
-        self.found["seconds_row"] = end - middle
-
-    def look_by_rows(self, theta: Tensor, action: Tensor) -> None:
-        """Simulate so that only the rows are lost that raise; raises where all do."""
-        start = time.perf_counter()
-        x = self.simulate(theta, action).x
-        seconds = time.perf_counter() - start
-        self.found |= {"num_rows": len(theta), "x_shape": (*x.shape[1:],)}
-        self.found |= {"output": f"{x.dtype} after conversion"}
-        self.found |= {"seconds_batch": seconds, "seconds_row": seconds / len(theta)}
+        return seconds
 
     def compare(self, num_rows: int) -> None:
         """Run so many rows under the same and other seeds, parameters and actions."""
-        self.found["num_rows"] = num_rows
         theta, action = self.draw(num_rows)
         seeds = row_seeds(derive_seed(self.seed, "x"), num_rows)
         start = time.perf_counter()
@@ -194,16 +182,18 @@ class _Check:
         independent = None
         if self.found["takes_seeds"] and rows.counts["missing"] == 0:
             order = torch.arange(num_rows).flip(0)
-            x = outcome_tensor(self.call(theta, action, seeds), num_rows)
+            x = self.call(theta, action, seeds)
             permuted = self.call(theta[order], action[order], seeds[order])
-            independent = _close(outcome_tensor(permuted, num_rows), x[order])
+            independent = _close(permuted, x[order])
+        is_deterministic, noiseless = _silent(rows.x, other.x)
         self.found |= {
-            "seconds_batch": seconds,
+            "num_rows": num_rows,
+            "x_shape": (*rows.x.shape[1:],),
+            "seconds": seconds,
             "counts": rows.counts,
-            "lost_by_action": _lost(action, rows.status != Outcome.OK),
             "is_reproducible": _same(rows.x, again.x),
-            "is_deterministic": _identical(rows.x, other.x),
-            "noiseless": _noiseless(rows.x, other.x),
+            "is_deterministic": is_deterministic,
+            "noiseless": noiseless,
             "rows_are_independent": independent,
         }
         if self.found["is_reproducible"]:
@@ -325,18 +315,6 @@ def _told(error: Exception) -> str:
     return text if text.startswith("expected ") else f"{type(error).__name__}: {text}"
 
 
-def _lost(action: Tensor, lost: Tensor) -> tuple[tuple[tuple[float, ...], float], ...]:
-    """Return the share of lost rows by action, largest first."""
-    distinct, inverse = torch.unique(action, dim=0, return_inverse=True)
-    if len(distinct) > len(action) / 2:  # a continuous space: too few rows an action
-        return ()
-    share = torch.zeros(len(distinct)).index_add_(0, inverse, lost.float())
-    share /= torch.bincount(inverse)
-    order = share.argsort(descending=True, stable=True)
-    order = order[share[order] > 0]
-    return tuple((tuple(distinct[i].tolist()), float(share[i])) for i in order)
-
-
 def _same(x: Tensor, other: Tensor) -> bool:
     return bool(((x == other) | (x.isnan() & other.isnan())).all())
 
@@ -348,15 +326,12 @@ def _close(x: Tensor, other: Tensor) -> bool:
     return bool((near | (x == other) | (x.isnan() & other.isnan())).all())
 
 
-def _identical(x: Tensor, other: Tensor) -> bool:
-    """Return whether all numbers that both have are equal, and there are some."""
-    both = x.isfinite() & other.isfinite()
-    return bool(both.any()) and bool((x[both] == other[both]).all())
-
-
-def _noiseless(x: Tensor, other: Tensor) -> tuple[int, ...]:
-    """Return numbers of x that the seed leaves alone while it changes others."""
+def _silent(x: Tensor, other: Tensor) -> tuple[bool, tuple[int, ...]]:
+    """Return whether two seeds give one x, and else the numbers that they leave."""
     x, other = x.flatten(1), other.flatten(1)
     both = x.isfinite() & other.isfinite()
-    silent = ((x == other) | ~both).all(0) & both.any(0)
-    return () if bool(silent.all()) else tuple(torch.nonzero(silent)[:, 0].tolist())
+    known = both.any(0)
+    silent = ((x == other) | ~both).all(0) & known
+    if bool(known.any()) and bool((silent == known).all()):
+        return True, ()
+    return False, tuple(torch.nonzero(silent)[:, 0].tolist())

@@ -6,6 +6,7 @@ import os
 import threading
 import uuid
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -203,24 +204,6 @@ class SimulatorModel(Shown):
         seeds = torch.zeros(len(theta), dtype=torch.int64)
         return self._run(theta, action, seeds, effects)
 
-    def log_prob(
-        self, x: Tensor, theta: Tensor, action: Tensor, **effects: Any
-    ) -> Tensor:
-        r"""Return :math:`\log p(x | \theta, \xi)`, the noise's density around the mean.
-
-        Args:
-            x: Observations, shape (n, *x_shape).
-            theta: Parameters, shape (n, theta_dim).
-            action: Actions, shape (n, action_dim).
-            effects: Effects by name, a number or one a row.
-
-        Returns:
-            Shape (n,), float64, nats.
-        """
-        mean = self.mean(theta, action, **effects)
-        assert self.noise is not None
-        return self.noise.log_prob(x, mean)
-
     @property
     def draws_by_noise_alone(self) -> bool:
         """Whether a draw is the mean with ``noise`` as declared, and no more."""
@@ -266,10 +249,8 @@ class SimulatorModel(Shown):
             for i in range(len(theta)):
                 row = slice(i, i + 1)
                 own = at_rows(effects, row)
-                try:
+                with suppress(Exception):
                     answers.append(self._agrees(theta[row], action[row], own))
-                except Exception:
-                    continue
             if not answers:
                 raise
             return all(answers)

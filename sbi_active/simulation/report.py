@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from sbi_active.identifiability.undetermined import Undetermined
 from sbi_active.messages import Message
 
-LINES = 10  # of actions without a measurement
-
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatorReport:
@@ -17,21 +15,17 @@ class SimulatorReport:
     Attributes:
         num_rows: Rows that each check simulated.
         x_shape: Shape of one outcome; None if there was none.
-        output: Type of the simulator's output, "torch.float32".
         takes_seeds: Whether it is given one seed a row.
         is_deterministic: Whether two seeds gave identical x.
         is_reproducible: Whether one seed gave the same x twice.
         rows_are_independent: Whether rows permuted with their seeds give permuted x;
             None for a simulator without seeds.
         counts: Rows by outcome.
-        lost_by_action: Actions and the share of their rows without a measurement,
-            largest first, where any were lost.
         idle_parameters: Parameters that change nothing.
         idle_actions: Entries of the action that change nothing.
         undetermined: Parameters that no permitted action tells apart, as far as was
             tried, and the combinations of them that actions do determine.
-        seconds_batch: Time of ``num_rows`` rows at once.
-        seconds_row: Time of a call with one row.
+        seconds: Time of ``num_rows`` rows at once.
         num_simulations: Simulations that a campaign needs.
         num_workers: Workers that share them.
         noiseless: Numbers of x, flattened, that two seeds leave as they are while
@@ -42,18 +36,15 @@ class SimulatorReport:
 
     num_rows: int = 0
     x_shape: tuple[int, ...] | None = None
-    output: str = ""
     takes_seeds: bool = False
     is_deterministic: bool | None = None
     is_reproducible: bool | None = None
     rows_are_independent: bool | None = None
     counts: dict[str, int] = field(default_factory=dict)
-    lost_by_action: tuple[tuple[tuple[float, ...], float], ...] = ()
     idle_parameters: tuple[str, ...] = ()
     idle_actions: tuple[str, ...] = ()
     undetermined: tuple[Undetermined, ...] = ()
-    seconds_batch: float | None = None
-    seconds_row: float | None = None
+    seconds: float | None = None
     num_simulations: int | None = None
     num_workers: int = 1
     noiseless: tuple[int, ...] = ()
@@ -72,33 +63,22 @@ class SimulatorReport:
     @property
     def minutes(self) -> float | None:
         """Time of a campaign's simulations, which workers share evenly."""
-        if self.seconds_batch is None or self.num_simulations is None:
+        if self.seconds is None or self.num_simulations is None:
             return None
-        seconds = self.num_simulations * self.seconds_batch / self.num_rows
+        seconds = self.num_simulations * self.seconds / self.num_rows
         return seconds / self.num_workers / 60
 
     def __str__(self) -> str:
         lines = []
         if self.x_shape is not None:
             none = "none taken (one seeds 256 rows)"
-            seeds = "one a row" if self.takes_seeds else none
-            lines += [
-                f"x: shape (n, {', '.join(map(str, self.x_shape))}), {self.output}",
-                f"seeds: {seeds}",
-            ]
-        if self.counts:
             counts = ", ".join(f"{n} {name}" for name, n in self.counts.items())
-            lines.append(f"rows: {counts}")
-        for action, share in self.lost_by_action[:LINES]:
-            text = ", ".join(f"{a:g}" for a in action)
-            lines.append(f"  action {text}: {share:.0%} without a measurement")
-        if len(self.lost_by_action) > LINES:
-            lines.append(f"  and {len(self.lost_by_action) - LINES} actions more")
-        if self.seconds_batch is not None and self.seconds_row is not None:
-            lines.append(
-                f"time: {1e3 * self.seconds_batch:.3g} ms for {self.num_rows} rows at "
-                f"once, {1e3 * self.seconds_row:.3g} ms for one"
-            )
+            lines += [
+                f"x: shape (n, {', '.join(map(str, self.x_shape))})",
+                f"seeds: {'one a row' if self.takes_seeds else none}",
+                f"rows: {counts}",
+                f"time: {1e3 * (self.seconds or 0.0):.3g} ms for {self.num_rows} rows",
+            ]
         if self.minutes is not None:
             workers = f"{self.num_workers} worker{'s' * (self.num_workers > 1)}"
             lines.append(

@@ -7,15 +7,19 @@ import numpy as np
 import pytest
 import torch
 from sbi.utils import BoxUniform
+from torch.distributions import MultivariateNormal
 
 from sbi_active import (
     Campaign,
     CampaignOptions,
     DiscreteActions,
     GaussianNoise,
+    RefinementOptions,
     SimulatorModel,
+    StopRules,
 )
 from sbi_active.campaign.options import CampaignDetails
+from sbi_active.simulation import Workers
 from tests.campaign.problem import ACTIONS, OPTIONS, PRIOR, campaign, draws, noisy
 
 
@@ -145,6 +149,11 @@ def test_other_errors():
         campaign(simulator=lambda theta, action: torch.zeros(len(theta), 0))
     with pytest.raises(ValueError, match="expected num_scored >= 100; got 5"):
         CampaignDetails(num_scored=5)
+    for effects in (["bias"], "bias"):
+        with pytest.raises(TypeError, match="expected effects of class Effect; got '"):
+            campaign(given={"effects": effects})
+        with pytest.raises(TypeError, match="expected effects of class Effect; got '"):
+            campaign().criticize(effects)  # pyright: ignore
     c = campaign()
     with pytest.raises(ValueError, match="expected the index of one of 0 trials"):
         c.tell([1.0], trial=3)
@@ -158,6 +167,67 @@ def test_other_errors():
     with pytest.raises(ValueError, match="expected action of shape"):
         c.tell([1.0], action=[1.0, 2.0])
     assert c.pending is not None
+
+
+@pytest.mark.parametrize(
+    ("wrong", "expected"),
+    [
+        ({"estimator": "foo"}, "estimator among 'auto', 'entropy'.*; got 'foo'"),
+        ({"network": "never"}, "network among 'each round', 'on demand'; got 'never'"),
+        ({"refine": 3}, "refine of class bool; got 3; pass True or False"),
+        ({"stop": 3}, r"stop of class StopRules; got 3; pass StopRules\(...\)"),
+        ({"refinement": {}}, "refinement of class RefinementOptions; got {}"),
+        ({"details": None}, "details of class CampaignDetails; got None"),
+        ({"num_simulations": "many"}, "num_simulations >= 100; got 'many'"),
+        ({"num_simulations": 99}, "num_simulations >= 100; got 99"),
+        ({"num_samples": 7}, "num_samples >= 8; got 7"),
+        ({"max_simulations": 99}, "max_simulations >= 100 or None; got 99"),
+        ({"planned_trials": 0}, "planned_trials >= 1; got 0"),
+        ({"check_every": 0}, "check_every >= 1 or None; got 0"),
+        ({"refinement": RefinementOptions(workers=Workers(2))}, "to run as all others"),
+    ],
+)
+def test_options_that_cannot_be_are_refused_at_once(wrong, expected):
+    with pytest.raises((ValueError, TypeError), match=f"expected .*{expected}"):
+        CampaignOptions(**wrong)
+
+
+def test_the_smallest_options_are_taken():
+    least = {"num_simulations": 100, "num_samples": 8, "max_simulations": 100}
+    options = CampaignOptions.of({**least, "planned_trials": 1, "check_every": 1})
+    assert (options.num_simulations, options.workers) == (100, Workers())
+    assert CampaignOptions.of(options) is options
+    assert CampaignOptions.of(None) == CampaignOptions()
+    with pytest.raises(TypeError, match="expected options of a campaign; got 3"):
+        CampaignOptions.of(3)
+
+
+@pytest.mark.parametrize("limit", [0.0, -1.0, [0.1, 0.0]])
+def test_limits_to_stop_at_are_positive(limit):
+    with pytest.raises(ValueError, match="expected positive limits to stop at"):
+        StopRules(max_sd=limit)
+    if not isinstance(limit, list):
+        with pytest.raises(ValueError, match="expected positive limits to stop at"):
+            StopRules(min_information_gain=limit)
+
+
+@pytest.mark.parametrize(
+    ("max_sd", "stops"),
+    [(0.11, True), (0.09, False), ([0.11, 0.21], True), ([0.11, 0.19], False)],
+)
+def test_every_parameter_must_be_known_to_stop(max_sd, stops):
+    belief = MultivariateNormal(torch.zeros(2), torch.tensor([0.01, 0.04]).diag())
+    if isinstance(max_sd, float):
+        belief = MultivariateNormal(torch.zeros(2), 0.01 * torch.eye(2))
+    reason = StopRules(max_sd=max_sd).reason(belief, None, seed=0)
+    assert (reason is not None) == stops
+    assert StopRules().reason(belief, None, seed=0) is None
+
+
+def test_as_many_limits_as_parameters():
+    belief = MultivariateNormal(torch.zeros(2), torch.eye(2))
+    with pytest.raises(ValueError, match="one for each of 2 parameters; got 3"):
+        StopRules(max_sd=[1.0, 1.0, 1.0]).reason(belief, None, seed=0)
 
 
 @pytest.mark.parametrize("scale", [1e-30, 1e20])

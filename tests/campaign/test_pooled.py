@@ -16,6 +16,7 @@ from sbi_active import (
 from sbi_active.actions import SummaryAction
 from sbi_active.simulation.workers.store import SimulationBudgetError
 from sbi_active.tasks import get_task
+from tests.effects import BIAS
 
 PRIOR = BoxUniform(torch.zeros(2), torch.ones(2))
 SIZE = 8  # pixels a side
@@ -155,6 +156,25 @@ def test_it_goes_on_where_it_was_left(tmp_path):
         theta = PRIOR.sample((50,))
         same = c.belief.log_prob(theta), whole.belief.log_prob(theta)
         assert torch.allclose(*same, atol=1e-6)
+
+
+def test_an_effect_is_adopted_within_the_budget():
+    """A pool learns the augmented simulator, and never the prior's 2,000 rows."""
+    model = SimulatorModel(lambda t, a: t[:, :1] * a, noise=GaussianNoise(0.05))
+    prior = BoxUniform(torch.zeros(1), torch.ones(1))
+    options = {"max_simulations": 600, "planned_trials": 4}
+    actions = DiscreteActions([-2.0, -1.0, 1.0, 2.0])
+    c = Campaign(model, prior, actions, effects=[BIAS], options=options)
+    for action in (-2.0, -1.0, 1.0, 2.0, -2.0, 2.0):
+        c.tell([0.5 * action + 0.8], action=[action])
+    c.update()
+    report = c.criticize(evaluate=False)
+    assert report.verdict == "bias"
+    belief = c.adopt(report)
+    assert c.state.meter.spent <= 600
+    assert all(t.outlyingness is None for t in c.history if t.surprise is None)
+    mean = belief.sample((1_000,)).mean(0)
+    assert torch.allclose(mean, torch.tensor([0.5, 0.8]), atol=0.15)
 
 
 # The posterior of all trials from a pool of few simulations

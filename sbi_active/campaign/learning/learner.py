@@ -27,18 +27,19 @@ from sbi_active.campaign.learning.indexed import (
 )
 from sbi_active.campaign.learning.methods import find_method
 from sbi_active.campaign.learning.rounds import Round
-from sbi_active.campaign.score import score_outcome, simulate_from
+from sbi_active.campaign.score import score_outcome
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.identifiability.known import note_combinations
 from sbi_active.inference.beliefs.belief import information_gained, named
 from sbi_active.inference.beliefs.diagnostics import Diagnostics
 from sbi_active.inference.beliefs.enumerated import Enumeration
 from sbi_active.inference.beliefs.priors import require_support, require_width
+from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.rounds.rows import Observation, UnexplainedOutcomeError
 from sbi_active.inference.trainers.base import ActiveInference
 from sbi_active.messages import warn
 from sbi_active.seeding import derive_seed, forked_generators
-from sbi_active.simulation import Simulations, simulate
+from sbi_active.simulation import simulate
 from sbi_active.simulation.simulator import square_of
 from sbi_active.simulation.workers.store import SimulationBudgetError
 
@@ -146,16 +147,39 @@ class Learner:
         """Return the simulator of the trial of an index."""
         return at_index(self.simulator, index) if self.has_index else self.simulator
 
-    def score(self, trial: Trial) -> None:
+    def takes(self, trial: Trial) -> bool:
+        """Score a trial and learn from it; return False if simulations ran out.
+
+        The trial then stays recorded and the belief as it is, as it does for a trial
+        that nothing in the prior explains.
+        """
+        state = self.state
+        try:
+            if trial.version != state.version.number:
+                trial = self._scored(trial)
+            self._learn(trial)
+        except SimulationBudgetError as error:
+            state.unscore(trial.index)
+            warn(
+                f"SA602 trial {trial.index} is recorded and not in the belief: {error}"
+            )
+            return False
+        return True
+
+    def _scored(self, trial: Trial) -> Trial:
         """Compare a trial with what the belief before it predicts."""
         state, index = self.state, trial.index
         diagnostics = getattr(self.belief, "diagnostics", Diagnostics())
         with state.stage(index, "scoring"):
             surprise, log_score = self._score(trial)
-        found: Any = {"surprise": surprise, "log_score": log_score}
-        found["belief_error"] = error_nats(diagnostics)
-        state.change(index, **found, version=state.version.number)
-        self._examine(state.trials[index])
+        state.change(
+            index,
+            surprise=surprise,
+            log_score=log_score,
+            belief_error=error_nats(diagnostics),
+            version=state.version.number,
+        )
+        return self._examined(state.trials[index])
 
     def _score(self, trial: Trial, size: int = 4_000_000) -> tuple[float, float]:
         """Return the surprise and the log score of a trial.
@@ -167,92 +191,68 @@ class Learner:
         """
         assert trial.x is not None
         affordable = max(400, size // max(trial.x.numel(), 1))
-        return score_outcome(
-            trial.x, self._simulated(self.belief, trial, "score", affordable)
-        )
+        drawn = self._simulated(self.belief, trial, "score", affordable)
+        return score_outcome(trial.x, drawn)
 
     def _simulated(
         self, source: Distribution, trial: Trial, purpose: str, most: float = math.inf
-    ) -> Simulations:
-        """Return simulations of a trial with parameters from a distribution."""
-        options = self.state.options
-        rows = simulate_from(
-            source,
-            self.at(trial.index),
-            trial.action,
-            num_samples=int(min(options.details.num_scored, most)),
-            seed=derive_seed(self.state.seed, purpose, trial.index),
+    ) -> Tensor:
+        """Return outcomes of a trial's action with parameters from a distribution."""
+        options, index = self.state.options, trial.index
+        num = int(min(options.details.num_scored, most))
+        seed = derive_seed(self.state.seed, purpose, index)
+        with forked_generators(seed, "theta"):
+            theta = source.sample(torch.Size([num]))
+        rows = simulate(
+            self.at(index),
+            theta,
+            trial.action.expand(num, -1),
+            seed=derive_seed(seed, "x"),
             workers=options.workers,
         )
-        self.state.account(trial.index, len(rows), rows.counts["missing"])
-        return rows
+        self.state.account(index, num, rows.counts["missing"])
+        return rows.without_missing().x
 
-    def _examine(self, trial: Trial) -> Trial:
+    def _examined(self, trial: Trial) -> Trial:
         """Compare a trial that the belief did not lead to with all of the prior."""
         if not is_suspect(trial):
             return trial
         assert trial.x is not None
         with self.state.stage(trial.index, "scoring"):
-            rows = self._simulated(self.prior, trial, "prior")
-        far = outlyingness(trial.x, rows.without_missing().x)
-        self.state.change(trial.index, outlyingness=far)
-        return self._warned(trial.index)
+            drawn = self._simulated(self.prior, trial, "prior")
+        return self._found_far(trial.index, outlyingness(trial.x, drawn))
 
-    def _warned(self, index: int) -> Trial:
+    def _found_far(self, index: int, ranges: float) -> Trial:
+        """Note how far beyond all simulations a trial is, and warn of one that is."""
+        self.state.change(index, outlyingness=ranges)
         trial = self.state.trials[index]
         for text in doubts([trial]):
-            warn(text, stacklevel=2)
+            warn(text)
         return trial
 
-    def takes(self, trial: Trial) -> bool:
-        """Score a trial and learn from it; return False if simulations ran out.
-
-        The trial then stays recorded and the belief as it is, as it does for a trial
-        that nothing in the prior explains.
-        """
-        state = self.state
-        try:
-            if trial.version != state.version.number:
-                self.score(trial)
-            self.learn(state.trials[trial.index])
-        except SimulationBudgetError as error:
-            state.unscore(trial.index)
-            warn(
-                f"SA602 trial {trial.index} is recorded and not in the belief: {error}",
-                stacklevel=4,
-            )
-            return False
-        return True
-
-    def learn(self, trial: Trial) -> None:
+    def _learn(self, trial: Trial) -> None:
         """Bring the belief up to date with one more trial."""
+        # A tail probability below what any number of simulations resolves.
+        found: dict[str, Any] = {"information_gained": 0.0, "misfit": 0.0}
         if trial.is_explained:
             try:
-                self._learn(trial)
-                return
+                found = self._update(trial)
             except UnexplainedOutcomeError:
-                self.state.account(trial.index, 0, 0, outlyingness=math.inf)
-                self._warned(trial.index)
-        # Its tail probability is below what any number of simulations resolves.
-        self.state.account(trial.index, 0, 0, information_gained=0.0, misfit=0.0)
+                self._found_far(trial.index, math.inf)
+        self.state.change(trial.index, **found)
 
-    def _learn(self, trial: Trial) -> None:
+    def _update(self, trial: Trial) -> dict[str, Any]:
+        """Learn from a trial, and return what that changed of its entries."""
         state, index = self.state, trial.index
         self._prepare(index)
         before = self.belief
         with state.stage(index, "update"):
-            belief, num_simulations, num_missing = self._updated(trial)
-            gained = information_gained(
-                belief, before, seed=derive_seed(state.seed, "gain", index)
-            )
-        self.round.close()
-        state.account(
-            index,
-            num_simulations,
-            num_missing,
-            information_gained=gained,
-            misfit=misfit(belief.diagnostics),
-        )
+            belief, *spent = self._updated(trial)
+            seed = derive_seed(state.seed, "gain", index)
+            gained = information_gained(belief, before, seed=seed)
+        self.round = Round(self)
+        state.account(index, *spent)
+        return {"information_gained": gained, "misfit": misfit(belief.diagnostics)}
 
     def _prepare(self, index: int) -> None:
         """Train the network that the update of a trial uses."""
@@ -264,22 +264,21 @@ class Learner:
 
     def _updated(self, trial: Trial) -> tuple[Any, int, int]:
         """Return the belief with one more trial, its simulations and those missing."""
-        assert trial.x is not None
-        state, index = self.state, trial.index
-        seed, options = state.seed, state.options
+        state = self.state
         if self.has_index:
-            earlier = [t for t in state.explained if t.index != index]
-            belief = self._infer([*earlier, trial], index)
+            earlier = [t for t in state.explained if t.index != trial.index]
+            belief = self._inferred([*earlier, trial], trial.index)
         else:
-            with forked_generators(seed, "update", index):
+            with forked_generators(state.seed, "update", trial.index):
+                assert trial.x is not None
                 belief = self.inference.update(
                     trial.x,
                     action=trial.action,
-                    simulator=self.simulator if options.refine else None,
-                    refinement=replace(options.refinement, workers=options.workers),
-                    seed=derive_seed(seed, "refine", index),
+                    simulator=self.simulator if state.options.refine else None,
+                    refinement=self._refinement,
+                    seed=derive_seed(state.seed, "refine", trial.index),
                 )
-            note_combinations(belief, self._names, seed=seed)
+            note_combinations(belief, self._names, seed=state.seed)
         figures = belief.diagnostics
         return belief, figures.num_simulations, figures.num_missing
 
@@ -290,26 +289,28 @@ class Learner:
             Its misfit to them, as in :class:`.ModelVersion`.
         """
         self.restart()
-        explained = [t for t in map(self._examine, trials) if t.is_explained]
+        explained = [t for t in map(self._examined, trials) if t.is_explained]
         if not explained:
             return 0.0 if trials else None
-        found = misfit(self._infer(explained, len(trials)).diagnostics)
+        found = misfit(self._inferred(explained, len(trials)).diagnostics)
         return found if len(explained) == len(trials) else 0.0
 
-    def _infer(self, trials: Sequence[Trial], key: int) -> Any:
-        simulator: Any = self.simulator
-        if self.has_index:
-            simulator = IndexedSimulator(simulator)
-        state = self.state
-        options = state.options
-        belief = self.inference.update_all(
+    def _inferred(self, trials: Sequence[Trial], key: int) -> Any:
+        """Return the belief of trials, from scratch."""
+        state, simulator = self.state, self.simulator
+        belief: Any = self.inference.update_all(
             [self._observation(trial) for trial in trials],
-            simulator,
-            refinement=replace(options.refinement, workers=options.workers),
+            IndexedSimulator(simulator) if self.has_index else simulator,
+            refinement=self._refinement,
             seed=derive_seed(state.seed, "infer", state.version.number, key),
         )
         note_combinations(belief, self._names, seed=state.seed)
         return belief
+
+    @property
+    def _refinement(self) -> RefinementOptions:
+        options = self.state.options
+        return replace(options.refinement, workers=options.workers)
 
     def simulated(self, action: Tensor) -> Tensor:
         """Return actions (..., action_dim) as the simulator gets them."""
@@ -326,8 +327,9 @@ class Learner:
     def _probe(self) -> torch.Size:
         """Return x_shape from a few simulations, which must differ by seed."""
         theta, action = self._few()
-        options: dict[str, Any] = {"seed": derive_seed(self.state.seed, "probe", 1)}
-        options["workers"] = self.state.options.workers
+        workers = self.state.options.workers
+        options: Any = {"seed": derive_seed(self.state.seed, "probe", 1)}
+        options |= {"workers": workers}
         x = simulate(self.simulator, theta, action, check_noise=True, **options).x
         if square_of(x, None) is not None:  # by chance, or is it one for each row?
             fewer = simulate(self.simulator, theta[1:], action[1:], **options)

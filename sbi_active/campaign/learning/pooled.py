@@ -16,7 +16,7 @@ from sbi_active.actions import ActionSpace
 from sbi_active.actions.summaries import find_summaries
 from sbi_active.campaign.learning.learner import Learner
 from sbi_active.campaign.learning.methods import find_method
-from sbi_active.campaign.score import compared
+from sbi_active.campaign.score import score_outcome
 from sbi_active.campaign.state import CampaignState, Trial
 from sbi_active.design.design import Design
 from sbi_active.design.elimination import choose
@@ -267,7 +267,7 @@ class PooledLearner(Learner):
         z = near[rng.integers(len(near), size=size)]
         if fitted.processes:
             drawn = torch.from_numpy(fitted.draw(z, rng))
-            return compared(drawn, torch.from_numpy(fitted.observed))
+            return score_outcome(torch.from_numpy(fitted.observed), drawn)
         share = 1.0
         if fitted.outcome is not None:
             share = float(np.exp(fitted.outcome.log_prob(z)).mean())
@@ -279,10 +279,10 @@ class PooledLearner(Learner):
     def _updated(self, trial: Trial) -> tuple[Any, int, int]:
         state, start = self.state, self.state.meter.spent
         trials = [*(t for t in state.explained if t.index != trial.index), trial]
-        belief = self._infer(trials, trial.index)
+        belief = self._inferred(trials, trial.index)
         return belief, state.meter.spent - start, self.pool.num_missing
 
-    def _infer(self, trials: Sequence[Trial], key: int) -> Any:
+    def _inferred(self, trials: Sequence[Trial], key: int) -> Any:
         own = [self._trial(t) for t in trials]
         index = trials[-1].index
         allowed, start = self._rows_left("belief", index), self.state.meter.spent
@@ -299,7 +299,7 @@ class PooledLearner(Learner):
         self._saved = None
         return belief
 
-    def _examine(self, trial: Trial) -> Trial:
+    def _examined(self, trial: Trial) -> Trial:
         return trial  # few simulations tell nothing about all of the prior
 
 

@@ -44,6 +44,7 @@ def compare(
     # Criticism reads results of everything below, so it is imported where it is used.
     from sbi_active.criticism import Criticism, Trials
 
+    require_kind(effects)
     if len(trials) < 2:
         raise ValueError(
             f"expected at least two trials to compare; got {len(trials)}; run more "
@@ -117,6 +118,18 @@ def revise(state: CampaignState, actions: ActionSpace, report: Report) -> Learne
     state.versions[-1] = replace(version, misfit=misfit)
     state.keep_draws(revised.belief)
     return revised
+
+
+def require_kind(effects: Sequence[Effect]) -> None:
+    """Raise a TypeError if effects are none, as where their names are given."""
+    from sbi_active.criticism import Effect
+
+    for effect in effects:
+        if not isinstance(effect, Effect):
+            raise TypeError(
+                f"expected effects of class Effect; got {effect!r:.80}; pass "
+                "Effect(...), or those of generic_effects(...)"
+            )
 
 
 def require_effects(what: str, names: Sequence[str], effects: Sequence[Effect]) -> None:

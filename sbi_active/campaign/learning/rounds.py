@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from sbi_active.campaign.isolation import isolated
+from sbi_active.expected import require
 from sbi_active.inference.beliefs.enumerated import Enumeration
 from sbi_active.inference.models.posterior import ActionPosterior
 from sbi_active.seeding import derive_seed, forked_generators
@@ -33,20 +34,16 @@ class Round:
 
     def __init__(self, learner: Any) -> None:
         self._learner = learner
-        self.close()
+        self._is_trained = False
+        self._users: tuple[str, ...] = ()
 
-    def close(self) -> None:
-        """Have the next question train a network again."""
-        self._is_trained, self._asked = False, ()
-
-    def note(self, index: int, *by: str) -> None:
-        """Write down what asked this round's network, see :class:`.Trial`."""
+    def note(self, index: int, *users: str) -> None:
+        """Write down who uses this round's network, see :class:`.Trial`."""
         state = self._learner.state
-        self._asked = (*self._asked, *by)
+        self._users = (*self._users, *users)
         if index < len(state.trials):
-            earlier = state.trials[index].network_used_by
-            asked = tuple(dict.fromkeys((*earlier, *self._asked)))
-            state.change(index, network_used_by=asked)
+            all_users = (*state.trials[index].network_used_by, *self._users)
+            state.change(index, network_used_by=(*dict.fromkeys(all_users),))
 
     def model(self, index: int) -> RoundModel:
         """Return the model that a design asks, trained now or on demand.
@@ -57,10 +54,10 @@ class Round:
         learner = self._learner
         if Enumeration.of(learner.prior) is not None:
             return RoundModel(None)
-        is_due = learner.trains_each_round or not learner.inference.amortized
-        return RoundModel(
-            lambda: self.trained(index), self.trained(index) if is_due else None
-        )
+        model = RoundModel(lambda: self.trained(index))
+        if learner.trains_each_round or not learner.inference.amortized:
+            model.train()
+        return model
 
     def posterior(self, index: int) -> ActionPosterior:
         """Return the model of this round where it is a posterior.
@@ -71,17 +68,16 @@ class Round:
         Raises:
             ValueError: If it is another one, or none is trained.
         """
-        if not self._learner.has_networks:
-            raise ValueError(
-                "expected a campaign that trains networks; got max_simulations or a "
-                "SummaryAction, with which none is trained; use the belief"
-            )
+        require(
+            self._learner.has_networks,
+            "a campaign that trains networks",
+            "max_simulations or a SummaryAction, with which none is trained",
+            "use the belief",
+        )
         model = self.trained(index)
-        if not isinstance(model, ActionPosterior):
-            raise ValueError(
-                "expected the method 'asbi' or 'nsbi', whose network is a posterior; "
-                f"got {self._learner.state.method!r}; use the belief"
-            )
+        expected = "the method 'asbi' or 'nsbi', whose network is a posterior"
+        is_posterior = isinstance(model, ActionPosterior)
+        require(is_posterior, expected, self._learner.state.method, "use the belief")
         self.note(index, "posterior")
         return model
 
@@ -184,18 +180,18 @@ class Round:
 class RoundModel:
     """The model of a round, as a designer takes it.
 
+    It is trained once something asks for one of its densities.
+
     Args:
-        train: Function that returns the model, trained in this call if needed; None
+        trained: Function that returns the model, trained in this call if needed; None
             if none can be, as of discrete parameters.
-        model: The trained model; None leaves it untrained until something asks for one
-            of its densities.
 
     Attributes:
         was_asked: Whether something did.
     """
 
-    def __init__(self, train: Callable[[], Any] | None, model: Any = None) -> None:
-        self._train, self._model = train, model
+    def __init__(self, trained: Callable[[], Any] | None) -> None:
+        self._trained, self._model = trained, None
         self.was_asked = False
 
     @property
@@ -203,13 +199,18 @@ class RoundModel:
         """Whether the model is there without any work."""
         return self._model is not None
 
-    def __getattr__(self, name: str) -> Any:
-        is_density = name in DENSITIES
-        if self._train is None:
-            raise AttributeError(name)
-        if is_density and self._model is None:
+    def train(self) -> None:
+        """Train the model, unless that has been done."""
+        if self._model is None and self._trained is not None:
             # Estimates are made without gradients, training is not.
-            self._model = isolated(self._train)()
+            self._model = isolated(self._trained)()
+
+    def __getattr__(self, name: str) -> Any:
+        if self._trained is None:
+            raise AttributeError(name)
+        is_density = name in DENSITIES
+        if is_density:
+            self.train()
         found = getattr(self._model, name)
         self.was_asked |= is_density
         return found
