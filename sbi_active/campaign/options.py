@@ -12,6 +12,7 @@ import torch
 from torch.distributions import Distribution
 
 from sbi_active.design.design import Design
+from sbi_active.design.estimators.automatic import find_estimator
 from sbi_active.expected import require, require_least, require_one_of, suggests
 from sbi_active.inference.declared.settings import RefinementOptions
 from sbi_active.inference.networks.mixture_density import MixtureDensity
@@ -238,6 +239,12 @@ class CampaignOptions:
         )
 
     def __post_init__(self) -> None:
+        kinds = {"refine": bool, "stop": StopRules, "details": CampaignDetails}
+        for name, kind in (kinds | {"refinement": RefinementOptions}).items():
+            value = getattr(self, name)
+            expected = f"{name} of class {kind.__name__}"
+            require(isinstance(value, kind), expected, repr(value), "pass one of these")
+        find_estimator(self.estimator)  # an unknown name is an error here
         if self.bank is not None:
             object.__setattr__(self, "bank", os.fspath(self.bank))
         object.__setattr__(self, "workers", Workers.of(self.workers))

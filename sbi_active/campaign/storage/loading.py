@@ -13,12 +13,17 @@ from sbi_active.campaign.learning.pooled import make_learner
 from sbi_active.campaign.learning.revision import rebuilt, require_effects
 from sbi_active.campaign.state import CampaignState
 from sbi_active.campaign.storage.codec import Absent, NotStorableError, decode
-from sbi_active.campaign.storage.directory import BELIEF, SAVED, Storage
+from sbi_active.campaign.storage.directory import (
+    BELIEF,
+    SAVED,
+    Storage,
+    settings_of,
+)
 from sbi_active.campaign.telling import STATE
 from sbi_active.expected import require
 from sbi_active.messages import warn
 from sbi_active.simulation.bank.errors import whole
-from sbi_active.simulation.bank.fingerprint import fingerprint, require_same
+from sbi_active.simulation.fingerprint import fingerprint, require_same
 
 
 def load(
@@ -57,6 +62,9 @@ def load(
             text = f"expected {what}=, which only its author can make again; got None"
             made = f"{manifest[f'{what}_text']:.200}"
             raise NotStorableError(f"{text}; pass what it was made with: {made}")
+        before = manifest.get(f"{what}_settings") or thing and settings_of(thing)
+        if before and what != "options" and given[what] is not None:
+            require_same("the campaign", before, settings_of(given[what]), what)
     with store.reading():
         state = CampaignState(**facts, options=found["options"])
         content = restore(state, storage)
