@@ -17,18 +17,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
 
+from sbi_active.campaign import telling
 from sbi_active.campaign.isolation import guarded, isolated
 from sbi_active.campaign.learning.indexed import IndexedSimulator
 from sbi_active.campaign.state import CampaignState
 from sbi_active.campaign.storage.codec import NotStorableError, encode
-from sbi_active.campaign.telling import (
-    LOG,
-    STATE,
-    SUMMARY,
-    LogChangedError,
-    event_of,
-    now,
-)
+from sbi_active.campaign.telling import LOG, STATE, SUMMARY, LogChangedError, event_of
 from sbi_active.expected import require
 from sbi_active.simulation.bank.bank import Bank
 from sbi_active.simulation.bank.store import NAME, Store
@@ -214,7 +208,7 @@ def make_campaign(
     manifest = {
         name: getattr(state, name) for name in ("method", "seed", "num_earlier")
     }
-    manifest |= {"created": now(), "packages": packages}
+    manifest |= {"created": telling.now(), "packages": packages}
     manifest["simulator"] = fingerprint(simulator)
     for name in ("parameter_names", "channel_names"):
         found = getattr(simulator, name, None)
@@ -222,15 +216,10 @@ def make_campaign(
     objects = {}
     for what, thing in given.items():
         manifest[f"{what}_text"] = repr(thing)
-        manifest[f"{what}_settings"] = settings_of(thing)
+        manifest[f"{what}_settings"] = fingerprint(thing, version="settings")
         with suppress(NotStorableError):
             objects[what] = encode(thing, known={})
     write_campaign(folder, manifest | facts, objects)
-
-
-def settings_of(thing: Any) -> dict[str, Any]:
-    """Return the settings of a prior or a space, whose source may change."""
-    return fingerprint(thing, version="settings")
 
 
 def write_campaign(
