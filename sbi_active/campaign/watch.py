@@ -42,7 +42,7 @@ class Watched:
         """Return the page, which asks for :meth:`state` each second."""
         if (seal := self._now()) != self._seal:
             self._campaign = Campaign.load(self._folder)
-            follow = templates().get_template("follow.html.jinja").render()
+            follow = templates().get_template("follow.html.jinja").render(seal=seal)
             self._page = page(self._campaign).replace("<main>", follow, 1)
             self._seal = seal
         return self._page
@@ -56,14 +56,15 @@ class Watched:
         return Store(self._folder, "campaign").seal(LOG, STATE)
 
     def _doing(self) -> str:
-        """Return what the campaign waits for, or what a process computes for it."""
+        """Return what the campaign waits for: the robot, or a process that has it."""
         pending, late = self._campaign.pending, self._campaign.not_in_belief
         if pending is not None:
             return f"trial {pending.index} waits for its outcome"
         if not is_written(self._folder):
             return "no process has the campaign open"
         told = ", ".join(map(str, late))
-        return f"being learned: trial {told}" if late else "being designed: a trial"
+        work = f"learned: trial {told}" if late else "designed: the next trial"
+        return f"a process has it open; to be {work}"
 
 
 def is_written(folder: Path) -> bool:

@@ -64,6 +64,7 @@ def test_the_page_follows_a_campaign_of_another_process(camp, tmp_path):
     page = wait_for("1 trials told; trial 1 is pending", place[1])
     state = json.loads(ask(place[1], "/state"))
     assert state["doing"] == "trial 1 waits for its outcome"
+    assert f'now.seal !== "{state["seal"]}"' in page  # else it is loaded again
     assert {p.name: p.read_bytes() for p in camp.iterdir()} == before  # it is only read
     assert "https:" not in page
     assert main(["tell", "camp", "0.7"]) == 0
@@ -83,7 +84,7 @@ def test_what_is_going_on_is_said(camp):
     with watched(camp) as url:
         with Campaign.load(camp) as campaign:
             campaign.tell([0.7])
-            assert doing() == "being learned: trial 1"
+            assert doing() == "a process has it open; to be learned: trial 1"
         assert doing() == "no process has the campaign open"
 
 
