@@ -1,10 +1,10 @@
 """Messages by code: what each warning is called, its class, and where it is explained.
 
 ``messages.md`` beside this file is the registry: a code, a title, and what to do. The
-site's page "What the warnings mean" is that file. A message ends in its place there,
-"(see warnings.html#sa301-rows-missing)", which is all that it needs to keep its code
-through JSON, a file, or another process. Built-in errors about an argument have none:
-they say what was expected, what was given and what to do.
+site's page "What the warnings mean" is that file. A message ends in its code there,
+"(SA301)", which is all that it needs to keep it through JSON, a file, or another
+process. Built-in errors about an argument have none: they say what was expected, what
+was given and what to do.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ from pathlib import Path
 
 from sbi_active.callers import stack_level
 
-PAGE = "warnings.html"
 _ENTRY = re.compile(r"^### (SA\d+) (.+)\n((?:.+\n)+)", re.MULTILINE)
-_PLACE = re.compile(rf"\(see {PAGE}#(?:sa(\d+)-)?([\w-]+)\)$")
+_CODE = re.compile(r"\((SA\d+)\)$")
+#: How messages ended in earlier versions, with or without the number.
+_FORMER = re.compile(r"\(see warnings\.html#(?:sa(\d+)-)?([\w-]+)\)$")
 
 
 class SBIActiveWarning(UserWarning):
@@ -81,30 +82,27 @@ class Message(str):
     Example:
         >>> said = Message("SA301 3 of 9 rows are missing: 3 raised")
         >>> said, said.code, said.category.__name__
-        ('3 of 9 rows are missing: 3 raised (see warnings.html#sa301-rows-missing)',
-         'SA301', 'SimulationWarning')
+        ('3 of 9 rows are missing: 3 raised (SA301)', 'SA301', 'SimulationWarning')
         >>> Message(said) == said
         True
-        >>> Message("few draws (see warnings.html#few-draws)").code  # as it was
-        'SA114'
+        >>> Message("few (see warnings.html#few-draws)")  # as it once was
+        'few (SA114)'
     """
 
     __slots__ = ()
 
     def __new__(cls, text: object = "") -> Message:
-        """Put the place of a code that comes first to the end of a text."""
+        """Put a code that comes first to the end of a text."""
         code, _, rest = str(text).partition(" ")
         is_coded = code in explanations()
-        return super().__new__(cls, rest + place(code) if is_coded else str(text))
+        said = rest + place(code) if is_coded else _FORMER.sub(_as_now, str(text))
+        return super().__new__(cls, said)
 
     @property
     def code(self) -> str:
         """Code of the message, "" for a text without one."""
-        place = _PLACE.search(self)
-        if place is None:
-            return ""
-        number, slug = place.groups()
-        return f"SA{number}" if number else _codes().get(slug, "")
+        found = _CODE.search(self)
+        return found[1] if found else ""
 
     @property
     def category(self) -> type[SBIActiveWarning]:
@@ -124,19 +122,17 @@ def explanations() -> dict[str, tuple[str, str]]:
     return {c: (title, " ".join(t.split())) for c, title, t in _ENTRY.findall(text)}
 
 
-@cache
-def _codes() -> dict[str, str]:
-    """Return codes by slug, by which the last version named its places."""
-    return {_slug(title): code for code, (title, _) in explanations().items()}
-
-
-def _slug(title: str) -> str:
-    return title.lower().replace(" ", "-")
+def _as_now(former: re.Match[str]) -> str:
+    """Return the end of a message for one of earlier versions."""
+    number, slug = former.groups()
+    titles = {t.lower().replace(" ", "-"): c for c, (t, _) in explanations().items()}
+    code = f"SA{number}" if number else titles.get(slug, "")
+    return f"({code})" if code else former[0]
 
 
 def place(code: str) -> str:
-    """Return the place where a code is explained, as the end of a message."""
-    return f" (see {PAGE}#{code.lower()}-{_slug(explanations()[code][0])})"
+    """Return a code as the end of a message."""
+    return f" ({code})"
 
 
 def warn(
@@ -145,7 +141,7 @@ def warn(
     *,
     stacklevel: int | None = None,
 ) -> None:
-    """Warn as :func:`warnings.warn` does, and say where the message is explained.
+    """Warn as :func:`warnings.warn` does, with the code of the message.
 
     Args:
         text: Code, what is wrong and what to do.
@@ -159,7 +155,7 @@ def warn(
 
 
 class Explained:
-    """An error whose text names its place on the page.
+    """An error whose text ends in its code.
 
     Attributes:
         code: Code of the message.

@@ -257,8 +257,8 @@ def _doubt(trial: Trial) -> str:
         )
     so = ", so that the belief leaves it out" if far > FAR else ""
     return (
-        f"SA102 {where}{what}{so}; correct it with tell(x, trial={index}) or take it "
-        f"out with withdraw({index}), and criticize() where it is right"
+        f"SA102 {where}{what}{so}; correct or withdraw trial {index}, and criticize "
+        "where it is right"
     )
 
 

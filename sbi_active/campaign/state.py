@@ -177,7 +177,8 @@ UNSCORED: dict[str, Any] = dict.fromkeys(
 
 def tensor_of(listed: Any) -> Tensor:
     """Return the numbers of :class:`.Facts`, whose None are NaN."""
-    return torch.from_numpy(np.array(listed, np.float64)).float()
+    with torch.inference_mode(False):  # they are trained on later
+        return torch.from_numpy(np.array(listed, np.float64)).float()
 
 
 def _with(value: float | None, unit: str = "") -> str:

@@ -14,6 +14,7 @@ from datetime import datetime, timezone
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from sbi_active.expected import require
+from sbi_active.messages import Explained
 
 if TYPE_CHECKING:
     import numpy as np
@@ -27,6 +28,19 @@ Status = Literal["pending", "ok", "invalid", "missing", "withdrawn"]
 #: Records of a campaign's store: what happened, what was computed from it, and what a
 #: reader without torch needs of that.
 LOG, STATE, SUMMARY = "log", "state", "summary"
+
+
+class LogChangedError(Explained, ValueError):
+    """Another writer added to a campaign since it was loaded here."""
+
+    code = "SA607"
+
+    def __init__(self, folder: Any) -> None:
+        super().__init__(
+            f"expected the campaign in {folder} as it was loaded; got trials that "
+            "another process told since; load it again, and tell this once more: "
+            "nothing was written"
+        )
 
 
 @dataclass(frozen=True)
@@ -192,7 +206,8 @@ class Telling(Generic[Kept]):
 
         Args:
             trial: The trial or its index, a pending one too.
-            reason: Reason that is kept with the trial.
+            reason: Reason that is kept with the trial; without one, a trial that is
+                withdrawn already keeps its own.
 
         Returns:
             The recorded trial.
@@ -201,8 +216,13 @@ class Telling(Generic[Kept]):
             ValueError: If there is no such trial.
         """
         found = self._found(trial)
-        return self._record(
-            "withdrawn", replace(found, status="withdrawn", reason=reason)
+        if found.status == "withdrawn":
+            reason = reason or found.reason
+        told = replace(found, status="withdrawn", reason=reason)
+        return (
+            self._trials[found.index]
+            if told == found
+            else self._record("withdrawn", told)
         )
 
     def _found(self, trial: Any) -> Facts:

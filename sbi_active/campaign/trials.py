@@ -246,7 +246,7 @@ class CampaignTrials(Telling[Trial]):
         how = {"theta_true": theta_true, "num_predicted": num_predicted}
         return legible(plot_campaign(self, **how))
 
-    tell = guarded(isolated(Telling.tell))
+    tell = guarded(Telling.tell)
     attach = guarded(Telling.attach)
     correct = guarded(Telling.correct)
     withdraw = guarded(Telling.withdraw)

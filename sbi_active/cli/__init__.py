@@ -18,11 +18,8 @@ from click.exceptions import Exit
 from click.shell_completion import shell_complete
 
 from sbi_active.cli import declare as cli
-from sbi_active.cli.declare import NAME, Answer, as_line, failure, program, say
 
 __all__ = ["main"]
-
-COMPLETE = "_SBI_ACTIVE_COMPLETE"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -40,8 +37,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     sys.path[:] = [p for p in sys.path if p and Path(p).resolve() != here]
     from sbi_active.cli import campaign, simulators  # noqa: F401
 
-    if shell := os.environ.get(COMPLETE):
-        return shell_complete(program, {}, NAME, COMPLETE, shell)
+    if shell := os.environ.get(variable := "_SBI_ACTIVE_COMPLETE"):
+        return shell_complete(cli.program, {}, cli.NAME, variable, shell)
     is_json = "--json" in words
     with contextlib.suppress(AttributeError, ValueError):
         # A terminal that has no such letter shows its number.
@@ -49,13 +46,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         answer = _answer(words, is_json)
         if answer.text:
-            print(as_line(answer.data) if is_json else answer.text, flush=True)
+            print(cli.as_line(answer.data) if is_json else answer.text, flush=True)
         return answer.status
     except (Exception, KeyboardInterrupt) as raised:
-        error = failure(raised)
+        error = cli.failure(raised)
     if error["type"] != "BrokenPipeError":  # as in "| head": nobody reads on
-        say(error["message"])
-    shown = f"{as_line({'error': error})}\n" if is_json else ""
+        cli.say(error["message"])
+    shown = f"{cli.as_line({'error': error})}\n" if is_json else ""
     try:
         print(shown, end="", flush=True)
     except OSError:  # the end of the process has then nothing to complain of
@@ -63,15 +60,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     return error["status"]
 
 
-def _answer(words: list[str], is_json: bool) -> Answer:
+def _answer(words: list[str], is_json: bool) -> cli.Answer:
     """Run a command; the answer for programs has standard output for itself."""
     # Words are UTF-8, whatever the locale.
     words = [word.encode(errors="surrogateescape").decode() for word in words]
     apart = cli.output_to_errors() if is_json else contextlib.nullcontext()
     with apart, warnings.catch_warnings():
-        warnings.showwarning = lambda message, *_: say(f"note: {message}")
+        warnings.showwarning = lambda message, *_: cli.say(f"note: {message}")
         try:
-            with program.make_context(NAME, words) as context:
-                return program.invoke(context) or Answer({}, "")
+            with cli.program.make_context(cli.NAME, words) as context:
+                return cli.program.invoke(context) or cli.Answer({}, "")
         except Exit as ended:  # of help and version
-            return Answer({}, "", ended.exit_code)
+            return cli.Answer({}, "", ended.exit_code)

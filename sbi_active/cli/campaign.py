@@ -19,20 +19,20 @@ from typing import Any
 
 import click
 
-from sbi_active.campaign.telling import flat, shaped
+from sbi_active.campaign.telling import LogChangedError, flat, shaped
 from sbi_active.cli import declare as cli
 from sbi_active.cli import record
-from sbi_active.cli.declare import Answer, as_line, failure, output_to_errors
 from sbi_active.expected import require
+from sbi_active.simulation.bank.errors import LockedError
+from sbi_active.simulation.bank.store import PATIENCE
 
-AGAIN = '<meta http-equiv="refresh" content="5">'
 #: Commands on a campaign by name, which a request may call too.
 ON_CAMPAIGN: dict[str, click.Command] = {}
 
 
 def on_campaign(
     *params: click.Parameter, need: str = "reader"
-) -> Callable[[Callable[..., Answer]], click.Command]:
+) -> Callable[[Callable[..., cli.Answer]], click.Command]:
     """Make a function of a campaign and options a command on a folder.
 
     Args:
@@ -42,7 +42,7 @@ def on_campaign(
             where that is named; "simulator", one that simulates.
     """
 
-    def decorate(function: Callable[..., Answer]) -> click.Command:
+    def decorate(function: Callable[..., cli.Answer]) -> click.Command:
         @wraps(function)
         def call(folder: Path, simulator: Any = None, noise: Any = None, **how: Any):
             session = click.get_current_context().obj
@@ -70,37 +70,37 @@ class Session:
         self.folder, self._place = folder, (folder, simulator, noise)
         self._campaign, self._digest = None, ""
 
-    def call(
-        self, function: Any, need: str, simulator_changed: bool = False, **options: Any
-    ) -> Answer:
-        """Return the answer of a command.
+    def call(self, function: Any, need: str, **options: Any) -> cli.Answer:
+        """Return the answer of a command; what is told waits while others write.
 
         Args:
             function: Function of the command.
             need: Kind of campaign that it works on, see :func:`on_campaign`.
-            simulator_changed: Whether to take another simulator than before.
-            **options: Options of the command.
+            **options: Options of the command, and ``simulator_changed``.
         """
+        until = time.monotonic() + PATIENCE
+        while need == "record" and time.monotonic() < until:
+            with contextlib.suppress(LockedError, LogChangedError):  # before it wrote
+                return self._call(function, need, **options)
+            time.sleep(0.05)
+        return self._call(function, need, **options)
+
+    def _call(
+        self, function: Any, need: str, simulator_changed: bool = False, **options: Any
+    ) -> cli.Answer:
         is_known = self._digest == record.digest(self.folder)
         campaign: Any = self._campaign if is_known else None
         self._campaign = None  # after an error, too: another process may have written
         if need == "record" and campaign is None:
             with contextlib.suppress(record.Unsure):
                 return function(record.Record(self.folder), **options)
-        simulates = need == "simulator" or need == "reader" and self._place[1]
-        if campaign is None and not simulates:
-            from sbi_active import Campaign
-            from sbi_active.campaign.storage.codec import NotStorableError
-
-            with contextlib.suppress(
-                NotStorableError
-            ):  # if a program alone can make it
-                campaign = Campaign.load(self.folder)
+        simulates = need == "simulator" or bool(need == "reader" and self._place[1])
         lacks = simulates and getattr(campaign, "simulator", None) is None
         if campaign is None or lacks or simulator_changed:
             from sbi_active.cli.problem import open_campaign
 
-            campaign = open_campaign(*self._place, simulator_changed)
+            how: Any = {"simulator_changed": simulator_changed}
+            campaign = open_campaign(*self._place, simulates, **how)
         with campaign:  # then others may write
             answer = function(campaign, **options)
             if need == "simulator":
@@ -111,7 +111,6 @@ class Session:
 
 TARGET = cli.option("--target", "theta, model or a parameter", default="auto")
 CHANGED = cli.option("--simulator-changed", "take another, compute all again", None)
-PAGE = cli.option("--out", "where to", cli.FILE, "PAGE.html")
 NETCDF = cli.option("--netcdf", "where to", cli.FILE, "FILE.nc", required=True)
 AT = cli.option("--trial", "by default the pending one, or a new one", int, "K")
 TRIAL = cli.argument("trial", "TRIAL", int)
@@ -131,7 +130,7 @@ OUTCOME = [
     cli.option("--units", "of the action's entries", metavar="A,B,..."),
     *(cli.METHOD, cli.SEED, cli.SETTINGS),
 )
-def init(folder: Path, method: str, seed: int, **given: Any) -> Answer:
+def init(folder: Path, method: str, seed: int, **given: Any) -> cli.Answer:
     """Make a campaign in a new folder."""
     from sbi_active import Campaign
     from sbi_active.cli.problem import campaign_options, problem_of, remember
@@ -143,11 +142,11 @@ def init(folder: Path, method: str, seed: int, **given: Any) -> Answer:
         remember(folder, simulator=given["simulator"], noise=given["noise"])
         record.sum_up_campaign(campaign)
     text = f"{folder}: a campaign of {campaign.actions}\nnext: sbi-active ask {folder}"
-    return Answer({}, text)
+    return cli.Answer({}, text)
 
 
 @on_campaign(TARGET, need="simulator")
-def ask(campaign: Any, target: str) -> Answer:
+def ask(campaign: Any, target: str) -> cli.Answer:
     """Design the next trial, or show the pending one."""
     trial = campaign.ask(target=target)
     gain, error = trial.expected_gain
@@ -155,11 +154,11 @@ def ask(campaign: Any, target: str) -> Answer:
     data |= {"expected_information_gain": gain, "standard_error": error}
     tells = "" if math.isnan(gain) else f", expected to tell {gain:.2f} nats"
     text = f"trial {trial.index}: {record.place_of(data)}{tells}"
-    return Answer(data, f"{text}\nthen: sbi-active tell {campaign.directory}")
+    return cli.Answer(data, f"{text}\nthen: sbi-active tell {campaign.directory}")
 
 
 @on_campaign(*OUTCOME, AT, need="record")
-def tell(campaign: Any, trial: int | None, action: Any, **outcome: Any) -> Answer:
+def tell(campaign: Any, trial: int | None, action: Any, **outcome: Any) -> cli.Answer:
     """Record what a trial gave. X are the numbers, nan for one not measured."""
     x, status = _outcome(campaign, **outcome)
     told = campaign.tell(x, trial=trial, action=action, status=status)
@@ -169,7 +168,7 @@ def tell(campaign: Any, trial: int | None, action: Any, **outcome: Any) -> Answe
 @on_campaign(TRIAL, *OUTCOME, REASON, need="record")
 def correct(
     campaign: Any, trial: int, action: Any, reason: str, **outcome: Any
-) -> Answer:
+) -> cli.Answer:
     """Replace what was told of a trial."""
     is_of_action = action is not None and not any(outcome.values())
     x, status = (None, "ok") if is_of_action else _outcome(campaign, **outcome)
@@ -178,7 +177,7 @@ def correct(
 
 
 @on_campaign(TRIAL, REASON, need="record")
-def withdraw(campaign: Any, trial: int, reason: str) -> Answer:
+def withdraw(campaign: Any, trial: int, reason: str) -> cli.Answer:
     """Take a trial out of the belief."""
     return record.confirmed(campaign, campaign.withdraw(trial, reason=reason))
 
@@ -203,20 +202,20 @@ def _outcome(
 
 
 @on_campaign(need="record")
-def status(campaign: Any) -> Answer:
+def status(campaign: Any) -> cli.Answer:
     """Show the trials, the belief and the health."""
     return record.answer_of(campaign)
 
 
 @on_campaign(CHANGED, need="simulator")
-def update(campaign: Any) -> Answer:
+def update(campaign: Any) -> cli.Answer:
     """Bring the belief up to date."""
     campaign.update()
     return record.answer_of(campaign)
 
 
 @on_campaign(need="simulator")
-def adopt(campaign: Any) -> Answer:
+def adopt(campaign: Any) -> cli.Answer:
     """Go on with the effects that a verdict names."""
     from sbi_active.cli.problem import library_of
 
@@ -224,45 +223,32 @@ def adopt(campaign: Any) -> Answer:
     return record.answer_of(campaign)
 
 
-@on_campaign(PAGE)
-def report(campaign: Any, out: Path | None) -> Answer:
+@on_campaign(cli.option("--out", "where to", cli.FILE, "PAGE.html"))
+def report(campaign: Any, out: Path | None) -> cli.Answer:
     """Write one page that shows the campaign."""
     from sbi_active.campaign.display.page import write_page
 
     path = write_page(campaign, out or Path(campaign.directory, "report.html"))
-    return Answer({"saved": str(path)}, f"saved: {path}")
+    return cli.Answer({"saved": str(path)}, f"saved: {path}")
 
 
 @on_campaign(cli.SEED, NETCDF)
-def export(campaign: Any, netcdf: Path, seed: int) -> Answer:
+def export(campaign: Any, netcdf: Path, seed: int) -> cli.Answer:
     """Write belief and trials for ArviZ; predictions too, with --simulator."""
     from sbi_active import to_inference_data
 
     to_inference_data(campaign, seed=seed).to_netcdf(str(netcdf))
-    return Answer({"saved": str(netcdf)}, f"saved: {netcdf}")
+    return cli.Answer({"saved": str(netcdf)}, f"saved: {netcdf}")
 
 
-@cli.command(cli.DIR, PAGE)
-def watch(folder: Path, out: Path | None) -> None:
-    """Write a page that follows a campaign while another process runs it.
+@cli.command(cli.DIR, cli.option("--port", "of the page; else a free one", int, "N"))
+def watch(folder: Path, port: int | None) -> None:
+    """Show a campaign in a browser on this machine while another process runs it."""
+    from sbi_active.campaign.watch import server_of
 
-    A browser loads the page again every five seconds; the folder is only read.
-    """
-    from sbi_active import Campaign
-    from sbi_active.campaign.display.page import page
-
-    out, seen = out or Path("watch.html"), None
-    while True:
-        if (now := record.digest(folder)) != seen:
-            with Campaign.load(folder) as campaign:
-                text = page(campaign).replace("<head>", f"<head>\n{AGAIN}", 1)
-            part = out.with_suffix(".part")  # no browser sees half of it
-            part.write_text(text, encoding="utf-8")
-            part.replace(out)
-            if seen is None:
-                print(f"open {out.resolve().as_uri()}, until Ctrl-C", flush=True)
-            seen = now
-        time.sleep(1)
+    with server_of(folder, port or 0) as server:
+        print(f"open http://127.0.0.1:{server.server_port}, until Ctrl-C", flush=True)
+        server.serve_forever()
 
 
 @cli.command(cli.DIR, cli.SIMULATOR, cli.NOISE)
@@ -273,21 +259,24 @@ def serve(folder: Path, simulator: str | None, noise: Any) -> None:
     """
     session = Session(folder, simulator, noise)
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    with answers, output_to_errors():
+    with answers, cli.output_to_errors():
         for line in filter(bytes.strip, sys.stdin.buffer):
             name: dict[str, Any] = {}
             try:
-                request, got = json.loads(line), f"{line.strip()!a:.80}"
-                advice = 'write one, as {"command": "ask"}'
-                require(isinstance(request, dict), "a JSON object a line", got, advice)
-                name = {key: request.pop(key) for key in request.keys() & {"id"}}
+                what = "a JSON object a line"
+                with cli.misuse(what):  # as one that is nested too deeply
+                    request, got = json.loads(line), f"{line.strip()!a:.80}"
+                    advice = 'write one, as {"command": "ask"}'
+                    require(isinstance(request, dict), what, got, advice)
+                    own = {key: request.pop(key) for key in request.keys() & {"id"}}
+                    name = json.loads(cli.as_line(own))
                 answer = {"answer": _called(session, **request).data}
             except Exception as error:
-                answer = {"error": failure(error)}
-            print(as_line({**name, **answer}), file=answers, flush=True)
+                answer = {"error": cli.failure(error)}
+            print(cli.as_line({**name, **answer}), file=answers, flush=True)
 
 
-def _called(session: Session, command: Any = None, **given: Any) -> Answer:
+def _called(session: Session, command: Any = None, **given: Any) -> cli.Answer:
     expected = f"a command among {', '.join(sorted(ON_CAMPAIGN))}"
     got, advice = f"{command!r:.80}", "write one of these"
     require(command in [*ON_CAMPAIGN], expected, got, advice)
@@ -295,12 +284,12 @@ def _called(session: Session, command: Any = None, **given: Any) -> Answer:
     names = {param.name for param in found.params} - {"folder", "simulator", "noise"}
     wrong = ", ".join(given.keys() - names)
     require(not wrong, f"options among {', '.join(sorted(names))}", wrong, "correct it")
-    if given.get("x") is not None:  # numbers of any shape, null for one not measured
-        given["x"] = ["nan" if v is None else v for v in flat(given["x"])]
-    values = {name: _word(value) for name, value in given.items() if value is not None}
     root: Any = click.get_current_context().find_root()
-    how: Any = {"parent": root, "default_map": {**values, "folder": session.folder}}
     with cli.misuse(f"options of {command}"):  # a number in place of a flag, say
+        if given.get("x") is not None:  # of any shape, null for one not measured
+            given["x"] = ["nan" if v is None else v for v in flat(given["x"])]
+        words = {name: _word(v) for name, v in given.items() if v is not None}
+        how: Any = {"parent": root, "default_map": {**words, "folder": session.folder}}
         made = found.make_context(command, [], obj=session, **how)
     with made as context:
         return found.invoke(context)

@@ -21,6 +21,8 @@ from sbi_active.plain import plain
 
 NAME = "sbi-active"
 FAILED, MISUSED, INTERRUPTED = 1, 2, 130
+#: What a call raises that is none: of other names, types, files, or nested too deeply.
+MISUSES = TypeError, AttributeError, ImportError, FileNotFoundError, RecursionError
 #: Frames in what a worker says of an error, which is told without them.
 FRAMES = re.compile(r"Traceback \(most recent call last\):\n(?: .*\n)*")
 #: Names of the tasks, as in ``sbi_active.tasks.TASKS``.
@@ -128,8 +130,7 @@ SPACE = [
 
 def say(said: object) -> None:
     """Print a note or an error to standard error."""
-    if sys.stderr is not None:
-        print(f"sbi-active: {said}", file=sys.stderr)
+    click.echo(f"sbi-active: {said}", err=True)
 
 
 def failure(error: BaseException) -> dict[str, Any]:
@@ -140,11 +141,10 @@ def failure(error: BaseException) -> dict[str, Any]:
         status, text = INTERRUPTED, f"{said}; what was told before is kept"
     elif isinstance(error, click.ClickException):
         status, text = MISUSED, error.format_message()
-    elif isinstance(error, ValueError | OSError):
-        is_unread = isinstance(error, BrokenPipeError)
-        status, text = FAILED if is_unread else MISUSED, str(error)
-    text = FRAMES.sub("", text)
-    return {"type": type(error).__name__, "message": text, "status": status}
+    elif isinstance(error, ValueError | OSError) and type(error) is not BrokenPipeError:
+        status, text = MISUSED, str(error)
+    said = FRAMES.sub("", text)
+    return {"type": type(error).__name__, "message": said, "status": status}
 
 
 def located(error: BaseException) -> str:
@@ -161,7 +161,7 @@ def misuse(what: str) -> Iterator[None]:
     """Have errors of a call count as one of the command line."""
     try:
         yield
-    except (TypeError, AttributeError, ImportError, FileNotFoundError) as error:
+    except MISUSES as error:
         raise ValueError(f"expected {what}; got {error}; correct it") from error
 
 

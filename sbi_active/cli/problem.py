@@ -27,11 +27,11 @@ from torch.distributions import Distribution
 
 from sbi_active import BoxActions, Campaign, CampaignOptions, DiscreteActions
 from sbi_active.actions import ActionSpace
+from sbi_active.campaign.storage.codec import NotStorableError
 from sbi_active.cli.declare import located, misuse, number_of, pairs_of
 from sbi_active.criticism import Effect, generic_effects
 from sbi_active.expected import require
 from sbi_active.simulation import GaussianNoise, SimulatorModel
-from sbi_active.simulation.bank.store import Store
 from sbi_active.tasks import Task, get_task  # pyright: ignore
 
 #: Actions of one space. A choice: each is stored in the campaign's folder and takes
@@ -216,27 +216,33 @@ def library_of(campaign: Campaign) -> list[Effect]:
 
 
 def open_campaign(
-    folder: Path, simulator: str | None, noise: Any, simulator_changed: bool
+    folder: Path, simulator: str | None, noise: Any, simulates: bool = True, **how: Any
 ) -> Campaign:
-    """Return the campaign of a folder, with its simulator.
+    """Return the campaign of a folder.
 
     Args:
         folder: Folder of the campaign.
         simulator: Place of the simulator; None is the one that was named before.
         noise: Standard deviation of x; None is what was given before.
-        simulator_changed: Whether to take another simulator than before.
+        simulates: Whether its simulator is needed, whose module is imported then, and
+            else where the campaign has a prior or actions that only this can make.
+        **how: Further arguments of :meth:`.Campaign.load`.
 
     Raises:
         ValueError: If there is no campaign, or its simulator is not known.
     """
-    Store(folder, "campaign")  # where there is none, this is said first
+    reader: Campaign | None = None
+    with suppress(NotStorableError):  # as of a prior that only a program can make
+        reader = Campaign.load(folder)
+        if not simulates:
+            return reader
     known = {"simulator": simulator, "noise": noise} if simulator else _named(folder)
     model, prior, actions, effects = problem_of(known, needs=())
-    reader = Campaign.load(folder, prior=prior, actions=actions)
+    own: Any = {} if reader else {"prior": prior, "actions": actions}
+    reader = reader or Campaign.load(folder, **own)
     if reader.state.version.effects:
         effects = with_generic(effects, model, reader.actions, reader.first_prior)
-    how = {"simulator": model, "prior": prior, "actions": actions, "effects": effects}
-    campaign = Campaign.load(folder, simulator_changed=simulator_changed, **how)
+    campaign = Campaign.load(folder, simulator=model, effects=effects, **own, **how)
     remember(folder, **known)
     return campaign
 
@@ -253,10 +259,9 @@ def remember(folder: Path, /, **options: Any) -> None:
 
 
 def _named(folder: Path) -> dict[str, Any]:
-    found: Any = {}
     with suppress(OSError, ValueError):
-        found = json.loads(_path_of(folder).read_text())
-    return found
+        return json.loads(_path_of(folder).read_text())
+    return {}
 
 
 def _path_of(folder: Path) -> Path:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -32,9 +31,7 @@ def digest(folder: Path) -> str:
     Args:
         folder: Folder of the campaign.
     """
-    with contextlib.suppress(OSError, ValueError), _stored(folder) as store:
-        return store.seal(telling.LOG, telling.STATE)
-    return ""
+    return Store(folder, "campaign").seal(telling.LOG, telling.STATE)
 
 
 class Record(Telling[Any]):
@@ -54,14 +51,13 @@ class Record(Telling[Any]):
     def __init__(self, folder: Path) -> None:
         self.directory = folder
         try:
-            with _stored(folder) as store:
-                self._known = json.loads(store.get(telling.SUMMARY) or b"{}")
-                trials = self._known["trials"]
-                self._kept: list[Any] = [SimpleNamespace(**facts) for facts in trials]
-                self.actions = SimpleNamespace(**self._known["actions"])
-                self._num: int = self._known["lines"]
-                for number in range(self._num + 1, store.length(telling.LOG) + 1):
-                    self._take(store.json(telling.LOG, number) or {})
+            store = Store(folder, "campaign")
+            self._known = json.loads(store.get(telling.SUMMARY) or b"{}")
+            self._kept: Any = [SimpleNamespace(**t) for t in self._known["trials"]]
+            self.actions = SimpleNamespace(**self._known["actions"])
+            self._num: int = self._known["lines"]
+            for number in range(self._num + 1, store.length(telling.LOG) + 1):
+                self._take(store.json(telling.LOG, number) or {})
         except (OSError, ValueError, RecursionError, LookupError, TypeError) as error:
             raise Unsure from error
 
@@ -103,12 +99,13 @@ class Record(Telling[Any]):
 
     def _record(self, event: str, facts: Facts) -> Any:
         line = telling.event_of(event, facts)
-        with _stored(self.directory) as store, store.writing():
+        store = Store(self.directory, "campaign")
+        with contextlib.closing(store), store.writing():
             is_known = store.length(telling.LOG) == self._num  # else others were faster
             if is_known:
                 store.append(telling.LOG, line)
         if not is_known:
-            raise Unsure
+            raise telling.LogChangedError(self.directory)
         self._take(line)
         return self._kept[facts.index]
 
@@ -125,10 +122,6 @@ class Record(Telling[Any]):
         summary["not_in_belief"] = sorted({*summary["not_in_belief"], *told})
 
 
-def _stored(folder: Path) -> contextlib.closing[Store]:
-    return contextlib.closing(Store(folder, "campaign"))
-
-
 def _single(x: Any) -> Any:
     """Return numbers as float32 has them, None for one not measured."""
     if isinstance(x, list):
@@ -142,13 +135,12 @@ def sum_up_campaign(campaign: Any) -> None:
     with contextlib.suppress(Exception):  # a belief without moments has no summary
         is_box = type(actions).__name__ == "BoxActions"
         ends = (actions.low.tolist(), actions.high.tolist()) if is_box else ([], [])
-        names, units = [*actions.names], [*actions.units]
-        limits = [*zip(*ends, strict=True)]
+        own = {"names": [*actions.names], "units": [*actions.units]}
         known = {
             "summary": summary_of(campaign),
             "trials": [scored(trial) for trial in campaign.state.trials],
             "x_shape": [*campaign.x_shape],
-            "actions": {"names": names, "units": units, "limits": limits},
+            "actions": {**own, "limits": [*zip(*ends, strict=True)]},
             "processed": [*campaign.state.processed],
         }
         campaign._storage.sum_up(known)
@@ -160,13 +152,12 @@ def summary_of(campaign: Any) -> dict[str, Any]:
         return campaign.summary
     belief = campaign.belief
     mean, sd = belief.mean.flatten().tolist(), belief.variance.flatten().tolist()
-    names = campaign.parameter_names or [f"theta_{k + 1}" for k in range(len(mean))]
     moments = [{"mean": m, "sd": v**0.5} for m, v in zip(mean, sd, strict=True)]
     diagnostics = getattr(belief, "diagnostics", None)
     said = [*getattr(diagnostics, "warnings", ())]
     together = getattr(diagnostics, "combinations", None)
     found = {
-        "parameters": dict(zip(names, moments, strict=True)),
+        "parameters": dict(zip(campaign.parameter_names, moments, strict=True)),
         "trustworthy": getattr(diagnostics, "trustworthy", None),
         "warnings": said,
         "codes": [warning.code for warning in said],
@@ -183,13 +174,12 @@ def scored(trial: Any) -> dict[str, Any]:
 
 
 def trial_of(campaign: Any, trial: Any) -> dict[str, Any]:
-    """Return a trial as JSON, but for NaN."""
+    """Return a trial as JSON, null for a number that was not measured."""
     found = scored(trial)
     found = {"trial": found.pop("index"), **found}
     for name in ("action", "x"):
         if found[name] is not None:
-            numbers = flat(found[name])
-            found[name] = [math.nan if value is None else value for value in numbers]
+            found[name] = flat(found[name])
     actions = campaign.actions
     return {**found, "names": [*actions.names], "units": [*actions.units]}
 
@@ -225,6 +215,7 @@ def place_of(trial: Mapping[str, Any]) -> str:
 
 def _line_of(trial: Mapping[str, Any]) -> str:
     x, reason = trial["x"] or [], trial["reason"]
-    numbers = ", ".join(f"{v:.4g}" for v in x[:4]) + ", ..." * (len(x) > 4)
+    shown = ["nan" if value is None else f"{value:.4g}" for value in x[:4]]
+    numbers = ", ".join(shown) + ", ..." * (len(x) > 4)
     line = f"{trial['trial']:>4}  {trial['status']:<9} {place_of(trial)}"
     return line + f"  x = {numbers}" * bool(x) + f"  ({reason})" * bool(reason)

@@ -12,7 +12,6 @@ import click
 
 from sbi_active.cli import declare as cli
 from sbi_active.cli.campaign import Session
-from sbi_active.cli.declare import Answer
 from sbi_active.cli.record import answer_of, sum_up_campaign
 from sbi_active.expected import require
 
@@ -28,7 +27,7 @@ CRITICIZE = [
 
 
 @cli.command(*CRITICIZE)
-def criticize(trials: Path, **given: Any) -> Answer:
+def criticize(trials: Path, **given: Any) -> cli.Answer:
     """Find what a simulator lacks, from measured trials.
 
     Find the residual, trace it to an effect that the simulator lacks, add it, and
@@ -55,7 +54,7 @@ def criticize(trials: Path, **given: Any) -> Answer:
 
 
 @cli.command(*CRITICIZE)
-def gate(**given: Any) -> Answer:
+def gate(**given: Any) -> cli.Answer:
     """Say whether a simulator may be used, as criticize finds it from the same trials.
 
     The exit status is 0 for SHIP, 10 for NO_IMPROVEMENT, 11 for NOT_IDENTIFIABLE, 12
@@ -63,23 +62,23 @@ def gate(**given: Any) -> Answer:
     """
     found = criticize.callback(**given).data["gate"]
     text = f"{found['decision']}: {found['reason']}"
-    return Answer(found, text, found["exit_code"])
+    return cli.Answer(found, text, found["exit_code"])
 
 
-def _criticized(campaign: Any, out: Path | None) -> Answer:
+def _criticized(campaign: Any, out: Path | None) -> cli.Answer:
     from sbi_active.cli.problem import library_of
 
     data, text, _ = _answer(campaign.criticize(library_of(campaign)), out)
     text += f"\n\nto go on with what it names: sbi-active adopt {campaign.directory}"
-    return Answer(data, text)
+    return cli.Answer(data, text)
 
 
-def _answer(report: Any, out: Path | None) -> Answer:
+def _answer(report: Any, out: Path | None) -> cli.Answer:
     saved = "" if out is None else f"\n\nsaved: {report.save(out)}"
-    return Answer(report.to_dict(), f"{report}{saved}")
+    return cli.Answer(report.to_dict(), f"{report}{saved}")
 
 
-def _compared(path: Path, given: dict[str, Any]) -> Answer:
+def _compared(path: Path, given: dict[str, Any]) -> cli.Answer:
     """Compare a simulator with the trials of a table, or of a folder of recordings."""
     from sbi_active import DiscreteActions, SimulatorModel
     from sbi_active.cli.problem import problem_of, with_generic, with_noise
@@ -109,7 +108,7 @@ def _compared(path: Path, given: dict[str, Any]) -> Answer:
     cli.option("--rounds", "real trials", cli.COUNT, default=4),
     cli.option("--out", "folder for the results", cli.FOLDER, "DIR", required=True),
 )
-def run(task: str, out: Path, method: str, seed: int, **given: Any) -> Answer:
+def run(task: str, out: Path, method: str, seed: int, **given: Any) -> cli.Answer:
     """Run a campaign on a task, and save its table and figure."""
     from sbi_active import Campaign
     from sbi_active.cli.problem import campaign_options, remember, task_of
@@ -121,10 +120,9 @@ def run(task: str, out: Path, method: str, seed: int, **given: Any) -> Answer:
     paths = (out / f"campaign{f'-{k}' * (k > 1)}" for k in itertools.count(1))
     folder = next(path for path in paths if not path.exists())
     real = (derive_seed(seed, "real", index) for index in itertools.count())
-    problem = found.simulator, found.prior, found.actions
     how: Any = {"options": campaign_options(given["set"]), "method": method}
-    how |= {"show_progress": sys.stderr.isatty(), "directory": folder}
-    with Campaign(*problem, seed=seed, **how) as campaign:
+    how |= {"seed": seed, "show_progress": sys.stderr.isatty(), "directory": folder}
+    with Campaign(found.simulator, found.prior, found.actions, **how) as campaign:
         remember(folder, task=task, option=given["option"])
 
         def execute(action: Any) -> Any:
@@ -140,7 +138,7 @@ def run(task: str, out: Path, method: str, seed: int, **given: Any) -> Answer:
     truth = dict(zip(found.parameter_names, found.theta_true.tolist(), strict=True))
     lines = [text, f"the truth: {', '.join(f'{k} = {v:g}' for k, v in truth.items())}"]
     lines += [f"saved: {out / 'loop.png'}, trials.csv; next: sbi-active ask {folder}"]
-    return Answer({**data, "truth": truth}, "\n".join(lines))
+    return cli.Answer({**data, "truth": truth}, "\n".join(lines))
 
 
 @cli.command(
@@ -151,7 +149,7 @@ def run(task: str, out: Path, method: str, seed: int, **given: Any) -> Answer:
 )
 def check(
     rows: int, simulations: int | None, workers: int, seed: int, **problem: Any
-) -> Answer:
+) -> cli.Answer:
     """Look a simulator over before a campaign.
 
     Shapes, seeds, noise, lost rows, time, and parameters that change nothing; exit
@@ -163,15 +161,15 @@ def check(
     *found, _ = problem_of(problem)
     how: Any = {"num_simulations": simulations, "workers": workers, "seed": seed}
     report = check_simulator(*found, num_rows=rows, **how)
-    return Answer({}, str(report), 0 if report.is_ready else 1)
+    return cli.Answer({}, str(report), 0 if report.is_ready else 1)
 
 
 @cli.command(cli.DIR)
-def migrate(folder: Path) -> Answer:
+def migrate(folder: Path) -> cli.Answer:
     """Bring a campaign or bank of release 0.1 up to date."""
     from sbi_active.migration import migrate as migrated
 
     counts = migrated(folder)
     lines = [f"{name}: {number}" for name, number in counts.items()]
     lines += [f"the files of before are in {folder / 'version-1'}"]
-    return Answer(counts, "\n".join(lines))
+    return cli.Answer(counts, "\n".join(lines))

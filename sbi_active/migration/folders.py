@@ -15,6 +15,7 @@ from typing import Any
 from sbi_active.campaign.storage.codec import decode, encode
 from sbi_active.campaign.storage.directory import BELIEF, FOR_PEOPLE, write_campaign
 from sbi_active.campaign.telling import LOG, STATE
+from sbi_active.messages import warn
 from sbi_active.migration.described import actions_from, options_from, prior_from
 from sbi_active.migration.segments import copy_bank
 from sbi_active.simulation.bank.errors import CorruptSegmentError
@@ -139,10 +140,13 @@ def _manifest(folder: Path) -> dict[str, Any]:
 
 
 def _entries(path: Path) -> list[Mapping[str, Any]]:
-    """Return the lines of a log; a last one that was not finished is none."""
-    content = path.read_bytes() if path.exists() else b""
+    """Return the lines of a log; one that was not finished is none, which is said."""
+    *lines, rest = (path.read_bytes() if path.exists() else b"").split(b"\n")
+    if rest:
+        text = f"SA610 {path} ends within line {len(lines) + 1}, which is left out:"
+        warn(f"{text} {rest!r:.200}", stacklevel=4)
     entries = []
-    for number, line in enumerate(content[: content.rfind(b"\n") + 1].splitlines(), 1):
+    for number, line in enumerate(lines, 1):
         head, _, tail = line.rpartition(b', "crc": "')
         text = head + b"}"
         if tail != f'{zlib.crc32(text):08x}"}}'.encode():

@@ -12,7 +12,6 @@ from sbi_active.renamed import lazy_names
 
 if TYPE_CHECKING:
     from sbi_active.simulation.bank.bank import Bank
-    from sbi_active.simulation.bank.reweighting import reuse
     from sbi_active.simulation.check import check_simulator
     from sbi_active.simulation.model import SimulatorModel
     from sbi_active.simulation.noise.autocorrelated import AutocorrelatedNoise
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
         SimulationInterrupted,
         Simulations,
     )
+    from sbi_active.simulation.reweighting import reuse
     from sbi_active.simulation.workers.engine import simulate
     from sbi_active.simulation.workers.settings import Workers
 
@@ -52,7 +52,7 @@ __all__ = [
 __getattr__ = lazy_names(
     __name__,
     {
-        "ReusedRows": "sbi_active.simulation.bank:ReusedRows",
+        "ReusedRows": "sbi_active.simulation.reweighting:ReusedRows",
         "RowStore": "sbi_active.simulation.workers.store:RowStore",
         "Simulator": "sbi_active.simulation.simulator:Simulator",
         "SimulatorReport": "sbi_active.simulation.report:SimulatorReport",

@@ -1,6 +1,8 @@
 """A campaign driven from the command line, as a robot's program would."""
 
+import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
 import arviz as az
@@ -81,3 +83,9 @@ def test_a_missing_effect_is_found_and_adopted(capsys, monkeypatch, tmp_path):
     page = (tmp_path / "camp" / "report.html").read_text()
     assert "tape slipped" in page
     assert "http" not in page.replace("http-equiv", "")
+
+
+def test_python_has_the_command_line():
+    command = [sys.executable, "-m", "sbi_active", "--version"]
+    shown = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert shown.stdout.strip() == version("sbi-active")

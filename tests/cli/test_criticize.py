@@ -204,3 +204,10 @@ def test_a_task_gives_its_simulator_and_prior(capsys):
     write([f"{a},{v:.3f}" for a, v in zip(actions, x, strict=True)], "action_xi,x_y")
     assert main(["criticize", "trials.csv", "--task", "numerical"]) == 0
     assert capsys.readouterr().out.startswith("Verdict: none")
+
+
+def test_trials_of_another_shape_than_a_task_s(tmp_path, capsys):
+    (tmp_path / "t.csv").write_text("action_1,x_1\n0.5,1\n1.0,2\n1.5,3\n")
+    words = ["criticize", str(tmp_path / "t.csv"), "--task", "ball_drops"]
+    assert main(words) == 2
+    assert "expected x of 60 samples" in capsys.readouterr().err

@@ -116,7 +116,7 @@ def test_a_summary_that_is_none_is_not_asked(camp, content, capsys):
 
 def test_what_is_computed_is_summed_up_no_more(camp):
     assert record.Record(camp).summary
-    with open_campaign(camp, "sled.py:slide", [0.02], False) as campaign:
+    with open_campaign(camp, "sled.py:slide", [0.02]) as campaign:
         campaign.tell([0.2, 0.4], trial=1)
         assert record.Record(camp).summary["not_in_belief"] == [1]
         campaign.update()
@@ -131,7 +131,18 @@ def test_what_was_refused_needs_the_campaign_once(camp, capsys):
     assert record.Record(camp).summary["not_in_belief"] == []
 
 
-def test_one_writer_at_a_time(camp, capsys):
+def test_several_processes_tell_at_once(camp):
+    words = ["tell", "camp", "0.4", "0.8", "--action"]
+    telling = [run([*words, str(1 + k / 4)]) for k in range(6)]
+    for process in telling:
+        _, error = process.communicate(timeout=60)
+        assert process.returncode == 0, error
+    actions = [t.action.item() for t in Campaign.load(camp).history]
+    assert sorted(actions[-6:]) == [1 + k / 4 for k in range(6)]
+
+
+def test_one_writer_at_a_time(camp, capsys, monkeypatch):
+    monkeypatch.setattr("sbi_active.cli.campaign.PATIENCE", 0.2)
     store = record.Store(camp, "campaign")
     store.acquire()
     with contextlib.closing(store):

@@ -98,6 +98,9 @@ def test_a_robot_s_loop(server):
 WRONG = [
     ("\xff", "decode"),
     ("{", "Expecting property name"),
+    ("[" * 100_000, "expected a JSON object a line; got"),
+    ('{"id": ' + "[" * 900 + "]" * 900 + "}", "expected a JSON object a line; got"),
+    ('{"command": "tell", "x": ' + "[" * 900 + "]" * 900 + "}", "expected options of"),
     ("[1]", "expected a JSON object a line"),
     ({}, "expected a command among adopt, ask, correct"),
     ({"command": ["ask"]}, "expected a command among adopt"),

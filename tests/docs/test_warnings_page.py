@@ -111,13 +111,13 @@ def test_warnings_as_python_shows_them():
         warnings.simplefilter("always")
         Trials([1.0, 2.0], torch.tensor([1.0, torch.inf]))
     (note,) = noted
-    assert str(note.message).endswith("(see warnings.html#sa201-infinite)")
+    assert str(note.message).endswith(" (SA201)")
     assert note.filename == __file__
     assert isinstance(note.message, TrialWarning)
     assert note.message.code == "SA201"
     with warnings.catch_warnings(record=True) as noted:
         warnings.simplefilter("always")
-        warnings.filterwarnings("ignore", ".*#sa201-")
+        warnings.filterwarnings("ignore", ".*SA201")
         Trials([1.0, 2.0], torch.tensor([1.0, torch.inf]))
     assert not noted
 
@@ -136,10 +136,8 @@ def test_warnings_as_a_belief_keeps_them(through):
     known = Diagnostics().warned("SA114 few; raise num_histories")
     known = through(known.warned("found by one (see warnings.html#one-search)", "odd"))
     assert [warning.code for warning in known.warnings] == ["SA114", "SA118", ""]
-    assert known.warnings[0] == (
-        "few; raise num_histories (see warnings.html#sa114-few-draws)"
-    )
-    assert str(known).count("warnings.html#") == 2
+    assert known.warnings[0] == "few; raise num_histories (SA114)"
+    assert str(known).count("(SA1") == 2
 
 
 @pytest.mark.parametrize("error", named(), ids=lambda c: c.__name__)

@@ -16,8 +16,8 @@ from sbi_active.inference.beliefs.enumerated import Enumeration
 from sbi_active.inference.models.posterior import ActionPosterior
 from sbi_active.seeding import derive_seed, forked_generators
 from sbi_active.simulation.bank.bank import Bank
-from sbi_active.simulation.bank.reweighting import FEW, reuse
 from sbi_active.simulation.outcomes import Simulations
+from sbi_active.simulation.reweighting import FEW, reuse
 from sbi_active.simulation.workers.engine import simulate
 from sbi_active.simulation.workers.store import find_store
 

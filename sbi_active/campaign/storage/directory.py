@@ -17,16 +17,16 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
 
+from sbi_active.campaign import telling
 from sbi_active.campaign.isolation import guarded, isolated
 from sbi_active.campaign.learning.indexed import IndexedSimulator
 from sbi_active.campaign.state import CampaignState
 from sbi_active.campaign.storage.codec import NotStorableError, encode
-from sbi_active.campaign.telling import LOG, STATE, SUMMARY, event_of, now
+from sbi_active.campaign.telling import LOG, STATE, SUMMARY, LogChangedError, event_of
 from sbi_active.expected import require
-from sbi_active.messages import Explained
 from sbi_active.simulation.bank.bank import Bank
-from sbi_active.simulation.bank.fingerprint import fingerprint
 from sbi_active.simulation.bank.store import NAME, Store
+from sbi_active.simulation.fingerprint import fingerprint
 from sbi_active.simulation.model import SimulatorModel
 from sbi_active.simulation.workers.store import metering
 
@@ -37,12 +37,6 @@ PACKAGES = "sbi-active", "sbi", "torch", "numpy"
 #: What a state holds beside the settings of the campaign.
 SAVED = ("trials", "processed", "draws", "versions", "is_stale", "batches")
 Method = TypeVar("Method", bound=Callable[..., Any])
-
-
-class LogChangedError(Explained, ValueError):
-    """Another writer added to a campaign since it was loaded here."""
-
-    code = "SA607"
 
 
 class Storage:
@@ -125,10 +119,10 @@ class Storage:
             **entries: JSON data.
         """
         if self.store is not None:
-            line = json.loads(json.dumps(event_of(event, trial, **entries)))
+            line = json.dumps(event_of(event, trial, **entries), allow_nan=False)
             with self._writing():
-                number = self.store.append(LOG, line)
-            self.events.append({**line, "line": number})  # as it is read again
+                number = self.store.append(LOG, line.encode())
+            self.events.append({**json.loads(line), "line": number})
 
     def save(self, state: CampaignState, learner: Any) -> None:
         """Write what follows from the log so far.
@@ -190,11 +184,7 @@ class Storage:
                 yield
         if not same:
             self.store.close()
-            raise LogChangedError(
-                f"expected the campaign in {self.path} as it was loaded; got trials "
-                "that another process told since; load it again, and tell this once "
-                "more: nothing was written"
-            )
+            raise LogChangedError(self.path)
 
 
 def make_campaign(
@@ -218,7 +208,7 @@ def make_campaign(
     manifest = {
         name: getattr(state, name) for name in ("method", "seed", "num_earlier")
     }
-    manifest |= {"created": now(), "packages": packages}
+    manifest |= {"created": telling.now(), "packages": packages}
     manifest["simulator"] = fingerprint(simulator)
     for name in ("parameter_names", "channel_names"):
         found = getattr(simulator, name, None)
@@ -226,6 +216,7 @@ def make_campaign(
     objects = {}
     for what, thing in given.items():
         manifest[f"{what}_text"] = repr(thing)
+        manifest[f"{what}_settings"] = fingerprint(thing, version="settings")
         with suppress(NotStorableError):
             objects[what] = encode(thing, known={})
     write_campaign(folder, manifest | facts, objects)
@@ -251,7 +242,8 @@ def write_campaign(
     store.close()
     lines = [f"# What this campaign is, for people. {NAME} has all; this is not read."]
     for key, value in manifest.items():  # a text of JSON is one of TOML
-        if value is not None and key not in ("packages", "simulator", "own"):
+        is_read = isinstance(value, str | int | list)
+        if is_read and key != "own":
             lines.append(f"{key.removesuffix('_text')} = {json.dumps(value)}")
     (folder / FOR_PEOPLE).write_text("\n".join([*lines, ""]), encoding="utf-8")
 

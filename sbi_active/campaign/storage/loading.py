@@ -18,7 +18,7 @@ from sbi_active.campaign.telling import STATE
 from sbi_active.expected import require
 from sbi_active.messages import warn
 from sbi_active.simulation.bank.errors import whole
-from sbi_active.simulation.bank.fingerprint import fingerprint, require_same
+from sbi_active.simulation.fingerprint import fingerprint, require_same
 
 
 def load(
@@ -57,6 +57,9 @@ def load(
             text = f"expected {what}=, which only its author can make again; got None"
             made = f"{manifest[f'{what}_text']:.200}"
             raise NotStorableError(f"{text}; pass what it was made with: {made}")
+        before = manifest.get(f"{what}_settings") or thing and _settings(thing)
+        if before and what != "options" and given[what] is not None:
+            require_same("the campaign", before, _settings(given[what]), what)
     with store.reading():
         state = CampaignState(**facts, options=found["options"])
         content = restore(state, storage)
@@ -119,6 +122,10 @@ def restore(state: CampaignState, storage: Storage) -> bytes | None:
     lost = has_belief and not content and state.processed
     state.is_stale |= bool(lost or not saved and len(state.versions) > 1)
     return content
+
+
+#: Settings of a prior or a space; the source of its class may change.
+_settings = functools.partial(fingerprint, version="settings")
 
 
 def _decoded(content: bytes | None, known: Mapping[str, Any] | None = None) -> Any:

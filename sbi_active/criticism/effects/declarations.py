@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from sbi_active.criticism.effects.effect import NUM_DRAWS, Effect
+from sbi_active.expected import require
 
 
 def require_nested(effects: Sequence[Effect]) -> None:
@@ -32,6 +33,10 @@ def require_distinct(effects: Sequence[Effect], parameters: Sequence[str] = ()) 
             again either, since that joins names, and those of the entries of their phi.
         parameters: Names of the simulator's own.
     """
+    for effect in effects:
+        advice = "declare Effect(name, ...), or take one of generic_effects"
+        is_one = isinstance(effect, Effect)
+        require(is_one, "effects of class Effect", repr(effect), advice)
     parts = [part for effect in effects for part in effect.name.split(" + ")]
     _require_once(parts, "effects with distinct names")
     shown = [effect for effect in effects if effect.scope == "campaign"]

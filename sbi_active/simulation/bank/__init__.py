@@ -1,6 +1,6 @@
-"""Simulations on disk, and their reuse.
+"""Simulations on disk.
 
-This package contains the file, its checksums and locks, and weights. It does not
+This package contains the file, its checksums and locks, and the rows in it. It does not
 simulate. Names are imported when they are used: a store needs no torch.
 """
 
@@ -11,8 +11,13 @@ from sbi_active.renamed import lazy_names
 if TYPE_CHECKING:
     from sbi_active.simulation.bank.bank import Bank
     from sbi_active.simulation.bank.errors import CorruptSegmentError, LockedError
-    from sbi_active.simulation.bank.reweighting import ReusedRows, reuse
 
-__all__ = ["Bank", "CorruptSegmentError", "LockedError", "ReusedRows", "reuse"]
+__all__ = ["Bank", "CorruptSegmentError", "LockedError"]
 
-__getattr__ = lazy_names(__name__)
+__getattr__ = lazy_names(
+    __name__,
+    {
+        name: f"sbi_active.simulation.reweighting:{name}"
+        for name in ("ReusedRows", "reuse")
+    },
+)

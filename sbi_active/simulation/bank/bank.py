@@ -20,8 +20,8 @@ from sbi_active.arrays import Array, own_tensor
 from sbi_active.expected import require
 from sbi_active.messages import warn
 from sbi_active.simulation.bank.errors import CorruptSegmentError, whole
-from sbi_active.simulation.bank.fingerprint import fingerprint, require_same
 from sbi_active.simulation.bank.store import Store
+from sbi_active.simulation.fingerprint import fingerprint, require_same
 from sbi_active.simulation.outcomes import Outcome, Simulations
 from sbi_active.simulation.workers.store import run_digest
 from sbi_active.support import log_density
@@ -51,7 +51,6 @@ class Bank:
         simulator: Simulator of these rows. Its name, settings and source are compared
             with those in the bank.
         version: Version of the simulator, yours; given, it stands for the source code.
-        created: Date to note in a new bank.
         name: Name of the bank in its file, which may hold several, as a campaign's
             does.
 
@@ -83,7 +82,6 @@ class Bank:
         *,
         simulator: Callable[..., Any] | None = None,
         version: str = "",
-        created: str | None = None,
         name: str = "rows",
     ) -> None:
         self._writable = simulator is not None
@@ -96,8 +94,7 @@ class Bank:
         if simulator is not None:
             names = getattr(simulator, "parameter_names", None)
             mine = fingerprint(simulator, version=version)
-            mine |= {"created": created, "shapes": None}
-            mine["parameter_names"] = names and [*names]
+            mine |= {"shapes": None, "parameter_names": names and [*names]}
             if self._store.json(self._key) is None:
                 with self._store.writing():
                     if self._store.json(self._key) is None:  # nobody was faster
@@ -326,18 +323,14 @@ class Bank:
         ends = np.cumsum([len(segment) for segment, _ in segments])
         places = positions(rows, int(ends[-1]))
         which = np.searchsorted(ends, places, side="right")
-        order = np.argsort(which, kind="stable")  # segment by segment, and back
-        groups = np.split(order, np.flatnonzero(np.diff(which[order])) + 1)
-        back = np.empty_like(order)
-        back[order] = np.arange(len(order))
-        found = {}
-        for name in names:
-            parts = []
-            for group in groups:
-                k = int(which[group].max(initial=0))
-                parts.append(self._values(name, k)[places[group] - ends[k]])
-            found[name] = torch.from_numpy(np.concatenate(parts)[back])
-        return found
+        found: dict[str, Array] = {}
+        for k in np.unique(which) if len(places) else (0,):
+            own, start = which == k, ends[k] - len(segments[k][0])
+            for name in names:
+                values = self._values(name, int(k))[places[own] - start]
+                empty = np.empty((len(places), *values.shape[1:]), values.dtype)
+                found.setdefault(name, empty)[own] = values
+        return {name: torch.from_numpy(column) for name, column in found.items()}
 
     def _values(self, name: str, k: int) -> Array:
         """Return a column of a segment."""

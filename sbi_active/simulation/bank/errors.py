@@ -38,11 +38,7 @@ class LockedError(Explained, OSError):
 
 
 def whole(path: Path, holds: bool, reason: str) -> None:
-    """Raise if something does not hold of a file.
-
-    Raises:
-        CorruptSegmentError: If it does not hold, with the reason.
-    """
+    """Raise a CorruptSegmentError, with a reason, unless something holds of a file."""
     if not holds:
         raise CorruptSegmentError(path, reason)
 

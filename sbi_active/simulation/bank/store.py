@@ -76,6 +76,7 @@ class Store:
         self.folder, self.path, self._what = folder, folder / NAME, what
         self._connection: Any = None
         self._lock: Any = None
+        self._catalog: dict[str, int] | None = None  # in a transaction
         with _GUARD:
             _STORES.add(self)
         if make and not os.path.lexists(self.path):
@@ -116,7 +117,7 @@ class Store:
                 keeps = self.held
             finally:
                 if opens and not keeps:
-                    self._disconnect()
+                    self._drop("_connection")
 
     @contextmanager
     def writing(self) -> Iterator[None]:
@@ -133,9 +134,13 @@ class Store:
                 whole(self.path, is_left, "another file; nothing was written to it now")
                 connection.execute("BEGIN IMMEDIATE")
                 try:
+                    before = self._catalog = self.catalog
                     yield
+                    if self._catalog != before:
+                        self.put(CATALOG, 0, self._catalog)
                     connection.commit()
                 finally:
+                    self._catalog = None
                     connection.rollback()  # of what was not committed
                 self._left = self._state()
 
@@ -154,7 +159,7 @@ class Store:
                 self._lock.execute("PRAGMA journal_mode = MEMORY")  # nothing is written
                 self._lock.execute("BEGIN EXCLUSIVE")
             except BaseException:
-                self._unlock()
+                self._drop("_lock")
                 raise
             for left in self.folder.glob(f"{TEMPORARY}*{NAME}*"):  # by the killed
                 left.unlink(missing_ok=True)
@@ -165,8 +170,7 @@ class Store:
             if self._connection is not None:
                 with suppress(sqlite3.Error):  # a full disk must not keep the lock
                     self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-            self._disconnect()
-            self._unlock()
+            self._drop("_connection", "_lock")
 
     def get(self, kind: str, number: int = 0, *, part: str = "head") -> bytes | None:
         """Return the head or the body of a record; None if there is none."""
@@ -190,6 +194,8 @@ class Store:
     @property
     def catalog(self) -> dict[str, int]:
         """The last number of each kind."""
+        if self._catalog is not None:  # as it will be written
+            return self._catalog
         found = self.json(CATALOG) or {}
         own = all(type(number) is int for number in found.values())
         whole(self.path, own, "a catalog that none writes")
@@ -203,7 +209,8 @@ class Store:
         """Return a text that changes with the last record of each of some kinds."""
         read = "SELECT max(number), head_digest FROM records WHERE kind = ?"
         with self.reading() as connection:
-            return str([connection.execute(read, (k,)).fetchone() for k in kinds])
+            last = [connection.execute(read, (k,)).fetchone() for k in kinds]
+        return hashlib.sha256(repr(last).encode()).hexdigest()
 
     def put(self, kind: str, number: int, head: Any, body: Any = b"") -> None:
         """Write a record in place of another; for use in :meth:`writing`.
@@ -214,8 +221,8 @@ class Store:
             head: Bytes, or JSON data.
             body: Bytes.
         """
-        if kind != CATALOG and number > (catalog := self.catalog).get(kind, -1):
-            self.put(CATALOG, 0, {**catalog, kind: number})
+        if kind != CATALOG and number > self.catalog.get(kind, -1):
+            self._catalog = {**self.catalog, kind: number}
         _insert(self._connection, self._id, kind, number, head, body)
 
     def append(self, series: str, head: Any, body: Any = b"") -> int:
@@ -292,15 +299,13 @@ class Store:
         state = self.path.stat() if self.path.exists() else None
         return state and (state.st_ino, state.st_size, state.st_mtime_ns)
 
-    def _disconnect(self) -> None:
-        if self._connection is not None:
-            self._connection.close()
-        self._connection = None
-
-    def _unlock(self) -> None:
-        if self._lock is not None:
-            self._lock.close()
-        self._lock = None
+    def _drop(self, *names: str) -> None:
+        """Close the connection to the file, or the lock, where it is held."""
+        for name in names:
+            held = getattr(self, name)
+            setattr(self, name, None)
+            if held is not None:
+                held.close()
 
 
 def synchronize(folder: Path) -> None:
@@ -355,13 +360,13 @@ def _before_fork() -> None:
     """Close connections, which a child must not have, once they are not in use."""
     _GUARD.acquire()
     for store in _STORES:
-        store._disconnect()
+        store._drop("_connection")
 
 
 def _in_child() -> None:
     """Give back what a child has no right to: that of its parent to write."""
     for store in _STORES:
-        store._unlock()
+        store._drop("_lock")
     _GUARD.release()
 
 

@@ -5,12 +5,15 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.distributions import Uniform
 
 from sbi_active import BoxActions, Campaign
 from sbi_active.simulation.bank import Bank, LockedError
 from tests.campaign.storage.campaigns import (
+    ACTIONS,
     MODEL,
     OPTIONS,
+    PRIOR,
     TRUTH,
     drawn,
     draws,
@@ -100,6 +103,7 @@ def test_correct_and_withdraw_keep_the_old_lines(tmp_path):
     campaign.correct(1, 100 * x, reason="told in m")
     campaign.correct(1, x, reason="it was cm")
     campaign.withdraw(0, reason="bumped into the table")
+    assert campaign.withdraw(0).reason == "bumped into the table"
     campaign.close()
 
     lines = Campaign.load(tmp_path / "c").events
@@ -194,7 +198,7 @@ def price(action):
     return 1 + action[:, 0]
 
 
-class OwnPrior(torch.distributions.Uniform):
+class OwnPrior(Uniform):
     pass
 
 
@@ -212,6 +216,27 @@ def test_what_only_its_author_can_make_is_asked_for(tmp_path):
         Campaign.load(tmp_path / "c", simulator=MODEL, prior=prior)
     again = Campaign.load(tmp_path / "c", simulator=MODEL, prior=prior, cost=price)
     assert torch.equal(draws(again), draws(campaign))
+
+
+def test_another_prior_or_space_is_refused(tmp_path):
+    def of(kind, high):
+        return torch.distributions.Independent(kind(torch.zeros(2), high), 1)
+
+    own = of(OwnPrior, torch.ones(2))
+    for name, prior in (("own", own), ("stored", PRIOR)):
+        new(tmp_path / name, prior=prior).close()
+        Campaign.load(tmp_path / name, prior=prior, actions=ACTIONS)
+        for another in (of(OwnPrior, 2 * torch.ones(2)), of(Uniform, torch.ones(2))):
+            with pytest.raises(ValueError, match="the prior of the campaign; got an"):
+                Campaign.load(tmp_path / name, prior=another)
+        wider = BoxActions([0.5], [3.0], names=["speed"], units=["m/s"])
+        with pytest.raises(ValueError, match="actions.high .2.0. there, .3.0. here"):
+            Campaign.load(tmp_path / name, prior=prior, actions=wider)
+
+
+def test_effects_of_another_class_are_named():
+    with pytest.raises(ValueError, match="effects of class Effect; got 'drag'"):
+        new(effects=["drag"])
 
 
 def test_adopted_effects_come_back(tmp_path):

@@ -155,6 +155,15 @@ def test_damage_is_named_and_nothing_is_moved(old, name):
     assert (old / "campaign.json").exists()
 
 
+def test_a_log_that_ends_within_a_line_is_said(old):
+    path = old / "trials.jsonl"
+    content = path.read_bytes()
+    path.write_bytes(content[:-20])  # as after a kill
+    with pytest.warns(UserWarning, match="ends within line 5, which is left out"):
+        assert migrate(old)["log"] == 4
+    assert (old / "version-1" / "trials.jsonl").read_bytes() == content[:-20]
+
+
 def test_without_h5py_it_says_what_to_install(old, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(ImportError, match=r"pip install 'sbi-active\[migrate\]'"):

@@ -10,7 +10,7 @@ import torch
 from sbi_active import Bank, GaussianNoise, SimulatorModel, simulate
 from sbi_active.seeding import row_normals
 from sbi_active.simulation import Simulations
-from sbi_active.simulation.bank.fingerprint import fingerprint, require_same
+from sbi_active.simulation.fingerprint import fingerprint, require_same
 from tests.simulation.bank.filled import execute
 
 

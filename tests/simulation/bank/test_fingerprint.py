@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sbi_active.simulation.bank.fingerprint import fingerprint, require_same
+from sbi_active.simulation.fingerprint import fingerprint, require_same
 
 
 class Rail:

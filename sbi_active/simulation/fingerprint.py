@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from sbi_active.expected import require
+
 #: Arrays up to this size are kept as numbers, so that a difference can be shown.
 SMALL = 16
 
@@ -42,29 +44,34 @@ def fingerprint(simulator: Callable[..., Any], *, version: str = "") -> dict[str
     return {"version": version, "simulator": _describe(simulator, DEPTH)}
 
 
-def require_same(what: str, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+def require_same(
+    what: str,
+    before: Mapping[str, Any],
+    now: Mapping[str, Any],
+    part: str = "simulator",
+) -> None:
     """Raise if the fingerprint of a simulator is not the one that was stored.
 
     Args:
         what: Words for what it was stored with.
         before: Fingerprint that was stored, among other data.
         now: Fingerprint of the simulator that is given.
+        part: Word for it, where it is no simulator.
 
     Raises:
         ValueError: If they differ, with the differences.
     """
-    lines = [*_differences("simulator", before["simulator"], now["simulator"])]
+    lines = [*_differences(part, before["simulator"], now["simulator"])]
     if now["version"]:
         lines = [line for line in lines if ".source " not in line]
     if before["version"] != now["version"]:
         lines = [f"version {before['version']!r} there, {now['version']!r} here"]
-    if lines:
-        raise ValueError(
-            f"expected the simulator of {what}; got another: {'; '.join(lines)}; give "
-            "the one that it was made with, and its noise (--noise), or, where x is "
-            "the same, the same version= of a bank; a campaign takes another by "
-            "simulator_changed=True"
-        )
+    got, advice = f"another: {'; '.join(lines)}", "give the one that it was made with"
+    if part == "simulator":
+        advice += ", and its noise (--noise), or, where x is the same, the same "
+        advice += "version= of a bank; a campaign takes another by "
+        advice += "simulator_changed=True"
+    require(not lines, f"the {part} of {what}", got, advice)
 
 
 def _differences(path: str, before: Any, now: Any) -> Iterator[str]:
