@@ -28,6 +28,7 @@ from dataclasses import dataclass, field, replace
 from typing import cast
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 from scipy.special import entr
 
 from sbi_active.arrays import Array
@@ -35,7 +36,12 @@ from sbi_active.inference.engine.pool import Pool
 from sbi_active.inference.engine.potential import Density, Potential
 from sbi_active.inference.engine.ridges import Ridge, along_ridges
 from sbi_active.inference.engine.search import Found
-from sbi_active.inference.engine.settings import Settings
+from sbi_active.inference.engine.settings import CHEAP, Settings
+from sbi_active.inference.engine.surface import (
+    Screened,
+    SurfacePotential,
+    fitted_surface,
+)
 from sbi_active.inference.sampling.mixtures import (
     Defended,
     Proposal,
@@ -46,6 +52,7 @@ from sbi_active.inference.sampling.mixtures import (
 from sbi_active.inference.sampling.weights import (
     effective_sample_size,
     largest_power,
+    log_sum_exp,
     normalized,
     systematic,
 )
@@ -82,6 +89,7 @@ class ImportanceSampling:
     num_components: int
     settings: Settings
     found: Found | None = None
+    has_residuals: bool = False
     num_full: int = 0
     num_tempered: int = 0
     ridge: Ridge | None = None
@@ -94,12 +102,29 @@ class ImportanceSampling:
         """Whether the likelihood had to be tempered often."""
         return self.num_tempered > self.settings.few_tempered
 
-    @property
-    def num_modes(self) -> float:
-        """The number of modes, by the entropy of their weights; 1 along a ridge."""
-        if self.found is None or self.ridge is not None:
+    def _num_regions(self, *, touching: float = 0.02, num: int = 1_000) -> float:
+        """Return the number of regions apart, by the entropy of their probabilities.
+
+        Components that are fitted to the final draws are of one region where they share
+        draws: modes along a ridge are no regions.
+
+        Args:
+            touching: Share of a component's draws that another has as well, from which
+                on they touch.
+            num: Number of draws that are looked at.
+        """
+        pool, found = self.pool, self.found
+        if found is None or len(found.modes) == 1 or not pool.is_final.any():
             return 1.0
-        return float(np.exp(entr(self.found.guess.weights).sum()))
+        rows = systematic(normalized(pool.log_weight), num, 0.5)
+        k = max(self.num_components, len(found.modes))
+        mixture = fitted_normals(pool.u[rows], k, np.random.default_rng(0))
+        parts = mixture.log_parts(pool.u[rows])
+        share = np.exp(parts - log_sum_exp(parts, axis=0))
+        common = share @ share.T / share.sum(1)
+        _, label = connected_components(np.minimum(common, common.T) > touching)
+        total = np.bincount(label, share.sum(1)) / num
+        return float(np.exp(entr(total).sum()))
 
     def run(self) -> None:
         """Draw until enough are effective, or the budget is spent."""
@@ -113,8 +138,10 @@ class ImportanceSampling:
             power = _largest_power(*self._logs(), own.fewest)
             effective = pool.effective_sample_size
             is_cheap = left > (1 - own.share_of_plenty) * budget and not self.is_rough
-            divergence = self.num_modes * pool.divergence
-            wanted = own.asked(effective, divergence, is_cheap=is_cheap)
+            wanted = own.asked(effective, pool.divergence, is_cheap=is_cheap)
+            if power == 1 and effective >= wanted:  # enough, if they are of one region
+                divergence = self._num_regions() * pool.divergence
+                wanted = own.asked(effective, divergence, is_cheap=is_cheap)
             wanted = max(wanted, least)
             if not len(pool.u) or left <= 0:
                 break
@@ -191,6 +218,10 @@ class ImportanceSampling:
             efficiency: Share of the last proposal's draws that were effective.
         """
         pool, own, rng = self.pool, self.settings, self.rng
+        screened = self._screened(efficiency)
+        if screened is not None:
+            self.num_full += 1
+            return screened
         share = own.share_if_rough if self.is_rough else own.share_of_wide
         self.num_full += power == 1
         self.num_tempered += power < 1
@@ -221,6 +252,28 @@ class ImportanceSampling:
                 self.is_along = True
                 return self.ridge.mixture
         return Defended(main, wide, share)
+
+    def _screened(self, efficiency: float) -> Proposal | None:
+        """Return draws that a surface of the likelihood lets pass; None if it is bad.
+
+        Args:
+            efficiency: Share of the last proposal's draws that were effective.
+        """
+        if not self.has_residuals:
+            return None
+        own, rng = self.settings.surface, self.rng
+        searched = cast(Potential, self.potential)  # what was searched has residuals
+        surface = fitted_surface(searched, self.pool, rng, own)
+        if surface is None or surface.efficiency < max(own.good, efficiency):
+            return None
+        target = SurfacePotential(self.potential, surface)
+        pool = target.reweighted(self.pool)
+        free = replace(CHEAP, num_effective=own.num_effective, fitted=1.0)
+        num = max(own.num_components, self.num_components)
+        ImportanceSampling(pool, target, rng, num, free).run()
+        if pool.final is None:
+            return None
+        return Screened(pool.final, target).leveled(rng, own)
 
     def _logs(self) -> tuple[Array, Array]:
         """Return log weights without the new likelihood, and that, shapes (n,)."""

@@ -78,6 +78,7 @@ def infer(
         *(pool, potential, rng, max(settings.num_components, num_modes), settings),
         # After a further trial the modes are not all, and the draws may know others.
         found=found if past is None else None,
+        has_residuals=found is not None,
     )
     sampling.run()
     final, effective = pool.is_final, pool.effective_sample_size
