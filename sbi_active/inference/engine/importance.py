@@ -71,7 +71,9 @@ class ImportanceSampling:
         rng: Source of the draws.
         num_components: Number of components of a proposal at most.
         settings: Numbers of draws.
-        found: Modes, to propose along ridges from; None if there are none.
+        found: Modes, whose potential has residuals; None if there are none.
+        is_first: Whether the modes are all that are known, so that proposals along
+            ridges begin there; after a further trial the draws may know others.
 
     Attributes:
         num_full: Number of proposals fitted to the whole likelihood.
@@ -89,7 +91,7 @@ class ImportanceSampling:
     num_components: int
     settings: Settings
     found: Found | None = None
-    has_residuals: bool = False
+    is_first: bool = True
     num_full: int = 0
     num_tempered: int = 0
     ridge: Ridge | None = None
@@ -114,7 +116,7 @@ class ImportanceSampling:
             num: Number of draws that are looked at.
         """
         pool, found = self.pool, self.found
-        if found is None or len(found.modes) == 1 or not pool.is_final.any():
+        if found is None or not self.is_first or len(found.modes) == 1:
             return 1.0
         rows = systematic(normalized(pool.log_weight), num, 0.5)
         k = max(self.num_components, len(found.modes))
@@ -218,7 +220,9 @@ class ImportanceSampling:
             efficiency: Share of the last proposal's draws that were effective.
         """
         pool, own, rng = self.pool, self.settings, self.rng
-        screened = self._screened(efficiency)
+        # Few draws may lie across a ridge, of which a surface sees a piece.
+        sees_all = power == 1 or self.ridge is not None
+        screened = self._screened(efficiency) if sees_all else None
         if screened is not None:
             self.num_full += 1
             return screened
@@ -236,10 +240,10 @@ class ImportanceSampling:
             self.efficiency[self.is_along] = efficiency
         self.is_along = False
         # Where few draws count, they may lie across a ridge.
-        is_first = self.num_full + self.num_tempered <= own.num_ridged
+        is_early = self.num_full + self.num_tempered <= own.num_ridged
         known = self.efficiency
         is_better = known.get(True, 0.0) > known.get(False, np.inf)
-        if self.found is not None and (is_first or is_better):
+        if self.found is not None and self.is_first and (is_early or is_better):
             full = normalized(pool.log_mixture_weight)
             if self.ridge is not None:
                 self.ridge = self.ridge.grown(pool.u, full, rng)
@@ -259,12 +263,14 @@ class ImportanceSampling:
         Args:
             efficiency: Share of the last proposal's draws that were effective.
         """
-        if not self.has_residuals:
+        if self.found is None:
             return None
         own, rng = self.settings.surface, self.rng
         searched = cast(Potential, self.potential)  # what was searched has residuals
-        surface = fitted_surface(searched, self.pool, rng, own)
-        if surface is None or surface.efficiency < max(own.good, efficiency):
+        whiten = searched.whitener(self.found.modes[:1])
+        surface = fitted_surface(searched, whiten, self.pool, rng, own)
+        least = max(own.good, efficiency)
+        if surface is None or surface.efficiency < least:
             return None
         target = SurfacePotential(self.potential, surface)
         pool = target.reweighted(self.pool)
@@ -273,7 +279,8 @@ class ImportanceSampling:
         ImportanceSampling(pool, target, rng, num, free).run()
         if pool.final is None:
             return None
-        return Screened(pool.final, target).leveled(rng, own)
+        screened = Screened(pool.final, target).leveled(rng, own)
+        return screened if screened.efficiency >= least else None
 
     def _logs(self) -> tuple[Array, Array]:
         """Return log weights without the new likelihood, and that, shapes (n,)."""

@@ -36,8 +36,9 @@ from sbi_active.arrays import Array
 from sbi_active.inference.engine.pool import Pool
 from sbi_active.inference.engine.potential import Density, Potential
 from sbi_active.inference.engine.settings import SurfaceSettings
+from sbi_active.inference.sampling.least_squares import Whitener
 from sbi_active.inference.sampling.mixtures import Proposal, lower_factors
-from sbi_active.inference.sampling.weights import normalized
+from sbi_active.inference.sampling.weights import log_sum_exp, normalized
 
 
 @dataclass(frozen=True)
@@ -99,6 +100,7 @@ def features(z: Array, degree: int) -> Array:
 
 def fitted_surface(
     potential: Potential,
+    whiten: Whitener,
     pool: Pool,
     rng: np.random.Generator,
     settings: SurfaceSettings,
@@ -109,6 +111,7 @@ def fitted_surface(
 
     Args:
         potential: Potential, whose residuals are known where the draws are.
+        whiten: Whitener of the residuals by the likeliest error.
         pool: Draws so far.
         rng: Source of the choice of draws.
         settings: Settings of the fit.
@@ -131,7 +134,7 @@ def fitted_surface(
     if len(rows) > most:
         rows = np.sort(rng.choice(rows, most, replace=False))
     u, log_likelihood = pool.u[rows], pool.log_likelihood[rows]
-    residual = potential.residual(u)[0]
+    residual = whiten(potential.residual(u)[0])
     if not np.isfinite(residual).all():
         return None
     # Far from the posterior a response need not be a polynomial of so low a degree.
@@ -222,6 +225,7 @@ class Screened(Proposal):
         floor: Least probability to pass.
         log_mass: Log of the share that passes.
         error: Standard error of log_mass, nats.
+        efficiency: Share of what passes that is expected to be effective.
     """
 
     base: Proposal
@@ -230,6 +234,7 @@ class Screened(Proposal):
     floor: float = 1.0
     log_mass: float = 0.0
     error: float = 0.0
+    efficiency: float = 0.0
 
     def log_passed(self, z: Array) -> Array:
         """Return log probabilities to pass, shape (n,)."""
@@ -270,9 +275,10 @@ class Screened(Proposal):
 
         def efficiency(level: float) -> float:
             """Return the share of what passes that is effective."""
-            passed = np.exp(np.minimum(log_weight - level, 0.0))
-            rest = np.exp(np.maximum(log_weight - level, 0.0))
-            return float((passed @ rest) ** 2 / (passed.sum() * (passed @ rest**2)))
+            passed = np.minimum(log_weight - level, 0.0)
+            rest = np.maximum(log_weight - level, 0.0)
+            square = log_sum_exp(passed) + log_sum_exp(passed + 2 * rest)
+            return float(np.exp(2 * log_sum_exp(passed + rest) - square))
 
         def mass(level: float) -> float:
             return float(np.exp(np.minimum(log_weight - level, 0.0)).mean())
@@ -284,5 +290,10 @@ class Screened(Proposal):
         share = float(passed.mean())
         error = float(passed.std() / share / len(passed) ** 0.5)
         return replace(
-            self, log_level=level, floor=floor, log_mass=np.log(share), error=error
+            self,
+            log_level=level,
+            floor=floor,
+            log_mass=float(np.log(share)),
+            error=error,
+            efficiency=efficiency(level) * self.target.surface.efficiency,
         )
