@@ -116,7 +116,9 @@ class ImportanceSampling:
             num: Number of draws that are looked at.
         """
         pool, found = self.pool, self.found
-        if found is None or not self.is_first or len(found.modes) == 1:
+        if found is None or not self.is_first or self.ridge is not None:
+            return 1.0
+        if len(found.modes) == 1:
             return 1.0
         rows = systematic(normalized(pool.log_weight), num, 0.5)
         k = max(self.num_components, len(found.modes))

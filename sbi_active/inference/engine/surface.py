@@ -162,7 +162,7 @@ def fitted_surface(
     best, degree = max(candidates)
     slopes = _solved(features(z, degree), residual, scale)
     reach = own.reach * float((z**2).sum(1).max())
-    root = np.linalg.qr(slopes.T, mode="r")
+    root = np.asarray(np.linalg.qr(slopes.T, mode="r"))
     return Surface(center, inverse, degree, root, constant, reach, best)
 
 
