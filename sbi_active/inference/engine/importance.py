@@ -28,7 +28,6 @@ from dataclasses import dataclass, field, replace
 from typing import cast
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
 from scipy.special import entr
 
 from sbi_active.arrays import Array
@@ -52,7 +51,6 @@ from sbi_active.inference.sampling.mixtures import (
 from sbi_active.inference.sampling.weights import (
     effective_sample_size,
     largest_power,
-    log_sum_exp,
     normalized,
     systematic,
 )
@@ -104,31 +102,12 @@ class ImportanceSampling:
         """Whether the likelihood had to be tempered often."""
         return self.num_tempered > self.settings.few_tempered
 
-    def _num_regions(self, *, touching: float = 0.02, num: int = 1_000) -> float:
-        """Return the number of regions apart, by the entropy of their probabilities.
-
-        Components that are fitted to the final draws are of one region where they share
-        draws: modes along a ridge are no regions.
-
-        Args:
-            touching: Share of a component's draws that another has as well, from which
-                on they touch.
-            num: Number of draws that are looked at.
-        """
-        pool, found = self.pool, self.found
-        if found is None or not self.is_first or self.ridge is not None:
+    @property
+    def num_modes(self) -> float:
+        """The number of modes, by the entropy of their weights; 1 along a ridge."""
+        if self.found is None or not self.is_first or self.ridge is not None:
             return 1.0
-        if len(found.modes) == 1:
-            return 1.0
-        rows = systematic(normalized(pool.log_weight), num, 0.5)
-        k = max(self.num_components, len(found.modes))
-        mixture = fitted_normals(pool.u[rows], k, np.random.default_rng(0))
-        parts = mixture.log_parts(pool.u[rows])
-        share = np.exp(parts - log_sum_exp(parts, axis=0))
-        common = share @ share.T / share.sum(1)
-        _, label = connected_components(np.minimum(common, common.T) > touching)
-        total = np.bincount(label, share.sum(1)) / num
-        return float(np.exp(entr(total).sum()))
+        return float(np.exp(entr(self.found.guess.weights).sum()))
 
     def run(self) -> None:
         """Draw until enough are effective, or the budget is spent."""
@@ -142,10 +121,8 @@ class ImportanceSampling:
             power = _largest_power(*self._logs(), own.fewest)
             effective = pool.effective_sample_size
             is_cheap = left > (1 - own.share_of_plenty) * budget and not self.is_rough
-            wanted = own.asked(effective, pool.divergence, is_cheap=is_cheap)
-            if power == 1 and effective >= wanted:  # enough, if they are of one region
-                divergence = self._num_regions() * pool.divergence
-                wanted = own.asked(effective, divergence, is_cheap=is_cheap)
+            divergence = self.num_modes * pool.divergence
+            wanted = own.asked(effective, divergence, is_cheap=is_cheap)
             wanted = max(wanted, least)
             if not len(pool.u) or left <= 0:
                 break
