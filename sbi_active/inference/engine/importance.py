@@ -17,6 +17,9 @@ A parameter that another can stand in for leaves a curved ridge, on which a norm
 approximation at a mode has few of its draws, and a few components fitted to draws have
 not many more: there narrow proposals lie along the ridge (:mod:`.ridges`).
 
+Of more than a few parameters, most draws of a mixture count for little. Once enough do,
+a surface of the likelihood says which of further ones to simulate (:mod:`.surface`).
+
 References:
     Cornuet, Marin, Mira & Robert, Scand. J. Stat. 2012 (adaptive multiple importance
     sampling); Veach & Guibas, SIGGRAPH 1995 (the balance heuristic).
@@ -211,10 +214,7 @@ class ImportanceSampling:
         log_rest, log_new = self._logs()
         weight = normalized(log_rest + power * log_new)
         main = fitted(pool.u, weight, self.num_components, own, rng)
-        log_rest = pool.log_prior - pool.log_mixture
-        flat = _largest_power(log_rest, pool.log_likelihood, own.broad)
-        weight = normalized(log_rest + flat * pool.log_likelihood)
-        wide = fitted(pool.u, weight, 2, own, rng)
+        wide = self._wide()
         if self.is_along is not None:
             self.efficiency[self.is_along] = efficiency
         self.is_along = False
@@ -242,7 +242,8 @@ class ImportanceSampling:
         Args:
             efficiency: Share of the last proposal's draws that were effective.
         """
-        if self.found is None:
+        # Of few parameters a mixture follows the posterior.
+        if self.found is None or self.potential.dim <= self.settings.few:
             return None
         own, rng = self.settings.surface, self.rng
         searched = cast(Potential, self.potential)  # what was searched has residuals
@@ -258,8 +259,17 @@ class ImportanceSampling:
         ImportanceSampling(pool, target, rng, num, free).run()
         if pool.final is None:
             return None
-        screened = Screened(pool.final, target).leveled(rng, own)
+        base = Defended(pool.final, self._wide(), self.settings.share_of_wide)
+        screened = Screened(base, target).leveled(rng, own)
         return screened if screened.efficiency >= least else None
+
+    def _wide(self) -> Proposal:
+        """Return a proposal fitted to a power of the likelihood that leaves many."""
+        pool, own = self.pool, self.settings
+        log_rest = pool.log_prior - pool.log_mixture
+        flat = _largest_power(log_rest, pool.log_likelihood, own.broad)
+        weight = normalized(log_rest + flat * pool.log_likelihood)
+        return fitted(pool.u, weight, 2, own, self.rng)
 
     def _logs(self) -> tuple[Array, Array]:
         """Return log weights without the new likelihood, and that, shapes (n,)."""

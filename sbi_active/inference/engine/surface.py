@@ -52,7 +52,6 @@ class Surface:
         root: Matrix whose products with features are as long as the residuals, shape
             (k, m).
         constant: Log likelihood of residuals that vanish.
-        reach: Squared distance from the center beyond which it says nothing.
         efficiency: Share of draws of its posterior that are effective draws of the
             posterior, by places that had no part in a fit.
     """
@@ -62,11 +61,10 @@ class Surface:
     degree: int
     root: Array
     constant: float
-    reach: float
     efficiency: float
 
     def log_likelihood(self, u: Array, *, most: int = 1_000_000) -> Array:
-        """Return log likelihoods, shape (n,); -inf beyond its reach.
+        """Return log likelihoods, shape (n,).
 
         Args:
             u: Places, shape (n, d).
@@ -77,11 +75,8 @@ class Surface:
 
     def _at(self, u: Array) -> Array:
         z = (u - self.center) @ self.inverse.T
-        is_near = (z**2).sum(1) <= self.reach
-        residual = features(z[is_near], self.degree) @ self.root.T
-        log_likelihood = np.full(len(u), -np.inf)
-        log_likelihood[is_near] = self.constant - 0.5 * (residual**2).sum(1)
-        return log_likelihood
+        residual = features(z, self.degree) @ self.root.T
+        return self.constant - 0.5 * (residual**2).sum(1)
 
 
 def features(z: Array, degree: int) -> Array:
@@ -130,9 +125,9 @@ def fitted_surface(
     ]
     if not degrees:
         return None
-    most = own.plenty * comb(dim + degrees[-1], degrees[-1])
-    if len(rows) > most:
-        rows = np.sort(rng.choice(rows, most, replace=False))
+    enough = own.plenty * comb(dim + degrees[-1], degrees[-1])
+    if len(rows) > enough:
+        rows = np.sort(rng.choice(rows, enough, replace=False))
     u, log_likelihood = pool.u[rows], pool.log_likelihood[rows]
     residual = whiten(potential.residual(u)[0])
     if not np.isfinite(residual).all():
@@ -159,11 +154,11 @@ def fitted_surface(
         return float((weight @ ratio) ** 2 / (weight @ ratio**2))
 
     candidates = [(efficiency(features(z, degree)), degree) for degree in degrees]
-    best, degree = max(candidates)
+    most = max(candidates)[0]  # a lower degree that is as good costs less
+    best, degree = next(pair for pair in candidates if pair[0] >= 0.99 * most)
     slopes = _solved(features(z, degree), residual, scale)
-    reach = own.reach * float((z**2).sum(1).max())
     root = np.asarray(np.linalg.qr(slopes.T, mode="r"))
-    return Surface(center, inverse, degree, root, constant, reach, best)
+    return Surface(center, inverse, degree, root, constant, best)
 
 
 def _solved(f: Array, residual: Array, scale: Array) -> Array:
@@ -201,16 +196,18 @@ class SurfacePotential:
         return self.surface.log_likelihood(u)
 
     def reweighted(self, pool: Pool) -> Pool:
-        """Return a pool's draws within the surface's reach, with its likelihood."""
-        log_likelihood = self.log_likelihood(pool.u)
-        rows = np.isfinite(log_likelihood)
-        log_own = pool.log_own[rows]
-        return Pool(
-            *(pool.u[rows], pool.log_prior[rows], log_likelihood[rows]),
-            *(pool.log_mixture[rows], log_own, np.zeros(len(log_own), dtype=bool)),
+        """Return a pool's draws with the surface's likelihood."""
+        num = len(pool.u)
+        return replace(
+            pool,
+            log_likelihood=self.log_likelihood(pool.u),
+            is_final=np.zeros(num, dtype=bool),
+            num_final=0,
             proposals=[*pool.proposals],
             num_trials=1,
-            log_past=np.zeros(len(log_own)),
+            log_past=np.zeros(num),
+            num_past=0,
+            final=None,
         )
 
 
