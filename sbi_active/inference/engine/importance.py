@@ -17,6 +17,9 @@ A parameter that another can stand in for leaves a curved ridge, on which a norm
 approximation at a mode has few of its draws, and a few components fitted to draws have
 not many more: there narrow proposals lie along the ridge (:mod:`.ridges`).
 
+Of more than a few parameters, most draws of a mixture count for little. Once enough do,
+a surface of the likelihood says which of further ones to simulate (:mod:`.surface`).
+
 References:
     Cornuet, Marin, Mira & Robert, Scand. J. Stat. 2012 (adaptive multiple importance
     sampling); Veach & Guibas, SIGGRAPH 1995 (the balance heuristic).
@@ -35,7 +38,12 @@ from sbi_active.inference.engine.pool import Pool
 from sbi_active.inference.engine.potential import Density, Potential
 from sbi_active.inference.engine.ridges import Ridge, along_ridges
 from sbi_active.inference.engine.search import Found
-from sbi_active.inference.engine.settings import Settings
+from sbi_active.inference.engine.settings import CHEAP, Settings
+from sbi_active.inference.engine.surface import (
+    Screened,
+    SurfacePotential,
+    fitted_surface,
+)
 from sbi_active.inference.sampling.mixtures import (
     Defended,
     Proposal,
@@ -64,7 +72,9 @@ class ImportanceSampling:
         rng: Source of the draws.
         num_components: Number of components of a proposal at most.
         settings: Numbers of draws.
-        found: Modes, to propose along ridges from; None if there are none.
+        found: Modes, whose potential has residuals; None if there are none.
+        is_first: Whether the modes are all that are known, so that proposals along
+            ridges begin there; after a further trial the draws may know others.
 
     Attributes:
         num_full: Number of proposals fitted to the whole likelihood.
@@ -82,6 +92,7 @@ class ImportanceSampling:
     num_components: int
     settings: Settings
     found: Found | None = None
+    is_first: bool = True
     num_full: int = 0
     num_tempered: int = 0
     ridge: Ridge | None = None
@@ -97,7 +108,7 @@ class ImportanceSampling:
     @property
     def num_modes(self) -> float:
         """The number of modes, by the entropy of their weights; 1 along a ridge."""
-        if self.found is None or self.ridge is not None:
+        if self.found is None or not self.is_first or self.ridge is not None:
             return 1.0
         return float(np.exp(entr(self.found.guess.weights).sum()))
 
@@ -191,24 +202,27 @@ class ImportanceSampling:
             efficiency: Share of the last proposal's draws that were effective.
         """
         pool, own, rng = self.pool, self.settings, self.rng
+        # Few draws may lie across a ridge, of which a surface sees a piece.
+        sees_all = power == 1 or self.ridge is not None
+        screened = self._screened(efficiency) if sees_all else None
+        if screened is not None:
+            self.num_full += 1
+            return screened
         share = own.share_if_rough if self.is_rough else own.share_of_wide
         self.num_full += power == 1
         self.num_tempered += power < 1
         log_rest, log_new = self._logs()
         weight = normalized(log_rest + power * log_new)
         main = fitted(pool.u, weight, self.num_components, own, rng)
-        log_rest = pool.log_prior - pool.log_mixture
-        flat = _largest_power(log_rest, pool.log_likelihood, own.broad)
-        weight = normalized(log_rest + flat * pool.log_likelihood)
-        wide = fitted(pool.u, weight, 2, own, rng)
+        wide = self._wide()
         if self.is_along is not None:
             self.efficiency[self.is_along] = efficiency
         self.is_along = False
         # Where few draws count, they may lie across a ridge.
-        is_first = self.num_full + self.num_tempered <= own.num_ridged
+        is_early = self.num_full + self.num_tempered <= own.num_ridged
         known = self.efficiency
         is_better = known.get(True, 0.0) > known.get(False, np.inf)
-        if self.found is not None and (is_first or is_better):
+        if self.found is not None and self.is_first and (is_early or is_better):
             full = normalized(pool.log_mixture_weight)
             if self.ridge is not None:
                 self.ridge = self.ridge.grown(pool.u, full, rng)
@@ -221,6 +235,41 @@ class ImportanceSampling:
                 self.is_along = True
                 return self.ridge.mixture
         return Defended(main, wide, share)
+
+    def _screened(self, efficiency: float) -> Proposal | None:
+        """Return draws that a surface of the likelihood lets pass; None if it is bad.
+
+        Args:
+            efficiency: Share of the last proposal's draws that were effective.
+        """
+        # Of few parameters a mixture follows the posterior.
+        if self.found is None or self.potential.dim <= self.settings.few:
+            return None
+        own, rng = self.settings.surface, self.rng
+        searched = cast(Potential, self.potential)  # what was searched has residuals
+        whiten = searched.whitener(self.found.modes[:1])
+        surface = fitted_surface(searched, whiten, self.pool, rng, own)
+        least = max(own.good, efficiency)
+        if surface is None or surface.efficiency < least:
+            return None
+        target = SurfacePotential(self.potential, surface)
+        pool = target.reweighted(self.pool)
+        free = replace(CHEAP, num_effective=own.num_effective, fitted=1.0)
+        num = max(own.num_components, self.num_components)
+        ImportanceSampling(pool, target, rng, num, free).run()
+        if pool.final is None:
+            return None
+        base = Defended(pool.final, self._wide(), self.settings.share_of_wide)
+        screened = Screened(base, target).leveled(rng, own)
+        return screened if screened.efficiency >= least else None
+
+    def _wide(self) -> Proposal:
+        """Return a proposal fitted to a power of the likelihood that leaves many."""
+        pool, own = self.pool, self.settings
+        log_rest = pool.log_prior - pool.log_mixture
+        flat = _largest_power(log_rest, pool.log_likelihood, own.broad)
+        weight = normalized(log_rest + flat * pool.log_likelihood)
+        return fitted(pool.u, weight, 2, own, self.rng)
 
     def _logs(self) -> tuple[Array, Array]:
         """Return log weights without the new likelihood, and that, shapes (n,)."""

@@ -76,8 +76,8 @@ def infer(
     num_modes = 0 if found is None else len(found.modes)
     sampling = ImportanceSampling(
         *(pool, potential, rng, max(settings.num_components, num_modes), settings),
-        # After a further trial the modes are not all, and the draws may know others.
-        found=found if past is None else None,
+        found=found,
+        is_first=past is None,
     )
     sampling.run()
     final, effective = pool.is_final, pool.effective_sample_size

@@ -12,7 +12,7 @@ from torch.distributions import Distribution
 from sbi_active.arrays import Array
 from sbi_active.inference.beliefs.weighted import WeightedBelief
 from sbi_active.inference.engine.infer import infer
-from sbi_active.inference.engine.settings import Settings
+from sbi_active.inference.engine.settings import CHEAP
 from sbi_active.inference.rounds.rows import NOTHING_EXPLAINS, UnexplainedOutcomeError
 from sbi_active.inference.sampling.coordinates import (
     NormalCoordinates,
@@ -20,20 +20,6 @@ from sbi_active.inference.sampling.coordinates import (
 )
 from sbi_active.inference.sampling.mixtures import Proposal
 from sbi_active.inference.sampling.weights import normalized, systematic
-
-#: Settings of :func:`.infer` where a likelihood is cheap. On four modes and on a peak
-#: of six parameters half of the draws, and twice, are as right; twice takes up to 1.5
-#: times as long.
-CHEAP = Settings(
-    plenty=1.0,
-    num_draws=2_000,
-    fewest=200.0,
-    max_fits=6,
-    efficient=0.4,
-    affordable=0.0,  # a fit takes as long as many draws
-    jitter=0.0,
-    fitted=0.25,
-)
 
 
 class LearnedLikelihood(Protocol):

@@ -56,7 +56,7 @@ class SearchSettings:
     max_starts: int = 64
     num_found: int = 3
     explained: float = 1e-4
-    iterations: int = 12
+    iterations: int = 30
     same: float = 2.0
     negligible: float = 40.0
     phases: int = 0

@@ -45,14 +45,18 @@ class Given(SimulatedPotential):
         )
         self.dim, self.searched = dim, np.ones(dim, dtype=bool)
         self.function, self.num_observed, self.step = function, observed, 3e-3
-        self.sd, self.num_trials, self.num_rows = sd, 1, 0
+        self.sd, self.num_trials, self.known = sd, 1, set()
+
+    @property
+    def num_rows(self):
+        return len(self.known)
 
     @property
     def num_simulations(self):
         return self.num_rows
 
     def residual(self, u):
-        self.num_rows += len(u)
+        self.known.update(row.tobytes() for row in u)  # each is simulated once
         return (self.function(u),)
 
     def simulated(self, u):
