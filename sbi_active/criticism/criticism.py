@@ -26,7 +26,6 @@ from sbi_active.criticism.effects.joint_prior import joint_prior
 from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summarize
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.screening import linear_models
-from sbi_active.criticism.misfit.contrary import widened
 from sbi_active.criticism.misfit.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.misfit.rule import Rule
@@ -245,14 +244,10 @@ class Criticism:
     @cached_property
     def _traced(self) -> tuple[Tracing, RivalSet]:
         found, large = self._verdict, self._is_large
-        # Each model's held-out errors would take as much as the verdict; and what
-        # separates effects of a large library, the next action looks for.
+        # Each model's held-out errors would take as much as the verdict.
         held_out = None if large else self._parts[1].held_out
-        actions = None if large else self.actions
         with stage("verdict, sets of effects fitted", show_progress=self.show_progress):
-            tracing, models = traced(found, held_out, actions=actions, near=not large)
-        if tracing.misfit is None:
-            tracing = widened(tracing, self.seed, models.within)
+            tracing, models = traced(found, held_out, near=not large)
         return replace(tracing, set_aside=self.set_aside), models
 
     def add(

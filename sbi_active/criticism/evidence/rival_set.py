@@ -180,10 +180,6 @@ class RivalSet:
         noise = self.model.noise
         return noise is not None and noise.is_known_gaussian and self.noise.is_known
 
-    def within(self, key: ModelKey, z: Array) -> Array:
-        """Return draws of a model, (n, d), moved into the bounds of its prior."""
-        return self.rival(key).coordinates.within(z)
-
     @cached_property
     def _process(self) -> ResidualProcess:
         noise = self.noise

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sbi_active.arrays import Array
+from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.results import (
     CATCH_ALLS,
     NONE,
     OUTLIER,
     UNEXPLAINED,
-    Estimate,
     Evaluation,
-    Evidence,
     ModelKey,
     Tracing,
 )
@@ -135,9 +133,7 @@ def withdrawn(tracing: Tracing) -> Tracing:
     )
 
 
-def widened(
-    tracing: Tracing, seed: int, within: Callable[[ModelKey, Array], Array]
-) -> Tracing:
+def widened(tracing: Tracing, rivals: RivalSet) -> Tracing:
     r"""Return a verdict whose refuted models have draws that know of it.
 
     The posterior of a model that misses the trials is as narrow as the sensor allows,
@@ -148,8 +144,7 @@ def widened(
 
     Args:
         tracing: Tracing with effects as the verdict.
-        seed: Seed of the draws.
-        within: Moves draws of a model, shape (n, k), into the bounds of its prior.
+        rivals: The models, for bounds of priors.
 
     References:
         Birge, Physical Review 40 (1932), for the ratio.
@@ -158,28 +153,21 @@ def widened(
     if not tracing.chosen or best is None:
         return tracing
     found = dict(tracing.evidences)
-    for name, own in found.items():
+    known = dict(zip(best.names, best.draws.mean(0), strict=True))
+    for name, own in tracing.evidences.items():
         near = own.log_evidence > best.log_evidence - THRESHOLD
         if near or own.key.error is not None:
             continue
-        draws = _widened(own, best, derive_seed(seed, "refuted", name))
-        draws = within(own.key, draws)
+        ratio = max(own.best_chi_square / max(best.best_chi_square, 1.0), 1.0)
+        mean = own.draws.mean(0)
+        center = [known.get(n, m) for n, m in zip(own.names, mean, strict=True)]
+        rng = np.random.default_rng(derive_seed(rivals.seed, "refuted", name))
+        moved = rng.normal(size=(len(own.draws), 1)) * (np.array(center) - mean)
+        draws = mean + np.sqrt(ratio) * (own.draws - mean) + moved
+        draws = rivals.rival(own.key).coordinates.within(draws)
         found[name] = replace(own, draws=draws, narrow=own.draws)
-    estimates = [_estimate(e, found[e.name].draws) for e in tracing.estimates]
+    estimates = []
+    for one in tracing.estimates:
+        phi = found[one.name].draws[:, -len(one.mean) :]
+        estimates.append(replace(one, mean=phi.mean(0), sd=phi.std(0)))
     return replace(tracing, evidences=found, estimates=(*estimates,))
-
-
-def _estimate(estimate: Estimate, draws: Array) -> Estimate:
-    """Return an effect's estimate by the draws of the model that has it alone."""
-    phi = draws[:, -len(estimate.mean) :]
-    return replace(estimate, mean=phi.mean(0), sd=phi.std(0))
-
-
-def _widened(own: Evidence, best: Evidence, seed: int) -> Array:
-    ratio = own.best_chi_square / max(best.best_chi_square, 1.0)
-    mean = own.draws.mean(0)
-    known = dict(zip(best.names, best.draws.mean(0), strict=True))
-    apart = np.array([known.get(n, m) for n, m in zip(own.names, mean, strict=True)])
-    normal = np.random.default_rng(seed).normal(size=(len(own.draws), 1))
-    spread = np.sqrt(max(ratio, 1.0)) * (own.draws - mean)
-    return mean + spread + normal * (apart - mean)
