@@ -65,7 +65,7 @@ def probe_step(rival: Rival, u: Array) -> tuple[float | None, bool]:
         rival: The bare model.
         u: Places, shape (n, dim).
     """
-    whiten, coarse = rival.error.start(), 5e-2
+    whiten, coarse = rival.whitener(), 5e-2
 
     def slope(step: float) -> Array:
         return rival.jacobian(u, whiten, step)[1]

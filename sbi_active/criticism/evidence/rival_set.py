@@ -293,7 +293,7 @@ class RivalSet:
             u: Draws that are shown, shape (n, dim).
             chi_square: Smallest whitened residual sum of squares.
         """
-        own = sum(rival.coordinates.joint.sizes)
+        own = rival.coordinates.num_own
         return Evidence(
             key=rival.key,
             log_evidence=sample.log_evidence,

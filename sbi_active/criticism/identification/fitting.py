@@ -291,7 +291,7 @@ def _beside(
     whole: Rival, bare: LinearModel, unit: Array, settings: IdentifySettings
 ) -> Linear:
     """Return a model with effects that are absent so far, at the fit without."""
-    columns, effect = whole.columns(), np.full(whole.dim, -1)
+    columns, effect = whole.coordinates.places, np.full(whole.dim, -1)
     null = np.full(whole.dim, np.nan)
     for k, own in enumerate(whole.effects):
         effect[columns[own.name]] = k

@@ -237,7 +237,7 @@ class Search:
         rival = self.rival(key)
         keep = np.ones(rival.dim, dtype=bool)
         for name in {*key.effects} - {*part.effects}:
-            keep[rival.columns()[name]] = False
+            keep[rival.coordinates.places[name]] = False
         return keep
 
     def column(
@@ -378,7 +378,7 @@ class Search:
         effect as strong as its prior holds the machine still, or throws it about.
         """
         rival, model = self.rival(key), self.found[parent].model
-        u, columns = np.empty(rival.dim), rival.columns()
+        u, columns = np.empty(rival.dim), rival.coordinates.places
         u[self.columns(key, parent)] = model.u
         for name in {*key.effects} - {*parent.effects}:
             null, step = self._at_null(name)

@@ -134,7 +134,7 @@ def _unless_none(tracing: Tracing, bounds: Bounds) -> Tracing:
 def _sides(fit: Fit, seed: int) -> NDArray[np.int64]:
     """Return at which bound each of theta and phi is in a model, (d,): -1, 1 or 0."""
     c = fit.rival.coordinates
-    own = sum(c.joint.sizes)
+    own = c.num_own
     if fit.best is None:
         u = fit.sample.draws(NUM_DRAWS, np.random.default_rng(seed))
     else:  # where draws are as wide as misfit asks, some reach any bound

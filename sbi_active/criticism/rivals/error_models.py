@@ -160,8 +160,9 @@ class NoiseGrid:
         joint = self.joint(residual[None])[0]
         return np.exp(joint - log_sum_exp(joint))
 
+    @cached_property
     def start(self) -> Whitener:
-        """Return the whitening transform to start a least-squares search with."""
+        """The whitening transform to start a least-squares search with."""
         middle = np.argsort(self.scales)[len(self.scales) // 2]
         sizes = np.full(len(self.factors), self.scales[middle])
         return self._whitener(int(np.argmax(self.log_prior)), sizes)

@@ -47,7 +47,7 @@ def conditioned(
     size = np.sqrt(np.mean((own / rivals.noise.typical_sd) ** 2))
     unit = error.typical_sd * max(size, 1e-3)
     c, first = rival.coordinates, is_first_part(m, rivals.warm_up)
-    num_own = sum(c.joint.sizes)
+    num_own = c.num_own
     z = np.zeros((len(u), c.dim))
     z[:, :num_own] = fit.rival.coordinates.to_z(u)[:, :num_own]
     draws = c.from_z(z)
