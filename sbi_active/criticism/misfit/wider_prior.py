@@ -98,9 +98,7 @@ def beyond_bounds(rivals: RivalSet, tracing: Tracing) -> Tracing:
     u = _best(rivals, own, whiten, start[None])
     assert u is not None
     square = float((whiten(own.residual(u[None])[0][0]) ** 2).sum())
-    dim = rivals.prior.event_shape[0]
-    found: list[BoundParameter] = []
-    p_value, replaces = float("nan"), ""
+    dim, bounds = rivals.prior.event_shape[0], Bounds()
     for key, fit, side in zip(keys, fits, sides, strict=True):
         if not side.any():
             continue
@@ -108,16 +106,15 @@ def beyond_bounds(rivals: RivalSet, tracing: Tracing) -> Tracing:
         starts = np.stack([fit.point, np.r_[start[:dim], fit.point[dim:]]])
         u = _best(rivals, rival, whiten, starts)
         held = _told(rivals, fit, side, rival, u)
-        found += held
+        bounds = replace(bounds, parameters=(*bounds.parameters, *held))
         if key != ModelKey() or u is None or not held:
             continue
         rest = rival.residual(u[None])[0][0]
         spare = max(len(rest) - rival.dim, 1)
-        p_value = _tail(rivals, tracing, rest, whiten, spare)
         more = float((whiten(rest) ** 2).sum()) - square
+        bounds = replace(bounds, p_value=_tail(rivals, tracing, rest, whiten, spare))
         if tracing.chosen and more < 2 * THRESHOLD * max(square / spare, 1.0):
-            replaces = str(ModelKey(tracing.chosen))
-    bounds = Bounds(parameters=(*found,), p_value=p_value, replaces=replaces)
+            bounds = replace(bounds, replaces=str(ModelKey(tracing.chosen)))
     return _unless_none(tracing, bounds)
 
 
@@ -141,14 +138,12 @@ def _sides(fit: Fit, seed: int) -> NDArray[np.int64]:
         u = fit.best[None]
     side = c.sides(u[:, :own])
     # An effect that vanishes at a bound is a weak one, and no prior is too narrow.
-    nulls = [e.null_phi(1).double().numpy()[0] for e in fit.rival.effects]
-    z = c.to_z(c.center[None])[0]
-    declared = np.concatenate([z[:0], *nulls])
-    first = own - len(declared)  # of a simulator that was extended there are more
-    z[first:own] = declared
+    z, null = c.to_z(c.center[None])[0], np.zeros(own, dtype=bool)
+    for effect in fit.rival.effects:
+        place = c.places[effect.name]
+        z[place], null[place] = effect.null_phi(1).double().numpy()[0], True
     ends = np.where(side < 0, c.low[:own], c.high[:own])
-    vanishes = np.abs(c.from_z(z[None])[0, :own] - ends) < 1e-6
-    side[first:][vanishes[first:]] = 0
+    side[null & (np.abs(c.from_z(z[None])[0, :own] - ends) < 1e-6)] = 0
     return side
 
 
@@ -161,15 +156,14 @@ def _moved(rival: Rival, side: NDArray[np.int64]) -> Rival:
     """
     c = rival.coordinates
     zero, width = -c.shift / c.scale, c.high - c.low
-    low, high = c.low.copy(), c.high.copy()
+    c.low, c.high = c.low.copy(), c.high.copy()
     for k in np.flatnonzero(side):
-        end, bound = (low, c.low[k]) if side[k] < 0 else (high, c.high[k])
-        end[k] = bound + side[k] * width[k]
+        end = c.low if side[k] < 0 else c.high
+        bound, farthest = end[k], end[k] + side[k] * width[k]
         is_signed = not c.is_log[k] and side[k] * (zero[k] - bound) > 0
-        if is_signed:
-            last = zero[k] + 0.1 * (bound - zero[k])
-            end[k] = max(end[k], last) if side[k] < 0 else min(end[k], last)
-    c.low, c.high = low, high
+        last = zero[k] + 0.1 * (bound - zero[k])
+        end[k] = side[k] * min(side[k] * farthest, side[k] * last)
+        end[k] = end[k] if is_signed else farthest
     return rival
 
 
