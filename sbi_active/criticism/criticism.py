@@ -26,6 +26,7 @@ from sbi_active.criticism.effects.joint_prior import joint_prior
 from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summarize
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.screening import linear_models
+from sbi_active.criticism.misfit.contrary import widened
 from sbi_active.criticism.misfit.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.misfit.rule import Rule
@@ -248,6 +249,8 @@ class Criticism:
         held_out = None if large else self._parts[1].held_out
         with stage("verdict, sets of effects fitted", show_progress=self.show_progress):
             tracing, models = traced(found, held_out, near=not large)
+        if tracing.misfit is None:
+            tracing = widened(tracing, models)
         return replace(tracing, set_aside=self.set_aside), models
 
     def add(

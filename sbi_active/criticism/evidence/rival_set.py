@@ -89,6 +89,7 @@ class RivalSet:
         self.simulator = TrialSimulator(augmented, trials, seed=seed_of_trials)
         self.measurements = self.simulator.measurements
         self._factors: tuple[Array, Array] | None = None
+        self._sizes: Sequence[Array] = ()
         self.noise = self.noise_of(self.measurements)
         self._predictives: dict[tuple[bytes | None, ...], tuple[Array, Array]] = {}
         self._modes: dict[tuple[ModelKey, bytes], Found] = {}
@@ -125,17 +126,30 @@ class RivalSet:
             largest: Largest value of their unknown factor, which is log-uniform from
                 one.
         """
-        new = self.with_fits({})
         factors = np.geomspace(1.0, max(largest, 2.0), 14)
-        new._factors = factors, np.full(len(factors), -np.log(len(factors)))
-        new.noise, new._modes = self.noise.scaled(*new._factors), {}
+        log_p = np.full(len(factors), -np.log(len(factors)))
+        return self._with_noise(_factors=(factors, log_p))
+
+    def with_sizes(self, sizes: Sequence[Array]) -> RivalSet:
+        """Return these models with errors of one of some sizes by channel, (c,)."""
+        return self._with_noise(_sizes=sizes)
+
+    def _with_noise(self, **own: Any) -> RivalSet:
+        new = self.with_fits({})
+        vars(new).update(own, _modes={})
         vars(new).pop("_process", None)  # which has that noise
+        new.noise = new.noise_of(new.measurements)
+        if new.roughness.any():
+            new.noise = new.noise.with_extra(new.roughness)
         return new
 
     def noise_of(self, measurements: Measurements) -> NoiseGrid:
         """Return the errors of some measurements."""
         seed = derive_seed(self.seed, "noise")
         noise = declared_noise(self.model.noise, measurements, seed=seed)
+        if self._sizes:
+            sizes = [np.maximum(size, 1e-300) for size in self._sizes]
+            noise = noise.sized([size[measurements.channel] for size in sizes])
         return noise if self._factors is None else noise.scaled(*self._factors)
 
     def rival(
@@ -182,11 +196,8 @@ class RivalSet:
 
     @cached_property
     def _process(self) -> ResidualProcess:
-        noise = self.noise
-        if noise.channel is not None:
-            best = self.fit().likeliest
-            noise = noise.settled(self.rival(ModelKey()).residual(best)[0][0])
-        return self.residual_process(noise, np.ones(len(self.measurements), bool))
+        every = np.ones(len(self.measurements), dtype=bool)
+        return self.residual_process(self.noise, every)
 
     def residual_process(
         self, noise: NoiseGrid, at: NDArray[np.bool_]

@@ -7,7 +7,7 @@ is linear algebra; effects that are in none of the best are set aside.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -17,7 +17,8 @@ from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
-from sbi_active.criticism.linear.fits import JUMPING, FitSettings
+from sbi_active.criticism.linear.fits import JUMPING, FitSettings, best_fit
+from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
 from sbi_active.criticism.linear.sensor import sensor_of
 from sbi_active.criticism.results import ModelKey
@@ -57,16 +58,18 @@ def linear_models(rivals: RivalSet) -> tuple[Search, Screening | None]:
         The models, without what is set aside; None for a screening where all effects
         are to be fitted.
     """
-    sensor = sensor_of(rivals)
     settings = JUMPING if rivals.roughness.any() else FitSettings()
-    search = Search(rivals, sensor, settings)
-    if rivals.noise.channel is not None:
+    if rivals.noise.is_by_channel:
+        own = rivals.rival(ModelKey()), rivals.prior_draws, rivals.noise.typical_sd
+        rivals = _sized(rivals, own[2], [best_fit(*own, settings)])
+    search = Search(rivals, sensor_of(rivals), settings)
+    if rivals.noise.is_by_channel:
         # What is missing may be seen in one channel alone, and no error of it.
         search.fit_singles()
         models, m = [c.model for c in search.found.values()], rivals.measurements
         best = min(models, key=lambda model: _log_sizes(model.residual, m))
-        sensor = sensor_of(rivals, [search.model(ModelKey()), best])
-        search = Search(rivals, sensor, settings)
+        rivals = _sized(rivals, search.unit, [search.model(ModelKey()), best])
+        search = Search(rivals, sensor_of(rivals), settings)
     if len(rivals.effects) <= MANY:
         return search, None
     search.library.look_at_each()
@@ -76,6 +79,13 @@ def linear_models(rivals: RivalSet) -> tuple[Search, Screening | None]:
     found = _with_kin(found, search)
     search.rivals = rivals.with_effects(found.kept)
     return search, found if found.behind else None
+
+
+def _sized(rivals: RivalSet, unit: Array, fits: Sequence[LinearModel]) -> RivalSet:
+    """Return the models with errors of the sizes that fits leave, by channel."""
+    m = rivals.measurements
+    left = [np.sqrt(m.by_channel((fit.residual * unit) ** 2)) for fit in fits]
+    return rivals.with_sizes(left)
 
 
 def _log_sizes(residual: Array, m: Measurements) -> float:

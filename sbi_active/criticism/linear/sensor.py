@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sbi_active.arrays import Array
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.linear.fits import FitSettings, best_fit
-from sbi_active.criticism.linear.model import LinearModel
-from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.error_models import NoiseCell, NoiseGrid
 from sbi_active.criticism.rivals.noise_grid import measurement_sds
 
@@ -33,7 +29,7 @@ class Sensor:
     df: float = np.inf
 
 
-def sensor_of(rivals: RivalSet, likely: Sequence[LinearModel] = ()) -> Sensor:
+def sensor_of(rivals: RivalSet) -> Sensor:
     """Return the sensor's error.
 
     What a simulator that jumps strays from any smooth function is part of it, unless
@@ -42,8 +38,6 @@ def sensor_of(rivals: RivalSet, likely: Sequence[LinearModel] = ()) -> Sensor:
 
     Args:
         rivals: The models, with the noise as it was declared.
-        likely: Models whose residuals tell the ratio of unknown sizes from channel to
-            channel; the bare one is fitted without any.
     """
     noise, m, grid = rivals.model.noise, rivals.measurements, rivals.noise
     measured = measurement_sds(noise, m)
@@ -62,17 +56,4 @@ def sensor_of(rivals: RivalSet, likely: Sequence[LinearModel] = ()) -> Sensor:
     one_size = all((cell.sd == unit).all() for cell in grid.cells)
     if is_declared and one_size and len(grid.scales) == 1:
         return Sensor(unit, grid, is_known=True, df=df)
-
-    unit = grid.typical_sd
-    if grid.channel is not None:
-        if not likely:
-            bare = rivals.rival(ModelKey())
-            likely = [best_fit(bare, rivals.prior_draws, unit, FitSettings())]
-        each = [grid.settled(model.residual * unit) for model in likely]
-        cells = [
-            replace(cell, log_weight=log_p)
-            for one in each
-            for cell, log_p in zip(one.cells, one.log_prior, strict=True)
-        ]
-        grid = NoiseGrid(cells, scales=each[0].scales)
-    return Sensor(unit, grid, is_known=False, df=df)
+    return Sensor(grid.typical_sd, grid, is_known=False, df=df)

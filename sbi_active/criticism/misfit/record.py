@@ -10,11 +10,7 @@ import numpy as np
 from sbi_active.arrays import Array
 from sbi_active.criticism.data.trials import Trials
 from sbi_active.criticism.evidence.rival_set import RivalSet
-from sbi_active.criticism.misfit.contrary import (
-    is_left_to_chance,
-    widened,
-    withdrawn,
-)
+from sbi_active.criticism.misfit.contrary import is_left_to_chance, withdrawn
 from sbi_active.criticism.misfit.draws import posterior
 from sbi_active.criticism.misfit.guesses import guess_residual
 from sbi_active.criticism.misfit.scored import weights_by_error
@@ -65,10 +61,8 @@ def traced(
         trial_names=dict(zip(trials.index.tolist(), trials.names, strict=True)),
         **(_missing(found, models, held_out) if is_missed else _explaining(found)),
     )
-    if is_missed:
-        return tracing, models
-    is_withdrawn = is_left_to_chance(tracing)
-    return widened(withdrawn(tracing) if is_withdrawn else tracing, models), models
+    is_withdrawn = not is_missed and is_left_to_chance(tracing)
+    return withdrawn(tracing) if is_withdrawn else tracing, models
 
 
 def _likely(found: Verdict) -> tuple[list[ModelKey], dict[str, float]]:

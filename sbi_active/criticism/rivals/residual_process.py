@@ -167,7 +167,7 @@ class ResidualProcess:
         """Return a cell and a size of the noise for each residual, at random."""
         basis, _, scale = drawn(self._joint(residual), rng)
         cells = np.array([b.cell for b in self._bases])[basis]
-        return cells, self.noise.sizes(self.noise.scales[scale])
+        return cells, self.noise.scales[scale]
 
     def _relative(self, spread: Array, sd: Array) -> Array:
         """Return the spread, in the median as large as the noise."""

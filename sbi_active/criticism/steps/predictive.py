@@ -147,7 +147,6 @@ def predict(
         )
         mean = mean + shift
     cells, sizes = fit.error.noise_posterior(own_residual, rng)
-    sizes = noise.by_number(sizes)
     errors, sd = noise.errors(cells, sizes, rng)
     errors, sd = errors * factor, np.sqrt((sd * factor) ** 2 + extra**2)
     errors = errors + extra * rng.normal(size=mean.shape)
@@ -160,7 +159,7 @@ def predict(
             each[:, t] = (-0.5 * e**2 - own - 0.5 * LOG_2PI).sum(1)
         else:
             e, log_scale = residual / factor[:, at], np.log(factor[:, at]).sum(1)
-            log_p = noise.part(at).log_density(cells, sizes[:, at], e)
+            log_p = noise.part(at).log_density(cells, sizes, e)
             each[:, t] = log_p - log_scale
         each[:, t] += flags[t]
     kept = ~drops
