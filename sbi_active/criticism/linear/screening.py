@@ -17,10 +17,9 @@ from sbi_active.arrays import Array
 from sbi_active.criticism.data.measurements import Measurements
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.forces.library import is_force
-from sbi_active.criticism.linear.fits import JUMPING, FitSettings, best_fit
+from sbi_active.criticism.linear.fits import JUMPING, FitSettings, best_fit, sensor_of
 from sbi_active.criticism.linear.model import LinearModel
 from sbi_active.criticism.linear.search import Search
-from sbi_active.criticism.linear.sensor import sensor_of
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.steps.equivalence import MANY
 

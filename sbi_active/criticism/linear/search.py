@@ -22,6 +22,7 @@ from sbi_active.criticism.forces.library import is_force
 from sbi_active.criticism.linear.errors import Errors
 from sbi_active.criticism.linear.fits import (
     FitSettings,
+    Sensor,
     along_secants,
     best_fit,
     onward,
@@ -36,7 +37,6 @@ from sbi_active.criticism.linear.model import (
     enlarged,
     has_null,
 )
-from sbi_active.criticism.linear.sensor import Sensor
 from sbi_active.criticism.results import ModelKey
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival

@@ -8,8 +8,8 @@ from torch.distributions import Independent, Normal, Uniform
 
 from sbi_active import GaussianNoise, SimulatorModel
 from sbi_active.criticism import Criticism, Effect, Trials
+from sbi_active.criticism.linear.fits import sensor_of
 from sbi_active.criticism.linear.search import Search
-from sbi_active.criticism.linear.sensor import sensor_of
 from sbi_active.criticism.results import ModelKey
 
 SENSOR, NUM_TRIALS, LIMIT, SLOPE = 0.5, 14, 14.0, 2.0
