@@ -177,9 +177,8 @@ class Criticism:
     def _models(self) -> RivalSet:
         model, trials, effects = self._parts
         own = model, self.prior, trials.fit, effects
-        return RivalSet(
-            *own, actions=self.actions, seed=self.seed, warm_up=self._warm_up
-        )
+        options = {"actions": self.actions, "warm_up": self._warm_up}
+        return RivalSet(*own, seed=self.seed, **options)
 
     @cached_property
     def _verdict(self) -> Verdict:
@@ -230,8 +229,7 @@ class Criticism:
             return ()
         if self._equivalent is None:
             with stage("effects told apart", show_progress=self.show_progress):
-                found = equivalent_effects(self._search.rivals, self.actions)
-                self._equivalent = found
+                self._equivalent = equivalent_effects(self._search.rivals, self.actions)
         return self._equivalent
 
     def detect(self) -> Detection:
@@ -313,17 +311,13 @@ class Criticism:
     @cached_property
     def _evaluation(self) -> Evaluation | None:
         tracing, trials = self.trace(), self._parts[1]
-        num = FEW_DRAWS if self._is_large else NUM_DRAWS
+        options = {"num_draws": FEW_DRAWS if self._is_large else NUM_DRAWS}
         if (held_out := trials.held_out) is not None:
-            return evaluate_held_out(self.rivals, tracing, held_out, num_draws=num)
+            return evaluate_held_out(self.rivals, tracing, held_out, **options)
         if int(self.trials.valid.sum()) < FEWEST_TRIALS:
             return None
-        shown = self.show_progress
-        return evaluate_left_out(
-            *(self._verdict, self.rivals, trials.fit),
-            num_draws=num,
-            show_progress=shown,
-        )
+        shown, given = self.show_progress, (self._verdict, self.rivals, trials.fit)
+        return evaluate_left_out(*given, show_progress=shown, **options)
 
     def judged(self, evaluation: Evaluation | None) -> Tracing:
         """Return the tracing, unless trials that had no part in it speak against it.
@@ -358,14 +352,10 @@ class Criticism:
         """
         from sbi_active.criticism.reporting import report_of
 
-        held_out = self._parts[1].held_out
         evaluation = self.evaluate() if evaluate else None
-        return report_of(
-            *(self, evaluation, held_out),
-            plan=plan,
-            designed=designed,
-            exploratory=exploratory,
-        )
+        own = self, evaluation, self._parts[1].held_out
+        options = {"designed": designed, "exploratory": exploratory}
+        return report_of(*own, plan=plan, **options)
 
 
 def _without(trials: Trials, outlying: Sequence[OutlyingTrial]) -> Trials:

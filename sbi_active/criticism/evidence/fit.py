@@ -13,7 +13,6 @@ from sbi_active.criticism.results import Evidence
 from sbi_active.criticism.rivals.error_models import NoiseGrid
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
-from sbi_active.inference.engine import Fit as Sampled
 from sbi_active.inference.engine import WeightedDraws
 from sbi_active.inference.sampling.weights import effective_sample_size, normalized
 
@@ -52,22 +51,12 @@ class Fit:
         return error.part(self.known)
 
     @property
-    def likeliest(self) -> Array:
-        """The mode or the draw of the largest density, shape (1, dim)."""
-        if self.mode is not None:
-            return self.mode[None]
-        own = self.sample
-        best = own.u[[int(np.argmax(own.weight))]]
-        if not isinstance(own, Sampled) or own.found is None:
-            return best
-        u = np.concatenate([best, own.found.modes[:1]])
-        log_p = self.rival.log_prior(u) + self.rival.log_likelihood(u)
-        return u[[int(np.argmax(log_p))]]
-
-    @property
     def point(self) -> Array:
         """The point from which one prediction is made, shape (dim,)."""
-        return self.likeliest[0] if self.best is None else self.best
+        if self.best is not None:
+            return self.best
+        own = self.sample
+        return own.u[int(np.argmax(own.weight))] if self.mode is None else self.mode
 
     def weighed(
         self, u: Array, residual: Array, rng: np.random.Generator

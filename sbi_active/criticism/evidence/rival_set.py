@@ -294,7 +294,12 @@ class RivalSet:
         return Fit(rival, sample, self.record(rival, sample, drawn, float(min(square))))
 
     def record(
-        self, rival: Rival, sample: WeightedDraws, u: Array, chi_square: float
+        self,
+        rival: Rival,
+        sample: WeightedDraws,
+        u: Array,
+        chi_square: float,
+        best: Array | None = None,
     ) -> Evidence:
         """Return the record of a rival.
 
@@ -303,8 +308,9 @@ class RivalSet:
             sample: Sample of its posterior.
             u: Draws that are shown, shape (n, dim).
             chi_square: Smallest whitened residual sum of squares.
+            best: Point from which other trials are predicted; None for the draws.
         """
-        own = rival.coordinates.num_own
+        c, own = rival.coordinates, rival.coordinates.num_own
         return Evidence(
             key=rival.key,
             log_evidence=sample.log_evidence,
@@ -312,7 +318,8 @@ class RivalSet:
             effective_sample_size=sample.effective_sample_size,
             engine=sample.method,
             names=self.names_of(rival),
-            draws=rival.coordinates.to_z(u)[:, :own],
+            draws=c.to_z(u)[:, :own],
+            best=None if best is None else c.to_z(best[None])[0, :own],
             best_chi_square=chi_square,
         )
 

@@ -204,13 +204,12 @@ def predict(
             for effect in rivals.nuisances:  # an unseen trial draws its own
                 fresh = effect.sample(num_draws * len(target))
                 phi[effect.name] = fresh.reshape(num_draws, len(target), -1)
-    known = trials is None and not simulator.is_stochastic  # are simulated already
-    source = rivals.simulator if known else simulator
-    mean, unit, probability = source.predict(theta, phi)
+    if trials is None and not simulator.is_stochastic:  # simulated already
+        simulator = rivals.simulator
+    mean, unit, probability = simulator.predict(theta, phi)
     at_best = None
     if trials is not None and fit.best is not None and not rivals.nuisances:
-        at = rival.coordinates.split(fit.best[None])
-        at_best = simulator.predict(*at)[0][0]
+        at_best = simulator.predict(*rival.coordinates.split(fit.best[None]))[0][0]
         at_best = np.where(np.isfinite(at_best), at_best, mean.mean(0))
     noise = rivals.noise_of(m)
     factor = simulator.noise_scale(phi, num_draws)
@@ -222,10 +221,6 @@ def predict(
     if missing.any():  # all that is known of such a number is the prior predictive
         wide = spread / noise.typical_sd
         mean, factor = np.where(missing, center, mean), np.where(missing, wide, factor)
-    flags = [
-        log_outcomes(p[:, None], v[None])
-        for p, v in zip(probability.T, m.valid, strict=True)
-    ]
     extra = np.zeros(len(m))
     if isinstance(rival.error, ResidualProcess):
         shift, extra = rival.error.condition(
@@ -251,7 +246,7 @@ def predict(
             e, log_scale = residual / factor[:, at], np.log(factor[:, at]).sum(1)
             log_p = noise.part(at).log_density(cells, sizes, e)
             each[:, t] = log_p - log_scale
-        each[:, t] += flags[t]
+        each[:, t] += log_outcomes(probability[:, [t]], m.valid[[t]])
     kept = ~drops
     return Prediction(
         mean[:, kept],
