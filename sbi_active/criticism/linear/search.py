@@ -256,11 +256,6 @@ class Search:
         slope = chords(rival, start, own, step, model, self.units)
         return enlarged(model, rival, own, null, slope), own
 
-    def rms(self, key: ModelKey, u: Array) -> float:
-        """Return the rms residual of a model anywhere, in sensor deviations."""
-        r = self.rival(key).residual(u[None])[0] / self.units
-        return float(np.sqrt(np.mean(r[:, : len(self.unit)] ** 2)))
-
     def _best(self, size: int) -> list[ModelKey]:
         """Return the sets to add to: the likeliest by either error, the best fits.
 
