@@ -20,7 +20,7 @@ from sbi_active.criticism.effects.augmented import AugmentedSimulator
 from sbi_active.criticism.effects.effect import Effect
 from sbi_active.criticism.evidence.fit import Fit
 from sbi_active.criticism.evidence.jumps import STEPS, look_for_jumps
-from sbi_active.criticism.evidence.settings import NESTED, ROUGH, THOROUGH, settings_of
+from sbi_active.criticism.evidence.settings import NESTED, THOROUGH, settings_of
 from sbi_active.criticism.results import SCATTER, UNEXPLAINED, Evidence, ModelKey
 from sbi_active.criticism.rivals.coordinates import SearchCoordinates
 from sbi_active.criticism.rivals.error_models import NoiseGrid
@@ -28,7 +28,7 @@ from sbi_active.criticism.rivals.noise_grid import declared_noise, scattered
 from sbi_active.criticism.rivals.residual_process import ResidualProcess
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.criticism.rivals.trial_simulator import NUM_REPLICATES, TrialSimulator
-from sbi_active.inference.engine import Found, WeightedDraws, infer, search
+from sbi_active.inference.engine import WeightedDraws, infer, search
 from sbi_active.seeding import derive_seed
 from sbi_active.simulation import SimulatorModel
 
@@ -92,7 +92,6 @@ class RivalSet:
         self._sizes: Sequence[Array] = ()
         self.noise = self.noise_of(self.measurements)
         self._predictives: dict[tuple[bytes | None, ...], tuple[Array, Array]] = {}
-        self._modes: dict[tuple[ModelKey, bytes], Found] = {}
         self.fits: Mapping[ModelKey, Fit] = {}
         self.center, self.spread = self.prior_predictive(self.simulator)
         # Beyond a thousand deviations of the prior predictive a number is as far.
@@ -136,7 +135,7 @@ class RivalSet:
 
     def _with_noise(self, **own: Any) -> RivalSet:
         new = self.with_fits({})
-        vars(new).update(own, _modes={})
+        vars(new).update(own)
         vars(new).pop("_process", None)  # which has that noise
         new.noise = new.noise_of(new.measurements)
         if new.roughness.any():
@@ -258,18 +257,6 @@ class RivalSet:
         found = self.fits.get(key)
         return self.sampled(key) if found is None else found
 
-    def search(self, key: ModelKey, near: Array | None = None) -> Found:
-        """Return the modes of a rival, computed once, see :meth:`sampled`."""
-        asked = key, b"" if near is None else near.tobytes()
-        if asked not in self._modes:
-            rng = np.random.default_rng(derive_seed(self.seed, "search", str(key)))
-            how = THOROUGH if near is None else NESTED
-            how = how if self.is_smooth else ROUGH
-            found = search(self.rival(key), rng, near, how)
-            assert found is not None  # residuals are bounded
-            self._modes[asked] = found
-        return self._modes[asked]
-
     def sampled(self, key: ModelKey, near: Array | None = None) -> Fit:
         """Return one rival with a sample of its posterior and its evidence.
 
@@ -281,7 +268,9 @@ class RivalSet:
         rival, seed = self.rival(key), derive_seed(self.seed, "evidence", str(key))
         repeats = NUM_REPLICATES if self.simulator.is_stochastic else 1
         settings = settings_of(len(self.trials) * repeats, is_bare=key == ModelKey())
-        rng, found = np.random.default_rng(seed), self.search(key, near)
+        rng = np.random.default_rng(derive_seed(self.seed, "search", str(key)))
+        found = search(rival, rng, near, THOROUGH if near is None else NESTED)
+        rng = np.random.default_rng(seed)
         sample = infer(rival, rng, found=found, settings=settings)
         if not len(sample.u):  # nothing has a likelihood
             u = rival.sample_prior(NUM_DRAWS, rng)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from sbi_active.inference.engine.search import SearchSettings
@@ -24,9 +22,6 @@ NESTED = SearchSettings(
     iterations=6,
     phases=10,
 )
-#: Searches where the simulator jumps: derivatives lead to the neighborhood of a mode at
-#: most.
-ROUGH = replace(NESTED, num_screened=128, num_starts=8, max_starts=8, phases=2)
 
 
 def settings_of(num_trials: int, *, is_bare: bool) -> Settings:

@@ -10,7 +10,7 @@ beside one of the best single effects, and larger sets grown from the best small
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
@@ -105,13 +105,12 @@ class Search:
         if self._looked_again:
             return False
         self._looked_again = True
-        key, settings = ModelKey(), self.settings
-        found, own = self.rivals.search(key), self.rival(key)
-        best = min(
-            (self._polished(own, u) for u in found.modes[: settings.num_kept]),
-            key=lambda fit: fit.cost,
-        )
-        fall = self.found[key].model.cost - best.cost
+        own, settings = self.rival(ModelKey()), self.settings
+        seed = derive_seed(self._seed, "again")
+        u = own.coordinates.sample(settings.num_again, seed=seed)
+        most = {"num_starts": settings.starts_again, "num_kept": settings.kept_again}
+        best = best_fit(own, u, self.units, replace(settings, **most))
+        fall = self.found[ModelKey()].model.cost - best.cost
         if fall < settings.worth * max(best.rms, 1.0) ** 2:
             return False
         self._begin(best)
