@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sbi_active.arrays import Array
-from sbi_active.criticism.evidence.settings import THOROUGH
+from sbi_active.criticism.evidence.fit import THOROUGH
 from sbi_active.criticism.rivals.error_models import NoiseGrid
 from sbi_active.criticism.rivals.rival import Rival
 from sbi_active.inference.engine import search
