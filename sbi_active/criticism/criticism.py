@@ -26,12 +26,11 @@ from sbi_active.criticism.effects.joint_prior import joint_prior
 from sbi_active.criticism.effects.summaries import MANY, MOST, obstacle, summarize
 from sbi_active.criticism.evidence.rival_set import RivalSet
 from sbi_active.criticism.linear.screening import linear_models
-from sbi_active.criticism.misfit.contrary import widened
+from sbi_active.criticism.misfit.contrary import judged, widened
 from sbi_active.criticism.misfit.evaluation import evaluate_held_out, evaluate_left_out
 from sbi_active.criticism.misfit.record import traced
 from sbi_active.criticism.misfit.rule import Rule
 from sbi_active.criticism.misfit.verdict import Verdict, judge
-from sbi_active.criticism.misfit.wider_prior import judged
 from sbi_active.criticism.next_trial.next_action import choose_action
 from sbi_active.criticism.results import (
     Detection,

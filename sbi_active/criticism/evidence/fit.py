@@ -29,7 +29,8 @@ class Fit:
         evidence: Evidence that is recorded of it.
         best: Point from which other trials are predicted, shape (dim,); None takes the
             draws.
-        mode: Point at which it is linear, shape (dim,); None if it was sampled.
+        mode: Point at which it is linear, or of the largest density of a sample, shape
+            (dim,); None where effects on the noise are drawn beside it.
         linear: Function from u (n, dim) to the residuals (n, N) of the linear model
             that draws are of; None if they are of the simulator's own posterior.
         known: Mask of the numbers that it is fitted to, shape (N,); None for all.

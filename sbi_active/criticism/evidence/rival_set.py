@@ -278,8 +278,11 @@ class RivalSet:
         drawn = sample.draws(NUM_DRAWS, np.random.default_rng(seed))
         best = sample.u[np.argsort(sample.weight)[-20:]]
         residual = rival.residual(best, penalized=False)[0]
-        square = [(rival.error.whitener(r)(r) ** 2).sum() for r in residual]
-        return Fit(rival, sample, self.record(rival, sample, drawn, float(min(square))))
+        square = min((rival.noise.whitener(r)(r) ** 2).sum() for r in residual)
+        evidence = self.record(rival, sample, drawn, float(square))
+        u = best[-1:] if found is None else np.r_[best[-1:], found.modes[:1]]
+        log_p = rival.log_prior(u) + rival.log_likelihood(u)
+        return Fit(rival, sample, evidence, mode=u[int(np.argmax(log_p))])
 
     def record(
         self,

@@ -77,6 +77,11 @@ class Rival:
         return int(self.prior.event_shape[0])
 
     @property
+    def noise(self) -> NoiseGrid:
+        """The error without a residual process, which no search has to follow."""
+        return self.error if isinstance(self.error, NoiseGrid) else self.error.noise
+
+    @property
     def searched(self) -> NDArray[np.bool_]:
         """Coordinates that a least-squares search may move: not those of the noise."""
         flags = np.ones(self.dim, dtype=bool)
@@ -148,10 +153,9 @@ class Rival:
 
         It is the same object if the error has nothing unknown, and without u.
         """
-        assert isinstance(self.error, NoiseGrid)  # a process is not searched
-        if u is None or self.error.is_known:
-            return self.error.start
-        return self.error.whitener(self.residual(u)[0][0])
+        if u is None or self.noise.is_known:
+            return self.noise.start
+        return self.noise.whitener(self.residual(u)[0][0])
 
     def log_likelihood(self, u: Array, *, floor: float = -np.inf) -> Array:
         """Return log p(x | z), shape (n,); all trials are simulated at once."""
@@ -198,7 +202,6 @@ class Rival:
         for k, group in enumerate(groups):
             change = (r[k + 1] - r[0]) / step[group > 0][0]
             for j in np.flatnonzero(group):
-                part = sign[:, j, None] * change
-                mine = trial_of[j] < 0
-                jac[:, :, j] = part if mine else part * (trial == trial_of[j])
+                own = (trial_of[j] < 0) | (trial == trial_of[j])
+                jac[:, :, j] = np.where(own, sign[:, j, None] * change, 0.0)
         return r[0], jac
