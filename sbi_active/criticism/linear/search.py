@@ -190,7 +190,7 @@ class Search:
             new = [
                 c.log_p_either for k, c in self.found.items() if len(k.effects) == size
             ]
-            if max(new, default=-np.inf) < before:
+            if not new or max(new) < before:
                 break
             before = max(new)
 
