@@ -27,9 +27,8 @@ class FitSettings:
         num_starts: Draws of the prior at which the bare model's search begins.
         num_kept: Searches that go on from there.
         first: Steps of these searches along secants.
-        num_again: Draws of the prior at which the bare model's search begins before an
-            alarm: a mode that the first search missed would be a false one.
-        starts_again: Number of these searches.
+        starts_again: Draws of the prior at which the bare model's search begins before
+            an alarm: a mode that the first search missed would be a false one.
         kept_again: Searches that go on from there.
         num_drawn: Draws of a further effect at which its fit begins, beside its null.
         num_far: Draws of the prior that are screened for a set with an effect that no
@@ -54,9 +53,8 @@ class FitSettings:
     num_starts: int = 6
     num_kept: int = 2
     first: int = 8
-    num_again: int = 500
-    starts_again: int = 48
-    kept_again: int = 8
+    starts_again: int = 24
+    kept_again: int = 4
     num_drawn: int = 3
     num_far: int = 32
     num_kept_far: int = 6

@@ -105,11 +105,9 @@ class Search:
         if self._looked_again:
             return False
         self._looked_again = True
-        own, settings = self.rival(ModelKey()), self.settings
-        seed = derive_seed(self._seed, "again")
-        u = own.coordinates.sample(settings.num_again, seed=seed)
+        settings, given = self.settings, (self.rivals.prior_draws, self.units)
         most = {"num_starts": settings.starts_again, "num_kept": settings.kept_again}
-        best = best_fit(own, u, self.units, replace(settings, **most))
+        best = best_fit(self.rival(ModelKey()), *given, replace(settings, **most))
         fall = self.found[ModelKey()].model.cost - best.cost
         if fall < settings.worth * max(best.rms, 1.0) ** 2:
             return False
